@@ -1,0 +1,22 @@
+//! Poses, cameras, images, absolute orientation, PnP and registration.
+//!
+//! Conventions of the whole house: lengths in metres, angles in radians, poses in `f64` and named by
+//! their spaces (`camera_from_object`), the OpenCV camera frame (x right, y down, z forward), pixel
+//! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
+
+mod camera;
+mod image;
+mod pose;
+
+pub use camera::{BrownConrady, Camera, CameraError};
+pub use image::{DepthImage, Image, ImageError, Mask, NormalImage, PointImage, Rect, RgbImage};
+pub use pose::{Pose, PoseError};
+
+/// The linear algebra types in this crate's public signatures.
+pub use nalgebra;
+/// A point, direction or translation in three dimensions; metres where it has a length.
+pub type Vec3 = nalgebra::Vector3<f64>;
+/// A point in an image, in pixels (x to the right, y down).
+pub type Vec2 = nalgebra::Vector2<f64>;
+/// A 3x3 matrix, used for rotations and intrinsics.
+pub type Mat3 = nalgebra::Matrix3<f64>;
