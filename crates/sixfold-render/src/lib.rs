@@ -1,1 +1,17 @@
-//! Placeholder room, filled next.
+//! Our own CPU renderer: one pass fills a visibility buffer (inverse depth and triangle per pixel), and
+//! everything else (depth, masks, normals, object coordinates, barycentrics, colour) is read from it.
+//!
+//! Pixel centres lie at whole numbers, as in `sixfold-geometry`. Coverage is decided in integers on a
+//! grid of 1/4096 pixel with the top-left fill rule, so triangles that share an edge never both cover a
+//! pixel and never leave a gap. Depth is where the pixel's ray meets the triangle's plane, not an interpolation
+//! between rounded corners. One thread or many: same bytes.
+
+mod outputs;
+mod raster;
+mod sensor;
+mod shade;
+
+pub use outputs::{BoundingBoxScale, Surface};
+pub use raster::{Culling, Frame, RenderOptions, SceneObject, render_depth};
+pub use sensor::{DepthSensor, simulate_depth};
+pub use shade::{Light, Material, shade};
