@@ -1,5 +1,31 @@
 //! Triangle meshes of objects: reading, writing, measuring, sampling, simplifying.
+//!
+//! A [`Mesh`] is in metres and checked once, when it is made. Files do not say their unit, so readers ask
+//! for it ([`Unit`]) and refuse a size that no tabletop object has, with a message that names the likely unit.
+//!
+//! ```
+//! use sixfold_mesh::{Unit, no_resources, parse_ply};
+//! let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
+//!             property float z\nend_header\n0 0 0\n30 40 0\n";
+//! let mesh = parse_ply(text.as_bytes(), "two_points.ply", Unit::Millimetre, &no_resources)?;
+//! assert!((mesh.diameter() - 0.05).abs() < 1e-12);
+//! # Ok::<(), sixfold_mesh::MeshFileError>(())
+//! ```
 
+mod diameter;
+mod error;
+mod file;
+mod measure;
 mod mesh;
+mod ply;
+mod sample;
+mod unit;
 
+pub use error::MeshFileError;
+pub use file::{
+    LARGEST_DIAMETER, Resources, SMALLEST_DIAMETER, check_size, no_resources, read_mesh, read_mesh_unchecked,
+};
 pub use mesh::{Mesh, MeshError};
+pub use ply::parse_ply;
+pub use sample::SurfaceSamples;
+pub use unit::{Unit, UnitError};

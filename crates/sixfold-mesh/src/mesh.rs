@@ -3,6 +3,9 @@
 use sixfold_geometry::{RgbImage, Vec3};
 use thiserror::Error;
 
+use crate::MeshFileError;
+use crate::measure::computed_normals;
+
 /// Why arrays do not form a mesh.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
@@ -82,7 +85,7 @@ impl Mesh {
         Err(MeshError::AttributeLength { attribute, found, vertices: self.vertices.len() })
     }
 
-    /// With unit normals, one per vertex.
+    /// With unit normals, one per vertex; zero where one is not known.
     ///
     /// # Errors
     /// [`MeshError::AttributeLength`].
@@ -123,7 +126,7 @@ impl Mesh {
         &self.faces
     }
 
-    /// Unit normals per vertex, when known.
+    /// Unit normals per vertex, when known; a single one that is not known is zero.
     pub fn normals(&self) -> Option<&[Vec3]> {
         self.normals.as_deref()
     }
@@ -141,5 +144,101 @@ impl Mesh {
     /// The texture, when there is one.
     pub fn texture(&self) -> Option<&RgbImage> {
         self.texture.as_ref()
+    }
+
+    /// A mesh with its vertices and normals mapped; faces, colours and texture stay.
+    pub(crate) fn map_geometry(
+        &self,
+        vertex: impl Fn(&Vec3) -> Vec3,
+        normal: impl Fn(&Vec3) -> Vec3,
+    ) -> Mesh {
+        Mesh {
+            vertices: self.vertices.iter().map(vertex).collect(),
+            normals: self.normals.as_ref().map(|normals| normals.iter().map(normal).collect()),
+            ..self.clone()
+        }
+    }
+
+    /// All faces of several meshes in one; vertices follow in order. Normals, colours and texture
+    /// coordinates stay where every part has them; where only some have a normal, the others' are computed,
+    /// where only some have a colour, the others are grey. A texture stays only when all parts share it.
+    ///
+    /// # Errors
+    /// [`MeshError::Empty`] without any part.
+    pub fn merged(parts: &[Mesh]) -> Result<Mesh, MeshError> {
+        let first = parts.first().ok_or(MeshError::Empty)?;
+        let mut vertices = Vec::new();
+        let mut faces = Vec::new();
+        for part in parts {
+            let offset = vertices.len() as u32;
+            vertices.extend_from_slice(&part.vertices);
+            faces.extend(part.faces.iter().map(|face| face.map(|i| i + offset)));
+        }
+        let mut mesh = Mesh::new(vertices, faces)?;
+        if parts.iter().any(|part| part.normals.is_some()) {
+            mesh.normals = Some(parts.iter().flat_map(Mesh::vertex_normals).collect());
+        }
+        if parts.iter().any(|part| part.colors.is_some()) {
+            let colors = parts.iter().flat_map(|part| match &part.colors {
+                Some(colors) => colors.clone(),
+                None => vec![[128; 3]; part.vertices.len()],
+            });
+            mesh.colors = Some(colors.collect());
+        }
+        if first.texture.is_some() && parts.iter().all(|part| part.texture == first.texture) {
+            mesh.texcoords = parts
+                .iter()
+                .map(|part| part.texcoords.clone())
+                .collect::<Option<Vec<_>>>()
+                .map(|t| t.concat());
+            mesh.texture = first.texture.clone().filter(|_| mesh.texcoords.is_some());
+        }
+        Ok(mesh)
+    }
+}
+
+/// What a reader found in a file, before it is checked.
+#[derive(Debug, Default)]
+pub(crate) struct Parts {
+    /// In metres.
+    pub vertices: Vec<Vec3>,
+    pub faces: Vec<[u32; 3]>,
+    /// As in the file: of any length, perhaps zero or NaN.
+    pub normals: Option<Vec<Vec3>>,
+    pub colors: Option<Vec<[u8; 3]>>,
+    pub texcoords: Option<Vec<[f32; 2]>>,
+    pub texture: Option<RgbImage>,
+}
+
+impl Parts {
+    /// The checked mesh. Normals are made unit; one without a direction is computed from the faces.
+    pub fn into_mesh(self, file: &str) -> Result<Mesh, MeshFileError> {
+        let in_file = |source| MeshFileError::Mesh { file: file.to_owned(), source };
+        let mut mesh = Mesh::new(self.vertices, self.faces).map_err(in_file)?;
+        if let Some(mut normals) = self.normals {
+            mesh.check_length("normals", normals.len()).map_err(in_file)?;
+            let mut missing = false;
+            for normal in &mut normals {
+                let unit = normal.try_normalize(1e-12).filter(|n| n.iter().all(|c| c.is_finite()));
+                missing |= unit.is_none();
+                *normal = unit.unwrap_or_default();
+            }
+            if missing {
+                let computed = computed_normals(&mesh.vertices, &mesh.faces);
+                for (normal, computed) in normals.iter_mut().zip(computed) {
+                    if *normal == Vec3::zeros() {
+                        *normal = computed;
+                    }
+                }
+            }
+            mesh.normals = Some(normals);
+        }
+        if let Some(colors) = self.colors {
+            mesh = mesh.with_colors(colors).map_err(in_file)?;
+        }
+        if let (Some(texcoords), Some(texture)) = (self.texcoords, self.texture) {
+            mesh = mesh.with_texture(texcoords, texture).map_err(in_file)?;
+        }
+        Ok(mesh)
     }
 }

@@ -1,0 +1,88 @@
+//! What can be wrong with a mesh file: each error names the file, the place in it, and what to do.
+
+use thiserror::Error;
+
+use crate::MeshError;
+
+/// Why a mesh file could not be read or written.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum MeshFileError {
+    /// The file, or one that it names (texture, material, buffer), cannot be opened, read or written.
+    #[error("{file}: {source}")]
+    Io {
+        /// The file.
+        file: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A file that the mesh file names cannot be read.
+    #[error("{file}: {field} names \"{named}\": {reason}; put that file beside the mesh or remove the line")]
+    Named {
+        /// The mesh file.
+        file: String,
+        /// Where in the mesh file.
+        field: String,
+        /// The name found there.
+        named: String,
+        /// Why it cannot be used.
+        reason: String,
+    },
+    /// The file's name has no ending that is known.
+    #[error(
+        "{file}: unknown mesh format \"{found}\", expected a file ending in .ply, .obj, .stl, .gltf or .glb"
+    )]
+    Format {
+        /// The file.
+        file: String,
+        /// The ending.
+        found: String,
+    },
+    /// A field holds something else than it should.
+    #[error("{file}: {field}: expected {expected}, found {found}")]
+    Field {
+        /// The file.
+        file: String,
+        /// Element and property, or line, or object.
+        field: String,
+        /// What should be there.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// The arrays of the file do not form a mesh.
+    #[error("{file}: {source}")]
+    Mesh {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        source: MeshError,
+    },
+    /// The object is no tabletop object: most often the unit is wrong.
+    #[error("{file}: {explanation}")]
+    Size {
+        /// The file.
+        file: String,
+        /// The diameter that the given unit leads to, in metres.
+        diameter: f64,
+        /// What is suspicious and which unit to give.
+        explanation: String,
+    },
+}
+
+impl MeshFileError {
+    /// Shorthand for [`MeshFileError::Field`].
+    pub(crate) fn field(
+        file: &str,
+        field: impl Into<String>,
+        expected: impl Into<String>,
+        found: impl Into<String>,
+    ) -> Self {
+        MeshFileError::Field {
+            file: file.to_owned(),
+            field: field.into(),
+            expected: expected.into(),
+            found: found.into(),
+        }
+    }
+}

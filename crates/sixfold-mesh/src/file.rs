@@ -1,0 +1,158 @@
+//! The door for mesh files: format by ending, unit to metres, and the check for a wrong unit.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use sixfold_geometry::RgbImage;
+
+use crate::{Mesh, MeshFileError, Unit};
+
+/// Smallest diameter that [`read_mesh`] takes without asking, in metres.
+pub const SMALLEST_DIAMETER: f64 = 0.005;
+/// Largest diameter that [`read_mesh`] takes without asking, in metres.
+pub const LARGEST_DIAMETER: f64 = 5.0;
+
+/// Gives the bytes of a file that a mesh file names (texture, material, buffer), by that name.
+pub type Resources<'a> = &'a dyn Fn(&str) -> io::Result<Vec<u8>>;
+
+/// The [`Resources`] of bytes that stand alone: every name is missing.
+///
+/// # Errors
+/// Always [`io::ErrorKind::NotFound`].
+pub fn no_resources(_name: &str) -> io::Result<Vec<u8>> {
+    Err(io::Error::new(io::ErrorKind::NotFound, "no such file"))
+}
+
+/// Reads a mesh and tests its size: [`read_mesh_unchecked`], then [`check_size`].
+///
+/// The format follows from the ending (`.ply .obj .stl .gltf .glb`, upper or lower case). The vertices come
+/// out in metres: the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, and
+/// `unit` multiplies all the same: give [`Unit::Metre`] for a file that keeps to it.
+///
+/// # Errors
+/// [`MeshFileError`], naming file, field, what was expected and found; [`MeshFileError::Size`] for a diameter
+/// outside 5 mm to 5 m.
+pub fn read_mesh(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileError> {
+    let path = path.as_ref();
+    let mesh = read_mesh_unchecked(path, unit)?;
+    check_size(&mesh, &path.display().to_string(), unit)?;
+    Ok(mesh)
+}
+
+/// Reads a mesh as [`read_mesh`] does, of whatever size.
+///
+/// # Errors
+/// [`MeshFileError`], but never [`MeshFileError::Size`].
+pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileError> {
+    let path = path.as_ref();
+    let file = path.display().to_string();
+    let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+    let parse = match ending.as_str() {
+        "ply" => crate::parse_ply,
+        _ => return Err(MeshFileError::Format { file, found: ending }),
+    };
+    let bytes = fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
+    let folder = path.parent().map(Path::to_path_buf).unwrap_or_default();
+    parse(&bytes, &file, unit, &|name| read_beside(&folder, name))
+}
+
+/// A named file relative to the mesh file's folder; a name that is a path of another machine is looked for
+/// by its last part.
+fn read_beside(folder: &Path, name: &str) -> io::Result<Vec<u8>> {
+    let direct = folder.join(PathBuf::from(name.replace('\\', "/")));
+    match fs::read(&direct) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
+            fs::read(folder.join(last)).map_err(|_| error)
+        }
+        other => other,
+    }
+}
+
+/// Tests that a mesh read with `unit` has a diameter between 5 mm and 5 m; the error says in which unit it
+/// would have a sensible one.
+///
+/// # Errors
+/// [`MeshFileError::Size`].
+pub fn check_size(mesh: &Mesh, name: &str, unit: Unit) -> Result<(), MeshFileError> {
+    let diameter = mesh.diameter();
+    let sensible = SMALLEST_DIAMETER..=LARGEST_DIAMETER;
+    if sensible.contains(&diameter) {
+        return Ok(());
+    }
+    let in_file = diameter / unit.to_metres();
+    let better: Vec<String> = Unit::ALL
+        .into_iter()
+        .filter(|u| sensible.contains(&(in_file * u.to_metres())))
+        .map(|u| {
+            format!("{} if the file is in {}: give --unit {u}", length(in_file * u.to_metres()), u.plural())
+        })
+        .collect();
+    let advice = if diameter == 0.0 {
+        "all vertices are the same point".to_owned()
+    } else if better.is_empty() {
+        "no unit (m, mm, cm, in) makes it an object between 5 mm and 5 m: check the file".to_owned()
+    } else {
+        better.join("; ")
+    };
+    Err(MeshFileError::Size {
+        file: name.to_owned(),
+        diameter,
+        explanation: format!("the diameter would be {} as {}; {advice}", length(diameter), unit.plural()),
+    })
+}
+
+/// A length as people say it.
+fn length(metres: f64) -> String {
+    if metres >= 1e6 || (metres > 0.0 && metres < 1e-6) {
+        format!("{metres:.2e} m")
+    } else if metres >= 1.0 {
+        format!("{} m", significant(metres))
+    } else {
+        format!("{} mm", significant(metres * 1e3))
+    }
+}
+
+/// Three significant digits, whole numbers in full.
+fn significant(value: f64) -> String {
+    if value >= 100.0 {
+        format!("{value:.0}")
+    } else if value >= 10.0 {
+        format!("{value:.1}")
+    } else {
+        format!("{value:.3}")
+    }
+}
+
+/// Decodes a PNG or JPEG texture; at most 16384 pixels a side.
+pub(crate) fn decode_texture(bytes: &[u8]) -> Result<RgbImage, String> {
+    let mut reader = image::ImageReader::new(io::Cursor::new(bytes))
+        .with_guessed_format()
+        .map_err(|error| error.to_string())?;
+    let mut limits = image::Limits::default();
+    limits.max_image_width = Some(1 << 14);
+    limits.max_image_height = Some(1 << 14);
+    reader.limits(limits);
+    let rgb = reader.decode().map_err(|error| error.to_string())?.into_rgb8();
+    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
+    let pixels = rgb.into_raw().chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    RgbImage::from_vec(width, height, pixels).map_err(|error| error.to_string())
+}
+
+/// Reads and decodes a texture that `field` of `file` names.
+pub(crate) fn load_texture(
+    file: &str,
+    field: &str,
+    named: &str,
+    resources: Resources<'_>,
+) -> Result<RgbImage, MeshFileError> {
+    let error = |reason: String| MeshFileError::Named {
+        file: file.to_owned(),
+        field: field.to_owned(),
+        named: named.to_owned(),
+        reason,
+    };
+    let bytes = resources(named).map_err(|e| error(e.to_string()))?;
+    decode_texture(&bytes).map_err(error)
+}

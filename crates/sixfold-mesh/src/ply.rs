@@ -1,0 +1,658 @@
+//! PLY, the Polygon File Format (Turk 1994): ascii and binary of both byte orders.
+//!
+//! Our own parser, because the crates looked at keep every row of every element as a value of its own (with
+//! its property names compared as strings) and take an element's count at its word: `element x 4000000000`
+//! without properties needs no bytes in a binary file and grows a crate's array until memory is gone. Here a
+//! count is tested against the bytes that are left before anything is allocated, rows go straight into the
+//! mesh's arrays, and an error names element, row and property.
+
+use std::collections::HashMap;
+
+use sixfold_geometry::Vec3;
+
+use crate::file::load_texture;
+use crate::mesh::Parts;
+use crate::{Mesh, MeshFileError, Resources, Unit};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Ascii,
+    Little,
+    Big,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn from_name(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return None,
+        })
+    }
+
+    fn bytes(self) -> usize {
+        match self {
+            Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::F64 => 8,
+        }
+    }
+
+    fn is_float(self) -> bool {
+        matches!(self, Scalar::F32 | Scalar::F64)
+    }
+}
+
+#[derive(Debug)]
+struct Property {
+    name: String,
+    /// The type of the length, for a list.
+    count: Option<Scalar>,
+    scalar: Scalar,
+}
+
+#[derive(Debug)]
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<Property>,
+}
+
+impl Element {
+    fn scalar(&self, names: &[&str]) -> Option<(usize, Scalar)> {
+        let index =
+            self.properties.iter().position(|p| p.count.is_none() && names.contains(&p.name.as_str()))?;
+        Some((index, self.properties[index].scalar))
+    }
+
+    fn list(&self, names: &[&str]) -> Option<usize> {
+        self.properties.iter().position(|p| p.count.is_some() && names.contains(&p.name.as_str()))
+    }
+
+    /// The least bytes that a row can take in the body.
+    fn least_bytes(&self, encoding: Encoding) -> usize {
+        match encoding {
+            // A digit and what separates it from the next.
+            Encoding::Ascii => 2 * self.properties.len(),
+            _ => self.properties.iter().map(|p| p.count.unwrap_or(p.scalar).bytes()).sum(),
+        }
+    }
+}
+
+struct Header {
+    encoding: Encoding,
+    elements: Vec<Element>,
+    texture: Option<String>,
+    /// Where the body starts.
+    body: usize,
+    /// How many lines the header has.
+    lines: usize,
+}
+
+/// Splits off a line that ends in `\n`, `\r\n` or `\r`; gives the line and where the next one starts.
+fn split_line(bytes: &[u8], start: usize) -> Option<(&[u8], usize)> {
+    let rest = bytes.get(start..).filter(|rest| !rest.is_empty())?;
+    let end = rest.iter().position(|&b| b == b'\n' || b == b'\r').unwrap_or(rest.len());
+    let ending = match rest.get(end..) {
+        Some([b'\r', b'\n', ..]) => 2,
+        Some([_, ..]) => 1,
+        _ => 0,
+    };
+    Some((&rest[..end], start + end + ending))
+}
+
+fn parse_header(bytes: &[u8], file: &str) -> Result<Header, MeshFileError> {
+    let mut encoding = None;
+    let mut elements: Vec<Element> = Vec::new();
+    let mut texture = None;
+    let (mut at, mut lines) = (0, 0);
+    loop {
+        let Some((line, next)) = split_line(bytes, at) else {
+            return Err(MeshFileError::field(file, "header", "a line end_header", "the end of the file"));
+        };
+        at = next;
+        lines += 1;
+        let line = String::from_utf8_lossy(line);
+        let error = |expected: &str| {
+            MeshFileError::field(
+                file,
+                format!("header line {lines}"),
+                expected,
+                format!("\"{}\"", excerpt(&line)),
+            )
+        };
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        if lines == 1 {
+            if words != ["ply"] {
+                return Err(error("\"ply\", the first word of every PLY file"));
+            }
+            continue;
+        }
+        match words.as_slice() {
+            [] => {}
+            ["end_header"] => break,
+            ["comment", key, ..] if key.eq_ignore_ascii_case("TextureFile") => {
+                // The name may hold spaces: everything behind the key.
+                let name = line.split_once(*key).map_or("", |(_, rest)| rest).trim();
+                if !name.is_empty() {
+                    texture.get_or_insert_with(|| name.to_owned());
+                }
+            }
+            ["comment" | "obj_info", ..] => {}
+            ["format", kind, "1.0"] => {
+                encoding = Some(match *kind {
+                    "ascii" => Encoding::Ascii,
+                    "binary_little_endian" => Encoding::Little,
+                    "binary_big_endian" => Encoding::Big,
+                    _ => return Err(error("format ascii, binary_little_endian or binary_big_endian")),
+                });
+            }
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| error("element NAME COUNT with a whole COUNT"))?;
+                elements.push(Element { name: (*name).to_owned(), count, properties: Vec::new() });
+            }
+            ["property", rest @ ..] => {
+                let element = elements.last_mut().ok_or_else(|| error("an element before its properties"))?;
+                let (count, kind, name) = match rest {
+                    ["list", count, kind, name] => {
+                        let count = Scalar::from_name(count)
+                            .filter(|c| !c.is_float())
+                            .ok_or_else(|| error("an integer type for the length of the list"))?;
+                        (Some(count), kind, name)
+                    }
+                    [kind, name] => (None, kind, name),
+                    _ => return Err(error("property TYPE NAME or property list TYPE TYPE NAME")),
+                };
+                let scalar = Scalar::from_name(kind)
+                    .ok_or_else(|| error("a type: char uchar short ushort int uint float double"))?;
+                element.properties.push(Property { name: (*name).to_owned(), count, scalar });
+            }
+            _ => return Err(error("comment, format, element, property or end_header")),
+        }
+    }
+    let encoding =
+        encoding.ok_or_else(|| MeshFileError::field(file, "header", "a line format", "no such line"))?;
+    Ok(Header { encoding, elements, texture, body: at, lines })
+}
+
+/// The first characters of a text, for messages.
+pub(crate) fn excerpt(text: &str) -> String {
+    let mut short: String = text.chars().take(60).collect();
+    if short.len() < text.len() {
+        short.push_str("...");
+    }
+    short
+}
+
+/// Reads the numbers of the body in turn; every number of a PLY type is exact in `f64`.
+struct Body<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    encoding: Encoding,
+    file: &'a str,
+    line: usize,
+}
+
+impl<'a> Body<'a> {
+    fn left(&self) -> usize {
+        self.bytes.len() - self.at
+    }
+
+    fn error(
+        &self,
+        element: &Element,
+        row: usize,
+        property: &str,
+        expected: &str,
+        found: &str,
+    ) -> MeshFileError {
+        let line =
+            if self.encoding == Encoding::Ascii { format!("line {}, ", self.line) } else { String::new() };
+        MeshFileError::field(
+            self.file,
+            format!("{line}element {}, row {row} of {}, property {property}", element.name, element.count),
+            expected,
+            found,
+        )
+    }
+
+    /// Goes to the next line that is not blank (ascii only).
+    fn start_row(&mut self) {
+        if self.encoding != Encoding::Ascii {
+            return;
+        }
+        while let Some(&byte) = self.bytes.get(self.at) {
+            match byte {
+                b'\n' => self.line += 1,
+                // Old Macintosh files end lines in \r alone.
+                b'\r' if self.bytes.get(self.at + 1) != Some(&b'\n') => self.line += 1,
+                b' ' | b'\t' | b'\r' => {}
+                _ => break,
+            }
+            self.at += 1;
+        }
+    }
+
+    /// The next word of this line; empty at its end.
+    fn word(&mut self) -> &'a [u8] {
+        let rest = &self.bytes[self.at..];
+        let skip = rest.iter().take_while(|&&b| b == b' ' || b == b'\t').count();
+        let length = rest[skip..].iter().take_while(|b| !b.is_ascii_whitespace()).count();
+        self.at += skip + length;
+        &rest[skip..skip + length]
+    }
+
+    fn value(
+        &mut self,
+        scalar: Scalar,
+        element: &Element,
+        row: usize,
+        property: &str,
+    ) -> Result<f64, MeshFileError> {
+        if self.encoding == Encoding::Ascii {
+            let word = self.word();
+            return parse_number(word, scalar).ok_or_else(|| {
+                let found = if word.is_empty() {
+                    if self.left() == 0 {
+                        "the end of the file".to_owned()
+                    } else {
+                        "the end of the line".to_owned()
+                    }
+                } else {
+                    format!("\"{}\"", excerpt(&String::from_utf8_lossy(word)))
+                };
+                let expected = if scalar.is_float() { "a number" } else { "a whole number" };
+                self.error(element, row, property, expected, &found)
+            });
+        }
+        let size = scalar.bytes();
+        let Some(raw) = self.bytes.get(self.at..self.at + size) else {
+            return Err(self.error(
+                element,
+                row,
+                property,
+                &format!("{size} bytes"),
+                &format!("{} bytes up to the end of the file", self.left()),
+            ));
+        };
+        self.at += size;
+        let mut native = [0u8; 8];
+        native[..size].copy_from_slice(raw);
+        if self.encoding == Encoding::Big {
+            native[..size].reverse();
+        }
+        let [a, b, c, d, ..] = native;
+        Ok(match scalar {
+            Scalar::I8 => f64::from(a as i8),
+            Scalar::U8 => f64::from(a),
+            Scalar::I16 => f64::from(i16::from_le_bytes([a, b])),
+            Scalar::U16 => f64::from(u16::from_le_bytes([a, b])),
+            Scalar::I32 => f64::from(i32::from_le_bytes([a, b, c, d])),
+            Scalar::U32 => f64::from(u32::from_le_bytes([a, b, c, d])),
+            Scalar::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
+            Scalar::F64 => f64::from_le_bytes(native),
+        })
+    }
+
+    /// Reads a list into `out`, which is emptied first.
+    fn list(
+        &mut self,
+        property: &Property,
+        count: Scalar,
+        element: &Element,
+        row: usize,
+        out: &mut Vec<f64>,
+    ) -> Result<(), MeshFileError> {
+        out.clear();
+        let length = self.value(count, element, row, &property.name)?;
+        if length < 0.0 {
+            return Err(self.error(
+                element,
+                row,
+                &property.name,
+                "a list length of zero or more",
+                &length.to_string(),
+            ));
+        }
+        // Values are read one by one, so a length that lies ends at the end of the file.
+        for _ in 0..length as u64 {
+            out.push(self.value(property.scalar, element, row, &property.name)?);
+        }
+        Ok(())
+    }
+
+    /// Tests that a row is at its end (ascii only).
+    fn end_row(&mut self, element: &Element, row: usize) -> Result<(), MeshFileError> {
+        if self.encoding != Encoding::Ascii {
+            return Ok(());
+        }
+        let word = self.word();
+        if word.is_empty() {
+            return Ok(());
+        }
+        let last = element.properties.last().map_or("", |p| p.name.as_str());
+        let found = format!("\"{}\" behind it", excerpt(&String::from_utf8_lossy(word)));
+        Err(self.error(element, row, last, "the end of the line", &found))
+    }
+}
+
+/// A number in ascii; `float` values are rounded to 32 bit as a binary file would hold them.
+fn parse_number(word: &[u8], scalar: Scalar) -> Option<f64> {
+    if !scalar.is_float() && (1..=9).contains(&word.len()) && word.iter().all(u8::is_ascii_digit) {
+        return Some(f64::from(word.iter().fold(0u32, |n, d| 10 * n + u32::from(d - b'0'))));
+    }
+    let text = std::str::from_utf8(word).ok()?;
+    match scalar {
+        Scalar::F64 => text.parse().ok(),
+        Scalar::F32 => text.parse::<f32>().ok().map(f64::from),
+        // Some writers print "255.0" for a uchar.
+        _ => text.parse::<f64>().ok().filter(|v| v.fract() == 0.0),
+    }
+}
+
+/// The columns of a vertex row that are kept.
+const KEPT: [&[&str]; 11] = [
+    &["x"],
+    &["y"],
+    &["z"],
+    &["nx", "normal_x"],
+    &["ny", "normal_y"],
+    &["nz", "normal_z"],
+    &["red", "r", "diffuse_red"],
+    &["green", "g", "diffuse_green"],
+    &["blue", "b", "diffuse_blue"],
+    &["texture_u", "u", "s"],
+    &["texture_v", "v", "t"],
+];
+const SKIPPED: usize = KEPT.len();
+
+/// Reads a PLY mesh from the bytes of a file.
+///
+/// * vertices: `x y z`, times `unit`, in metres out;
+/// * normals `nx ny nz`, made unit; where one is zero or not finite, the normal of the faces around it;
+/// * colours `red green blue` (also `diffuse_red` ...): integers 0 to 255 (`ushort`: 0 to 65535), floats 0 to 1;
+/// * texture coordinates per vertex (`texture_u texture_v`, `u v` or `s t`) or per face corner (list
+///   `texcoord`; vertices are then split at the seams), kept when `comment TextureFile NAME` names a texture,
+///   which `resources` gives;
+/// * polygons with more than three corners become triangle fans, those with fewer are left out;
+/// * all other properties and elements are skipped; no faces makes a point model.
+///
+/// # Errors
+/// [`MeshFileError`]: `file` is the name that messages carry.
+pub fn parse_ply(
+    bytes: &[u8],
+    file: &str,
+    unit: Unit,
+    resources: Resources<'_>,
+) -> Result<Mesh, MeshFileError> {
+    let header = parse_header(bytes, file)?;
+    let mut body = Body { bytes, at: header.body, encoding: header.encoding, file, line: header.lines + 1 };
+    let mut parts = Parts::default();
+    let mut corner_texcoords: Vec<[[f32; 2]; 3]> = Vec::new();
+    let mut seen_vertices = false;
+    let mut list = Vec::new();
+    for element in &header.elements {
+        let least = element.least_bytes(header.encoding);
+        // The last line may lack its end.
+        let available = body.left() + usize::from(header.encoding == Encoding::Ascii);
+        if element.count.checked_mul(least).is_none_or(|needed| needed > available) {
+            return Err(MeshFileError::field(
+                file,
+                format!("element {}", element.name),
+                format!("{} rows of at least {least} bytes each", element.count),
+                format!("{} bytes up to the end of the file; it is cut off or its header lies", body.left()),
+            ));
+        }
+        if least == 0 {
+            continue;
+        }
+        match element.name.as_str() {
+            "vertex" if !seen_vertices => {
+                seen_vertices = true;
+                read_vertices(&mut body, element, unit, &mut parts)?;
+            }
+            "face" => read_faces(&mut body, element, &mut parts, &mut corner_texcoords)?,
+            "tristrips" if element.count > 0 => {
+                return Err(MeshFileError::field(
+                    file,
+                    "element tristrips",
+                    "triangles in an element face",
+                    "triangle strips, which are not supported; save the mesh with triangles",
+                ));
+            }
+            _ => {
+                for row in 0..element.count {
+                    body.start_row();
+                    skip_row(&mut body, element, row, &mut list)?;
+                    body.end_row(element, row)?;
+                }
+            }
+        }
+    }
+    if parts.vertices.is_empty() {
+        return Err(MeshFileError::field(file, "element vertex", "at least one vertex", "none"));
+    }
+    let vertices = parts.vertices.len();
+    for (face, corners) in parts.faces.iter().enumerate() {
+        if let Some(&found) = corners.iter().find(|&&i| i as usize >= vertices) {
+            return Err(MeshFileError::field(
+                file,
+                format!("element face, triangle {face}"),
+                format!("vertex indices below {vertices}"),
+                found.to_string(),
+            ));
+        }
+    }
+    if !corner_texcoords.is_empty() {
+        split_at_seams(&mut parts, &corner_texcoords);
+    }
+    match &header.texture {
+        Some(name) if parts.texcoords.is_some() => {
+            parts.texture = Some(load_texture(file, "comment TextureFile", name, resources)?);
+        }
+        _ => parts.texcoords = None,
+    }
+    parts.into_mesh(file)
+}
+
+fn skip_row(
+    body: &mut Body<'_>,
+    element: &Element,
+    row: usize,
+    list: &mut Vec<f64>,
+) -> Result<(), MeshFileError> {
+    for property in &element.properties {
+        match property.count {
+            Some(count) => body.list(property, count, element, row, list)?,
+            None => {
+                body.value(property.scalar, element, row, &property.name)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn read_vertices(
+    body: &mut Body<'_>,
+    element: &Element,
+    unit: Unit,
+    parts: &mut Parts,
+) -> Result<(), MeshFileError> {
+    let columns = KEPT.map(|names| element.scalar(names));
+    for (axis, column) in ["x", "y", "z"].iter().zip(&columns) {
+        if column.is_none() {
+            return Err(MeshFileError::field(
+                body.file,
+                "element vertex",
+                "the properties x, y and z",
+                format!("no property {axis}"),
+            ));
+        }
+    }
+    let has = |range: std::ops::Range<usize>| columns[range].iter().all(Option::is_some);
+    let (has_normals, has_colors, has_texcoords) = (has(3..6), has(6..9), has(9..11));
+    let mut slots = vec![SKIPPED; element.properties.len()];
+    for (slot, column) in columns.iter().enumerate() {
+        if let Some((index, _)) = column {
+            slots[*index] = slot;
+        }
+    }
+    let color_scale = match columns[6] {
+        Some((_, Scalar::F32 | Scalar::F64)) => 255.0,
+        Some((_, Scalar::U16)) => 1.0 / 257.0,
+        _ => 1.0,
+    };
+    let scale = unit.to_metres();
+    let n = element.count;
+    parts.vertices.reserve_exact(n);
+    let mut normals = Vec::with_capacity(if has_normals { n } else { 0 });
+    let mut colors = Vec::with_capacity(if has_colors { n } else { 0 });
+    let mut texcoords = Vec::with_capacity(if has_texcoords { n } else { 0 });
+    let mut list = Vec::new();
+    for row in 0..n {
+        let mut v = [0.0; SKIPPED + 1];
+        body.start_row();
+        for (property, &slot) in element.properties.iter().zip(&slots) {
+            match property.count {
+                Some(count) => body.list(property, count, element, row, &mut list)?,
+                None => v[slot] = body.value(property.scalar, element, row, &property.name)?,
+            }
+        }
+        body.end_row(element, row)?;
+        for (axis, value) in ["x", "y", "z"].iter().zip(&v) {
+            if !value.is_finite() {
+                return Err(body.error(element, row, axis, "a finite number", &value.to_string()));
+            }
+        }
+        parts.vertices.push(Vec3::new(v[0] * scale, v[1] * scale, v[2] * scale));
+        if has_normals {
+            normals.push(Vec3::new(v[3], v[4], v[5]));
+        }
+        if has_colors {
+            // A cast saturates and makes NaN zero.
+            colors.push([v[6], v[7], v[8]].map(|c| (c * color_scale).round() as u8));
+        }
+        if has_texcoords {
+            for (value, name) in v[9..11].iter().zip(["u", "v"]) {
+                if !(*value as f32).is_finite() {
+                    let name = format!("texture {name}");
+                    return Err(body.error(element, row, &name, "a finite number", &value.to_string()));
+                }
+            }
+            texcoords.push([v[9] as f32, v[10] as f32]);
+        }
+    }
+    parts.normals = has_normals.then_some(normals);
+    parts.colors = has_colors.then_some(colors);
+    parts.texcoords = has_texcoords.then_some(texcoords);
+    Ok(())
+}
+
+fn read_faces(
+    body: &mut Body<'_>,
+    element: &Element,
+    parts: &mut Parts,
+    corner_texcoords: &mut Vec<[[f32; 2]; 3]>,
+) -> Result<(), MeshFileError> {
+    let indices_at = element.list(&["vertex_indices", "vertex_index"]);
+    let texcoord_at = element.list(&["texcoord"]);
+    let Some(indices_at) = indices_at else {
+        return Err(MeshFileError::field(
+            body.file,
+            "element face",
+            "a property list vertex_indices",
+            "no such property",
+        ));
+    };
+    parts.faces.reserve(element.count);
+    let mut indices = Vec::new();
+    let mut texcoords = Vec::new();
+    let mut other = Vec::new();
+    for row in 0..element.count {
+        body.start_row();
+        for (at, property) in element.properties.iter().enumerate() {
+            let Some(count) = property.count else {
+                body.value(property.scalar, element, row, &property.name)?;
+                continue;
+            };
+            let out = if at == indices_at {
+                &mut indices
+            } else if Some(at) == texcoord_at {
+                &mut texcoords
+            } else {
+                &mut other
+            };
+            body.list(property, count, element, row, out)?;
+        }
+        body.end_row(element, row)?;
+        if let Some(found) = indices.iter().find(|i| !(0.0..=f64::from(u32::MAX)).contains(*i)) {
+            let expected = "a vertex index of zero or more";
+            return Err(body.error(element, row, "vertex_indices", expected, &found.to_string()));
+        }
+        if texcoord_at.is_some() {
+            if texcoords.len() != 2 * indices.len() {
+                let expected = format!("{} numbers, two for each corner", 2 * indices.len());
+                return Err(body.error(element, row, "texcoord", &expected, &texcoords.len().to_string()));
+            }
+            if let Some(found) = texcoords.iter().find(|t| !(**t as f32).is_finite()) {
+                return Err(body.error(element, row, "texcoord", "finite numbers", &found.to_string()));
+            }
+        }
+        for corner in 2..indices.len() {
+            let fan = [0, corner - 1, corner];
+            parts.faces.push(fan.map(|i| indices[i] as u32));
+            if texcoord_at.is_some() {
+                corner_texcoords.push(fan.map(|i| [texcoords[2 * i] as f32, texcoords[2 * i + 1] as f32]));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Gives every vertex one texture coordinate: the first one met stays with the vertex, every other one
+/// gets a copy of the vertex behind the others.
+fn split_at_seams(parts: &mut Parts, corner_texcoords: &[[[f32; 2]; 3]]) {
+    let mut texcoords: Vec<Option<[f32; 2]>> = vec![None; parts.vertices.len()];
+    let mut copies: HashMap<(u32, [u32; 2]), u32> = HashMap::new();
+    for (face, corners) in parts.faces.iter_mut().zip(corner_texcoords) {
+        for (index, uv) in face.iter_mut().zip(corners) {
+            let original = *index as usize;
+            let first = *texcoords[original].get_or_insert(*uv);
+            if first == *uv {
+                continue;
+            }
+            *index = *copies.entry((*index, uv.map(f32::to_bits))).or_insert_with(|| {
+                let copy = parts.vertices.len() as u32;
+                parts.vertices.push(parts.vertices[original]);
+                if let Some(normals) = &mut parts.normals {
+                    normals.push(normals[original]);
+                }
+                if let Some(colors) = &mut parts.colors {
+                    colors.push(colors[original]);
+                }
+                texcoords.push(Some(*uv));
+                copy
+            });
+        }
+    }
+    parts.texcoords = Some(texcoords.into_iter().map(Option::unwrap_or_default).collect());
+}
