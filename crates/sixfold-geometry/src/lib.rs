@@ -5,12 +5,28 @@
 //! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
 
 mod camera;
+mod cloud;
+mod icp;
 mod image;
+mod kabsch;
+mod nearest;
+mod normals;
+mod plane;
 mod pose;
+mod solver;
 
 pub use camera::{BrownConrady, Camera, CameraError};
+pub use cloud::PointCloud;
+pub use icp::{
+    CorrespondenceSource, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, icp,
+};
 pub use image::{DepthImage, Image, ImageError, Mask, NormalImage, PointImage, Rect, RgbImage};
+pub use kabsch::{AlignmentError, Similarity, kabsch, umeyama};
+pub use nearest::{KdTree, Neighbour};
+pub use normals::{NormalOptions, inpaint_depth, normals_from_depth};
+pub use plane::{Plane, PlaneOptions, dominant_plane, fit_plane};
 pub use pose::{Pose, PoseError};
+pub use solver::NormalEquations;
 
 /// The linear algebra types in this crate's public signatures.
 pub use nalgebra;
