@@ -3,6 +3,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use sixfold_geometry::RgbImage;
 
@@ -155,4 +156,18 @@ pub(crate) fn load_texture(
     };
     let bytes = resources(named).map_err(|e| error(e.to_string()))?;
     decode_texture(&bytes).map_err(error)
+}
+
+/// Writes a file aside and renames it, so that nobody sees a part of it.
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), MeshFileError> {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+    let aside = path.with_file_name(format!(".{name}.{}-{number}.part", std::process::id()));
+    let written = fs::write(&aside, bytes).and_then(|()| fs::rename(&aside, path));
+    written.map_err(|source| {
+        // The first error is the one to tell.
+        let _ = fs::remove_file(&aside);
+        MeshFileError::Io { file: path.display().to_string(), source }
+    })
 }

@@ -17,7 +17,9 @@ mod error;
 mod file;
 mod measure;
 mod mesh;
+mod models_info;
 mod ply;
+mod ply_write;
 mod sample;
 mod unit;
 
@@ -26,6 +28,8 @@ pub use file::{
     LARGEST_DIAMETER, Resources, SMALLEST_DIAMETER, check_size, no_resources, read_mesh, read_mesh_unchecked,
 };
 pub use mesh::{Mesh, MeshError};
+pub use models_info::{ContinuousSymmetry, ModelInfo, ModelsInfo};
 pub use ply::parse_ply;
+pub use ply_write::{PlyFormat, ply_bytes, write_ply};
 pub use sample::SurfaceSamples;
 pub use unit::{Unit, UnitError};
