@@ -51,6 +51,8 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
     let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     let parse = match ending.as_str() {
         "ply" => crate::parse_ply,
+        "obj" => crate::parse_obj,
+        "stl" => crate::parse_stl,
         _ => return Err(MeshFileError::Format { file, found: ending }),
     };
     let bytes = fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;

@@ -18,9 +18,13 @@ mod file;
 mod measure;
 mod mesh;
 mod models_info;
+mod obj;
+mod paint;
 mod ply;
 mod ply_write;
 mod sample;
+mod simplify;
+mod stl;
 mod unit;
 
 pub use error::MeshFileError;
@@ -29,7 +33,10 @@ pub use file::{
 };
 pub use mesh::{Mesh, MeshError};
 pub use models_info::{ContinuousSymmetry, ModelInfo, ModelsInfo};
+pub use obj::parse_obj;
 pub use ply::parse_ply;
 pub use ply_write::{PlyFormat, ply_bytes, write_ply};
 pub use sample::SurfaceSamples;
+pub use simplify::simplify;
+pub use stl::parse_stl;
 pub use unit::{Unit, UnitError};

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use sixfold_mesh::{Mesh, Unit, read_mesh};
+use sixfold_mesh::{Mesh, Unit, read_mesh, simplify};
 
 fn data() -> Option<PathBuf> {
     let folder = std::env::var_os("SIXFOLD_DATA")
@@ -98,4 +98,64 @@ fn a_wrong_unit_is_explained() {
     let expected =
         "the diameter would be 102 m as metres; 102 mm if the file is in millimetres: give --unit mm";
     assert!(error.contains(expected), "{error}");
+}
+
+#[test]
+fn textured_objs() {
+    let Some(data) = data() else { return };
+    let mut count = 0;
+    for (folder, unit) in [("meshes", Unit::Metre), ("hope/models_textured", Unit::Millimetre)] {
+        for entry in std::fs::read_dir(data.join(folder)).unwrap() {
+            let path = entry.unwrap().path().join("textured.obj");
+            if !path.is_file() {
+                continue;
+            }
+            count += 1;
+            // Against what its neighbours have, this one is in centimetres.
+            let unit = if path.to_string_lossy().contains("libero_mug") { Unit::Centimetre } else { unit };
+            let start = Instant::now();
+            let mesh = read(&path, unit);
+            eprintln!(
+                "{}: {} faces, {:.1} mm, {:?}",
+                path.display(),
+                mesh.faces().len(),
+                1e3 * mesh.diameter(),
+                start.elapsed()
+            );
+            assert!(mesh.texture().unwrap().width() >= 64);
+            assert_eq!(mesh.texcoords().unwrap().len(), mesh.vertices().len());
+        }
+    }
+    assert!(count >= 13, "{count}");
+    // The textured and the plain model of HOPE are the same object in the same frame.
+    let plain = read(&data.join("hope/models/obj_000002.ply"), Unit::Millimetre);
+    let textured = read(&data.join("hope/models_textured/obj_000002/textured.obj"), Unit::Millimetre);
+    assert!((plain.diameter() - textured.diameter()).abs() < 1e-3);
+    assert!((plain.bounding_box().0 - textured.bounding_box().0).norm() < 1e-3);
+}
+
+#[test]
+fn simplified_models_keep_their_size() {
+    let Some(data) = data() else { return };
+    for path in files(data.join("lmo/models"), "ply") {
+        let mesh = read(&path, Unit::Millimetre);
+        let start = Instant::now();
+        let small = simplify(&mesh, 2000);
+        let time = start.elapsed();
+        let ratio = small.diameter() / mesh.diameter();
+        let (low, high) = mesh.bounding_box();
+        let (small_low, small_high) = small.bounding_box();
+        eprintln!(
+            "{}: {} to {} faces in {time:?}, diameter x {ratio:.5}, area x {:.4}",
+            path.display(),
+            mesh.faces().len(),
+            small.faces().len(),
+            small.surface_area() / mesh.surface_area()
+        );
+        assert!(small.faces().len() <= 2000);
+        assert!((ratio - 1.0).abs() < 0.02);
+        let off = (low - small_low).amax().max((high - small_high).amax());
+        assert!(off < 0.02 * mesh.diameter(), "{off}");
+        assert_eq!(small.colors().unwrap().len(), small.vertices().len());
+    }
 }
