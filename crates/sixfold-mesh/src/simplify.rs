@@ -350,8 +350,9 @@ impl<'a> Nearest<'a> {
     }
 
     fn key(&self, point: &Vec3) -> [i64; 3] {
+        // A point far outside gets a cell far outside, without overflow.
         let scaled = (point - self.low) / self.cell;
-        [scaled.x.floor() as i64, scaled.y.floor() as i64, scaled.z.floor() as i64]
+        [scaled.x, scaled.y, scaled.z].map(|c| c.floor().clamp(-1e9, 1e9) as i64)
     }
 
     /// The index of the nearest point, the lowest among equals.
