@@ -61,9 +61,9 @@ impl Default for Pose {
 }
 
 impl Pose {
-    /// Largest deviation of `R^T R` from the identity that [`Pose::from_parts`] takes: BOP files carry
-    /// six decimals, some datasets fewer.
-    pub const ROTATION_TOLERANCE: f64 = 2e-3;
+    /// Largest deviation of `R^T R` from the identity that [`Pose::from_parts`] takes: the published ground truth of
+    /// LM-O holds rotations that are off by 0.009.
+    pub const ROTATION_TOLERANCE: f64 = 2e-2;
 
     /// The transformation that changes nothing.
     pub fn identity() -> Self {
@@ -295,7 +295,7 @@ mod tests {
         let mirror = Mat3::from_diagonal(&Vec3::new(1.0, 1.0, -1.0));
         assert!(matches!(Pose::from_parts(&mirror, Vec3::zeros()), Err(PoseError::NotARotation { .. })));
         assert!(matches!(
-            Pose::from_parts(&(Mat3::identity() * 1.01), Vec3::zeros()),
+            Pose::from_parts(&(Mat3::identity() * 1.02), Vec3::zeros()),
             Err(PoseError::NotARotation { .. })
         ));
         let nan = Mat3::from_element(f64::NAN);

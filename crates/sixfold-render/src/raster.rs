@@ -456,27 +456,21 @@ impl Band<'_> {
             step_y[i] = dx << SUBPIXEL_BITS;
         }
         let plane = plane();
-        let mut drawn = false;
-        let (mut x_low, mut x_high) = (i32::MAX, i32::MIN);
-        let (mut y_low, mut y_high) = (i32::MAX, i32::MIN);
         for y in first_y..=last_y {
             let offset = (y - self.y0) as usize * self.width;
+            let pixels = offset + first_x as usize..offset + last_x as usize + 1;
             let base = plane.b * f64::from(y) + plane.c;
             let mut e = row;
             let mut inside = false;
-            for x in first_x..=last_x {
+            let depths = &mut self.inverse_depth[pixels.clone()];
+            let numbers = &mut self.triangle[pixels];
+            for (x, (depth, pixel)) in (first_x..).zip(depths.iter_mut().zip(numbers)) {
                 if (e[0] | e[1] | e[2]) >= 0 {
                     inside = true;
                     let inverse = ((plane.a * f64::from(x) + base) as f32).max(plane.low).min(plane.high);
-                    let index = offset + x as usize;
-                    if inverse > self.inverse_depth[index] {
-                        self.inverse_depth[index] = inverse;
-                        self.triangle[index] = number;
-                        drawn = true;
-                        x_low = x_low.min(x);
-                        x_high = x_high.max(x);
-                        y_low = y_low.min(y);
-                        y_high = y_high.max(y);
+                    if inverse > *depth {
+                        *depth = inverse;
+                        *pixel = number;
                     }
                 } else if inside {
                     break;
@@ -489,12 +483,10 @@ impl Band<'_> {
             row[1] += step_y[1];
             row[2] += step_y[2];
         }
-        if drawn {
-            self.covered = union(
-                self.covered,
-                [x_low as usize, y_low as usize, x_high as usize + 1, y_high as usize + 1],
-            );
-        }
+        self.covered = union(
+            self.covered,
+            [first_x as usize, first_y as usize, last_x as usize + 1, last_y as usize + 1],
+        );
     }
 }
 

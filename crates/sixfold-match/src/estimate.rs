@@ -1,0 +1,304 @@
+//! From a prepared scene and a described object to poses: vote, join, screen, refine, verify.
+//!
+//! Screening compares the object's samples with the depth image at the hypothesis as the view-dependent
+//! re-scoring of Vidal et al. (2018), section 3.4: only samples seen from that side count. It is cheap enough for
+//! hundreds of hypotheses, so the number of votes decides little.
+
+use rayon::prelude::*;
+use serde::Serialize;
+use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, icp};
+
+use crate::V3;
+use crate::clustering::{ClusterOptions, cluster};
+use crate::model::ObjectModel;
+use crate::scene::Scene;
+use crate::verification::{VerificationOptions, VerificationScore, Verifier};
+use crate::voting::{Hypothesis, VotingOptions, vote};
+
+/// How poses are estimated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EstimateOptions {
+    /// Voting.
+    pub voting: VotingOptions,
+    /// Joining.
+    pub clustering: ClusterOptions,
+    /// Final scores.
+    pub verification: VerificationOptions,
+    /// Hypotheses that get a short ICP after screening.
+    pub refined: usize,
+    /// Hypotheses that get a full ICP and are verified by rendering.
+    pub verified: usize,
+    /// Most instances of the object returned.
+    pub max_instances: usize,
+    /// Poses whose [`VerificationScore::ranking`] is lower are not returned.
+    pub min_score: f64,
+}
+
+impl Default for EstimateOptions {
+    fn default() -> Self {
+        EstimateOptions {
+            voting: VotingOptions::default(),
+            clustering: ClusterOptions::default(),
+            verification: VerificationOptions::default(),
+            refined: 60,
+            verified: 15,
+            max_instances: 1,
+            min_score: 0.05,
+        }
+    }
+}
+
+/// A pose with its score.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// The pose.
+    pub camera_from_object: Pose,
+    /// What the verification says.
+    pub score: VerificationScore,
+    /// Votes of the hypothesis it came from.
+    pub votes: f32,
+}
+
+/// Where an estimate's time went, in seconds.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Timing {
+    /// Voting.
+    pub voting: f64,
+    /// Joining.
+    pub clustering: f64,
+    /// Screening and short ICP.
+    pub screening: f64,
+    /// Full ICP and verification.
+    pub verification: f64,
+}
+
+/// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives
+/// the same output at any number of threads.
+pub fn estimate(scene: &Scene, model: &ObjectModel, options: &EstimateOptions) -> Vec<Estimate> {
+    estimate_timed(scene, model, options).0
+}
+
+/// As [`estimate`], and where the time went.
+pub fn estimate_timed(
+    scene: &Scene,
+    model: &ObjectModel,
+    options: &EstimateOptions,
+) -> (Vec<Estimate>, Timing) {
+    let mut timing = Timing::default();
+    let threshold = options.verification.threshold_for(model.diameter);
+    let target = match IndexedCloud::new(scene.cloud.clone()) {
+        Ok(target) => target,
+        Err(_) => return (vec![], timing),
+    };
+    let mut found: Vec<Estimate> = vec![];
+    let mut taken: Vec<u32> = vec![];
+    // Several instances hide each other's votes: after each round the explained points are taken out.
+    for round in 0..options.max_instances.max(1) {
+        let start = std::time::Instant::now();
+        let cloud;
+        let voters = if round == 0 {
+            &scene.cloud
+        } else {
+            let width = scene.camera.width;
+            let explained: Vec<_> = taken
+                .iter()
+                .map(|&i| {
+                    let (x, y) = (i as usize % width, i as usize / width);
+                    let z = f64::from(scene.depth[(x, y)]);
+                    scene.camera.unproject(&sixfold_geometry::Vec2::new(x as f64, y as f64), z)
+                })
+                .collect();
+            cloud = scene.cloud_without(&explained, 0.003);
+            &cloud
+        };
+        let votes = vote(model, voters, &options.voting);
+        timing.voting += start.elapsed().as_secs_f64();
+        let start = std::time::Instant::now();
+        let clusters = cluster(&votes, &model.centre, model.diameter, &model.symmetries, &options.clustering);
+        timing.clustering += start.elapsed().as_secs_f64();
+        let start = std::time::Instant::now();
+        let refined = screen(scene, model, &target, &clusters, options);
+        timing.screening += start.elapsed().as_secs_f64();
+        let start = std::time::Instant::now();
+        let verified = verify(scene, model, &refined, threshold, options);
+        timing.verification += start.elapsed().as_secs_f64();
+        let before = found.len();
+        let mut verifier = Verifier::default();
+        for e in verified {
+            if found.len() >= options.max_instances || e.score.ranking() < options.min_score {
+                break;
+            }
+            let mut pixels = verifier.explained_pixels(scene, &model.mesh, &e.camera_from_object, threshold);
+            let shared = pixels.iter().filter(|p| taken.binary_search(p).is_ok()).count();
+            if pixels.is_empty() || shared * 10 > pixels.len() * 3 {
+                continue;
+            }
+            taken.append(&mut pixels);
+            taken.sort_unstable();
+            taken.dedup();
+            found.push(e);
+        }
+        if found.len() == before || found.len() >= options.max_instances {
+            break;
+        }
+    }
+    found.sort_by(|a, b| b.score.ranking().total_cmp(&a.score.ranking()));
+    (found, timing)
+}
+
+/// The samples of the model that are seen at a pose, in the object's frame.
+fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usize> {
+    let centre = pose.transform_point(&model.centre);
+    let towards = pose.inverse().transform_direction(&-centre.normalize()).cast::<f32>();
+    let bit = 1u64 << model.view_of(&towards);
+    model.visible_from.iter().enumerate().filter(move |(_, v)| **v & bit != 0).map(|(i, _)| i)
+}
+
+/// How well the visible samples agree with the depth image, in 0..=1.
+fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
+    let rotation = pose.rotation_matrix().cast::<f32>();
+    let t: V3 = pose.translation().cast();
+    let (fx, fy) = (scene.camera.fx as f32, scene.camera.fy as f32);
+    let (cx, cy) = (scene.camera.cx as f32, scene.camera.cy as f32);
+    let (width, height) = (scene.camera.width as f32, scene.camera.height as f32);
+    let (mut total, mut good, mut occluded, mut out) = (0f32, 0f32, 0f32, 0f32);
+    for i in visible_samples(model, pose) {
+        let p = rotation * model.samples.points[i].cast::<f32>() + t;
+        let n = rotation * model.samples.normals[i].cast::<f32>();
+        if p.z <= 0.05 {
+            continue;
+        }
+        let x = (fx * p.x / p.z + cx).round();
+        let y = (fy * p.y / p.z + cy).round();
+        total += 1.0;
+        if !(x >= 0.0 && y >= 0.0 && x < width && y < height) {
+            occluded += 1.0;
+            continue;
+        }
+        let pixel = (x as usize, y as usize);
+        let z = scene.depth[pixel];
+        if z <= 0.0 {
+            continue;
+        }
+        // Distance to the tangent plane along the ray: grazing surface may miss by more in depth.
+        let slope = (-n.dot(&p) / p.norm()).clamp(0.3, 1.0);
+        let difference = (z - p.z) * slope;
+        if difference > tolerance {
+            out += 1.0;
+        } else if difference < -tolerance {
+            occluded += 1.0;
+        } else {
+            let m = scene.normals[pixel];
+            let agreement = n.x * m[0] + n.y * m[1] + n.z * m[2];
+            good += if agreement > cosine { 1.0 } else { 0.2 };
+        }
+    }
+    if total == 0.0 {
+        return 0.0;
+    }
+    let seen = total - occluded;
+    good / (seen + 0.15 * total) * (1.0 - out / total)
+}
+
+fn screen(
+    scene: &Scene,
+    model: &ObjectModel,
+    target: &IndexedCloud,
+    clusters: &[Hypothesis],
+    options: &EstimateOptions,
+) -> Vec<Hypothesis> {
+    let step = model.diameter * model.options.sampling_step;
+    let coarse = (1.5 * step).max(0.006) as f32;
+    let mut scored: Vec<(f32, usize)> = clusters
+        .par_iter()
+        .enumerate()
+        .map(|(i, h)| (screening_score(scene, model, &h.camera_from_object, coarse, 0.7), i))
+        .collect();
+    scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    scored.truncate(options.refined);
+    let short = IcpOptions {
+        levels: vec![
+            IcpLevel { rejection_distance: 2.5 * step, iterations: 4, stride: 1 },
+            IcpLevel { rejection_distance: 1.2 * step, iterations: 4, stride: 1 },
+        ],
+        max_angle: 50f64.to_radians(),
+        convergence: 1e-4,
+        min_correspondences: 8,
+    };
+    let fine = (0.7 * step).max(0.004) as f32;
+    let mut refined: Vec<(f32, usize, Pose)> = scored
+        .par_iter()
+        .map(|&(_, i)| {
+            let start = clusters[i].camera_from_object;
+            let mut source = PointCloud::default();
+            for k in visible_samples(model, &start) {
+                source.points.push(model.samples.points[k]);
+                source.normals.push(model.samples.normals[k]);
+            }
+            let pose = icp(&source, target, &start, &short).map_or(start, |r| r.target_from_source);
+            (screening_score(scene, model, &pose, fine, 0.8), i, pose)
+        })
+        .collect();
+    refined.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    // Those that fell into the same place are one.
+    let mut kept: Vec<Hypothesis> = vec![];
+    for (_, i, pose) in refined {
+        let same = kept.iter().any(|k| {
+            let centre = |p: &Pose| p.transform_point(&model.centre);
+            (centre(&k.camera_from_object) - centre(&pose)).norm() < 0.03 * model.diameter
+                && k.camera_from_object.rotation_angle_to(&pose) < 0.1
+        });
+        if !same {
+            kept.push(Hypothesis { camera_from_object: pose, votes: clusters[i].votes });
+            if kept.len() >= options.verified * if options.max_instances > 1 { 2 } else { 1 } {
+                break;
+            }
+        }
+    }
+    kept
+}
+
+fn verify(
+    scene: &Scene,
+    model: &ObjectModel,
+    hypotheses: &[Hypothesis],
+    threshold: f64,
+    options: &EstimateOptions,
+) -> Vec<Estimate> {
+    let mut verified: Vec<Estimate> = hypotheses
+        .par_iter()
+        .map_init(Verifier::default, |verifier, h| {
+            let pose = refine(verifier, scene, model, &h.camera_from_object, threshold);
+            let score = verifier.score(scene, &model.mesh, &pose, threshold, &options.verification);
+            Estimate { camera_from_object: pose, score, votes: h.votes }
+        })
+        .collect();
+    // A stable sort: equal scores stay in the order of the screening.
+    verified.sort_by(|a, b| b.score.ranking().total_cmp(&a.score.ranking()));
+    verified
+}
+
+/// ICP of the rendered points against the depth image, rendered anew between the levels.
+fn refine(verifier: &mut Verifier, scene: &Scene, model: &ObjectModel, start: &Pose, threshold: f64) -> Pose {
+    let target = DepthTarget { depth: &scene.depth, normals: &scene.normals, camera: &scene.camera };
+    let mut pose = *start;
+    for (distance, iterations) in [(2.0 * threshold, 5), (1.2 * threshold, 5), (0.8 * threshold, 8)] {
+        let points = verifier.visible_points(scene, &model.mesh, &pose, 2.0 * distance, 600);
+        let mut source = PointCloud::default();
+        for p in points.iter().filter(|p| p.inlier) {
+            source.points.push(p.point);
+            source.normals.push(p.normal);
+        }
+        let options = IcpOptions {
+            levels: vec![IcpLevel { rejection_distance: distance, iterations, stride: 1 }],
+            max_angle: 45f64.to_radians(),
+            convergence: 1e-5,
+            min_correspondences: 12,
+        };
+        match icp(&source, &target, &pose, &options) {
+            Ok(report) => pose = report.target_from_source,
+            Err(_) => break,
+        }
+    }
+    pose
+}

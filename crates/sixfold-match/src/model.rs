@@ -1,0 +1,372 @@
+//! The description of an object: what its surface looks like from outside, sampled, and the table of its
+//! point pair features (Drost et al. 2010, section 3).
+//!
+//! Differences to the paper, and why:
+//! * The surface is sampled from renderings around the object, not from the mesh: inner walls vanish and normals
+//!   point outwards whatever the winding (Hinterstoisser et al. 2016, section 3.1, ask for the same).
+//! * Every sample knows from which of the views it is seen. Pairs that no view sees together are not in the table:
+//!   one depth image cannot show them.
+
+use sixfold_geometry::{Camera, PointCloud, Pose, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+use thiserror::Error;
+
+use crate::V3;
+
+/// Why a mesh cannot be described.
+#[derive(Debug, Error, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// There is nothing to render.
+    #[error(
+        "the mesh has {faces} faces, a model to be matched needs a surface: give a mesh, not a point cloud"
+    )]
+    NoSurface {
+        /// Faces found.
+        faces: usize,
+    },
+    /// Too few samples were seen from outside.
+    #[error(
+        "only {found} surface samples are seen from outside, at least {needed} are needed: lower the sampling step or check the mesh"
+    )]
+    TooFewSamples {
+        /// Samples found.
+        found: usize,
+        /// Samples needed.
+        needed: usize,
+    },
+    /// An option is out of range.
+    #[error("option {option}: found {found}, expected {expected}")]
+    Option {
+        /// Name of the option.
+        option: &'static str,
+        /// Its value.
+        found: f64,
+        /// What it should be.
+        expected: &'static str,
+    },
+}
+
+/// How an object is described.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct ModelOptions {
+    /// Distance between samples as a share of the diameter; also the step of the feature's distance
+    /// (Drost et al. 2010: 0.05).
+    pub sampling_step: f64,
+    /// Number of steps of each of the feature's angles over half a turn.
+    pub angle_steps: usize,
+}
+
+impl Default for ModelOptions {
+    fn default() -> Self {
+        ModelOptions { sampling_step: 0.05, angle_steps: 15 }
+    }
+}
+
+impl ModelOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`ModelError::Option`].
+    pub fn check(&self) -> Result<(), ModelError> {
+        if !(self.sampling_step >= 0.02 && self.sampling_step <= 0.2) {
+            let found = self.sampling_step;
+            return Err(ModelError::Option { option: "sampling_step", found, expected: "0.02 to 0.2" });
+        }
+        if !(4..=60).contains(&self.angle_steps) {
+            let found = self.angle_steps as f64;
+            return Err(ModelError::Option { option: "angle_steps", found, expected: "4 to 60" });
+        }
+        Ok(())
+    }
+}
+
+/// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each.
+pub const VIEWS: usize = 64;
+const VIEW_PIXELS: usize = 160;
+
+/// An object ready to be matched.
+#[derive(Debug, Clone)]
+pub struct ObjectModel {
+    pub(crate) mesh: Mesh,
+    pub(crate) options: ModelOptions,
+    pub(crate) diameter: f64,
+    /// Centre of the bounding box, in the object's frame, metres.
+    pub(crate) centre: Vec3,
+    /// Samples for the feature table, in the object's frame.
+    pub(crate) samples: PointCloud,
+    /// Per sample, the views that see it, one bit each.
+    pub(crate) visible_from: Vec<u64>,
+    /// Directions from the object to the views.
+    pub(crate) view_directions: Vec<V3>,
+    /// Symmetry transformations of the object, the identity among them.
+    pub(crate) symmetries: Vec<Pose>,
+    pub(crate) table: FeatureTable,
+}
+
+/// Model point pairs by their quantised feature: rows of `(reference point, angle)`.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct FeatureTable {
+    /// Metres per distance step.
+    pub distance_step: f32,
+    pub distance_steps: usize,
+    pub angle_steps: usize,
+    /// Start of each feature's row in `entries`, and the end.
+    pub starts: Vec<u32>,
+    /// `reference << 8 | angle`, the angle in 256ths of a turn.
+    pub entries: Vec<u32>,
+}
+
+impl FeatureTable {
+    /// Number of the feature's row.
+    #[inline]
+    pub fn row(&self, distance: usize, angles: [usize; 3]) -> usize {
+        ((distance * self.angle_steps + angles[0]) * self.angle_steps + angles[1]) * self.angle_steps
+            + angles[2]
+    }
+}
+
+/// The point pair feature of Drost et al. (2010), equation 1: distance in metres and three angles in
+/// radians.
+#[inline]
+pub(crate) fn pair_feature(p1: &V3, n1: &V3, p2: &V3, n2: &V3) -> Option<(f32, [f32; 3])> {
+    let d = p2 - p1;
+    let length = d.norm();
+    if length < 1e-6 {
+        return None;
+    }
+    let u = d / length;
+    Some((length, [fast_acos(n1.dot(&u)), fast_acos(n2.dot(&u)), fast_acos(n1.dot(n2))]))
+}
+
+/// Arc cosine to 7e-5 radians (Abramowitz and Stegun 1964, 4.4.45).
+#[inline]
+pub(crate) fn fast_acos(x: f32) -> f32 {
+    let a = x.abs().min(1.0);
+    let p = ((-0.018_729_3 * a + 0.074_261) * a - 0.212_114_4) * a + 1.570_728_8;
+    let r = (1.0 - a).sqrt() * p;
+    if x < 0.0 { std::f32::consts::PI - r } else { r }
+}
+
+/// A frame at a point: rows of a rotation that turns the normal onto x.
+#[inline]
+pub(crate) fn local_frame(n: &V3) -> [V3; 3] {
+    // Duff et al. (2017), Building an orthonormal basis, revisited.
+    let sign = 1f32.copysign(n.z);
+    let a = -1.0 / (sign + n.z);
+    let b = n.x * n.y * a;
+    [*n, V3::new(1.0 + sign * n.x * n.x * a, sign * b, -sign * n.x), V3::new(b, sign + n.y * n.y * a, -n.y)]
+}
+
+/// The angle of `d` about the frame's x axis, in 256ths of a turn.
+#[inline]
+pub(crate) fn turn_about_normal(frame: &[V3; 3], d: &V3) -> u8 {
+    let (y, z) = (frame[1].dot(d), frame[2].dot(d));
+    (z.atan2(y) * (128.0 / std::f32::consts::PI)).round() as i32 as u8
+}
+
+/// Evenly spread unit directions (Fibonacci sphere).
+pub(crate) fn sphere_directions(n: usize) -> Vec<Vec3> {
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    (0..n)
+        .map(|i| {
+            let z = 1.0 - (2.0 * i as f64 + 1.0) / n as f64;
+            let r = (1.0 - z * z).sqrt();
+            let a = golden * i as f64;
+            Vec3::new(r * a.cos(), r * a.sin(), z)
+        })
+        .collect()
+}
+
+/// A camera pose that looks at `centre` from `direction`, `distance` metres away.
+pub(crate) fn look_at(centre: &Vec3, direction: &Vec3, distance: f64) -> Pose {
+    let z = -direction;
+    let up = if z.z.abs() < 0.9 { Vec3::z() } else { Vec3::y() };
+    let x = up.cross(&z).normalize();
+    let y = z.cross(&x);
+    let rotation = sixfold_geometry::Mat3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]);
+    let translation = -rotation * (centre + direction * distance);
+    let q =
+        nalgebra::UnitQuaternion::from_rotation_matrix(&nalgebra::Rotation3::from_matrix_unchecked(rotation));
+    Pose::new(q, translation)
+}
+
+impl ObjectModel {
+    /// Describes a mesh. `symmetries` are the transformations that leave it as it is; the identity is added.
+    ///
+    /// # Errors
+    /// [`ModelError`].
+    pub fn new(mesh: &Mesh, symmetries: &[Pose], options: &ModelOptions) -> Result<ObjectModel, ModelError> {
+        options.check()?;
+        if mesh.faces().is_empty() {
+            return Err(ModelError::NoSurface { faces: 0 });
+        }
+        let diameter = mesh.diameter();
+        let (low, high) = mesh.bounding_box();
+        let centre = (low + high) * 0.5;
+        let step = diameter * options.sampling_step;
+        let directions = sphere_directions(VIEWS);
+        let distance = 4.0 * diameter;
+        let focal = 0.9 * VIEW_PIXELS as f64 * distance / (diameter * 1.15);
+        let middle = (VIEW_PIXELS as f64 - 1.0) / 2.0;
+        let camera = Camera {
+            fx: focal,
+            fy: focal,
+            cx: middle,
+            cy: middle,
+            width: VIEW_PIXELS,
+            height: VIEW_PIXELS,
+            distortion: None,
+        };
+        let mut dense = PointCloud::default();
+        let mut views = Vec::with_capacity(VIEWS);
+        let mut frame = Frame::new(&camera);
+        let flat = Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())
+            .map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
+        for direction in &directions {
+            let pose = look_at(&centre, direction, distance);
+            let objects = [SceneObject { mesh: &flat, camera_from_object: pose }];
+            frame.render(&objects, &RenderOptions::default());
+            let depth = frame.depth();
+            // Grazing pixels say little about the surface and much about the silhouette.
+            let normals = frame.normals(&objects).map(|n| if n[2] < -0.3 { *n } else { [0.0; 3] });
+            let seen = PointCloud::from_depth(&depth, Some(&normals), &camera);
+            let back = seen.transformed(&pose.inverse());
+            dense.points.extend(back.points);
+            dense.normals.extend(back.normals);
+            views.push((pose, depth));
+        }
+        let samples = dense.voxel_downsample(step, 30f64.to_radians());
+        let tolerance = 0.5 * step;
+        let mut kept = PointCloud::default();
+        let mut visible_from = Vec::new();
+        for (p, n) in samples.points.iter().zip(&samples.normals) {
+            let mut bits = 0u64;
+            for (i, (pose, depth)) in views.iter().enumerate() {
+                let q = pose.transform_point(p);
+                if pose.transform_direction(n).dot(&q.normalize()) > -0.1 {
+                    continue;
+                }
+                let Some(pixel) = camera.project(&q) else { continue };
+                let (x, y) = (pixel.x.round().max(0.0) as usize, pixel.y.round().max(0.0) as usize);
+                if depth.get(x, y).is_some_and(|&z| z == 0.0 || q.z < f64::from(z) + tolerance) {
+                    bits |= 1 << i;
+                }
+            }
+            if bits != 0 {
+                kept.points.push(*p);
+                kept.normals.push(*n);
+                visible_from.push(bits);
+            }
+        }
+        const NEEDED: usize = 20;
+        if kept.len() < NEEDED {
+            return Err(ModelError::TooFewSamples { found: kept.len(), needed: NEEDED });
+        }
+        let table = build_table(&kept, &visible_from, step, diameter, options.angle_steps);
+        let mut all_symmetries = vec![Pose::identity()];
+        all_symmetries.extend(symmetries.iter().filter(|s| s.log().amax() > 1e-9));
+        Ok(ObjectModel {
+            mesh: flat,
+            options: *options,
+            diameter,
+            centre,
+            samples: kept,
+            visible_from,
+            view_directions: directions.iter().map(|d| d.cast()).collect(),
+            symmetries: all_symmetries,
+            table,
+        })
+    }
+
+    /// Largest distance between two points of the object, metres.
+    pub fn diameter(&self) -> f64 {
+        self.diameter
+    }
+
+    /// The surface samples the features are made of, in the object's frame.
+    pub fn samples(&self) -> &PointCloud {
+        &self.samples
+    }
+
+    /// Number of point pairs in the feature table.
+    pub fn pair_count(&self) -> usize {
+        self.table.entries.len()
+    }
+
+    /// The mesh, in the object's frame.
+    pub fn mesh(&self) -> &Mesh {
+        &self.mesh
+    }
+
+    /// The transformations that leave the object as it is, the identity first.
+    pub fn symmetries(&self) -> &[Pose] {
+        &self.symmetries
+    }
+
+    /// The samples seen when the camera looks along `-direction` (a unit vector from the object to the camera, in
+    /// the object's frame): those of the nearest sampled view.
+    pub(crate) fn view_of(&self, direction: &V3) -> usize {
+        let mut best = (0, f32::NEG_INFINITY);
+        for (i, d) in self.view_directions.iter().enumerate() {
+            let c = d.dot(direction);
+            if c > best.1 {
+                best = (i, c);
+            }
+        }
+        best.0
+    }
+}
+
+fn build_table(
+    samples: &PointCloud,
+    visible_from: &[u64],
+    step: f64,
+    diameter: f64,
+    angle_steps: usize,
+) -> FeatureTable {
+    let distance_steps = (diameter / step).ceil() as usize + 1;
+    let mut table = FeatureTable {
+        distance_step: step as f32,
+        distance_steps,
+        angle_steps,
+        starts: vec![0; distance_steps * angle_steps.pow(3) + 1],
+        entries: vec![],
+    };
+    let points: Vec<V3> = samples.points.iter().map(|p| p.cast()).collect();
+    let normals: Vec<V3> = samples.normals.iter().map(|n| n.cast()).collect();
+    let per_angle = angle_steps as f32 / std::f32::consts::PI;
+    let mut pairs: Vec<(u32, u32)> = vec![];
+    for r in 0..points.len().min(1 << 24) {
+        let frame = local_frame(&normals[r]);
+        for i in 0..points.len() {
+            if i == r || visible_from[i] & visible_from[r] == 0 {
+                continue;
+            }
+            let Some((length, angles)) = pair_feature(&points[r], &normals[r], &points[i], &normals[i])
+            else {
+                continue;
+            };
+            let distance = ((length / table.distance_step) as usize).min(distance_steps - 1);
+            let angles = angles.map(|a| ((a * per_angle) as usize).min(angle_steps - 1));
+            let turn = turn_about_normal(&frame, &(points[i] - points[r]));
+            pairs.push((table.row(distance, angles) as u32, (r as u32) << 8 | u32::from(turn)));
+        }
+    }
+    // Counting sort keeps the pairs of a row in the order of their reference points.
+    for (row, _) in &pairs {
+        table.starts[*row as usize + 1] += 1;
+    }
+    for i in 1..table.starts.len() {
+        table.starts[i] += table.starts[i - 1];
+    }
+    let mut next = table.starts.clone();
+    table.entries = vec![0; pairs.len()];
+    for (row, entry) in pairs {
+        let at = &mut next[row as usize];
+        table.entries[*at as usize] = entry;
+        *at += 1;
+    }
+    table
+}

@@ -1,0 +1,261 @@
+//! Judging a pose by rendering it: does the depth image agree with what would be seen?
+//!
+//! The scores of the dissertation, section 5.2.5: depth fitness `S_D = P_O N_i / (N_m - N_occ)` with
+//! `P_O = 1 - N_out / N_m`, the share `S_N` of matched normals, the share `S_B` of the silhouette that lies on an edge
+//! of the scene, and their product. `N_m` are the rendered pixels; a pixel is an inlier within the threshold,
+//! occluded when the scene is nearer, an outlier when the scene is further away (one would see through the object).
+//! Pixels without measured depth count in `N_m` only, as printed.
+
+use sixfold_geometry::{Camera, Pose, Rect, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+use crate::scene::Scene;
+
+/// Thresholds of the verification.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VerificationOptions {
+    /// Depth inlier threshold in metres (dissertation: 10 mm, 5 mm for small objects); `None` takes 5 % of the diameter,
+    /// between 5 and 10 mm.
+    pub depth_threshold: Option<f64>,
+    /// Normals of an inlier agree within this angle, radians.
+    pub normal_angle: f64,
+    /// A silhouette pixel lies on a scene edge within this distance, pixels.
+    pub boundary_distance: u8,
+}
+
+impl Default for VerificationOptions {
+    fn default() -> Self {
+        VerificationOptions { depth_threshold: None, normal_angle: 30f64.to_radians(), boundary_distance: 3 }
+    }
+}
+
+impl VerificationOptions {
+    /// The depth inlier threshold for an object of this diameter, metres.
+    pub fn threshold_for(&self, diameter: f64) -> f64 {
+        self.depth_threshold.unwrap_or((0.05 * diameter).clamp(0.005, 0.010))
+    }
+}
+
+/// The counts and scores of one pose.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct VerificationScore {
+    /// Rendered pixels, `N_m`.
+    pub rendered: usize,
+    /// Pixels whose depth agrees, `N_i`.
+    pub inliers: usize,
+    /// Pixels where the scene is nearer, `N_occ`.
+    pub occluded: usize,
+    /// Pixels where the scene is further away, `N_out`.
+    pub outliers: usize,
+    /// Depth fitness `S_D`.
+    pub depth: f64,
+    /// Share of the visible silhouette on a scene edge, `S_B`.
+    pub boundary: f64,
+    /// Share of the inliers whose normals agree, `S_N`.
+    pub normals: f64,
+    /// `S_D S_B S_N`.
+    pub total: f64,
+}
+
+impl VerificationScore {
+    /// Inliers as a share of the rendered pixels: how much of the object is really seen.
+    pub fn visible_share(&self) -> f64 {
+        if self.rendered == 0 { 0.0 } else { self.inliers as f64 / self.rendered as f64 }
+    }
+
+    /// The total, lowered where little of the object is seen: `total * v / (v + 0.1)` with `v` the
+    /// [`visible_share`](Self::visible_share). The dissertation removes every penalty for occlusion, so a pose hidden
+    /// behind something scores like one in full view; between hypotheses of one object the seen one is the better
+    /// bet.
+    pub fn ranking(&self) -> f64 {
+        let v = self.visible_share();
+        self.total * v / (v + 0.1)
+    }
+}
+
+/// Renders poses into crops of a scene and compares; keeps its buffers.
+#[derive(Debug)]
+pub struct Verifier {
+    frame: Frame,
+}
+
+impl Default for Verifier {
+    fn default() -> Self {
+        let one = Camera { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1, distortion: None };
+        Verifier { frame: Frame::new(&one) }
+    }
+}
+
+/// A point seen at a pixel of a rendered pose.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct RenderedPoint {
+    /// In the object's frame, metres.
+    pub point: Vec3,
+    /// Unit normal in the object's frame.
+    pub normal: Vec3,
+    /// Whether the scene's depth agrees here.
+    pub inlier: bool,
+}
+
+impl Verifier {
+    /// Renders the mesh into the part of the image it projects to; the corner of that part, or `None` when nothing
+    /// of it is in the image.
+    fn render(&mut self, scene: &Scene, mesh: &Mesh, pose: &Pose) -> Option<(usize, usize)> {
+        let camera = &scene.camera;
+        let (mut x0, mut y0, mut x1, mut y1) =
+            (f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY);
+        let (low, high) = mesh.bounding_box();
+        for k in 0..8 {
+            let corner = Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] });
+            // An object that reaches behind the camera is drawn into the whole image.
+            let Some(p) = camera.project(&pose.transform_point(&corner)) else {
+                (x0, y0, x1, y1) = (0.0, 0.0, camera.width as f64, camera.height as f64);
+                break;
+            };
+            (x0, y0, x1, y1) = (x0.min(p.x), y0.min(p.y), x1.max(p.x), y1.max(p.y));
+        }
+        let x0 = (x0.floor() - 1.0).clamp(0.0, camera.width as f64);
+        let y0 = (y0.floor() - 1.0).clamp(0.0, camera.height as f64);
+        let x1 = (x1.ceil() + 2.0).clamp(0.0, camera.width as f64);
+        let y1 = (y1.ceil() + 2.0).clamp(0.0, camera.height as f64);
+        if x1 <= x0 || y1 <= y0 {
+            return None;
+        }
+        let crop = camera.crop(&Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 });
+        self.frame.set_camera(&crop);
+        self.frame.render(&[SceneObject { mesh, camera_from_object: *pose }], &RenderOptions::default());
+        Some((x0 as usize, y0 as usize))
+    }
+
+    /// Scores a pose. `threshold` is the depth inlier threshold in metres.
+    pub fn score(
+        &mut self,
+        scene: &Scene,
+        mesh: &Mesh,
+        camera_from_object: &Pose,
+        threshold: f64,
+        options: &VerificationOptions,
+    ) -> VerificationScore {
+        let mut score = VerificationScore::default();
+        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return score };
+        let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
+        let normals = self.frame.normals(&objects);
+        let cosine = options.normal_angle.cos() as f32;
+        let (width, height) = (self.frame.width(), self.frame.height());
+        let inverse = self.frame.inverse_depth();
+        let (mut with_normal, mut good_normals, mut contour, mut on_edge) = (0usize, 0usize, 0usize, 0usize);
+        let [cx0, cy0, cx1, cy1] = self.frame.covered();
+        for y in cy0..cy1 {
+            for x in cx0..cx1 {
+                let index = y * width + x;
+                if inverse[index] <= 0.0 {
+                    continue;
+                }
+                score.rendered += 1;
+                let (sx, sy) = (x + x0, y + y0);
+                let measured = scene.depth[(sx, sy)];
+                let difference = f64::from(measured) - 1.0 / f64::from(inverse[index]);
+                let occluded = measured > 0.0 && difference < -threshold;
+                if occluded {
+                    score.occluded += 1;
+                } else if measured > 0.0 && difference > threshold {
+                    score.outliers += 1;
+                } else if measured > 0.0 {
+                    score.inliers += 1;
+                    let (a, b) = (normals[(x, y)], scene.normals[(sx, sy)]);
+                    if b != [0.0; 3] {
+                        with_normal += 1;
+                        good_normals += usize::from(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > cosine);
+                    }
+                }
+                let empty = |x: isize, y: isize| {
+                    x >= 0
+                        && y >= 0
+                        && (x as usize) < width
+                        && (y as usize) < height
+                        && inverse[y as usize * width + x as usize] <= 0.0
+                };
+                let (ix, iy) = (x as isize, y as isize);
+                if !occluded
+                    && (empty(ix - 1, iy) || empty(ix + 1, iy) || empty(ix, iy - 1) || empty(ix, iy + 1))
+                {
+                    contour += 1;
+                    on_edge += usize::from(scene.edge_distance[(sx, sy)] <= options.boundary_distance);
+                }
+            }
+        }
+        let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+        let outlier_penalty = 1.0 - share(score.outliers, score.rendered);
+        score.depth = outlier_penalty * share(score.inliers, score.rendered - score.occluded);
+        score.boundary = share(on_edge, contour);
+        score.normals = share(good_normals, with_normal);
+        score.total = score.depth * score.boundary * score.normals;
+        score
+    }
+
+    /// About `count` of the points that would be seen at a pose, evenly over the image.
+    pub(crate) fn visible_points(
+        &mut self,
+        scene: &Scene,
+        mesh: &Mesh,
+        camera_from_object: &Pose,
+        threshold: f64,
+        count: usize,
+    ) -> Vec<RenderedPoint> {
+        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return vec![] };
+        let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
+        let inverse = self.frame.inverse_depth();
+        let total = inverse.iter().filter(|&&d| d > 0.0).count();
+        let stride = ((total as f64 / count.max(1) as f64).sqrt().round() as usize).max(1);
+        let normals = self.frame.normals(&objects);
+        let coordinates = self.frame.object_coordinates(&objects);
+        let object_from_camera = camera_from_object.inverse();
+        let mut points = Vec::with_capacity(count * 2);
+        for y in (0..self.frame.height()).step_by(stride) {
+            for x in (0..self.frame.width()).step_by(stride) {
+                let index = y * self.frame.width() + x;
+                if inverse[index] <= 0.0 {
+                    continue;
+                }
+                let normal = normals[(x, y)];
+                // Grazing surface slides out of its pixel.
+                if normal[2] > -0.15 {
+                    continue;
+                }
+                let measured = f64::from(scene.depth[(x + x0, y + y0)]);
+                let z = 1.0 / f64::from(inverse[index]);
+                points.push(RenderedPoint {
+                    point: Vec3::from(coordinates[(x, y)].map(f64::from)),
+                    normal: object_from_camera.transform_direction(&Vec3::from(normal.map(f64::from))),
+                    inlier: measured > 0.0 && (measured - z).abs() < threshold,
+                });
+            }
+        }
+        points
+    }
+
+    /// The pixels (numbers in the scene image) where the pose's rendering agrees with the scene.
+    pub(crate) fn explained_pixels(
+        &mut self,
+        scene: &Scene,
+        mesh: &Mesh,
+        camera_from_object: &Pose,
+        threshold: f64,
+    ) -> Vec<u32> {
+        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return vec![] };
+        let inverse = self.frame.inverse_depth();
+        let width = self.frame.width();
+        let mut pixels = vec![];
+        for (index, &inverse) in inverse.iter().enumerate() {
+            if inverse > 0.0 {
+                let (sx, sy) = (index % width + x0, index / width + y0);
+                let measured = f64::from(scene.depth[(sx, sy)]);
+                if measured > 0.0 && (measured - 1.0 / f64::from(inverse)).abs() < threshold {
+                    pixels.push((sy * scene.camera.width + sx) as u32);
+                }
+            }
+        }
+        pixels
+    }
+}

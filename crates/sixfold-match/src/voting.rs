@@ -1,0 +1,284 @@
+//! Voting for poses: every scene reference point asks which model point it is and how the model is turned
+//! about its normal (Drost et al. 2010, section 3.4).
+//!
+//! With the improvements of Hinterstoisser et al. (2016) and Vidal et al. (2018): a feature near the border of its
+//! bin also votes from the neighbouring bins, and a feature votes only once per reference point and turn, so
+//! that large flat regions do not shout down the rest.
+
+use std::f32::consts::PI;
+
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+use rayon::prelude::*;
+use sixfold_geometry::{PointCloud, Pose};
+
+use crate::V3;
+use crate::model::{FeatureTable, ObjectModel, fast_acos, local_frame, turn_about_normal};
+
+/// A pose with the votes it got.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// The pose.
+    pub camera_from_object: Pose,
+    /// Votes, not comparable between objects.
+    pub votes: f32,
+}
+
+/// How votes are cast and counted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VotingOptions {
+    /// Every n-th scene point is a reference point (Drost et al. 2010: 5).
+    pub reference_stride: usize,
+    /// At most this many reference points; the stride grows to keep it.
+    pub max_references: usize,
+    /// Share of a bin at each border from which the neighbouring bin votes too; 0 for none.
+    pub bin_margin: f32,
+    /// Most peaks taken from one reference point.
+    pub peaks_per_reference: usize,
+    /// A peak needs this share of the reference point's best.
+    pub peak_share: f32,
+}
+
+impl Default for VotingOptions {
+    fn default() -> Self {
+        VotingOptions {
+            reference_stride: 4,
+            max_references: 2500,
+            bin_margin: 0.25,
+            peaks_per_reference: 4,
+            peak_share: 0.7,
+        }
+    }
+}
+
+/// Steps of the turn about the normal.
+const TURNS: usize = 32;
+
+/// The scene cloud at the model's sampling step, sorted into cells of the model's diameter so that all partners
+/// of a point lie in 27 cells.
+struct Grid {
+    points: Vec<V3>,
+    normals: Vec<V3>,
+    low: V3,
+    cell: f32,
+    size: [usize; 3],
+    starts: Vec<u32>,
+    order: Vec<u32>,
+}
+
+impl Grid {
+    fn new(cloud: &PointCloud, cell: f32) -> Option<Grid> {
+        let points: Vec<V3> = cloud.points.iter().map(|p| p.cast()).collect();
+        let normals = cloud.normals.iter().map(|n| n.cast()).collect();
+        let first = *points.first()?;
+        let (low, high) = points.iter().fold((first, first), |(a, b), p| (a.inf(p), b.sup(p)));
+        let size: [usize; 3] = std::array::from_fn(|k| ((high[k] - low[k]) / cell) as usize + 1);
+        let index = |p: &V3| {
+            let c: [usize; 3] = std::array::from_fn(|k| (((p[k] - low[k]) / cell) as usize).min(size[k] - 1));
+            (c[2] * size[1] + c[1]) * size[0] + c[0]
+        };
+        let mut starts = vec![0u32; size.iter().product::<usize>() + 1];
+        for p in &points {
+            starts[index(p) + 1] += 1;
+        }
+        for i in 1..starts.len() {
+            starts[i] += starts[i - 1];
+        }
+        let mut next = starts.clone();
+        let mut order = vec![0; points.len()];
+        for (i, p) in points.iter().enumerate() {
+            let at = &mut next[index(p)];
+            order[*at as usize] = i as u32;
+            *at += 1;
+        }
+        Some(Grid { points, normals, low, cell, size, starts, order })
+    }
+
+    fn for_neighbours(&self, p: &V3, mut f: impl FnMut(usize)) {
+        let centre: [isize; 3] = std::array::from_fn(|k| ((p[k] - self.low[k]) / self.cell) as isize);
+        let range = |k: usize| {
+            let low = (centre[k] - 1).max(0) as usize;
+            let high = ((centre[k] + 1).max(0) as usize).min(self.size[k] - 1);
+            low..=high
+        };
+        for z in range(2) {
+            for y in range(1) {
+                for x in range(0) {
+                    let cell = (z * self.size[1] + y) * self.size[0] + x;
+                    for &i in &self.order[self.starts[cell] as usize..self.starts[cell + 1] as usize] {
+                        f(i as usize);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Poses the model's features vote for in a scene cloud (points and normals in the camera frame), in the order
+/// of the reference points; the same at any number of threads.
+pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) -> Vec<Hypothesis> {
+    let step = model.diameter * model.options.sampling_step;
+    let thinned = cloud.voxel_downsample(step, 30f64.to_radians());
+    let Some(grid) = Grid::new(&thinned, model.diameter as f32) else { return vec![] };
+    let stride =
+        options.reference_stride.max(1).max(grid.points.len().div_ceil(options.max_references.max(1)));
+    let references: Vec<usize> = (0..grid.points.len()).step_by(stride).collect();
+    let model_points: Vec<V3> = model.samples.points.iter().map(|p| p.cast()).collect();
+    let model_frames: Vec<[V3; 3]> = model.samples.normals.iter().map(|n| local_frame(&n.cast())).collect();
+    references
+        .par_chunks(32)
+        .map(|chunk| {
+            let mut counter = Counter::new(model.samples.len(), &model.table);
+            let mut found = Vec::new();
+            for &r in chunk {
+                counter.vote(&grid, r, model.diameter as f32, &model.table, options.bin_margin);
+                counter.peaks(options, |reference, turn, votes| {
+                    found.push(Hypothesis {
+                        camera_from_object: pose_of(
+                            &grid.points[r],
+                            &local_frame(&grid.normals[r]),
+                            &model_points[reference],
+                            &model_frames[reference],
+                            turn,
+                        ),
+                        votes,
+                    });
+                });
+            }
+            found
+        })
+        .collect::<Vec<_>>()
+        .concat()
+}
+
+/// The accumulator of one reference point.
+struct Counter {
+    /// Votes per model point and turn.
+    votes: Vec<u16>,
+    /// Per feature row, the turns that have voted, one bit each.
+    voted: Vec<u32>,
+    touched: Vec<u32>,
+}
+
+impl Counter {
+    fn new(samples: usize, table: &FeatureTable) -> Counter {
+        Counter { votes: vec![0; samples * TURNS], voted: vec![0; table.starts.len()], touched: vec![] }
+    }
+
+    fn vote(&mut self, grid: &Grid, r: usize, diameter: f32, table: &FeatureTable, margin: f32) {
+        self.votes.fill(0);
+        for row in self.touched.drain(..) {
+            self.voted[row as usize] = 0;
+        }
+        let (p, n) = (grid.points[r], grid.normals[r]);
+        let frame = local_frame(&n);
+        let per_angle = table.angle_steps as f32 / PI;
+        let per_metre = 1.0 / table.distance_step;
+        let Counter { votes, voted, touched } = self;
+        grid.for_neighbours(&p, |i| {
+            let d = grid.points[i] - p;
+            let squared = d.norm_squared();
+            if i == r || squared > diameter * diameter || squared < 1e-10 {
+                return;
+            }
+            let m = &grid.normals[i];
+            let length = squared.sqrt();
+            let u = d / length;
+            let feature = [
+                length * per_metre,
+                fast_acos(n.dot(&u)) * per_angle,
+                fast_acos(m.dot(&u)) * per_angle,
+                fast_acos(n.dot(m)) * per_angle,
+            ];
+            let limits = [table.distance_steps, table.angle_steps, table.angle_steps, table.angle_steps];
+            let turn = turn_about_normal(&frame, &d);
+            // Up to two bins per dimension.
+            let mut bins = [[0usize; 2]; 4];
+            let mut counts = [1usize; 4];
+            for k in 0..4 {
+                let whole = (feature[k] as usize).min(limits[k] - 1);
+                bins[k][0] = whole;
+                let rest = feature[k] - whole as f32;
+                if rest < margin && whole > 0 {
+                    bins[k][1] = whole - 1;
+                    counts[k] = 2;
+                } else if rest > 1.0 - margin && whole + 1 < limits[k] {
+                    bins[k][1] = whole + 1;
+                    counts[k] = 2;
+                }
+            }
+            let bit = 1u32 << (u32::from(turn) * TURNS as u32 / 256);
+            for a in 0..counts[0] {
+                for b in 0..counts[1] {
+                    for c in 0..counts[2] {
+                        for e in 0..counts[3] {
+                            let row = table.row(bins[0][a], [bins[1][b], bins[2][c], bins[3][e]]);
+                            let (start, end) = (table.starts[row] as usize, table.starts[row + 1] as usize);
+                            if start == end || voted[row] & bit != 0 {
+                                continue;
+                            }
+                            if voted[row] == 0 {
+                                touched.push(row as u32);
+                            }
+                            voted[row] |= bit;
+                            for &entry in &table.entries[start..end] {
+                                // Scene turn minus model turn, in 256ths, to one of 32 bins.
+                                let difference = turn.wrapping_sub(entry as u8);
+                                let slot = (entry >> 8) as usize * TURNS + (difference >> 3) as usize;
+                                votes[slot] = votes[slot].saturating_add(1);
+                            }
+                        }
+                    }
+                }
+            }
+        });
+    }
+
+    /// The best model points and turns; votes of a turn are smoothed with its two neighbours.
+    fn peaks(&self, options: &VotingOptions, mut f: impl FnMut(usize, f32, f32)) {
+        let mut best: Vec<(u32, usize, usize)> = Vec::with_capacity(options.peaks_per_reference + 1);
+        let mut most = 0u32;
+        for (reference, turns) in self.votes.chunks_exact(TURNS).enumerate() {
+            // The best turn of each model point.
+            let (turn, sum) = (0..TURNS)
+                .map(|t| {
+                    let sum = 2 * u32::from(turns[t])
+                        + u32::from(turns[(t + 1) % TURNS])
+                        + u32::from(turns[(t + TURNS - 1) % TURNS]);
+                    (t, sum)
+                })
+                .max_by_key(|&(t, sum)| (sum, std::cmp::Reverse(t)))
+                .unwrap_or((0, 0));
+            if sum == 0 || (sum as f32) < options.peak_share * most as f32 {
+                continue;
+            }
+            most = most.max(sum);
+            let at = best.partition_point(|b| b.0 >= sum);
+            if at < options.peaks_per_reference {
+                best.insert(at, (sum, reference, turn));
+                best.truncate(options.peaks_per_reference);
+            }
+        }
+        for (sum, reference, turn) in best {
+            if sum as f32 >= options.peak_share * most as f32 {
+                let turns = &self.votes[reference * TURNS..(reference + 1) * TURNS];
+                let left = f32::from(turns[(turn + TURNS - 1) % TURNS]);
+                let right = f32::from(turns[(turn + 1) % TURNS]);
+                let shift = (right - left) / sum as f32;
+                let angle = (turn as f32 + 0.5 + shift) / TURNS as f32 * 2.0 * PI;
+                f(reference, angle, sum as f32);
+            }
+        }
+    }
+}
+
+/// The pose that lays the model's point and frame onto the scene's, turned about the common normal
+/// (Drost et al. 2010, equation 3).
+fn pose_of(p: &V3, scene: &[V3; 3], q: &V3, model: &[V3; 3], turn: f32) -> Pose {
+    let rows = |f: &[V3; 3]| Matrix3::from_rows(&[f[0].transpose(), f[1].transpose(), f[2].transpose()]);
+    let about_x = Rotation3::from_axis_angle(&nalgebra::Vector3::x_axis(), turn);
+    let rotation = (rows(scene).transpose() * about_x.matrix() * rows(model)).cast::<f64>();
+    let mut quaternion = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    quaternion.renormalize();
+    let translation = p.cast::<f64>() - quaternion * q.cast::<f64>();
+    Pose::new(quaternion, translation)
+}
