@@ -1,1 +1,49 @@
-//! Placeholder room, filled next.
+//! BOP datasets, result files, pose errors and scores.
+//!
+//! Millimetres exist in the files only; everything here is in metres, radians and pixels. The short way from a result
+//! file to scores: [`BopDataset::open`], [`read_results`], [`BopDataset::targets`], [`evaluate`].
+
+mod coco;
+mod coco_score;
+mod dataset;
+mod dataset_error;
+mod errors;
+mod evaluate;
+mod files;
+mod image_files;
+mod json;
+mod points;
+mod results;
+mod rle;
+mod scene_files;
+mod score;
+mod write;
+
+pub use coco::{
+    AdjustedDetection, Adjustment, Annotation, CocoGroundTruth, Detection, Detections, ReadDetections,
+    parse_detections, read_detections, write_detections,
+};
+pub use coco_score::{CocoScores, IouType, evaluate_coco};
+pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
+pub use dataset_error::{DatasetError, Place};
+pub use errors::{
+    VsdError, VsdOptions, add, adi, mspd, mssd, projection_error, rotation_error, translation_error, vsd,
+};
+pub use evaluate::{
+    Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, Progress, RecallCurves,
+    evaluate, evaluate_detection,
+};
+pub use points::ModelPoints;
+pub use results::{
+    BadRow, Estimate, ResultsAppender, ResultsError, parse_results, read_results, read_results_lenient,
+    write_results,
+};
+pub use rle::{Rle, RleError};
+pub use scene_files::{
+    GroundTruth, GroundTruthInfo, ImageCamera, Target, TargetObject, parse_scene_camera, parse_scene_gt,
+    parse_scene_gt_info, parse_targets,
+};
+pub use score::{
+    area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
+};
+pub use write::{NewImage, SceneWriter, write_camera, write_targets};

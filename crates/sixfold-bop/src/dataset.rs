@@ -1,0 +1,448 @@
+//! A BOP dataset on disk: split, scenes, images, models. Text files are checked when a scene is opened; images are
+//! read when they are asked for. What a dataset leaves out (depth, masks, ground truth, models) is `None`, what is
+//! broken is an error.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
+use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh};
+
+use crate::dataset_error::DatasetError;
+use crate::image_files::ImageFile;
+use crate::json::{At, parse};
+use crate::scene_files::{
+    GroundTruth, GroundTruthInfo, ImageCamera, Target, TargetObject, parse_scene_camera, parse_scene_gt,
+    parse_scene_gt_info, parse_targets,
+};
+
+/// Which of a dataset's model folders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Models {
+    /// `models_eval` where there is one (uniformly resampled, without inner faces), otherwise `models`.
+    #[default]
+    Evaluation,
+    /// `models`: what is rendered.
+    Rendering,
+}
+
+/// A dataset folder with one of its splits.
+#[derive(Debug, Clone)]
+pub struct BopDataset {
+    root: PathBuf,
+    split_dir: PathBuf,
+    size: Option<((usize, usize), PathBuf)>,
+    scenes: BTreeMap<u32, PathBuf>,
+}
+
+impl BopDataset {
+    /// Opens `dir/split` (such as `test`), or `dir` itself where it is a scene folder (`scene_camera.json` in it);
+    /// the scene then has the folder's number as id, or 0.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the folder or split is missing, has no scene, or `camera.json` is broken.
+    pub fn open(dir: &Path, split: &str) -> Result<Self, DatasetError> {
+        let size = read_camera_size(&dir.join("camera.json"))?;
+        if dir.join("scene_camera.json").is_file() {
+            let name = dir.file_name().and_then(|n| n.to_str()).and_then(|n| n.parse().ok());
+            let scenes = BTreeMap::from([(name.unwrap_or(0), dir.to_owned())]);
+            return Ok(BopDataset { root: dir.to_owned(), split_dir: dir.to_owned(), size, scenes });
+        }
+        if !dir.is_dir() {
+            return Err(DatasetError::Missing {
+                path: dir.to_owned(),
+                what: "the dataset folder",
+                advice: "give the folder that holds camera.json, models and test",
+            });
+        }
+        let split_dir = dir.join(split);
+        let missing = |what| DatasetError::Missing {
+            path: split_dir.clone(),
+            what,
+            advice: "a BOP split holds folders such as 000001 with scene_camera.json in them",
+        };
+        if !split_dir.is_dir() {
+            return Err(missing("the folder of the split"));
+        }
+        let read = |source| DatasetError::Read { path: split_dir.clone(), source };
+        let mut scenes = BTreeMap::new();
+        for entry in std::fs::read_dir(&split_dir).map_err(read)? {
+            let path = entry.map_err(read)?.path();
+            let number = path.file_name().and_then(|n| n.to_str()).and_then(|n| n.parse().ok());
+            if let Some(scene_id) = number.filter(|_| path.join("scene_camera.json").is_file()) {
+                scenes.insert(scene_id, path);
+            }
+        }
+        if scenes.is_empty() {
+            return Err(missing("a scene folder"));
+        }
+        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes })
+    }
+
+    /// The dataset's folder.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The scenes of the split, ascending.
+    pub fn scene_ids(&self) -> Vec<u32> {
+        self.scenes.keys().copied().collect()
+    }
+
+    /// Width and height that `camera.json` states.
+    pub fn image_size(&self) -> Option<(usize, usize)> {
+        self.size.as_ref().map(|(size, _)| *size)
+    }
+
+    /// Reads the text files of a scene.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the scene is not there or one of its files is broken.
+    pub fn scene(&self, scene_id: u32) -> Result<Scene, DatasetError> {
+        let dir = self.scenes.get(&scene_id).ok_or_else(|| DatasetError::NoScene {
+            path: self.split_dir.clone(),
+            scene_id,
+            known: list_ids(self.scenes.keys()),
+        })?;
+        Scene::read(scene_id, dir, self.size.clone())
+    }
+
+    /// The folder of models that will be used, if the dataset has one.
+    pub fn models_dir(&self, models: Models) -> Option<PathBuf> {
+        let names: &[&str] = match models {
+            Models::Evaluation => &["models_eval", "models"],
+            Models::Rendering => &["models", "models_eval"],
+        };
+        names.iter().map(|name| self.root.join(name)).find(|dir| dir.is_dir())
+    }
+
+    /// Diameters and symmetries of the models; `None` where the dataset has no `models_info.json`.
+    ///
+    /// # Errors
+    /// [`DatasetError::Model`] when the file is broken.
+    pub fn models_info(&self, models: Models) -> Result<Option<ModelsInfo>, DatasetError> {
+        let first = self.models_dir(models);
+        let other = self.models_dir(Models::Rendering);
+        for dir in [first, other].into_iter().flatten() {
+            let path = dir.join("models_info.json");
+            if path.is_file() {
+                return ModelsInfo::read(&path).map(Some).map_err(|e| DatasetError::Model(Box::new(e)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Reads the model of an object, in metres.
+    ///
+    /// # Errors
+    /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken.
+    pub fn model(&self, obj_id: u32, models: Models) -> Result<Mesh, DatasetError> {
+        let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
+        let path = dir.join(format!("obj_{obj_id:06}.ply"));
+        if !path.is_file() {
+            return Err(DatasetError::NoModel { path: dir, obj_id });
+        }
+        read_mesh(&path, Unit::Millimetre).map_err(|e| DatasetError::Model(Box::new(e)))
+    }
+
+    /// What has to be found: from `file`, or the dataset's `test_targets_bop19.json`, or where neither exists every
+    /// ground-truth pose of the split that is at least 10 % visible (or of unknown visibility).
+    ///
+    /// Targets in the BOP'24 form (images only) stay as they are; [`BopDataset::object_targets`] spells them out.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when a file is missing or broken.
+    pub fn targets(&self, file: Option<&Path>) -> Result<Vec<Target>, DatasetError> {
+        let default = self.root.join("test_targets_bop19.json");
+        let path = match file {
+            Some(path) => path,
+            None if default.is_file() => &default,
+            None => {
+                let mut targets = Vec::new();
+                for scene_id in self.scene_ids() {
+                    for im_id in self.scene(scene_id)?.image_ids() {
+                        targets.push(Target { scene_id, im_id, object: None });
+                    }
+                }
+                return self.object_targets(&targets);
+            }
+        };
+        let text =
+            std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+        parse_targets(&text, path)
+    }
+
+    /// Targets with an object each: those of a whole image become one per object with ground truth there that is at
+    /// least 10 % visible (or of unknown visibility).
+    ///
+    /// # Errors
+    /// [`DatasetError`] when a scene is missing or broken.
+    pub fn object_targets(&self, targets: &[Target]) -> Result<Vec<Target>, DatasetError> {
+        let mut scenes = BTreeMap::new();
+        let mut spelled = Vec::new();
+        for target in targets {
+            if target.object.is_some() {
+                spelled.push(*target);
+                continue;
+            }
+            if !scenes.contains_key(&target.scene_id) {
+                scenes.insert(target.scene_id, self.scene(target.scene_id)?);
+            }
+            let image = scenes[&target.scene_id].image(target.im_id)?;
+            let mut counts = BTreeMap::new();
+            for (pose, visible) in image.ground_truth.iter().zip(image.visible_fractions()) {
+                if visible.is_none_or(|v| v >= 0.1) {
+                    *counts.entry(pose.obj_id).or_insert(0) += 1;
+                }
+            }
+            spelled.extend(counts.into_iter().map(|(obj_id, inst_count)| Target {
+                object: Some(TargetObject { obj_id, inst_count }),
+                ..*target
+            }));
+        }
+        Ok(spelled)
+    }
+}
+
+fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
+    const SHOWN: usize = 12;
+    let more = ids.len().saturating_sub(SHOWN);
+    let mut text = ids.take(SHOWN).map(u32::to_string).collect::<Vec<_>>().join(", ");
+    if more > 0 {
+        text.push_str(&format!(" and {more} more"));
+    }
+    text
+}
+
+/// Width and height of `camera.json`, where it is there and has them.
+fn read_camera_size(path: &Path) -> Result<Option<((usize, usize), PathBuf)>, DatasetError> {
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let text = std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+    let json = parse(&text, path)?;
+    let at = At::file(path);
+    let map = at.object(&json)?;
+    let (Some(width), Some(height)) = (map.get("width"), map.get("height")) else { return Ok(None) };
+    let side = |field: &str, value| {
+        let side = at.id(field, value)?;
+        if side == 0 || side > 1 << 15 {
+            return Err(at.error(field, format!("{side}"), "an image side from 1 to 32768 pixels"));
+        }
+        Ok(side as usize)
+    };
+    Ok(Some(((side("width", width)?, side("height", height)?), path.to_owned())))
+}
+
+/// One image of a scene: what the text files say of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneImage {
+    /// Its id.
+    pub im_id: u32,
+    /// Intrinsics and depth unit.
+    pub camera: ImageCamera,
+    /// The objects in it; empty where the scene has no ground truth.
+    pub ground_truth: Vec<GroundTruth>,
+    /// What `scene_gt_info.json` says of each of them, in the same order.
+    pub info: Option<Vec<GroundTruthInfo>>,
+}
+
+impl SceneImage {
+    /// The visible fraction of each ground-truth pose, `None` where unknown.
+    pub fn visible_fractions(&self) -> Vec<Option<f64>> {
+        match &self.info {
+            Some(info) => info.iter().map(|i| Some(i.visib_fract)).collect(),
+            None => vec![None; self.ground_truth.len()],
+        }
+    }
+}
+
+/// Which mask of an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MaskKind {
+    /// The whole silhouette inside the image (`mask`).
+    Full,
+    /// What is visible (`mask_visib`).
+    Visible,
+}
+
+/// A scene folder with its text files read.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Its id.
+    pub scene_id: u32,
+    dir: PathBuf,
+    size: Option<((usize, usize), PathBuf)>,
+    has_ground_truth: bool,
+    images: BTreeMap<u32, SceneImage>,
+}
+
+impl Scene {
+    fn read(
+        scene_id: u32,
+        dir: &Path,
+        size: Option<((usize, usize), PathBuf)>,
+    ) -> Result<Self, DatasetError> {
+        let read = |name: &str| -> Result<Option<(Vec<u8>, PathBuf)>, DatasetError> {
+            let path = dir.join(name);
+            match std::fs::read(&path) {
+                Ok(text) => Ok(Some((text, path))),
+                Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+                Err(source) => Err(DatasetError::Read { path, source }),
+            }
+        };
+        let (text, camera_path) = read("scene_camera.json")?.ok_or_else(|| DatasetError::Missing {
+            path: dir.join("scene_camera.json"),
+            what: "the file with the intrinsics",
+            advice: "every BOP scene has one",
+        })?;
+        let cameras = parse_scene_camera(&text, &camera_path)?;
+        let ground_truth = read("scene_gt.json")?.map(|(t, p)| Ok((parse_scene_gt(&t, &p)?, p))).transpose()?;
+        let infos =
+            read("scene_gt_info.json")?.map(|(t, p)| Ok((parse_scene_gt_info(&t, &p)?, p))).transpose()?;
+        let has_ground_truth = ground_truth.is_some();
+        let (mut poses, gt_path) = ground_truth.unwrap_or_default();
+        let mut images = BTreeMap::new();
+        for (im_id, camera) in cameras {
+            images.insert(
+                im_id,
+                SceneImage { im_id, camera, ground_truth: poses.remove(&im_id).unwrap_or_default(), info: None },
+            );
+        }
+        if let Some((&im_id, _)) = poses.first_key_value() {
+            let found = "ground truth for it";
+            return Err(At::image(&gt_path, im_id).error("(key)", found, "an image of scene_camera.json"));
+        }
+        if let Some((infos, path)) = infos {
+            for (im_id, info) in infos {
+                let Some(image) = images.get_mut(&im_id) else { continue };
+                if info.len() != image.ground_truth.len() {
+                    let expected = format!("{}, as in scene_gt.json", image.ground_truth.len());
+                    return Err(At::image(&path, im_id).error(
+                        "(number of entries)",
+                        info.len().to_string(),
+                        expected,
+                    ));
+                }
+                image.info = Some(info);
+            }
+        }
+        Ok(Scene { scene_id, dir: dir.to_owned(), size, has_ground_truth, images })
+    }
+
+    /// The scene's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// The images of the scene, ascending.
+    pub fn image_ids(&self) -> Vec<u32> {
+        self.images.keys().copied().collect()
+    }
+
+    /// Whether the scene has a `scene_gt.json`.
+    pub fn has_ground_truth(&self) -> bool {
+        self.has_ground_truth
+    }
+
+    /// What the text files say of an image.
+    ///
+    /// # Errors
+    /// [`DatasetError::NoImage`].
+    pub fn image(&self, im_id: u32) -> Result<&SceneImage, DatasetError> {
+        let path = self.dir.join("scene_camera.json");
+        self.images.get(&im_id).ok_or(DatasetError::NoImage { path, im_id })
+    }
+
+    fn find(&self, folders: &[&str], im_id: u32) -> Option<PathBuf> {
+        let candidates = folders.iter().flat_map(|folder| {
+            ["png", "jpg", "jpeg", "tif"].map(|end| self.dir.join(folder).join(format!("{im_id:06}.{end}")))
+        });
+        candidates.into_iter().find(|path| path.is_file())
+    }
+
+    /// The colour (or grey) image file, if there is one.
+    pub fn rgb_path(&self, im_id: u32) -> Option<PathBuf> {
+        self.find(&["rgb", "gray"], im_id)
+    }
+
+    /// The depth image file, if there is one.
+    pub fn depth_path(&self, im_id: u32) -> Option<PathBuf> {
+        self.find(&["depth"], im_id)
+    }
+
+    /// The image with its size: from `camera.json`, or from the header of the colour or depth image.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the image is not in the scene or its size is unknown.
+    pub fn camera(&self, im_id: u32) -> Result<Camera, DatasetError> {
+        let image = self.image(im_id)?;
+        let (width, height) = self.expected_size(im_id)?.0;
+        let k = image.camera;
+        let camera =
+            Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
+        let path = self.dir.join("scene_camera.json");
+        camera.check().map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera"))?;
+        Ok(camera)
+    }
+
+    fn expected_size(&self, im_id: u32) -> Result<((usize, usize), String), DatasetError> {
+        if let Some((size, path)) = &self.size {
+            return Ok((*size, path.display().to_string()));
+        }
+        let path = self
+            .rgb_path(im_id)
+            .or_else(|| self.depth_path(im_id))
+            .ok_or_else(|| DatasetError::UnknownSize { path: self.dir.clone(), im_id })?;
+        let size = ImageFile { path: &path, im_id, expected: None }.size()?;
+        Ok((size, path.display().to_string()))
+    }
+
+    fn open_image<T>(
+        &self,
+        path: Option<PathBuf>,
+        im_id: u32,
+        decode: impl FnOnce(&ImageFile<'_>) -> Result<T, DatasetError>,
+    ) -> Result<Option<T>, DatasetError> {
+        let Some(path) = path else { return Ok(None) };
+        let expected = Some(self.expected_size(im_id)?);
+        decode(&ImageFile { path: &path, im_id, expected }).map(Some)
+    }
+
+    /// The colour image (grey images as colour); `None` where the scene has none.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the file is damaged or of another size than the camera.
+    pub fn rgb(&self, im_id: u32) -> Result<Option<RgbImage>, DatasetError> {
+        self.image(im_id)?;
+        self.open_image(self.rgb_path(im_id), im_id, |file| file.rgb())
+    }
+
+    /// The depth image in metres, zero where nothing was measured; `None` where the scene has none.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the file is damaged, of another size than the camera, or `depth_scale` is missing.
+    pub fn depth(&self, im_id: u32) -> Result<Option<DepthImage>, DatasetError> {
+        let image = self.image(im_id)?;
+        let Some(path) = self.depth_path(im_id) else { return Ok(None) };
+        let scene_camera = self.dir.join("scene_camera.json");
+        let scale = image.camera.depth_scale.ok_or_else(|| {
+            At::image(&scene_camera, im_id).error("depth_scale", "nothing", "millimetres per depth unit")
+        })?;
+        self.open_image(Some(path), im_id, |file| file.depth(scale))
+    }
+
+    /// The mask of ground-truth pose number `index` of an image; `None` where the scene has none.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the file is damaged or of another size than the camera.
+    pub fn mask(&self, im_id: u32, index: usize, kind: MaskKind) -> Result<Option<Mask>, DatasetError> {
+        self.image(im_id)?;
+        let folder = match kind {
+            MaskKind::Full => "mask",
+            MaskKind::Visible => "mask_visib",
+        };
+        let path = self.dir.join(folder).join(format!("{im_id:06}_{index:06}.png"));
+        self.open_image(path.is_file().then_some(path), im_id, |file| file.mask())
+    }
+}

@@ -1,0 +1,153 @@
+//! What can be wrong with a dataset on disk: every message names the file, the place in it, what was expected, what
+//! was found and what to do.
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+/// Where in a scene file something is: image, then number in that image's list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Place {
+    /// The image.
+    pub im_id: Option<u32>,
+    /// Number of the entry, from zero.
+    pub index: Option<usize>,
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(im_id) = self.im_id {
+            write!(f, "im_id {im_id}, ")?;
+        }
+        if let Some(index) = self.index {
+            write!(f, "entry {index}, ")?;
+        }
+        Ok(())
+    }
+}
+
+/// Why a dataset cannot be read or written.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum DatasetError {
+    /// Something that has to be there is not.
+    #[error("{}: {what} is missing; {advice}", path.display())]
+    Missing {
+        /// Where it should be.
+        path: PathBuf,
+        /// What it is.
+        what: &'static str,
+        /// What to do.
+        advice: &'static str,
+    },
+    /// The system could not read a file or folder.
+    #[error("{}: cannot be read: {source}", path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The system could not write a file.
+    #[error("{}: cannot be written: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A file is not JSON.
+    #[error(
+        "{}: not valid JSON: {source}; the file may be cut off, and NaN or Infinity are not allowed",
+        path.display()
+    )]
+    Json {
+        /// The file.
+        path: PathBuf,
+        /// What and where.
+        source: serde_json::Error,
+    },
+    /// A field holds something else than it should.
+    #[error("{}: {place}field {field}: found {found}, expected {expected}", path.display())]
+    Field {
+        /// The file.
+        path: PathBuf,
+        /// Image and entry.
+        place: Place,
+        /// Name of the field.
+        field: String,
+        /// What it held.
+        found: String,
+        /// What it should hold.
+        expected: String,
+    },
+    /// An image file cannot be decoded.
+    #[error("{}: im_id {im_id}: not a readable image: {reason}; get the file again or remove it", path.display())]
+    Image {
+        /// The file.
+        path: PathBuf,
+        /// The image.
+        im_id: u32,
+        /// What is wrong.
+        reason: String,
+    },
+    /// An image has another size than the camera.
+    #[error(
+        "{}: im_id {im_id}: the image is {}x{}, expected {}x{} from {size_from}; the intrinsics belong to \
+         another resolution: give the camera file of these images or resize them",
+        path.display(), found.0, found.1, expected.0, expected.1
+    )]
+    ImageSize {
+        /// The file.
+        path: PathBuf,
+        /// The image.
+        im_id: u32,
+        /// Width and height expected.
+        expected: (usize, usize),
+        /// Width and height found.
+        found: (usize, usize),
+        /// Where the expectation comes from.
+        size_from: String,
+    },
+    /// A scene was asked for that is not there.
+    #[error("{}: scene {scene_id} is not there; the split has scenes {known}", path.display())]
+    NoScene {
+        /// Folder of the split.
+        path: PathBuf,
+        /// What was asked for.
+        scene_id: u32,
+        /// What there is.
+        known: String,
+    },
+    /// An image was asked for that the scene does not have.
+    #[error("{}: im_id {im_id} is not there; was the right split given?", path.display())]
+    NoImage {
+        /// The file that should have it.
+        path: PathBuf,
+        /// What was asked for.
+        im_id: u32,
+    },
+    /// Nothing says how large the images are.
+    #[error(
+        "{}: im_id {im_id}: the image size is unknown; camera.json has no width and height and there is no rgb, \
+         gray or depth image",
+        path.display()
+    )]
+    UnknownSize {
+        /// Folder of the scene.
+        path: PathBuf,
+        /// The image.
+        im_id: u32,
+    },
+    /// An object has no model file.
+    #[error("{}: no model of object {obj_id}; expected obj_{obj_id:06}.ply there", path.display())]
+    NoModel {
+        /// Folder of the models.
+        path: PathBuf,
+        /// The object.
+        obj_id: u32,
+    },
+    /// A model or `models_info.json` is broken.
+    #[error(transparent)]
+    Model(Box<dyn std::error::Error + Send + Sync>),
+}

@@ -1,0 +1,12 @@
+//! The pose errors, one idea a file. Metres, pixels and radians; symmetries as lists of poses that map the object
+//! onto itself, the identity among them.
+
+mod projection;
+mod rotation_translation;
+mod surface;
+mod vsd;
+
+pub use projection::{mspd, projection_error};
+pub use rotation_translation::{rotation_error, translation_error};
+pub use surface::{add, adi, mssd};
+pub use vsd::{VsdError, VsdOptions, vsd};
