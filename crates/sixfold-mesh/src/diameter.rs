@@ -100,7 +100,7 @@ fn build(points: &mut [Vec3], start: usize, end: usize, nodes: &mut Vec<Node>) {
 /// Improves `best`, a squared distance, with pairs of one point in `a` and one in `b`.
 fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64) {
     let (node_a, node_b) = (&nodes[a], &nodes[b]);
-    if !(node_a.bounds.span_squared(&node_b.bounds) > *best) {
+    if node_a.bounds.span_squared(&node_b.bounds) <= *best {
         return;
     }
     match (node_a.right, node_b.right) {

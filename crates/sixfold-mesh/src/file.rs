@@ -53,6 +53,7 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
         "ply" => crate::parse_ply,
         "obj" => crate::parse_obj,
         "stl" => crate::parse_stl,
+        "gltf" | "glb" => crate::parse_gltf,
         _ => return Err(MeshFileError::Format { file, found: ending }),
     };
     let bytes = fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
@@ -172,4 +173,53 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), MeshFile
         let _ = fs::remove_file(&aside);
         MeshFileError::Io { file: path.display().to_string(), source }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::Vec3;
+
+    fn two_points(distance: f64) -> Mesh {
+        Mesh::new(vec![Vec3::zeros(), Vec3::x() * distance], vec![]).unwrap()
+    }
+
+    #[test]
+    fn a_factor_of_a_thousand_is_explained() {
+        let explain =
+            |metres: f64, unit: Unit| check_size(&two_points(metres), "o.ply", unit).unwrap_err().to_string();
+        assert_eq!(
+            explain(102.1, Unit::Metre),
+            "o.ply: the diameter would be 102 m as metres; 102 mm if the file is in millimetres: give --unit mm; \
+             1.021 m if the file is in centimetres: give --unit cm; 2.593 m if the file is in inches: give --unit in"
+        );
+        assert_eq!(
+            explain(0.000_125, Unit::Millimetre),
+            "o.ply: the diameter would be 0.125 mm as millimetres; 125 mm if the file is in metres: give --unit m"
+        );
+        assert!(explain(1e9, Unit::Metre).contains("no unit"), "{}", explain(1e9, Unit::Metre));
+        assert!(explain(0.0, Unit::Metre).contains("the same point"));
+        for metres in [0.005, 0.1, 5.0] {
+            check_size(&two_points(metres), "o.ply", Unit::Inch).unwrap();
+        }
+    }
+
+    #[test]
+    fn files_are_found_by_ending_and_beside() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("Thing.OBJ");
+        fs::write(
+            &path,
+            "mtllib C:\\models\\thing.mtl\nv 0 0 0\nv 100 0 0\nv 0 100 0\nusemtl red\nf 1 2 3\n",
+        )
+        .unwrap();
+        let error = read_mesh(&path, Unit::Millimetre).unwrap_err().to_string();
+        assert!(error.contains("thing.mtl") && error.contains("Thing.OBJ"), "{error}");
+        fs::write(folder.path().join("thing.mtl"), "newmtl red\nKd 1 0 0\n").unwrap();
+        assert_eq!(read_mesh(&path, Unit::Millimetre).unwrap().colors().unwrap(), [[255, 0, 0]; 3]);
+        let error = read_mesh(folder.path().join("a.step"), Unit::Metre).unwrap_err().to_string();
+        assert!(error.contains("\"step\"") && error.contains(".ply, .obj, .stl, .gltf or .glb"), "{error}");
+        let error = read_mesh(folder.path().join("a.stl"), Unit::Metre).unwrap_err();
+        assert!(matches!(error, MeshFileError::Io { .. }), "{error}");
+    }
 }

@@ -15,6 +15,7 @@
 mod diameter;
 mod error;
 mod file;
+mod gltf_file;
 mod measure;
 mod mesh;
 mod models_info;
@@ -31,6 +32,7 @@ pub use error::MeshFileError;
 pub use file::{
     LARGEST_DIAMETER, Resources, SMALLEST_DIAMETER, check_size, no_resources, read_mesh, read_mesh_unchecked,
 };
+pub use gltf_file::parse_gltf;
 pub use mesh::{Mesh, MeshError};
 pub use models_info::{ContinuousSymmetry, ModelInfo, ModelsInfo};
 pub use obj::parse_obj;

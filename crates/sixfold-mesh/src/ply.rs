@@ -656,3 +656,200 @@ fn split_at_seams(parts: &mut Parts, corner_texcoords: &[[[f32; 2]; 3]]) {
     }
     parts.texcoords = Some(texcoords.into_iter().map(Option::unwrap_or_default).collect());
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::no_resources;
+    use proptest::prelude::*;
+
+    fn parse(bytes: &[u8]) -> Result<Mesh, MeshFileError> {
+        parse_ply(bytes, "p.ply", Unit::Millimetre, &no_resources)
+    }
+
+    const SQUARE: &str = "ply\nformat ascii 1.0\ncomment made by hand\nobj_info nothing\nelement extra 1\n\
+        property list uchar short words\nproperty char c\nelement vertex 4\nproperty double x\nproperty short y\n\
+        property float z\nproperty float quality\nproperty list uchar int more\nproperty float nx\n\
+        property float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n\
+        element face 2\nproperty uchar flags\nproperty list uchar uint vertex_index\nelement edge 1\n\
+        property int a\nend_header\n\
+        2 -7 8 1\n\
+        0.5 0 0 9 0 0 0 2 1 2 3\n1 0 0 9 1 7 0 0 2 4 5 6\n\n1 1 0 9 2 7 7 nan 0 0 7 8 9\n0 1 0 9 0 0 0 0 255 0 0\n\
+        0 4 0 1 2 3\n0 2 0 1\n5\n";
+
+    #[test]
+    fn unknown_parts_are_skipped_and_polygons_cut() {
+        for text in [SQUARE.to_owned(), SQUARE.replace('\n', "\r\n"), SQUARE.replace('\n', "\r")] {
+            let mesh = parse(text.as_bytes()).unwrap();
+            assert_eq!(mesh.vertices()[0], Vec3::new(0.0005, 0.0, 0.0));
+            assert_eq!(mesh.faces(), [[0, 1, 2], [0, 2, 3]]);
+            assert_eq!(mesh.colors().unwrap()[2], [7, 8, 9]);
+            // One normal is NaN and one is zero: both come from the faces.
+            assert!(mesh.normals().unwrap().iter().all(|n| (n - Vec3::z()).norm() < 1e-12));
+        }
+    }
+
+    /// A PLY of every scalar type, in either byte order.
+    fn binary(big: bool) -> Vec<u8> {
+        let order = if big { "big" } else { "little" };
+        let mut bytes = format!(
+            "ply\nformat binary_{order}_endian 1.0\nelement vertex 3\nproperty double x\nproperty int16 y\n\
+             property float32 z\nproperty ushort red\nproperty ushort green\nproperty ushort blue\nproperty uint id\n\
+             element face 1\nproperty list int uint16 vertex_indices\nend_header\n"
+        )
+        .into_bytes();
+        let mut put = |little: &[u8]| {
+            bytes.extend(little);
+            if big {
+                let start = bytes.len() - little.len();
+                bytes[start..].reverse();
+            }
+        };
+        for (x, y, z) in [(0.25f64, 0i16, 0.0f32), (1.0, -2, 0.5), (0.0, 300, 0.0)] {
+            put(&x.to_le_bytes());
+            put(&y.to_le_bytes());
+            put(&z.to_le_bytes());
+            for color in [65535u16, 257, 0] {
+                put(&color.to_le_bytes());
+            }
+            put(&9u32.to_le_bytes());
+        }
+        put(&3i32.to_le_bytes());
+        for index in [0u16, 1, 2] {
+            put(&index.to_le_bytes());
+        }
+        bytes
+    }
+
+    #[test]
+    fn both_byte_orders() {
+        let little = parse(&binary(false)).unwrap();
+        assert_eq!(little.vertices()[1] * 1e3, Vec3::new(1.0, -2.0, 0.5));
+        assert_eq!(little.vertices()[2].y, 0.3);
+        assert_eq!(little.colors().unwrap()[1], [255, 1, 0]);
+        assert_eq!(little.faces(), [[0, 1, 2]]);
+        assert_eq!(parse(&binary(true)).unwrap(), little);
+    }
+
+    #[test]
+    fn colours_between_zero_and_one() {
+        let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+            property float red\nproperty float green\nproperty float blue\nend_header\n0 0 0 1 0.5 7\n";
+        assert_eq!(parse(text.as_bytes()).unwrap().colors().unwrap(), [[255, 128, 255]]);
+    }
+
+    #[test]
+    fn seams_split_vertices() {
+        let header = "ply\nformat ascii 1.0\ncomment TextureFile the picture.png\nelement vertex 4\n\
+            property float x\nproperty float y\nproperty float z\nelement face 2\n\
+            property list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n\
+            0 0 0\n1 0 0\n1 1 0\n0 1 0\n";
+        let faces = "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 0.5 0 1 1 0 1\n";
+        let picture = |name: &str| {
+            assert_eq!(name, "the picture.png");
+            let mut png = std::io::Cursor::new(Vec::new());
+            image::RgbImage::from_pixel(2, 1, image::Rgb([1, 2, 3]))
+                .write_to(&mut png, image::ImageFormat::Png)
+                .unwrap();
+            Ok(png.into_inner())
+        };
+        let text = format!("{header}{faces}");
+        let mesh = parse_ply(text.as_bytes(), "p.ply", Unit::Metre, &picture).unwrap();
+        assert_eq!(mesh.faces(), [[0, 1, 2], [4, 2, 3]]);
+        assert_eq!(mesh.vertices()[4], mesh.vertices()[0]);
+        let expected = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.0]];
+        assert_eq!(mesh.texcoords().unwrap(), expected);
+        assert_eq!(mesh.texture().unwrap().as_slice(), [[1, 2, 3]; 2]);
+        let error = parse(text.as_bytes()).unwrap_err().to_string();
+        assert!(error.contains("comment TextureFile names \"the picture.png\""), "{error}");
+    }
+
+    #[test]
+    fn lying_files_are_explained_without_taking_memory() {
+        for (from, to, names) in [
+            (
+                "vertex 4",
+                "vertex 4000000000",
+                ["element vertex", "4000000000 rows", "cut off or its header lies"],
+            ),
+            ("vertex 4", "vertex -1", ["header line 8", "whole COUNT", "element vertex -1"]),
+            // The first face is read as a fifth vertex and runs out of words.
+            (
+                "vertex 4",
+                "vertex 5",
+                ["element vertex, row 4 of 5, property more", "a whole number", "the end of the line"],
+            ),
+            (
+                "1 1 0 9",
+                "1 inf_ 0 9",
+                ["line 30, element vertex, row 2 of 4, property y", "a whole number", "\"inf_\""],
+            ),
+            ("0.5 0 0", "nan 0 0", ["row 0 of 4, property x", "a finite number", "NaN"]),
+            ("4 0 1 2 3", "4 0 1 2 -3", ["row 0 of 2, property vertex_indices", "zero or more", "-3"]),
+            ("4 0 1 2 3", "4 0 1 2 4", ["element face, triangle 1", "below 4", "found 4"]),
+            ("4 0 1 2 3", "-4 0 1 2 3", ["vertex_index", "list length of zero or more", "-4"]),
+            (
+                "4 0 1 2 3",
+                "99 0 1 2 3",
+                ["row 0 of 2, property vertex_index", "a whole number", "the end of the line"],
+            ),
+            (
+                "4 0 1 2 3",
+                "3 0 1 2 3",
+                ["row 0 of 2, property vertex_index", "the end of the line", "\"3\" behind it"],
+            ),
+            ("ply\n", "PLY2\n", ["header line 1", "\"ply\"", "PLY2"]),
+            ("ascii", "utf8", ["header line 2", "format ascii", "utf8"]),
+            ("property double x", "property half x", ["header line 9", "a type", "half"]),
+            ("property double x", "property double a", ["element vertex", "x, y and z", "no property x"]),
+            ("vertex_index", "corners", ["element face", "vertex_indices", "no such property"]),
+            ("end_header", "end", ["header line 25", "end_header", "\"end\""]),
+        ] {
+            assert!(SQUARE.contains(from), "{from}");
+            let result = parse(SQUARE.replacen(from, to, 1).as_bytes());
+            let error = result.unwrap_err().to_string();
+            for name in names.iter().chain(&["p.ply"]) {
+                assert!(error.contains(name), "{name} not in: {error}");
+            }
+        }
+        let empty = "ply\nformat binary_little_endian 1.0\nelement nothing 4000000000\nelement vertex 0\n\
+            property float x\nproperty float y\nproperty float z\nend_header\n";
+        let error = parse(empty.as_bytes()).unwrap_err().to_string();
+        assert!(error.contains("element vertex: expected at least one vertex"), "{error}");
+        let mut list = binary(false);
+        let at = list.len() - 10;
+        list[at..at + 4].copy_from_slice(&i32::MAX.to_le_bytes());
+        let error = parse(&list).unwrap_err().to_string();
+        assert!(
+            error.contains("row 0 of 1, property vertex_indices: expected 2 bytes, found 0 bytes"),
+            "{error}"
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            let _ = parse(&bytes);
+            let _ = parse(&[b"ply\nformat binary_big_endian 1.0\n", bytes.as_slice()].concat());
+        }
+
+        #[test]
+        fn words_never_panic(words in prop::collection::vec(prop::sample::select(vec![
+            "element", "vertex", "face", "property", "list", "float", "uchar", "int", "x", "y", "z", "vertex_indices",
+            "texcoord", "\n", "\n", "\n", "end_header\n", "0", "1", "3", "-1", "4000000000", "nan", "comment", "TextureFile"]), 0..120),
+            binary in any::<bool>()) {
+            let format = if binary { "binary_little_endian" } else { "ascii" };
+            let _ = parse(format!("ply\nformat {format} 1.0\n{}", words.join(" ")).as_bytes());
+        }
+
+        #[test]
+        fn changed_files_never_panic(kind in 0..3usize, changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4)) {
+            let mut bytes = [SQUARE.as_bytes().to_vec(), binary(false), binary(true)][kind].clone();
+            for (at, to) in changes {
+                let at = at.index(bytes.len());
+                bytes[at] = to;
+            }
+            let _ = parse(&bytes);
+        }
+    }
+}

@@ -251,7 +251,7 @@ impl Collapser {
                 let after = normal(face.map(|v| if v == vertex { *target } else { self.points[v as usize] }));
                 let product = before.norm() * after.norm();
                 // A face without area has no side to turn.
-                if before.norm() > 0.0 && !(before.dot(&after) > LEAST_COSINE * product) {
+                if before.norm() > 0.0 && before.dot(&after) <= LEAST_COSINE * product {
                     return false;
                 }
             }
