@@ -12,11 +12,13 @@ mod evaluate;
 mod files;
 mod image_files;
 mod json;
+mod plot;
 mod points;
 mod results;
 mod rle;
 mod scene_files;
 mod score;
+mod visibility;
 mod write;
 
 pub use coco::{
@@ -33,6 +35,7 @@ pub use evaluate::{
     Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, Progress, RecallCurves,
     evaluate, evaluate_detection,
 };
+pub use plot::{draw_recall_curves, write_recall_curves};
 pub use points::ModelPoints;
 pub use results::{
     BadRow, Estimate, ResultsAppender, ResultsError, parse_results, read_results, read_results_lenient,
@@ -46,4 +49,5 @@ pub use scene_files::{
 pub use score::{
     area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
 };
+pub use visibility::{ObjectVisibility, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};
