@@ -1,7 +1,7 @@
 //! The exact diameter of a point set by branch and bound over a tree of boxes.
 //!
 //! A double sweep gives a lower bound; two boxes whose farthest corners are no farther apart than the best
-//! pair found cannot hold a better one. No convex hull, so flat, doubled or degenerate point sets need no
+//! pair found cannot hold a better one, nor can two balls (the tighter bound on round objects). No convex hull, so flat, doubled or degenerate point sets need no
 //! special care.
 
 use sixfold_geometry::Vec3;
@@ -9,6 +9,8 @@ use sixfold_geometry::Vec3;
 use crate::Mesh;
 
 const LEAF: usize = 8;
+/// Keeps a bound above the truth whatever is lost to rounding.
+const ROUND_UP: f64 = 1.0 + 1e-12;
 
 impl Mesh {
     /// The largest distance between two vertices, in metres: exact.
@@ -76,6 +78,10 @@ impl Bounds {
 
 struct Node {
     bounds: Bounds,
+    /// The middle of the box.
+    middle: Vec3,
+    /// The distance of the farthest point from the middle, rounded up.
+    radius: f64,
     start: usize,
     end: usize,
     /// The right child; the left one follows its parent. Zero for a leaf.
@@ -85,7 +91,9 @@ struct Node {
 fn build(points: &mut [Vec3], start: usize, end: usize, nodes: &mut Vec<Node>) {
     let here = nodes.len();
     let bounds = Bounds::of(&points[start..end]);
-    nodes.push(Node { bounds, start, end, right: 0 });
+    let middle = bounds.low + (bounds.high - bounds.low) * 0.5;
+    let radius = points[start..end].iter().map(|p| (p - middle).norm_squared()).fold(0.0, f64::max).sqrt();
+    nodes.push(Node { bounds, middle, radius: radius * ROUND_UP, start, end, right: 0 });
     if end - start <= LEAF {
         return;
     }
@@ -97,10 +105,18 @@ fn build(points: &mut [Vec3], start: usize, end: usize, nodes: &mut Vec<Node>) {
     build(points, middle, end, nodes);
 }
 
+impl Node {
+    /// An upper bound of the squared distance of a point in this node and one in the other.
+    fn bound(&self, other: &Node) -> f64 {
+        let by_balls = ((self.middle - other.middle).norm() + self.radius + other.radius) * ROUND_UP;
+        self.bounds.span_squared(&other.bounds).min(by_balls * by_balls)
+    }
+}
+
 /// Improves `best`, a squared distance, with pairs of one point in `a` and one in `b`.
 fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64) {
     let (node_a, node_b) = (&nodes[a], &nodes[b]);
-    if node_a.bounds.span_squared(&node_b.bounds) <= *best {
+    if node_a.bound(node_b) <= *best {
         return;
     }
     match (node_a.right, node_b.right) {
@@ -118,21 +134,24 @@ fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64) {
             };
             let [a0, a1] = children(a);
             let [b0, b1] = children(b);
-            let mut pairs: Vec<(f64, usize, usize)> = Vec::with_capacity(4);
-            for i in [a0, a1] {
-                for j in [b0, b1] {
-                    // A pair of children of one node comes twice.
-                    let pair = if a == b { (i.min(j), i.max(j)) } else { (i, j) };
-                    if !pairs.iter().any(|&(_, i, j)| (i, j) == pair) {
-                        let span = nodes[pair.0].bounds.span_squared(&nodes[pair.1].bounds);
-                        pairs.push((span, pair.0, pair.1));
-                    }
-                }
+            let mut pairs =
+                [(a0, b0), (a0, b1), (a1, b0), (a1, b1)].map(|(i, j)| (nodes[i].bound(&nodes[j]), i, j));
+            // Children of one node, and a leaf in the place of two children, make a pair twice.
+            if a == b {
+                pairs[2].0 = f64::NEG_INFINITY;
+            }
+            if a0 == a1 {
+                (pairs[2].0, pairs[3].0) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
+            }
+            if b0 == b1 {
+                (pairs[1].0, pairs[3].0) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
             }
             // The most promising pair first.
-            pairs.sort_by(|x, y| y.0.total_cmp(&x.0));
-            for (_, i, j) in pairs {
-                search(nodes, points, i, j, best);
+            pairs.sort_unstable_by(|x, y| y.0.total_cmp(&x.0));
+            for (bound, i, j) in pairs {
+                if bound > *best {
+                    search(nodes, points, i, j, best);
+                }
             }
         }
     }

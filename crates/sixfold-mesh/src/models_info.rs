@@ -127,7 +127,7 @@ impl ModelsInfo {
         Ok(ModelsInfo(infos))
     }
 
-    /// Writes a `models_info.json` in millimetres, rounded to a femtometre's order so that a number read
+    /// Writes a `models_info.json` in millimetres, rounded to a picometre so that a number read
     /// comes out as it was; all or nothing.
     ///
     /// # Errors
