@@ -12,14 +12,14 @@ use std::path::Path;
 use std::time::Instant;
 
 use rayon::prelude::*;
-use sixfold_bop::{BopDataset, Estimate, ModelPoints, Models, add, mspd, mssd, read_results};
-use sixfold_geometry::{Camera, Pose};
+use sixfold_bop::{BopDataset, Estimate, ModelPoints, Models, Placement, add, mspd, mssd, read_results};
+use sixfold_geometry::Camera;
 
 struct Pair {
     im_id: u32,
     obj_id: u32,
-    estimate: Pose,
-    truth: Pose,
+    estimate: Placement,
+    truth: Placement,
     camera: Camera,
 }
 
@@ -51,9 +51,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         let camera = scene.camera(target.im_id)?;
         let image = scene.image(target.im_id)?;
         let truth = image.ground_truth.iter().find(|g| g.obj_id == id).ok_or("no ground truth")?;
-        let truth = truth.camera_from_object;
+        let truth = truth.placement();
         // A target without estimate is compared with its own ground truth: the work is the same.
-        let estimate = best.get(&(target.scene_id, target.im_id, id)).map_or(truth, |e| e.camera_from_object);
+        let estimate = best.get(&(target.scene_id, target.im_id, id)).map_or(truth, Estimate::placement);
         pairs.push(Pair { im_id: target.im_id, obj_id: id, estimate, truth, camera });
     }
 
@@ -77,7 +77,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         assert_eq!(found, parallel, "the number of threads changed an error");
     }
     if let Some(path) = rest.first() {
-        let rows = pairs.iter().zip(&found).map(|(p, (a, b, c))| format!("{},{},{a},{b},{c}\n", p.im_id, p.obj_id));
+        let rows =
+            pairs.iter().zip(&found).map(|(p, (a, b, c))| format!("{},{},{a},{b},{c}\n", p.im_id, p.obj_id));
         std::fs::write(path, rows.collect::<String>())?;
     }
     println!(

@@ -350,10 +350,7 @@ mod tests {
         let clipped = Rect { x: 0.0, y: 5.0, width: 20.0, height: 10.0 };
         assert_eq!(read.detections[0].bbox.unwrap(), clipped);
         let what: Vec<_> = read.adjusted.iter().map(|a| (a.index, a.adjustment)).collect();
-        assert_eq!(
-            what,
-            [(0, Adjustment::Clipped), (1, Adjustment::Outside), (3, Adjustment::Outside)]
-        );
+        assert_eq!(what, [(0, Adjustment::Clipped), (1, Adjustment::Outside), (3, Adjustment::Outside)]);
         assert!(read.adjusted[1].message.contains("entry 1, image 1"), "{}", read.adjusted[1].message);
     }
 

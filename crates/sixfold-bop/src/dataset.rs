@@ -297,7 +297,8 @@ impl Scene {
             advice: "every BOP scene has one",
         })?;
         let cameras = parse_scene_camera(&text, &camera_path)?;
-        let ground_truth = read("scene_gt.json")?.map(|(t, p)| Ok((parse_scene_gt(&t, &p)?, p))).transpose()?;
+        let ground_truth =
+            read("scene_gt.json")?.map(|(t, p)| Ok((parse_scene_gt(&t, &p)?, p))).transpose()?;
         let infos =
             read("scene_gt_info.json")?.map(|(t, p)| Ok((parse_scene_gt_info(&t, &p)?, p))).transpose()?;
         let has_ground_truth = ground_truth.is_some();
@@ -306,7 +307,12 @@ impl Scene {
         for (im_id, camera) in cameras {
             images.insert(
                 im_id,
-                SceneImage { im_id, camera, ground_truth: poses.remove(&im_id).unwrap_or_default(), info: None },
+                SceneImage {
+                    im_id,
+                    camera,
+                    ground_truth: poses.remove(&im_id).unwrap_or_default(),
+                    info: None,
+                },
             );
         }
         if let Some((&im_id, _)) = poses.first_key_value() {
@@ -379,8 +385,7 @@ impl Scene {
         let image = self.image(im_id)?;
         let (width, height) = self.expected_size(im_id)?.0;
         let k = image.camera;
-        let camera =
-            Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
+        let camera = Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
         let path = self.dir.join("scene_camera.json");
         camera.check().map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera"))?;
         Ok(camera)

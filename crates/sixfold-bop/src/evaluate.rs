@@ -16,13 +16,11 @@ use thiserror::Error;
 
 use crate::dataset::{BopDataset, Models, Scene};
 use crate::dataset_error::DatasetError;
-use crate::errors::{VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
+use crate::errors::{Placement, VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
 use crate::points::ModelPoints;
 use crate::results::Estimate;
-use crate::scene_files::{Target, TargetObject};
-use crate::score::{
-    average_precision, by_falling_score, fractions_05_to_50, greedy_matches, pixels_5_to_50,
-};
+use crate::scene_files::{GroundTruth, Target, TargetObject};
+use crate::score::{average_precision, by_falling_score, fractions_05_to_50, greedy_matches, pixels_5_to_50};
 
 /// How an evaluation is done. The default is the BOP Challenge's.
 #[derive(Debug, Clone, PartialEq)]
@@ -194,7 +192,7 @@ struct Object {
 struct Task<'a> {
     obj_id: u32,
     /// All ground-truth poses of the object in the image, and which of them are to be found.
-    poses: Vec<Pose>,
+    poses: Vec<GroundTruth>,
     valid: Vec<bool>,
     visible: Vec<f64>,
     /// By falling score.
@@ -271,8 +269,8 @@ fn prepare<'a>(
         let fractions = image.visible_fractions();
         let of_object = |obj_id: u32| {
             let of = image.ground_truth.iter().zip(&fractions).filter(move |(g, _)| g.obj_id == obj_id);
-            let (poses, visible): (Vec<Pose>, Vec<f64>) =
-                of.map(|(g, v)| (g.camera_from_object, v.unwrap_or(1.0))).unzip();
+            let (poses, visible): (Vec<GroundTruth>, Vec<f64>) =
+                of.map(|(g, v)| (*g, v.unwrap_or(1.0))).unzip();
             (poses, visible)
         };
         let found = by_image.get(&(scene_id, im_id));
@@ -364,12 +362,13 @@ fn best_of_image<'a>(objects: &ByObject<'a>, most: usize) -> ByObject<'a> {
 /// Errors of every estimate against every pose of a task.
 fn surface_and_projection(task: &Task<'_>, object: &Object, camera: &Camera, with_add: bool) -> TaskErrors {
     let width = 640.0 / camera.width as f64;
-    let table = |error: &dyn Fn(&Pose, &Pose) -> f64| -> Vec<Vec<f64>> {
-        let row = |e: &&Estimate| task.poses.iter().map(|g| error(&e.camera_from_object, g)).collect();
+    let table = |error: &dyn Fn(&Placement, &Placement) -> f64| -> Vec<Vec<f64>> {
+        let truth: Vec<Placement> = task.poses.iter().map(GroundTruth::placement).collect();
+        let row = |e: &&Estimate| truth.iter().map(|g| error(&e.placement(), g)).collect();
         task.estimates.iter().map(row).collect()
     };
     // Further apart than a diameter is wrong at every threshold; the reference does not look closer either.
-    let apart = |e: &Pose, g: &Pose| e.distance_to(g) >= object.diameter;
+    let apart = |e: &Placement, g: &Placement| e.distance_to(g) >= object.diameter;
     let d = object.diameter;
     TaskErrors {
         mssd: table(&|e, g| {
@@ -406,7 +405,7 @@ fn visible_surface(
     let mut by_tau = vec![vec![vec![1.0; task.poses.len()]; task.estimates.len()]; options.taus.len()];
     for (i, estimate) in task.estimates.iter().enumerate() {
         let mut rendered = None;
-        for (g, pose) in task.poses.iter().enumerate() {
+        for (g, pose) in task.poses.iter().map(|p| &p.camera_from_object).enumerate() {
             if !spheres_overlap(&estimate.camera_from_object, pose, object.diameter) {
                 continue;
             }
@@ -592,8 +591,10 @@ pub fn evaluate(
             count(&scored, |e| e.vsd.as_ref().map_or(&e.mssd, |v| &v[tau]), threshold)
         };
         let taus = options.vsd.taus.len();
-        let all: Vec<Counts> =
-            (0..taus).flat_map(|tau| fractions.iter().map(move |&t| (tau, t))).map(|(a, b)| by_tau(a, b)).collect();
+        let all: Vec<Counts> = (0..taus)
+            .flat_map(|tau| fractions.iter().map(move |&t| (tau, t)))
+            .map(|(a, b)| by_tau(a, b))
+            .collect();
         (ar_vsd, vsd_of) = average(&all);
         // Found and wanted summed over the taus: the mean recall.
         let list: Vec<(f64, Counts)> = (0..=steps)
@@ -628,10 +629,8 @@ pub fn evaluate(
         }
         let (ar_vsd, ar_mssd, ar_mspd) =
             (vsd_of.get(&id).copied(), mssd_of.get(&id).copied(), mspd_of.get(&id).copied());
-        per_object.insert(
-            id.to_string(),
-            ObjectScores { targets, ar_vsd, ar_mssd, ar_mspd, add_s_recall: add },
-        );
+        per_object
+            .insert(id.to_string(), ObjectScores { targets, ar_vsd, ar_mssd, ar_mspd, add_s_recall: add });
     }
     let of_objects: Vec<f64> = targets_of.keys().filter_map(|&id| add_counts.recall(id)).collect();
     let over_objects =
@@ -747,10 +746,11 @@ pub fn evaluate_detection(
         let right: Vec<bool> = found.into_iter().map(|f| f.1).collect();
         average_precision(&right, positives)
     };
-    let mean_over = |list: &[&Scored<'_, '_>], errors: &dyn Fn(&TaskErrors) -> &Vec<Vec<f64>>, ths: &[f64]| {
-        let all: Option<Vec<f64>> = ths.iter().map(|&th| precision(list, errors, th)).collect();
-        all.map(|all| all.iter().sum::<f64>() / all.len() as f64)
-    };
+    let mean_over =
+        |list: &[&Scored<'_, '_>], errors: &dyn Fn(&TaskErrors) -> &Vec<Vec<f64>>, ths: &[f64]| {
+            let all: Option<Vec<f64>> = ths.iter().map(|&th| precision(list, errors, th)).collect();
+            all.map(|all| all.iter().sum::<f64>() / all.len() as f64)
+        };
     let mut objects = BTreeMap::new();
     let (mut mssd_all, mut mspd_all, mut mm_all) = (Vec::new(), Vec::new(), Vec::new());
     for (&id, list) in &by_object {

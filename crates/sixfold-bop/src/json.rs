@@ -105,20 +105,23 @@ impl<'a> At<'a> {
         Ok(out)
     }
 
-    /// A pose from a row-major rotation and a translation in millimetres, both in `map`.
+    /// A pose from a row-major rotation and a translation in millimetres, both in `map`; and the rotation as it stands
+    /// there.
     pub(crate) fn pose_mm(
         &self,
         map: &Map<String, Value>,
         rotation: &str,
         translation: &str,
-    ) -> Result<Pose, DatasetError> {
+    ) -> Result<(Pose, Mat3), DatasetError> {
         let r: [f64; 9] =
             self.numbers(rotation, self.get(map, rotation, "a rotation, 9 numbers row by row")?)?;
         let t: [f64; 3] =
             self.numbers(translation, self.get(map, translation, "a translation, 3 numbers in mm")?)?;
-        Pose::from_parts(&Mat3::from_row_slice(&r), Vec3::from(t) / 1000.0).map_err(|reason| {
+        let written = Mat3::from_row_slice(&r);
+        let pose = Pose::from_parts(&written, Vec3::from(t) / 1000.0).map_err(|reason| {
             self.error(rotation, format!("{r:?} ({reason})"), "a rotation: orthonormal, determinant 1")
-        })
+        })?;
+        Ok((pose, written))
     }
 }
 

@@ -29,7 +29,8 @@ pub use coco_score::{CocoScores, IouType, evaluate_coco};
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{
-    VsdError, VsdOptions, add, adi, mspd, mssd, projection_error, rotation_error, translation_error, vsd,
+    Placement, VsdError, VsdOptions, add, adi, mspd, mssd, projection_error, rotation_error,
+    translation_error, vsd,
 };
 pub use evaluate::{
     Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, Progress, RecallCurves,

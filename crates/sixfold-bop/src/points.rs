@@ -1,29 +1,32 @@
 //! The points of an object model, laid out for the pose errors: structure of arrays in k-d tree order.
 //!
 //! One tree serves two purposes. A leaf's bounding box bounds the distance of everything in it, which finds
-//! nearest neighbours (ADI); and a leaf's bounding ball bounds how far a rigid motion can move anything in it,
+//! nearest neighbours (ADI); and a node's bounding ball bounds how far a motion can move anything in it,
 //! which finds the vertex that moves furthest (MSSD) without visiting most vertices. Both are exact.
 
-use sixfold_geometry::{Mat3, Pose, Vec3};
+use sixfold_geometry::{Mat3, Vec3};
 
 const LEAF_SIZE: usize = 32;
 
+/// Points that lie close together: their range, a box and a ball around them.
 #[derive(Debug, Clone)]
-struct Node {
+pub(crate) struct Node {
     low: [f64; 3],
     high: [f64; 3],
-    start: usize,
-    end: usize,
+    pub center: Vec3,
+    pub radius: f64,
+    pub start: usize,
+    pub end: usize,
     /// Index of the left child; the right child follows it. Zero for a leaf.
     children: usize,
 }
 
-#[derive(Debug, Clone)]
-struct Leaf {
-    center: Vec3,
-    radius: f64,
-    start: usize,
-    end: usize,
+/// At least the spectral norm of `a`, how much longer a vector can become, and at most 9 % more for the difference of
+/// two rotations: the Schatten norm of order 8.
+pub(crate) fn stretch(a: &Mat3) -> f64 {
+    let squared = a.transpose() * a;
+    let fourth = squared * squared;
+    fourth.norm_squared().sqrt().sqrt().sqrt()
 }
 
 /// The points of an object model with what the pose errors need to be fast.
@@ -33,7 +36,6 @@ pub struct ModelPoints {
     pub(crate) y: Vec<f64>,
     pub(crate) z: Vec<f64>,
     nodes: Vec<Node>,
-    leaves: Vec<Leaf>,
 }
 
 impl ModelPoints {
@@ -44,7 +46,6 @@ impl ModelPoints {
         }
         let mut sorted = points.to_vec();
         let mut nodes = Vec::with_capacity(2 * points.len() / LEAF_SIZE + 1);
-        let mut leaves = Vec::new();
         nodes.push(bounds(&sorted, 0, points.len()));
         let mut todo = vec![0];
         while let Some(index) = todo.pop() {
@@ -62,17 +63,11 @@ impl ModelPoints {
             nodes.push(bounds(&sorted, start + middle, end));
             todo.extend([children, children + 1]);
         }
-        for node in nodes.iter().filter(|n| n.children == 0) {
-            let center = 0.5 * (Vec3::from(node.low) + Vec3::from(node.high));
-            let radius = sorted[node.start..node.end].iter().map(|p| (p - center).norm()).fold(0.0, f64::max);
-            leaves.push(Leaf { center, radius, start: node.start, end: node.end });
-        }
         Some(ModelPoints {
             x: sorted.iter().map(|p| p.x).collect(),
             y: sorted.iter().map(|p| p.y).collect(),
             z: sorted.iter().map(|p| p.z).collect(),
             nodes,
-            leaves,
         })
     }
 
@@ -87,90 +82,98 @@ impl ModelPoints {
         Vec3::new(self.x[i], self.y[i], self.z[i])
     }
 
-    /// The largest `|a p + b|^2` over all points, or any number above `give_up` once it is known to be above.
+    /// The largest of a number that every point has, or any number above `give_up` once it is known to be above.
     ///
-    /// `|a p + b|` in a ball of radius `r` about `c` is at most `|a c + b| + |a| r` with the spectral norm of `a`
-    /// (here bounded by `sqrt(|a|_1 |a|_inf)`): leaves that cannot beat the best vertex so far are passed over.
-    pub(crate) fn largest_squared(&self, a: &Mat3, b: &Vec3, give_up: f64) -> f64 {
-        let column = (0..3).map(|j| a.column(j).abs().sum()).fold(0.0, f64::max);
-        let row = (0..3).map(|i| a.row(i).abs().sum()).fold(0.0, f64::max);
-        let stretch = (column * row).sqrt();
-        let at_center = |leaf: &Leaf| (a * leaf.center + b).norm();
-        let bound = |leaf: &Leaf| at_center(leaf) + stretch * leaf.radius;
-        let mut first = 0;
-        let mut highest = f64::NEG_INFINITY;
-        for (i, leaf) in self.leaves.iter().enumerate() {
-            let here = bound(leaf);
-            if here > highest {
-                (first, highest) = (i, here);
+    /// `bound(node)` is at least the root of the number of every point in the node, `largest(node)` is the largest
+    /// number in a leaf. Nodes that cannot beat the best point so far are passed over.
+    pub(crate) fn largest(
+        &self,
+        give_up: f64,
+        bound: impl Fn(&Node) -> f64,
+        largest: impl Fn(&Node) -> f64,
+    ) -> f64 {
+        // A balanced tree over at most 2^32 points has fewer levels than this.
+        let mut stack = [(f64::INFINITY, 0usize); 64];
+        let mut depth = 1;
+        let (mut best, mut needed) = (0.0f64, f64::NEG_INFINITY);
+        while depth > 0 && best <= give_up {
+            depth -= 1;
+            let (limit, index) = stack[depth];
+            // The margin keeps rounding in the bound from hiding a point.
+            if limit * (1.0 + 1e-9) < needed {
+                continue;
             }
-        }
-        let mut best = self.largest_in_leaf(&self.leaves[first], a, b);
-        for (i, leaf) in self.leaves.iter().enumerate() {
-            if best > give_up {
-                return best;
+            let node = &self.nodes[index];
+            if node.children == 0 {
+                best = best.max(largest(node));
+                needed = best.sqrt();
+                continue;
             }
-            // The margin keeps rounding in the bound from hiding a vertex.
-            let limit = bound(leaf) * (1.0 + 1e-12);
-            if i != first && limit * limit > best {
-                best = best.max(self.largest_in_leaf(leaf, a, b));
-            }
+            let left = (bound(&self.nodes[node.children]), node.children);
+            let right = (bound(&self.nodes[node.children + 1]), node.children + 1);
+            let (small, large) = if left.0 <= right.0 { (left, right) } else { (right, left) };
+            stack[depth] = small;
+            stack[depth + 1] = large;
+            depth += 2;
         }
         best
     }
 
-    fn largest_in_leaf(&self, leaf: &Leaf, a: &Mat3, b: &Vec3) -> f64 {
-        let mut best = 0.0f64;
-        for i in leaf.start..leaf.end {
-            let (x, y, z) = (self.x[i], self.y[i], self.z[i]);
-            let dx = a.m11 * x + a.m12 * y + a.m13 * z + b.x;
-            let dy = a.m21 * x + a.m22 * y + a.m23 * z + b.y;
-            let dz = a.m31 * x + a.m32 * y + a.m33 * z + b.z;
-            best = best.max(dx * dx + dy * dy + dz * dz);
-        }
-        best
+    /// The largest `|a p + b|^2` over all points, or any number above `give_up` once it is known to be above.
+    pub(crate) fn largest_squared(&self, a: &Mat3, b: &Vec3, give_up: f64) -> f64 {
+        let stretch = stretch(a);
+        let in_leaf = |leaf: &Node| {
+            let points = leaf.start..leaf.end;
+            points.map(|i| (a * self.point(i) + b).norm_squared()).fold(0.0, f64::max)
+        };
+        self.largest(give_up, |node| (a * node.center + b).norm() + stretch * node.radius, in_leaf)
     }
 
     /// The mean of `|a p + b|` over all points.
     pub(crate) fn mean_norm(&self, a: &Mat3, b: &Vec3) -> f64 {
-        // Four fixed partial sums: the compiler may use vector registers, the result is always the same.
-        let mut sums = [0.0f64; 4];
+        // Eight fixed partial sums: the compiler may use vector registers, the result is always the same.
+        const LANES: usize = 8;
+        // With a = q r, q orthogonal and r upper triangular, |a p + b| = |r p + q^T b|: a third less to multiply.
+        let (q, r) = a.qr().unpack();
+        let c = q.transpose() * b;
+        let mut sums = [0.0f64; LANES];
         let term = |x: f64, y: f64, z: f64| {
-            let dx = a.m11 * x + a.m12 * y + a.m13 * z + b.x;
-            let dy = a.m21 * x + a.m22 * y + a.m23 * z + b.y;
-            let dz = a.m31 * x + a.m32 * y + a.m33 * z + b.z;
+            let dx = r.m11 * x + r.m12 * y + (r.m13 * z + c.x);
+            let dy = r.m22 * y + (r.m23 * z + c.y);
+            let dz = r.m33 * z + c.z;
             (dx * dx + dy * dy + dz * dz).sqrt()
         };
-        let (xs, x_rest) = self.x.as_chunks::<4>();
-        let (ys, y_rest) = self.y.as_chunks::<4>();
-        let (zs, z_rest) = self.z.as_chunks::<4>();
+        let (xs, x_rest) = self.x.as_chunks::<LANES>();
+        let (ys, y_rest) = self.y.as_chunks::<LANES>();
+        let (zs, z_rest) = self.z.as_chunks::<LANES>();
         for ((x, y), z) in xs.iter().zip(ys).zip(zs) {
-            for lane in 0..4 {
+            for lane in 0..LANES {
                 sums[lane] += term(x[lane], y[lane], z[lane]);
             }
         }
         for (lane, ((&x, &y), &z)) in x_rest.iter().zip(y_rest).zip(z_rest).enumerate() {
             sums[lane] += term(x, y, z);
         }
-        ((sums[0] + sums[1]) + (sums[2] + sums[3])) / self.len() as f64
+        sums.iter().sum::<f64>() / self.len() as f64
     }
 
-    /// The mean distance from every point moved by `move_query` to its nearest point, exactly.
-    pub(crate) fn mean_nearest_after(&self, move_query: &Pose) -> f64 {
+    /// The mean distance from every point of `queries`, moved to `rotation p + translation`, to the nearest of these
+    /// points, exactly.
+    pub(crate) fn mean_nearest(&self, queries: &ModelPoints, rotation: &Mat3, translation: &Vec3) -> f64 {
         let mut total = 0.0;
         let mut last = 0;
-        let (rotation, translation) = (move_query.rotation_matrix(), move_query.translation());
-        for i in 0..self.len() {
-            let query = rotation * self.point(i) + translation;
+        for i in 0..queries.len() {
+            let query = rotation * queries.point(i) + translation;
             // Two guesses that are close in practice: the point itself and the neighbour of the point before.
-            let own = (self.point(i) - query).norm_squared();
+            let same = i.min(self.len() - 1);
+            let own = (self.point(same) - query).norm_squared();
             let before = (self.point(last) - query).norm_squared();
-            let mut best = if own < before { (own, i) } else { (before, last) };
+            let mut best = if own < before { (own, same) } else { (before, last) };
             self.nearest(&query, &mut best);
             last = best.1;
             total += best.0.sqrt();
         }
-        total / self.len() as f64
+        total / queries.len() as f64
     }
 
     fn nearest(&self, query: &Vec3, best: &mut (f64, usize)) {
@@ -223,13 +226,16 @@ fn bounds(points: &[Vec3], start: usize, end: usize) -> Node {
             high[axis] = high[axis].max(p[axis]);
         }
     }
-    Node { low, high, start, end, children: 0 }
+    let center = 0.5 * (Vec3::from(low) + Vec3::from(high));
+    let radius = points[start..end].iter().map(|p| (p - center).norm()).fold(0.0, f64::max);
+    Node { low, high, center, radius, start, end, children: 0 }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use sixfold_geometry::Pose;
     use sixfold_geometry::nalgebra::Vector6;
 
     fn points() -> impl Strategy<Value = Vec<Vec3>> {
@@ -248,7 +254,7 @@ mod tests {
                 let q = by.transform_point(p);
                 points.iter().map(|o| (o - q).norm()).fold(f64::INFINITY, f64::min)
             }).sum::<f64>() / points.len() as f64;
-            prop_assert!((model.mean_nearest_after(&by) - brute).abs() < 1e-12);
+            prop_assert!((model.mean_nearest(&model, &by.rotation_matrix(), &by.translation()) - brute).abs() < 1e-12);
         }
 
         #[test]
@@ -266,7 +272,7 @@ mod tests {
     fn many_equal_points_are_no_trouble() {
         let model = ModelPoints::new(&vec![Vec3::new(1.0, 2.0, 3.0); 1000]).unwrap();
         let by = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
-        assert_eq!(model.mean_nearest_after(&by), 0.5);
+        assert_eq!(model.mean_nearest(&model, &by.rotation_matrix(), &by.translation()), 0.5);
         assert!(ModelPoints::new(&[]).is_none());
         assert!(ModelPoints::new(&[Vec3::new(f64::NAN, 0.0, 0.0)]).is_none());
     }

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use sixfold_geometry::{Mat3, Pose, Vec3};
 use thiserror::Error;
 
+use crate::errors::Placement;
 use crate::files::write_atomically;
 use crate::write::{rotation_rows, translation_mm};
 
@@ -29,6 +30,23 @@ pub struct Estimate {
     pub camera_from_object: Pose,
     /// Seconds that all estimates of this image took together; `None` where not measured (-1 in the file).
     pub time: Option<f64>,
+    /// The rotation as the file had it, where it came from one; the pose holds the nearest true rotation. The errors
+    /// of an evaluation are computed with these numbers, as the official one does.
+    pub rotation_as_written: Option<Mat3>,
+}
+
+impl Estimate {
+    /// An estimate of an object in an image, without time.
+    pub fn new(scene_id: u32, im_id: u32, obj_id: u32, score: f64, camera_from_object: Pose) -> Self {
+        let (time, rotation_as_written) = (None, None);
+        Estimate { scene_id, im_id, obj_id, score, camera_from_object, time, rotation_as_written }
+    }
+
+    /// The pose as the evaluation sees it.
+    pub fn placement(&self) -> Placement {
+        let rotation = self.rotation_as_written.unwrap_or_else(|| self.camera_from_object.rotation_matrix());
+        Placement { rotation, translation: self.camera_from_object.translation() }
+    }
 }
 
 /// Why a result file cannot be read or written.
@@ -161,7 +179,11 @@ fn parse_row(line: &str, number: usize) -> Result<Estimate, BadRow> {
     let numbers = |column: usize, expected: &str, into: &mut [f64]| {
         let texts: Vec<&str> = columns[column].split_whitespace().collect();
         if texts.len() != into.len() {
-            return Err(bad(column, format!("{} numbers: {}", texts.len(), shorten(columns[column])), expected));
+            return Err(bad(
+                column,
+                format!("{} numbers: {}", texts.len(), shorten(columns[column])),
+                expected,
+            ));
         }
         for (value, text) in into.iter_mut().zip(texts) {
             *value = number_in(column, text)?;
@@ -176,7 +198,9 @@ fn parse_row(line: &str, number: usize) -> Result<Estimate, BadRow> {
     let time = number_in(6, columns[6])?;
     let camera_from_object = Pose::from_parts(&Mat3::from_row_slice(&r), Vec3::from(t) / 1000.0)
         .map_err(|e| bad(4, format!("{} ({e})", shorten(columns[4])), "a rotation"))?;
-    Ok(Estimate { scene_id, im_id, obj_id, score, camera_from_object, time: (time >= 0.0).then_some(time) })
+    let time = (time >= 0.0).then_some(time);
+    let rotation_as_written = Some(Mat3::from_row_slice(&r));
+    Ok(Estimate { scene_id, im_id, obj_id, score, camera_from_object, time, rotation_as_written })
 }
 
 fn format_row(estimate: &Estimate) -> String {
@@ -187,7 +211,7 @@ fn format_row(estimate: &Estimate) -> String {
         estimate.im_id,
         estimate.obj_id,
         estimate.score,
-        join(&rotation_rows(&estimate.camera_from_object)),
+        join(&rotation_rows(&estimate.placement().rotation)),
         join(&translation_mm(&estimate.camera_from_object)),
         estimate.time.unwrap_or(-1.0),
     )
@@ -235,8 +259,7 @@ impl ResultsAppender {
         file.read_to_end(&mut bytes)
             .map_err(|source| ResultsError::Read { path: path.to_owned(), source })?;
         let whole = bytes.iter().rposition(|&b| b == b'\n').map_or(0, |i| i + 1);
-        let torn =
-            (whole < bytes.len()).then(|| String::from_utf8_lossy(&bytes[whole..]).into_owned());
+        let torn = (whole < bytes.len()).then(|| String::from_utf8_lossy(&bytes[whole..]).into_owned());
         let text = std::str::from_utf8(&bytes[..whole]).map_err(|e| ResultsError::NotText {
             path: path.to_owned(),
             line: 1 + bytes[..e.valid_up_to()].iter().filter(|&&b| b == b'\n').count(),
@@ -336,6 +359,7 @@ mod tests {
             score: 0.1 * f64::from(im_id),
             camera_from_object: Pose::exp(&Vector6::from(t)),
             time: (im_id % 2 == 0).then_some(0.25),
+            rotation_as_written: None,
         }
     }
 

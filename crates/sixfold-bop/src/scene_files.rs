@@ -7,9 +7,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde_json::Value;
-use sixfold_geometry::{Pose, Rect};
+use sixfold_geometry::{Mat3, Pose, Rect};
 
 use crate::dataset_error::DatasetError;
+use crate::errors::Placement;
 use crate::json::{At, by_image, describe, parse};
 
 /// Intrinsics of one image without its size, and what turns a depth pixel into metres.
@@ -36,6 +37,23 @@ pub struct GroundTruth {
     pub obj_id: u32,
     /// Its pose.
     pub camera_from_object: Pose,
+    /// The rotation as the file had it, where it came from one (LM-O's are up to a thousandth off a rotation); the
+    /// pose holds the nearest true rotation. The errors of an evaluation are computed with these numbers, as the
+    /// official one does.
+    pub rotation_as_written: Option<Mat3>,
+}
+
+impl GroundTruth {
+    /// An object at a pose.
+    pub fn new(obj_id: u32, camera_from_object: Pose) -> Self {
+        GroundTruth { obj_id, camera_from_object, rotation_as_written: None }
+    }
+
+    /// The pose as the evaluation sees it.
+    pub fn placement(&self) -> Placement {
+        let rotation = self.rotation_as_written.unwrap_or_else(|| self.camera_from_object.rotation_matrix());
+        Placement { rotation, translation: self.camera_from_object.translation() }
+    }
 }
 
 /// What `scene_gt_info.json` says of one ground-truth pose. Boxes are as BOP writes them: first pixel, then last
@@ -123,7 +141,7 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
             }
         };
         let camera_from_world = match (map.contains_key("cam_R_w2c"), map.contains_key("cam_t_w2c")) {
-            (true, true) => Some(at.pose_mm(map, "cam_R_w2c", "cam_t_w2c")?),
+            (true, true) => Some(at.pose_mm(map, "cam_R_w2c", "cam_t_w2c")?.0),
             _ => None,
         };
         cameras.insert(
@@ -148,8 +166,8 @@ pub fn parse_scene_gt(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Vec<Grou
             let at = at.entry(index);
             let map = at.object(value)?;
             let obj_id = at.id("obj_id", at.get(map, "obj_id", "an object id")?)?;
-            let camera_from_object = at.pose_mm(map, "cam_R_m2c", "cam_t_m2c")?;
-            poses.push(GroundTruth { obj_id, camera_from_object });
+            let (camera_from_object, written) = at.pose_mm(map, "cam_R_m2c", "cam_t_m2c")?;
+            poses.push(GroundTruth { obj_id, camera_from_object, rotation_as_written: Some(written) });
         }
         images.insert(im_id, poses);
     }

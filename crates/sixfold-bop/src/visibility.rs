@@ -154,7 +154,8 @@ mod tests {
     #[test]
     fn objects_hide_one_another_without_depth_and_the_sensor_decides_with_it() {
         let mesh = square();
-        let near = Mesh::new(square().vertices().iter().map(|v| v * 0.5).collect(), square().faces().to_vec());
+        let near =
+            Mesh::new(square().vertices().iter().map(|v| v * 0.5).collect(), square().faces().to_vec());
         // The small square at half the distance covers the right half: shifted by 0.05 m at 0.5 m.
         let objects = [(&mesh, at(0.0, 1.0)), (&near.unwrap(), at(0.05, 0.5))];
         let found = ground_truth_visibility(&objects, &camera(), None, 0.015);
@@ -162,7 +163,15 @@ mod tests {
         assert_eq!(found[1].info.visib_fract, 1.0);
 
         // The sensor sees something 20 mm in front of the upper rows only; in the lower rows 10 mm, in one nothing.
-        let depth = Image::from_fn(100, 80, |_, y| if y < 35 { 0.98 } else if y == 49 { 0.0 } else { 0.99f32 });
+        let depth = Image::from_fn(100, 80, |_, y| {
+            if y < 35 {
+                0.98
+            } else if y == 49 {
+                0.0
+            } else {
+                0.99f32
+            }
+        });
         let found = &ground_truth_visibility(&objects[..1], &camera(), Some(&depth), 0.015)[0];
         assert_eq!(found.info.px_count_visib, Some(300));
         assert_eq!(found.info.px_count_valid, Some(380));

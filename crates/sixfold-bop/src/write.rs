@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value, json};
-use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Rect, RgbImage};
+use sixfold_geometry::{Camera, DepthImage, Mask, Mat3, Pose, Rect, RgbImage};
 
 use crate::dataset_error::DatasetError;
 use crate::files::write_atomically;
@@ -108,7 +108,11 @@ impl SceneWriter {
         if let Some(depth) = image.depth {
             same_size("depth", depth.size())?;
             if !(image.depth_scale.is_finite() && image.depth_scale > 0.0) {
-                return Err(at.error("depth_scale", image.depth_scale.to_string(), "metres per unit, above 0"));
+                return Err(at.error(
+                    "depth_scale",
+                    image.depth_scale.to_string(),
+                    "metres per unit, above 0",
+                ));
             }
             if let Some(png) = png_of_depth(depth, image.depth_scale) {
                 write_png(&self.dir.join("depth").join(&name), png)?;
@@ -127,13 +131,13 @@ impl SceneWriter {
         camera.insert("cam_K".into(), json!([c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0]));
         camera.insert("depth_scale".into(), json!(tidy(image.depth_scale * 1000.0)));
         if let Some(pose) = &image.camera_from_world {
-            camera.insert("cam_R_w2c".into(), json!(rotation_rows(pose)));
+            camera.insert("cam_R_w2c".into(), json!(rotation_rows(&pose.rotation_matrix())));
             camera.insert("cam_t_w2c".into(), json!(translation_mm(pose)));
         }
         self.cameras.insert(im_id, Value::Object(camera));
         let poses = image.ground_truth.iter().map(|gt| {
             json!({
-                "cam_R_m2c": rotation_rows(&gt.camera_from_object),
+                "cam_R_m2c": rotation_rows(&gt.placement().rotation),
                 "cam_t_m2c": translation_mm(&gt.camera_from_object),
                 "obj_id": gt.obj_id,
             })
@@ -204,8 +208,7 @@ fn tidy(value: f64) -> f64 {
     if (rounded - value).abs() <= 1e-12 * value.abs() { rounded } else { value }
 }
 
-pub(crate) fn rotation_rows(pose: &Pose) -> [f64; 9] {
-    let r = pose.rotation_matrix();
+pub(crate) fn rotation_rows(r: &Mat3) -> [f64; 9] {
     std::array::from_fn(|i| r[(i / 3, i % 3)])
 }
 

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use sixfold_bop::{
-    BopDataset, Estimate, EvalOptions, ModelPoints, Target, add, adi, area_under_accuracy,
-    evaluate, evaluate_detection, read_results,
+    BopDataset, Estimate, EvalOptions, ModelPoints, Target, add, adi, area_under_accuracy, evaluate,
+    evaluate_detection, read_results,
 };
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
@@ -52,7 +52,9 @@ fn lmo_ground_truth_scores_exactly_one() {
     for im_id in scene.image_ids() {
         for gt in &scene.image(im_id).unwrap().ground_truth {
             let (obj_id, camera_from_object) = (gt.obj_id, gt.camera_from_object);
-            estimates.push(Estimate { scene_id: 2, im_id, obj_id, score: 1.0, camera_from_object, time: Some(0.5) });
+            let estimate = Estimate::new(2, im_id, obj_id, 1.0, camera_from_object);
+            let rotation_as_written = gt.rotation_as_written;
+            estimates.push(Estimate { time: Some(0.5), rotation_as_written, ..estimate });
         }
     }
     // Written to a file and read again: the file must not cost anything.
@@ -100,9 +102,12 @@ fn lmo_published_results_as_detections() {
     println!("ap_mssd {mssd:.6} ap_mspd {mspd:.6} ap_mssd_mm {:.6}", found.ap_mssd_mm.unwrap());
     assert!((mssd - EXPECTED_AP_MSSD).abs() < 1e-6, "{mssd}");
     assert!((mspd - EXPECTED_AP_MSPD).abs() < 1e-6, "{mspd}");
+    let mm = found.ap_mssd_mm.unwrap();
+    assert!((mm - EXPECTED_AP_MSSD_MM).abs() < 1e-6, "{mm}");
 }
 
 const EXPECTED_AP_MSSD: f64 = 0.418_384_545_6;
+const EXPECTED_AP_MSSD_MM: f64 = 0.102_767_943_6;
 const EXPECTED_AP_MSPD: f64 = 0.530_951_948_1;
 
 #[test]
@@ -131,7 +136,11 @@ fn hope_as_a_bare_scene_folder_has_no_depth_and_says_so() {
     let found = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &|_| {}).unwrap();
     assert_eq!((found.ar, found.ar_mssd), (None, Some(0.0)));
     assert_eq!(found.add_s_recall["2"], Some(0.0));
-    assert!(found.reasons["ar_vsd"].contains("3 of 3 images with targets have no depth"), "{:?}", found.reasons);
+    assert!(
+        found.reasons["ar_vsd"].contains("3 of 3 images with targets have no depth"),
+        "{:?}",
+        found.reasons
+    );
     assert!(found.reasons["average_time_per_image"].contains("no estimates"), "{:?}", found.reasons);
 }
 
@@ -176,7 +185,8 @@ fn ycbv_areas(root: &Path, method: &str) -> (usize, f64, f64) {
             let read = |line: &str| {
                 Vec3::from_iterator(line.split_whitespace().take(3).map(|n| n.parse::<f64>().unwrap()))
             };
-            ModelPoints::new(&text.lines().filter(|l| !l.trim().is_empty()).map(read).collect::<Vec<_>>()).unwrap()
+            ModelPoints::new(&text.lines().filter(|l| !l.trim().is_empty()).map(read).collect::<Vec<_>>())
+                .unwrap()
         });
         let truth = read_keyframe_poses(&file);
         let estimates = read_keyframe_poses(&root.join("poses").join(method).join(name));

@@ -1,11 +1,15 @@
 //! The pose errors, one idea a file. Metres, pixels and radians; symmetries as lists of poses that map the object
 //! onto itself, the identity among them.
+//!
+//! Poses come as [`Placement`]s: a [`sixfold_geometry::Pose`] becomes one by itself.
 
+mod placement;
 mod projection;
 mod rotation_translation;
 mod surface;
 mod vsd;
 
+pub use placement::Placement;
 pub use projection::{mspd, projection_error};
 pub use rotation_translation::{rotation_error, translation_error};
 pub use surface::{add, adi, mssd};

@@ -1,10 +1,11 @@
 //! Distances between projections of model points at two poses: MSPD and the 2D projection error.
 
-use sixfold_geometry::{Camera, Pose, Vec3};
+use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
 
-use crate::points::ModelPoints;
+use super::Placement;
+use crate::points::{ModelPoints, Node, stretch};
 
-/// The third row and the focal rows of `[R | t]`, scaled so that `x / z` is in pixels without principal point.
+/// The rows of `[R | t]`, the first two times the focal lengths: `u / w` is in pixels without principal point.
 struct Projector {
     u: [f64; 4],
     v: [f64; 4],
@@ -12,8 +13,8 @@ struct Projector {
 }
 
 impl Projector {
-    fn new(camera: &Camera, pose: &Pose) -> Self {
-        let (r, t): (_, Vec3) = (pose.rotation_matrix(), pose.translation());
+    fn new(camera: &Camera, pose: &Placement) -> Self {
+        let (r, t) = (&pose.rotation, &pose.translation);
         let row = |i: usize, f: f64| [f * r[(i, 0)], f * r[(i, 1)], f * r[(i, 2)], f * t[i]];
         Projector { u: row(0, camera.fx), v: row(1, camera.fy), w: row(2, 1.0) }
     }
@@ -39,49 +40,96 @@ fn squared_shift(e: &Projector, g: &Projector, x: f64, y: f64, z: f64) -> (f64, 
 /// smallest. Infinite when a vertex lies at or behind the camera; `symmetries` must hold the identity.
 pub fn mspd(
     points: &ModelPoints,
-    estimate: &Pose,
-    ground_truth: &Pose,
+    estimate: impl Into<Placement>,
+    ground_truth: impl Into<Placement>,
     camera: &Camera,
     symmetries: &[Pose],
 ) -> f64 {
-    let e = Projector::new(camera, estimate);
+    let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
+    let e = Projector::new(camera, &estimate);
     let mut best = f64::INFINITY;
     for symmetry in symmetries {
-        let g = Projector::new(camera, &(ground_truth * symmetry));
-        best = best.min(largest_squared_shift(points, &e, &g, best));
+        let equivalent = ground_truth.after(&symmetry.into());
+        let g = Projector::new(camera, &equivalent);
+        let bound = NodeBound {
+            difference: estimate.rotation - equivalent.rotation,
+            offset: estimate.translation - equivalent.translation,
+            stretch: stretch(&(estimate.rotation - equivalent.rotation)),
+            estimate: &estimate,
+            ground_truth: &equivalent,
+            focal: camera.fx.max(camera.fy),
+        };
+        best = best.min(points.largest(
+            best,
+            |node| bound.of(node),
+            |leaf| largest_in_leaf(points, leaf, &e, &g),
+        ));
     }
     best.sqrt()
 }
 
-fn largest_squared_shift(points: &ModelPoints, e: &Projector, g: &Projector, give_up: f64) -> f64 {
-    // Chunks of this many vertices are finished before asking whether this symmetry is already out.
-    const CHUNK: usize = 256;
-    let mut largest = [0.0f64; 4];
-    let mut nearest = [f64::INFINITY; 4];
-    let chunks = points.x.chunks(CHUNK).zip(points.y.chunks(CHUNK)).zip(points.z.chunks(CHUNK));
-    for ((xs, ys), zs) in chunks {
-        let (x4, x_rest) = xs.as_chunks::<4>();
-        let (y4, y_rest) = ys.as_chunks::<4>();
-        let (z4, z_rest) = zs.as_chunks::<4>();
-        for ((x, y), z) in x4.iter().zip(y4).zip(z4) {
-            for lane in 0..4 {
-                let (shift, depth) = squared_shift(e, g, x[lane], y[lane], z[lane]);
-                largest[lane] = if shift > largest[lane] { shift } else { largest[lane] };
-                nearest[lane] = if depth < nearest[lane] { depth } else { nearest[lane] };
-            }
-        }
-        for ((&x, &y), &z) in x_rest.iter().zip(y_rest).zip(z_rest) {
-            let (shift, depth) = squared_shift(e, g, x, y, z);
-            largest[0] = if shift > largest[0] { shift } else { largest[0] };
-            nearest[0] = if depth < nearest[0] { depth } else { nearest[0] };
-        }
-        if nearest.iter().any(|&depth| depth <= 0.0) {
+/// An upper bound on the shift of all points in a node of the tree.
+///
+/// With `d = p_e - p_g` and `q = (x_g, y_g) / z_g` the shift is `f ((d_x, d_y) / z_e - q d_z / z_e)`. In a ball of radius
+/// `r` the points move with `d` by at most `|R_e - R_g| r` and with `p` by at most `r` (a little more for numbers that are
+/// not quite a rotation), which bounds how far the shift can be from that of the ball's centre.
+struct NodeBound<'a> {
+    difference: Mat3,
+    offset: Vec3,
+    stretch: f64,
+    estimate: &'a Placement,
+    ground_truth: &'a Placement,
+    focal: f64,
+}
+
+impl NodeBound<'_> {
+    fn of(&self, node: &Node) -> f64 {
+        let e = self.estimate.rotation * node.center + self.estimate.translation;
+        let g = self.ground_truth.rotation * node.center + self.ground_truth.translation;
+        let d = self.difference * node.center + self.offset;
+        let r = 1.01 * node.radius;
+        let (nearest_e, nearest_g) = (e.z - r, g.z - r);
+        if !(nearest_e > 0.0 && nearest_g > 0.0) {
             return f64::INFINITY;
         }
-        let so_far = largest.iter().fold(0.0f64, |a, &b| a.max(b));
-        if so_far > give_up {
-            return so_far;
+        let (inverse_e, inverse_near, inverse_g) = (1.0 / e.z, 1.0 / nearest_e, 1.0 / g.z);
+        let near_g = r / nearest_g;
+        let moved = self.stretch * node.radius * inverse_near;
+        let by_depth = r * inverse_near * inverse_e;
+        let (qx, qy, dz) = (g.x * inverse_g, g.y * inverse_g, d.z * inverse_e);
+        let (u, v) = (d.x * inverse_e - qx * dz, d.y * inverse_e - qy * dz);
+        let (center, sideways) = ((u * u + v * v).sqrt(), (d.x * d.x + d.y * d.y).sqrt());
+        let q = (qx * qx + qy * qy).sqrt();
+        let q_moves = (1.0 + q) * near_g;
+        let first = moved + sideways * by_depth;
+        let second = (q + q_moves) * (moved + d.z.abs() * by_depth) + q_moves * dz.abs();
+        self.focal * (center + first + second)
+    }
+}
+
+/// Infinite when a point of the leaf is at or behind the camera.
+fn largest_in_leaf(points: &ModelPoints, leaf: &Node, e: &Projector, g: &Projector) -> f64 {
+    let range = leaf.start..leaf.end;
+    let (xs, ys, zs) = (&points.x[range.clone()], &points.y[range.clone()], &points.z[range]);
+    let mut largest = [0.0f64; 4];
+    let mut nearest = [f64::INFINITY; 4];
+    let mut take = |lane: usize, (shift, depth): (f64, f64)| {
+        largest[lane] = if shift > largest[lane] { shift } else { largest[lane] };
+        nearest[lane] = if depth < nearest[lane] { depth } else { nearest[lane] };
+    };
+    let (x4, x_rest) = xs.as_chunks::<4>();
+    let (y4, y_rest) = ys.as_chunks::<4>();
+    let (z4, z_rest) = zs.as_chunks::<4>();
+    for ((x, y), z) in x4.iter().zip(y4).zip(z4) {
+        for lane in 0..4 {
+            take(lane, squared_shift(e, g, x[lane], y[lane], z[lane]));
         }
+    }
+    for ((&x, &y), &z) in x_rest.iter().zip(y_rest).zip(z_rest) {
+        take(0, squared_shift(e, g, x, y, z));
+    }
+    if nearest.iter().any(|&depth| depth <= 0.0) {
+        return f64::INFINITY;
     }
     largest.iter().fold(0.0f64, |a, &b| a.max(b))
 }
@@ -90,11 +138,11 @@ fn largest_squared_shift(points: &ModelPoints, e: &Projector, g: &Projector, giv
 /// Infinite when a point lies at or behind the camera.
 pub fn projection_error(
     points: &ModelPoints,
-    estimate: &Pose,
-    ground_truth: &Pose,
+    estimate: impl Into<Placement>,
+    ground_truth: impl Into<Placement>,
     camera: &Camera,
 ) -> f64 {
-    let (e, g) = (Projector::new(camera, estimate), Projector::new(camera, ground_truth));
+    let (e, g) = (Projector::new(camera, &estimate.into()), Projector::new(camera, &ground_truth.into()));
     let mut total = 0.0;
     for i in 0..points.len() {
         let (shift, depth) = squared_shift(&e, &g, points.x[i], points.y[i], points.z[i]);

@@ -28,8 +28,9 @@ mod tests {
 
     #[test]
     fn angles_and_distances_by_hand() {
-        let about_z =
-            |angle: f64, x: f64| Pose::new(UnitQuaternion::from_scaled_axis(Vec3::z() * angle), Vec3::x() * x);
+        let about_z = |angle: f64, x: f64| {
+            Pose::new(UnitQuaternion::from_scaled_axis(Vec3::z() * angle), Vec3::x() * x)
+        };
         let (e, g) = (about_z(3.0, 0.5), about_z(0.0, 0.2));
         let identity = Pose::identity();
         assert!((rotation_error(&e, &g, &[identity]) - 3.0).abs() < 1e-12);

@@ -1,42 +1,59 @@
 //! Distances between model points at two poses: MSSD, ADD and ADI.
 
-use sixfold_geometry::Pose;
+use sixfold_geometry::{Mat3, Pose, Vec3};
 
+use super::Placement;
 use crate::points::ModelPoints;
 
 /// Maximum Symmetry-Aware Surface Distance in metres (BOP Challenge 2019; Hodan et al. 2020, section 2.2): the
 /// largest distance between corresponding vertices, under the symmetry for which it is smallest.
 ///
 /// `symmetries` must hold the identity; an empty list gives infinity.
-pub fn mssd(points: &ModelPoints, estimate: &Pose, ground_truth: &Pose, symmetries: &[Pose]) -> f64 {
-    let rotation = estimate.rotation_matrix();
+pub fn mssd(
+    points: &ModelPoints,
+    estimate: impl Into<Placement>,
+    ground_truth: impl Into<Placement>,
+    symmetries: &[Pose],
+) -> f64 {
+    let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
     let mut best = f64::INFINITY;
     for symmetry in symmetries {
-        let equivalent = ground_truth * symmetry;
-        let a = rotation - equivalent.rotation_matrix();
-        let b = estimate.translation() - equivalent.translation();
+        let equivalent = ground_truth.after(&symmetry.into());
+        let a = estimate.rotation - equivalent.rotation;
+        let b = estimate.translation - equivalent.translation;
         best = best.min(points.largest_squared(&a, &b, best));
     }
     best.sqrt()
 }
 
 /// Average Distance of model points in metres, corresponding points (Hinterstoisser et al. 2012).
-pub fn add(points: &ModelPoints, estimate: &Pose, ground_truth: &Pose) -> f64 {
-    let a = estimate.rotation_matrix() - ground_truth.rotation_matrix();
-    points.mean_norm(&a, &(estimate.translation() - ground_truth.translation()))
+pub fn add(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: impl Into<Placement>) -> f64 {
+    let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
+    let a = estimate.rotation - ground_truth.rotation;
+    points.mean_norm(&a, &(estimate.translation - ground_truth.translation))
 }
 
 /// Average Distance of model points in metres, each point at the ground-truth pose to the nearest point at the
 /// estimated pose (Hinterstoisser et al. 2012; also written ADD-S). Exact.
-pub fn adi(points: &ModelPoints, estimate: &Pose, ground_truth: &Pose) -> f64 {
+pub fn adi(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: impl Into<Placement>) -> f64 {
+    let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
+    let back = estimate.rotation.transpose();
+    if (back * estimate.rotation - Mat3::identity()).amax() > 1e-6 {
+        // Not quite a rotation: distances change under it, so the points have to be where it puts them.
+        let placed: Vec<Vec3> = (0..points.len()).map(|i| estimate.rotation * points.point(i)).collect();
+        if let Some(placed) = ModelPoints::new(&placed) {
+            let translation = ground_truth.translation - estimate.translation;
+            return placed.mean_nearest(points, &ground_truth.rotation, &translation);
+        }
+    }
     // Distances do not change under the inverse of the estimate, so one tree in the object's frame serves all.
-    points.mean_nearest_after(&(estimate.inverse() * *ground_truth))
+    let translation = back * (ground_truth.translation - estimate.translation);
+    points.mean_nearest(points, &(back * ground_truth.rotation), &translation)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sixfold_geometry::Vec3;
     use sixfold_geometry::nalgebra::UnitQuaternion;
 
     /// Two points 0.2 m apart on the x axis.
@@ -80,5 +97,16 @@ mod tests {
         assert!((mssd(&points, &e, &g, &[Pose::identity()]) - 0.23).abs() < 1e-12);
         assert!((add(&points, &e, &g) - 0.2).abs() < 1e-12);
         assert!((adi(&points, &e, &g) - 0.03).abs() < 1e-12);
+    }
+
+    #[test]
+    fn numbers_that_are_not_quite_a_rotation_are_taken_as_they_are() {
+        // A rotation a thousandth too large moves the end at 0.1 m by 0.1 mm; symmetric or not, all say so.
+        let points = dumbbell();
+        let g = Placement::from(turned_about_z(0.0));
+        let e = Placement { rotation: g.rotation * 1.001, ..g };
+        for error in [mssd(&points, e, g, &[Pose::identity()]), add(&points, e, g), adi(&points, e, g)] {
+            assert!((error - 1e-4).abs() < 1e-12, "{error}");
+        }
     }
 }

@@ -1,0 +1,48 @@
+//! A pose as a matrix and a vector, the way a result file has it.
+
+use sixfold_geometry::{Mat3, Pose, Vec3};
+
+/// Where an object is: `rotation * point + translation`, metres.
+///
+/// The official evaluation takes the nine numbers of a result file as they are, also where rounding or a network's
+/// arithmetic left them a thousandth away from a rotation. Half a millimetre of error hangs on it, so the errors here
+/// take the numbers as they are, too.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placement {
+    /// The rotation, or nearly one.
+    pub rotation: Mat3,
+    /// The translation in metres.
+    pub translation: Vec3,
+}
+
+impl From<Pose> for Placement {
+    fn from(pose: Pose) -> Self {
+        Placement { rotation: pose.rotation_matrix(), translation: pose.translation() }
+    }
+}
+
+impl From<&Pose> for Placement {
+    fn from(pose: &Pose) -> Self {
+        Placement::from(*pose)
+    }
+}
+
+impl From<&Placement> for Placement {
+    fn from(placement: &Placement) -> Self {
+        *placement
+    }
+}
+
+impl Placement {
+    /// This placement after a symmetry of the object.
+    pub(crate) fn after(&self, symmetry: &Placement) -> Placement {
+        Placement {
+            rotation: self.rotation * symmetry.rotation,
+            translation: self.rotation * symmetry.translation + self.translation,
+        }
+    }
+
+    pub(crate) fn distance_to(&self, other: &Placement) -> f64 {
+        (self.translation - other.translation).norm()
+    }
+}
