@@ -3,6 +3,7 @@
 //! broken is an error.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
@@ -26,12 +27,15 @@ pub enum Models {
     Rendering,
 }
 
+/// Width and height of a split's images, and the file that states them.
+type StatedSize = ((usize, usize), PathBuf);
+
 /// A dataset folder with one of its splits.
 #[derive(Debug, Clone)]
 pub struct BopDataset {
     root: PathBuf,
     split_dir: PathBuf,
-    size: Option<((usize, usize), PathBuf)>,
+    size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
 }
 
@@ -185,10 +189,11 @@ impl BopDataset {
                 spelled.push(*target);
                 continue;
             }
-            if !scenes.contains_key(&target.scene_id) {
-                scenes.insert(target.scene_id, self.scene(target.scene_id)?);
-            }
-            let image = scenes[&target.scene_id].image(target.im_id)?;
+            let scene = match scenes.entry(target.scene_id) {
+                Entry::Occupied(known) => known.into_mut(),
+                Entry::Vacant(new) => new.insert(self.scene(target.scene_id)?),
+            };
+            let image = scene.image(target.im_id)?;
             let mut counts = BTreeMap::new();
             for (pose, visible) in image.ground_truth.iter().zip(image.visible_fractions()) {
                 if visible.is_none_or(|v| v >= 0.1) {
@@ -215,7 +220,7 @@ fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
 }
 
 /// Width and height of `camera.json`, where it is there and has them.
-fn read_camera_size(path: &Path) -> Result<Option<((usize, usize), PathBuf)>, DatasetError> {
+fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     if !path.is_file() {
         return Ok(None);
     }
@@ -272,17 +277,13 @@ pub struct Scene {
     /// Its id.
     pub scene_id: u32,
     dir: PathBuf,
-    size: Option<((usize, usize), PathBuf)>,
+    size: Option<StatedSize>,
     has_ground_truth: bool,
     images: BTreeMap<u32, SceneImage>,
 }
 
 impl Scene {
-    fn read(
-        scene_id: u32,
-        dir: &Path,
-        size: Option<((usize, usize), PathBuf)>,
-    ) -> Result<Self, DatasetError> {
+    fn read(scene_id: u32, dir: &Path, size: Option<StatedSize>) -> Result<Self, DatasetError> {
         let read = |name: &str| -> Result<Option<(Vec<u8>, PathBuf)>, DatasetError> {
             let path = dir.join(name);
             match std::fs::read(&path) {

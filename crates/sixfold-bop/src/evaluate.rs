@@ -5,6 +5,7 @@
 //! `inst_count` estimates per image and object against the most visible `inst_count` poses, greedy matching per
 //! threshold, recall over all targets, mean over thresholds.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
@@ -254,18 +255,18 @@ fn prepare<'a>(
     let mut scenes: BTreeMap<u32, Scene> = BTreeMap::new();
     let mut images = Vec::new();
     for (&(scene_id, im_id), objects) in &wanted {
-        if !scenes.contains_key(&scene_id) {
-            let scene = dataset.scene(scene_id)?;
-            if !scene.has_ground_truth() {
-                return Err(EvalError::Dataset(DatasetError::Missing {
-                    path: scene.dir().join("scene_gt.json"),
-                    what: "the ground truth",
-                    advice: "only images with ground truth can be scored",
-                }));
-            }
-            scenes.insert(scene_id, scene);
+        let scene = match scenes.entry(scene_id) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => new.insert(dataset.scene(scene_id)?),
+        };
+        if !scene.has_ground_truth() {
+            return Err(EvalError::Dataset(DatasetError::Missing {
+                path: scene.dir().join("scene_gt.json"),
+                what: "the ground truth",
+                advice: "only images with ground truth can be scored",
+            }));
         }
-        let image = scenes[&scene_id].image(im_id)?;
+        let image = scene.image(im_id)?;
         let fractions = image.visible_fractions();
         let of_object = |obj_id: u32| {
             let of = image.ground_truth.iter().zip(&fractions).filter(move |(g, _)| g.obj_id == obj_id);

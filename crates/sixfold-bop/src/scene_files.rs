@@ -109,7 +109,7 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
             at.get(map, "cam_K", "9 numbers, K row by row (only pinhole cameras are supported)")?,
         )?;
         for (i, field, found) in [(0, "cam_K[0] (fx)", k[0]), (4, "cam_K[4] (fy)", k[4])] {
-            if !(found > 0.0) {
+            if found <= 0.0 {
                 return Err(at.error(field, format!("{found}"), format!("K[{i}] above zero")));
             }
         }
@@ -127,10 +127,10 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
             None | Some(Value::Null) => None,
             Some(value) => {
                 let mm = at.number("depth_scale", value)?;
-                if !(mm > 0.0) {
+                if mm <= 0.0 {
                     return Err(at.error("depth_scale", format!("{mm}"), "millimetres per unit, above zero"));
                 }
-                if mm < 1e-4 || mm > 1e3 {
+                if !(1e-4..=1e3).contains(&mm) {
                     return Err(at.error(
                         "depth_scale",
                         format!("{mm}"),

@@ -171,10 +171,10 @@ mod tests {
         let g = Pose::from_translation(Vec3::new(0.0, 0.0, 1.0));
         let e = Pose::from_translation(Vec3::new(0.03, 0.0, 1.0));
         let identity = [Pose::identity()];
-        assert!((mspd(&points, &e, &g, &camera(), &identity) - 15.0).abs() < 1e-9);
-        assert!((projection_error(&points, &e, &g, &camera()) - 11.25).abs() < 1e-9);
+        assert!((mspd(&points, e, g, &camera(), &identity) - 15.0).abs() < 1e-9);
+        assert!((projection_error(&points, e, g, &camera()) - 11.25).abs() < 1e-9);
         let down = Pose::from_translation(Vec3::new(0.0, 0.03, 1.0));
-        assert!((mspd(&points, &down, &g, &camera(), &identity) - 12.0).abs() < 1e-9);
+        assert!((mspd(&points, down, g, &camera(), &identity) - 12.0).abs() < 1e-9);
     }
 
     #[test]
@@ -182,8 +182,8 @@ mod tests {
         let points = ModelPoints::new(&[Vec3::zeros()]).unwrap();
         let g = Pose::from_translation(Vec3::new(0.0, 0.0, 1.0));
         let e = Pose::from_translation(Vec3::new(0.0, 0.0, -1.0));
-        assert_eq!(mspd(&points, &e, &g, &camera(), &[Pose::identity()]), f64::INFINITY);
-        assert_eq!(projection_error(&points, &e, &g, &camera()), f64::INFINITY);
+        assert_eq!(mspd(&points, e, g, &camera(), &[Pose::identity()]), f64::INFINITY);
+        assert_eq!(projection_error(&points, e, g, &camera()), f64::INFINITY);
     }
 
     proptest! {
@@ -203,7 +203,7 @@ mod tests {
                 (a - b).norm()
             }).fold(0.0, f64::max);
             let expected = under(&Pose::identity()).min(under(&flip));
-            let found = mspd(&model, &e, &g, &c, &[Pose::identity(), flip]);
+            let found = mspd(&model, e, g, &c, &[Pose::identity(), flip]);
             prop_assert!((found - expected).abs() < 1e-9, "{found} {expected}");
         }
     }

@@ -71,11 +71,11 @@ mod tests {
         let (e, g) = (turned_about_z(std::f64::consts::PI), turned_about_z(0.0));
         let half_turn =
             Pose::new(UnitQuaternion::from_scaled_axis(Vec3::z() * std::f64::consts::PI), Vec3::zeros());
-        assert!((add(&points, &e, &g) - 0.2).abs() < 1e-12);
-        assert!(adi(&points, &e, &g) < 1e-12);
-        assert!((mssd(&points, &e, &g, &[Pose::identity()]) - 0.2).abs() < 1e-12);
-        assert!(mssd(&points, &e, &g, &[Pose::identity(), half_turn]) < 1e-12);
-        assert_eq!(mssd(&points, &e, &g, &[]), f64::INFINITY);
+        assert!((add(&points, e, g) - 0.2).abs() < 1e-12);
+        assert!(adi(&points, e, g) < 1e-12);
+        assert!((mssd(&points, e, g, &[Pose::identity()]) - 0.2).abs() < 1e-12);
+        assert!(mssd(&points, e, g, &[Pose::identity(), half_turn]) < 1e-12);
+        assert_eq!(mssd(&points, e, g, &[]), f64::INFINITY);
     }
 
     #[test]
@@ -84,8 +84,8 @@ mod tests {
         let points = dumbbell();
         let (e, g) = (turned_about_z(std::f64::consts::FRAC_PI_2), turned_about_z(0.0));
         let chord = 0.1 * 2f64.sqrt();
-        assert!((add(&points, &e, &g) - chord).abs() < 1e-12);
-        assert!((adi(&points, &e, &g) - chord).abs() < 1e-12);
+        assert!((add(&points, e, g) - chord).abs() < 1e-12);
+        assert!((adi(&points, e, g) - chord).abs() < 1e-12);
     }
 
     #[test]
@@ -94,9 +94,9 @@ mod tests {
         let points = dumbbell();
         let g = turned_about_z(0.0);
         let e = turned_about_z(std::f64::consts::PI).with_translation(Vec3::new(0.03, 0.0, 1.0));
-        assert!((mssd(&points, &e, &g, &[Pose::identity()]) - 0.23).abs() < 1e-12);
-        assert!((add(&points, &e, &g) - 0.2).abs() < 1e-12);
-        assert!((adi(&points, &e, &g) - 0.03).abs() < 1e-12);
+        assert!((mssd(&points, e, g, &[Pose::identity()]) - 0.23).abs() < 1e-12);
+        assert!((add(&points, e, g) - 0.2).abs() < 1e-12);
+        assert!((adi(&points, e, g) - 0.03).abs() < 1e-12);
     }
 
     #[test]
