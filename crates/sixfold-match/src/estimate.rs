@@ -28,9 +28,11 @@ pub struct EstimateOptions {
     pub refined: usize,
     /// Hypotheses that get a full ICP and are verified by rendering.
     pub verified: usize,
+    /// How much the votes say beside the verification: 0 nothing.
+    pub vote_power: f64,
     /// Most instances of the object returned.
     pub max_instances: usize,
-    /// Poses whose [`VerificationScore::ranking`] is lower are not returned.
+    /// Estimates whose [`Estimate::confidence`] is lower are not returned.
     pub min_score: f64,
 }
 
@@ -40,8 +42,9 @@ impl Default for EstimateOptions {
             voting: VotingOptions::default(),
             clustering: ClusterOptions::default(),
             verification: VerificationOptions::default(),
-            refined: 60,
-            verified: 15,
+            refined: 100,
+            verified: 40,
+            vote_power: 0.3,
             max_instances: 1,
             min_score: 0.05,
         }
@@ -57,6 +60,9 @@ pub struct Estimate {
     pub score: VerificationScore,
     /// Votes of the hypothesis it came from.
     pub votes: f32,
+    /// What decides between estimates, in `0..=1`: [`VerificationScore::ranking`] times the share of the most votes, to the
+    /// power [`EstimateOptions::vote_power`].
+    pub confidence: f64,
 }
 
 /// Where an estimate's time went, in seconds.
@@ -125,7 +131,7 @@ pub fn estimate_timed(
         let before = found.len();
         let mut verifier = Verifier::default();
         for e in verified {
-            if found.len() >= options.max_instances || e.score.ranking() < options.min_score {
+            if found.len() >= options.max_instances || e.confidence < options.min_score {
                 break;
             }
             let mut pixels = verifier.explained_pixels(scene, &model.mesh, &e.camera_from_object, threshold);
@@ -142,7 +148,7 @@ pub fn estimate_timed(
             break;
         }
     }
-    found.sort_by(|a, b| b.score.ranking().total_cmp(&a.score.ranking()));
+    found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
     (found, timing)
 }
 
@@ -155,7 +161,8 @@ fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usi
 }
 
 /// How well the visible samples agree with the depth image, in 0..=1.
-fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
+#[doc(hidden)]
+pub fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
     let rotation = pose.rotation_matrix().cast::<f32>();
     let t: V3 = pose.translation().cast();
     let (fx, fy) = (scene.camera.fx as f32, scene.camera.fy as f32);
@@ -200,7 +207,9 @@ fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, tolerance: f
     good / (seen + 0.15 * total) * (1.0 - out / total)
 }
 
-fn screen(
+/// The first sieve: the samples of every hypothesis against the depth image, a short ICP for the best
+/// [`EstimateOptions::refined`], and what is left without repetitions, best first.
+pub fn screen(
     scene: &Scene,
     model: &ObjectModel,
     target: &IndexedCloud,
@@ -215,7 +224,14 @@ fn screen(
         .map(|(i, h)| (screening_score(scene, model, &h.camera_from_object, coarse, 0.7), i))
         .collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    scored.truncate(options.refined);
+    // The best by agreement, and those with the most votes whatever they score: a coarse pose of a thin or curved
+    // object agrees badly before it is refined.
+    let by_votes = options.refined / 3;
+    let mut rank = 0;
+    scored.retain(|&(_, i)| {
+        rank += 1;
+        rank <= options.refined - by_votes || i < by_votes
+    });
     let short = IcpOptions {
         levels: vec![
             IcpLevel { rejection_distance: 2.5 * step, iterations: 4, stride: 1 },
@@ -225,7 +241,7 @@ fn screen(
         convergence: 1e-4,
         min_correspondences: 8,
     };
-    let fine = (0.7 * step).max(0.004) as f32;
+    let fine = (0.7 * step).max(options.verification.threshold_for(model.diameter)) as f32;
     let mut refined: Vec<(f32, usize, Pose)> = scored
         .par_iter()
         .map(|&(_, i)| {
@@ -240,41 +256,52 @@ fn screen(
         })
         .collect();
     refined.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    // Votes and agreement are two witnesses; half of the places go to each one's favourites.
+    let limit = options.verified * if options.max_instances > 1 { 2 } else { 1 };
+    let mut by_votes: Vec<_> = refined.clone();
+    by_votes.sort_by_key(|&(_, i, _)| i);
+    let mixed = refined.into_iter().zip(by_votes).flat_map(|(a, b)| [a, b]);
     // Those that fell into the same place are one.
     let mut kept: Vec<Hypothesis> = vec![];
-    for (_, i, pose) in refined {
-        let same = kept.iter().any(|k| {
-            let centre = |p: &Pose| p.transform_point(&model.centre);
+    for (_, i, pose) in mixed {
+        let votes = clusters[i].votes;
+        let centre = |p: &Pose| p.transform_point(&model.centre);
+        let same = kept.iter().position(|k| {
             (centre(&k.camera_from_object) - centre(&pose)).norm() < 0.03 * model.diameter
                 && k.camera_from_object.rotation_angle_to(&pose) < 0.1
         });
-        if !same {
-            kept.push(Hypothesis { camera_from_object: pose, votes: clusters[i].votes });
-            if kept.len() >= options.verified * if options.max_instances > 1 { 2 } else { 1 } {
-                break;
-            }
+        match same {
+            Some(k) => kept[k].votes = kept[k].votes.max(votes),
+            None if kept.len() < limit => kept.push(Hypothesis { camera_from_object: pose, votes }),
+            None => {}
         }
     }
     kept
 }
 
-fn verify(
+/// The second sieve: ICP of the rendered object against the depth image and the scores of
+/// [`crate::verification`], best [`VerificationScore::ranking`] first. `threshold` is the depth inlier threshold in
+/// metres.
+pub fn verify(
     scene: &Scene,
     model: &ObjectModel,
     hypotheses: &[Hypothesis],
     threshold: f64,
     options: &EstimateOptions,
 ) -> Vec<Estimate> {
+    let most_votes = hypotheses.iter().map(|h| h.votes).fold(0.0, f32::max);
     let mut verified: Vec<Estimate> = hypotheses
         .par_iter()
         .map_init(Verifier::default, |verifier, h| {
             let pose = refine(verifier, scene, model, &h.camera_from_object, threshold);
             let score = verifier.score(scene, &model.mesh, &pose, threshold, &options.verification);
-            Estimate { camera_from_object: pose, score, votes: h.votes }
+            let support = f64::from(h.votes / most_votes.max(1.0)).clamp(0.0, 1.0);
+            let confidence = score.ranking() * support.powf(options.vote_power);
+            Estimate { camera_from_object: pose, score, votes: h.votes, confidence }
         })
         .collect();
     // A stable sort: equal scores stay in the order of the screening.
-    verified.sort_by(|a, b| b.score.ranking().total_cmp(&a.score.ranking()));
+    verified.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
     verified
 }
 
