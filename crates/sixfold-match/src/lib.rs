@@ -8,12 +8,14 @@
 pub mod clustering;
 pub mod estimate;
 pub mod model;
+mod model_file;
 pub mod scene;
 pub mod verification;
 pub mod voting;
 
 pub use estimate::{Estimate, EstimateOptions, estimate};
 pub use model::{ModelError, ModelOptions, ObjectModel};
+pub use model_file::ModelFileError;
 pub use scene::{Scene, SceneError, SceneOptions};
 pub use verification::{VerificationOptions, VerificationScore, Verifier};
 

@@ -110,6 +110,17 @@ pub struct ObjectModel {
     pub(crate) table: FeatureTable,
 }
 
+/// The part of an [`ObjectModel`] that takes long to compute and little room to keep.
+#[derive(Debug, Clone)]
+pub(crate) struct Description {
+    pub mesh: Mesh,
+    pub options: ModelOptions,
+    pub diameter: f64,
+    pub centre: Vec3,
+    pub samples: PointCloud,
+    pub visible_from: Vec<u64>,
+}
+
 /// Model point pairs by their quantised feature: rows of `(reference point, angle)`.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct FeatureTable {
@@ -270,20 +281,31 @@ impl ObjectModel {
         if kept.len() < NEEDED {
             return Err(ModelError::TooFewSamples { found: kept.len(), needed: NEEDED });
         }
-        let table = build_table(&kept, &visible_from, step, diameter, options.angle_steps);
+        Ok(ObjectModel::assemble(
+            Description { mesh: flat, options: *options, diameter, centre, samples: kept, visible_from },
+            symmetries,
+        ))
+    }
+
+    /// Adds what follows from the description: symmetries and the feature table.
+    pub(crate) fn assemble(description: Description, symmetries: &[Pose]) -> ObjectModel {
+        let Description { mesh, options, diameter, centre, samples, visible_from } = description;
+        let step = diameter * options.sampling_step;
+        let table = build_table(&samples, &visible_from, step, diameter, options.angle_steps);
         let mut all_symmetries = vec![Pose::identity()];
         all_symmetries.extend(symmetries.iter().filter(|s| s.log().amax() > 1e-9));
-        Ok(ObjectModel {
-            mesh: flat,
-            options: *options,
+        let view_directions = sphere_directions(VIEWS).iter().map(|d| d.cast()).collect();
+        ObjectModel {
+            mesh,
+            options,
             diameter,
             centre,
-            samples: kept,
+            samples,
             visible_from,
-            view_directions: directions.iter().map(|d| d.cast()).collect(),
+            view_directions,
             symmetries: all_symmetries,
             table,
-        })
+        }
     }
 
     /// Largest distance between two points of the object, metres.
@@ -343,25 +365,24 @@ fn build_table(
     let points: Vec<V3> = samples.points.iter().map(|p| p.cast()).collect();
     let normals: Vec<V3> = samples.normals.iter().map(|n| n.cast()).collect();
     let per_angle = angle_steps as f32 / std::f32::consts::PI;
-    let mut pairs: Vec<(u32, u32)> = vec![];
-    for r in 0..points.len().min(1 << 24) {
-        let frame = local_frame(&normals[r]);
-        for i in 0..points.len() {
-            if i == r || visible_from[i] & visible_from[r] == 0 {
-                continue;
-            }
-            let Some((length, angles)) = pair_feature(&points[r], &normals[r], &points[i], &normals[i])
-            else {
-                continue;
-            };
-            let distance = ((length / table.distance_step) as usize).min(distance_steps - 1);
-            let angles = angles.map(|a| ((a * per_angle) as usize).min(angle_steps - 1));
-            let turn = turn_about_normal(&frame, &(points[i] - points[r]));
-            pairs.push((table.row(distance, angles) as u32, (r as u32) << 8 | u32::from(turn)));
-        }
-    }
+    let pairs: Vec<Vec<(u32, u32)>> = (0..points.len())
+        .into_par_iter()
+        .map(|r| {
+            let frame = local_frame(&normals[r]);
+            let partners = (0..points.len()).filter(|&i| i != r && visible_from[i] & visible_from[r] != 0);
+            partners
+                .filter_map(|i| {
+                    let (length, angles) = pair_feature(&points[r], &normals[r], &points[i], &normals[i])?;
+                    let distance = ((length / table.distance_step) as usize).min(distance_steps - 1);
+                    let angles = angles.map(|a| ((a * per_angle) as usize).min(angle_steps - 1));
+                    let turn = turn_about_normal(&frame, &(points[i] - points[r]));
+                    Some((table.row(distance, angles) as u32, (r as u32) << 8 | u32::from(turn)))
+                })
+                .collect()
+        })
+        .collect();
     // Counting sort keeps the pairs of a row in the order of their reference points.
-    for (row, _) in &pairs {
+    for (row, _) in pairs.iter().flatten() {
         table.starts[*row as usize + 1] += 1;
     }
     for i in 1..table.starts.len() {
