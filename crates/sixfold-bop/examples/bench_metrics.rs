@@ -7,6 +7,7 @@
 //! already read. With ERRORS.csv the errors of every target are written for comparison (metres and pixels).
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
@@ -42,10 +43,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     for target in dataset.object_targets(&dataset.targets(None)?)? {
         let Some(object) = target.object else { continue };
         let id = object.obj_id;
-        if !models.contains_key(&id) {
+        if let Entry::Vacant(new) = models.entry(id) {
             let mesh = dataset.model(id, Models::Evaluation)?;
             let points = ModelPoints::new(mesh.vertices()).ok_or("empty model")?;
-            models.insert(id, (points, info.0[&id].symmetry_poses(0.01)));
+            new.insert((points, info.0[&id].symmetry_poses(0.01)));
         }
         let scene = dataset.scene(target.scene_id)?;
         let camera = scene.camera(target.im_id)?;
@@ -60,9 +61,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     let errors = |p: &Pair| {
         let (points, symmetries) = &models[&p.obj_id];
         (
-            mssd(points, &p.estimate, &p.truth, symmetries),
-            mspd(points, &p.estimate, &p.truth, &p.camera, symmetries),
-            add(points, &p.estimate, &p.truth),
+            mssd(points, p.estimate, p.truth, symmetries),
+            mspd(points, p.estimate, p.truth, &p.camera, symmetries),
+            add(points, p.estimate, p.truth),
         )
     };
     let (mut one, mut all) = (f64::INFINITY, f64::INFINITY);

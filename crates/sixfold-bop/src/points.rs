@@ -6,7 +6,10 @@
 
 use sixfold_geometry::{Mat3, Vec3};
 
-const LEAF_SIZE: usize = 32;
+/// Points in a leaf of the tree: what a search for the nearest neighbour looks through at the end.
+const LEAF_SIZE: usize = 24;
+/// Looking through this many points is cheaper than asking for the bounds of their parts.
+const WHOLE_SIZE: usize = 128;
 
 /// Points that lie close together: their range, a box and a ball around them.
 #[derive(Debug, Clone)]
@@ -85,7 +88,7 @@ impl ModelPoints {
     /// The largest of a number that every point has, or any number above `give_up` once it is known to be above.
     ///
     /// `bound(node)` is at least the root of the number of every point in the node, `largest(node)` is the largest
-    /// number in a leaf. Nodes that cannot beat the best point so far are passed over.
+    /// number in a small node. Nodes that cannot beat the best point so far are passed over.
     pub(crate) fn largest(
         &self,
         give_up: f64,
@@ -104,7 +107,7 @@ impl ModelPoints {
                 continue;
             }
             let node = &self.nodes[index];
-            if node.children == 0 {
+            if node.end - node.start <= WHOLE_SIZE {
                 best = best.max(largest(node));
                 needed = best.sqrt();
                 continue;

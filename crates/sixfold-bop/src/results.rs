@@ -358,7 +358,7 @@ mod tests {
             obj_id: 5,
             score: 0.1 * f64::from(im_id),
             camera_from_object: Pose::exp(&Vector6::from(t)),
-            time: (im_id % 2 == 0).then_some(0.25),
+            time: im_id.is_multiple_of(2).then_some(0.25),
             rotation_as_written: None,
         }
     }

@@ -29,9 +29,10 @@ fn dot(row: &[f64; 4], x: f64, y: f64, z: f64) -> f64 {
 #[inline(always)]
 fn squared_shift(e: &Projector, g: &Projector, x: f64, y: f64, z: f64) -> (f64, f64) {
     let (depth_e, depth_g) = (dot(&e.w, x, y, z), dot(&g.w, x, y, z));
-    let (inverse_e, inverse_g) = (1.0 / depth_e, 1.0 / depth_g);
-    let du = dot(&e.u, x, y, z) * inverse_e - dot(&g.u, x, y, z) * inverse_g;
-    let dv = dot(&e.v, x, y, z) * inverse_e - dot(&g.v, x, y, z) * inverse_g;
+    // One division for four quotients.
+    let inverse = 1.0 / (depth_e * depth_g);
+    let du = (dot(&e.u, x, y, z) * depth_g - dot(&g.u, x, y, z) * depth_e) * inverse;
+    let dv = (dot(&e.v, x, y, z) * depth_g - dot(&g.v, x, y, z) * depth_e) * inverse;
     (du * du + dv * dv, if depth_e < depth_g { depth_e } else { depth_g })
 }
 
