@@ -12,6 +12,7 @@ mod kabsch;
 mod nearest;
 mod normals;
 mod plane;
+mod pnp;
 mod pose;
 mod solver;
 
@@ -25,6 +26,10 @@ pub use kabsch::{AlignmentError, Similarity, kabsch, umeyama};
 pub use nearest::{KdTree, Neighbour};
 pub use normals::{NormalOptions, inpaint_depth, normals_from_depth};
 pub use plane::{Plane, PlaneOptions, dominant_plane, fit_plane};
+pub use pnp::{
+    PnpError, PnpOptions, PnpReport, PnpSolver, RefineOptions, RefineReport, epnp, p3p, pnp_ransac,
+    refine_pose,
+};
 pub use pose::{Pose, PoseError};
 pub use solver::NormalEquations;
 

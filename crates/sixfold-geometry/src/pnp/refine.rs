@@ -1,0 +1,155 @@
+//! The pose that minimises the truncated squared reprojection error, `sum min(r^2, threshold^2)`, over all
+//! correspondences: Levenberg-Marquardt in which what is beyond the threshold has no pull (Blake and Zisserman 1987;
+//! Torr and Zisserman's MSAC cost, 2000).
+
+use super::{PnpError, Prepared};
+use crate::{Camera, Mat3, NormalEquations, Pose, Vec2, Vec3};
+
+/// How a pose is refined.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefineOptions {
+    /// Correspondences with a larger reprojection error have no influence, pixels.
+    pub threshold_px: f64,
+    /// Most steps.
+    pub max_iterations: usize,
+    /// Ends when a step lowers the cost by less than this share.
+    pub convergence: f64,
+}
+
+impl Default for RefineOptions {
+    fn default() -> Self {
+        RefineOptions { threshold_px: 3.0, max_iterations: 50, convergence: 1e-9 }
+    }
+}
+
+impl RefineOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`PnpError::Option`].
+    pub fn check(&self) -> Result<(), PnpError> {
+        if !(self.threshold_px > 0.0 && self.threshold_px.is_finite()) {
+            let found = self.threshold_px;
+            return Err(PnpError::Option { option: "threshold_px", found, expected: "above 0 pixels" });
+        }
+        if !(self.convergence >= 0.0) {
+            let found = self.convergence;
+            return Err(PnpError::Option { option: "convergence", found, expected: "0 or more" });
+        }
+        Ok(())
+    }
+}
+
+/// What a refinement came to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefineReport {
+    /// The refined pose.
+    pub camera_from_object: Pose,
+    /// Sum over all correspondences of the squared reprojection error, each at most the squared threshold; pixels squared.
+    pub cost: f64,
+    /// Correspondences within the threshold.
+    pub inlier_count: usize,
+    /// Steps tried.
+    pub iterations: usize,
+}
+
+/// Refines a pose over all correspondences, outliers included: object points in metres, image points in pixels of the
+/// raw image (a distortion of `camera` is undone first; errors are measured in pinhole pixels).
+///
+/// # Errors
+/// [`PnpError`] as for [`pnp_ransac`](crate::pnp_ransac); [`PnpError::NoModel`] when fewer than three correspondences
+/// are within the threshold of `initial`.
+pub fn refine_pose(
+    object_points: &[Vec3],
+    image_points: &[Vec2],
+    camera: &Camera,
+    initial: &Pose,
+    options: &RefineOptions,
+) -> Result<RefineReport, PnpError> {
+    options.check()?;
+    let data = Prepared::new(object_points, image_points, camera)?;
+    let start = initial.with_translation(initial.transform_point(&data.centre));
+    let refined = refine(&data, &start, options);
+    if refined.inlier_count < 3 {
+        return Err(PnpError::NoModel);
+    }
+    let pose = &refined.camera_from_object;
+    let camera_from_object = pose.with_translation(pose.transform_point(&-data.centre));
+    Ok(RefineReport { camera_from_object, ..refined })
+}
+
+/// As [`refine_pose`], for points relative to their centroid.
+pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -> RefineReport {
+    let limit = options.threshold_px * options.threshold_px;
+    let mut pose = *initial;
+    let mut equations = linearise(data, &pose, limit);
+    let mut lambda = 1e-4;
+    let mut iterations = 0;
+    while iterations < options.max_iterations && equations.count >= 6 {
+        iterations += 1;
+        let Some(step) = equations.solve(lambda) else {
+            lambda = lambda.max(1e-6) * 10.0;
+            if lambda > 1e6 { break } else { continue }
+        };
+        let next = pose * Pose::exp(&step);
+        let next_equations = linearise(data, &next, limit);
+        if next_equations.cost < equations.cost {
+            let gain = equations.cost - next_equations.cost;
+            let small = gain <= options.convergence * equations.cost;
+            pose = next;
+            equations = next_equations;
+            lambda = (lambda * 0.1).max(1e-10);
+            if small {
+                break;
+            }
+        } else {
+            if step.amax() < 1e-10 || lambda > 1e6 {
+                break;
+            }
+            lambda *= 10.0;
+        }
+    }
+    RefineReport {
+        camera_from_object: pose,
+        cost: equations.cost,
+        inlier_count: equations.count / 2,
+        iterations,
+    }
+}
+
+/// The normal equations of the correspondences within the threshold; their cost counts all. The twist moves the object
+/// in its own frame, about its centroid, where rotation and translation are least coupled.
+fn linearise(data: &Prepared, pose: &Pose, limit: f64) -> NormalEquations {
+    let r: Mat3 = pose.rotation_matrix();
+    let t = pose.translation();
+    let (fx, fy) = (data.camera.fx, data.camera.fy);
+    let mut sum = NormalEquations::default();
+    let mut outside = 0usize;
+    for (x, m) in data.points.iter().zip(&data.rays) {
+        let p = r * x + t;
+        let inverse = 1.0 / p.z;
+        let (a, b) = (p.x * inverse, p.y * inverse);
+        let (ru, rv) = (fx * (a - m.x), fy * (b - m.y));
+        if !(p.z > 0.0 && ru * ru + rv * rv < limit) {
+            outside += 1;
+            continue;
+        }
+        let (su, sv) = (fx * inverse, fy * inverse);
+        // Rows of d(pixel)/d(point), turned into the object's frame.
+        let gu = Vec3::new(
+            su * (r[(0, 0)] - a * r[(2, 0)]),
+            su * (r[(0, 1)] - a * r[(2, 1)]),
+            su * (r[(0, 2)] - a * r[(2, 2)]),
+        );
+        let gv = Vec3::new(
+            sv * (r[(1, 0)] - b * r[(2, 0)]),
+            sv * (r[(1, 1)] - b * r[(2, 1)]),
+            sv * (r[(1, 2)] - b * r[(2, 2)]),
+        );
+        let (wu, wv) = (x.cross(&gu), x.cross(&gv));
+        sum.add(&[gu.x, gu.y, gu.z, wu.x, wu.y, wu.z], ru, 1.0);
+        sum.add(&[gv.x, gv.y, gv.z, wv.x, wv.y, wv.z], rv, 1.0);
+    }
+    sum.cost += outside as f64 * limit;
+    sum
+}
