@@ -18,6 +18,7 @@ mod results;
 mod rle;
 mod scene_files;
 mod score;
+mod single_images;
 mod visibility;
 mod write;
 
@@ -50,5 +51,6 @@ pub use scene_files::{
 pub use score::{
     area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
 };
+pub use single_images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
 pub use visibility::{ObjectVisibility, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

@@ -1,2 +1,70 @@
-//! sixfold
-fn main() {}
+//! The program `sixfold`: a thin shell over the libraries.
+//!
+//! Exit status: 0 found, 1 nothing found, 2 error.
+
+mod arguments;
+mod camera_file;
+mod commands;
+mod objects;
+mod output;
+mod overlay;
+mod progress;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::arguments::{Arguments, Command};
+
+/// What a command that went through tells the shell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    /// Exit status 0.
+    Found,
+    /// Exit status 1: everything worked, but there was nothing.
+    NothingFound,
+    /// Exit status 2, after the reasons were already printed: part of a batch was skipped.
+    Incomplete,
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    progress::catch_interrupts();
+    if let Some(threads) = arguments.threads {
+        // Fails only when a pool exists already, and none does.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global();
+    }
+    let result = match &arguments.command {
+        Command::Demo(a) => commands::demo::run(a),
+        Command::Estimate(a) => commands::estimate::run(a),
+        Command::Eval(a) => commands::eval::run(a),
+        Command::Render(a) => commands::render::run(a),
+        Command::SimulateDepth(a) => commands::simulate::run(a),
+        Command::Object(a) => commands::object::run(a),
+        Command::Completions(a) => commands::completions::run(a),
+    };
+    match result {
+        Ok(Outcome::Found) => ExitCode::SUCCESS,
+        Ok(Outcome::NothingFound) => ExitCode::from(1),
+        Ok(Outcome::Incomplete) => ExitCode::from(2),
+        Err(error) => {
+            eprintln!("error: {}", describe(&error));
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// The whole chain of causes in one line, without repeating a cause that its parent already prints.
+pub(crate) fn describe(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let part = cause.to_string();
+        if !text.contains(&part) {
+            if !text.is_empty() {
+                text.push_str(": ");
+            }
+            text.push_str(&part);
+        }
+    }
+    text
+}

@@ -1,0 +1,331 @@
+//! The command line, defined once: parsing, `--help` and completions all come from here.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use sixfold_mesh::Unit;
+
+/// 6D object pose and grasp transfer from little data.
+#[derive(Debug, Parser)]
+#[command(
+    name = "sixfold",
+    version,
+    after_help = "Example:\n  sixfold demo\n\nExit status: 0 found, 1 nothing found, 2 error."
+)]
+pub(crate) struct Arguments {
+    /// Use this many threads (default: all cores); the results are the same for any number
+    #[arg(long, global = true, value_name = "N")]
+    pub threads: Option<NonZeroUsize>,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Estimate poses in the sample frames of this repository, score them and draw them
+    #[command(after_help = "Example:\n  sixfold demo --out out/demo")]
+    Demo(DemoArguments),
+    /// Estimate the 6D pose of known objects, in one image or in a whole dataset
+    #[command(after_help = "Examples:\n  \
+        sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
+        sixfold estimate --dataset lmo --split test --out results.csv")]
+    Estimate(EstimateArguments),
+    /// Score a result file against the ground truth of a BOP dataset
+    #[command(
+        after_help = "Example:\n  sixfold eval --dataset lmo --results results.csv --curves curves.png"
+    )]
+    Eval(EvalArguments),
+    /// Render an object: depth, mask, normals, object coordinates, colour
+    #[command(
+        after_help = "Example:\n  sixfold render --object mug.ply --unit mm --camera camera.json --pose 0,0,0.6,0.5,0,0 --out out/mug"
+    )]
+    Render(RenderArguments),
+    /// Write a dataset with simulated depth images, rendered from ground-truth poses on a table
+    #[command(
+        name = "simulate-depth",
+        after_help = "Example:\n  sixfold simulate-depth --dataset lmo --split test --out lmo-simulated"
+    )]
+    SimulateDepth(SimulateArguments),
+    /// Keep objects under a name: add, list, show, remove
+    #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
+    Object(ObjectArguments),
+    /// Print shell completions
+    #[command(
+        after_help = "Example:\n  sixfold completions bash > ~/.local/share/bash-completion/completions/sixfold"
+    )]
+    Completions(CompletionsArguments),
+}
+
+/// `--json`: to the screen, or to a file.
+#[derive(Debug, Args, Clone)]
+pub(crate) struct JsonArguments {
+    /// Print the result as JSON, or write it to FILE and keep the table
+    #[arg(long, value_name = "FILE", num_args = 0..=1)]
+    json: Option<Option<PathBuf>>,
+}
+
+impl JsonArguments {
+    /// Whether JSON replaces the table on the screen.
+    pub fn on_screen(&self) -> bool {
+        matches!(self.json, Some(None))
+    }
+
+    /// The file JSON goes to.
+    pub fn file(&self) -> Option<&PathBuf> {
+        self.json.as_ref().and_then(Option::as_ref)
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DemoArguments {
+    /// Folder for results and pictures
+    #[arg(long, default_value = "out/demo", value_name = "DIR")]
+    pub out: PathBuf,
+    /// Folder of the sample data (default: data/demo of this repository)
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Method {
+    /// Point pair features on depth, no training
+    Ppf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct EstimateArguments {
+    /// How poses are found
+    #[arg(long, value_enum, default_value = "ppf")]
+    pub method: Method,
+    /// Colour image, for the overlay
+    #[arg(long, value_name = "FILE", requires = "camera")]
+    pub rgb: Option<PathBuf>,
+    /// Depth image: PNG, one channel of 16 bits
+    #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
+    pub depth: Option<PathBuf>,
+    /// Camera: a JSON file with fx fy cx cy or cam_K, and depth_scale (millimetres per unit of the depth image)
+    #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
+    pub camera: Option<PathBuf>,
+    /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
+    #[arg(long, value_name = "MM")]
+    pub depth_scale: Option<f64>,
+    /// Objects to look for: mesh files, or names given with `sixfold object add`
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
+    pub objects: Vec<String>,
+    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// The object lies in this mask (PNG, above zero inside)
+    #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
+    pub mask: Option<PathBuf>,
+    /// The object lies in this box, in pixels
+    #[arg(
+        long = "box",
+        value_name = "X,Y,W,H",
+        value_delimiter = ',',
+        num_args = 4,
+        conflicts_with = "dataset"
+    )]
+    pub region: Option<Vec<f64>>,
+    /// Most instances of each object (in a dataset: what its targets say)
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub instances: NonZeroUsize,
+    /// BOP dataset folder: estimate all its targets
+    #[arg(long, value_name = "DIR", requires = "out")]
+    pub dataset: Option<PathBuf>,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub targets: Option<PathBuf>,
+    /// Where the objects are: gt for the ground truth's boxes, or a file of COCO detections (default: anywhere)
+    #[arg(long, value_name = "gt|FILE", requires = "dataset")]
+    pub boxes: Option<String>,
+    /// Result: a CSV file in the BOP format for a dataset, a folder for one image
+    #[arg(long, value_name = "PATH")]
+    pub out: Option<PathBuf>,
+    /// Folder for overlay pictures of a dataset's images
+    #[arg(long, value_name = "DIR", requires = "dataset")]
+    pub overlays: Option<PathBuf>,
+    /// Leave out poses with a lower confidence (0 to 1)
+    #[arg(long, value_name = "SCORE")]
+    pub min_score: Option<f64>,
+    /// Match points on the table plane too
+    #[arg(long)]
+    pub keep_plane: bool,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    /// Seed of everything random
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct EvalArguments {
+    /// BOP dataset folder
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file (default: the dataset's test_targets_bop19.json, or all ground truth)
+    #[arg(long, value_name = "FILE")]
+    pub targets: Option<PathBuf>,
+    /// Results in the BOP CSV format
+    #[arg(long, value_name = "FILE.csv", required_unless_present = "detections")]
+    pub results: Option<PathBuf>,
+    /// COCO detections to score by box AP (and mask AP where they have masks)
+    #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
+    pub detections: Option<PathBuf>,
+    /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)
+    #[arg(long)]
+    pub detection_ap: bool,
+    /// Skip broken rows of the result file, report them and score the rest (exit status 2)
+    #[arg(long)]
+    pub lenient: bool,
+    /// Leave out VSD, which renders every pose
+    #[arg(long)]
+    pub no_vsd: bool,
+    /// Picture of the recall curves
+    #[arg(long, value_name = "FILE.png")]
+    pub curves: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RenderArguments {
+    /// Mesh file or name of a stored object
+    #[arg(long, value_name = "NAME_OR_MESH")]
+    pub object: String,
+    /// Unit of the mesh file: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// Camera file (default: 640x480, 60 degrees wide)
+    #[arg(long, value_name = "FILE")]
+    pub camera: Option<PathBuf>,
+    /// Pose camera_from_object: tx,ty,tz,rx,ry,rz (metres, rotation vector in radians) or 16 numbers of a 4x4 matrix
+    /// row by row (default: fills the picture, seen from above)
+    #[arg(long, value_name = "NUMBERS", value_delimiter = ',', allow_hyphen_values = true, num_args = 1..)]
+    pub pose: Option<Vec<f64>>,
+    /// Folder for the pictures
+    #[arg(long, value_name = "DIR", default_value = "out/render")]
+    pub out: PathBuf,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Sensor {
+    /// Noise, quantisation and losses of a Kinect-class camera (Nguyen et al. 2012)
+    Kinect,
+    /// No noise
+    Ideal,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SimulateArguments {
+    /// BOP dataset folder with ground truth
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// New dataset folder
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Depth camera
+    #[arg(long, value_enum, default_value = "kinect")]
+    pub sensor: Sensor,
+    /// Copy the colour images too
+    #[arg(long)]
+    pub rgb: bool,
+    /// Simulate only these image ids
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub images: Vec<u32>,
+    /// Leave out the table
+    #[arg(long)]
+    pub no_table: bool,
+    /// Seed of the noise
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ObjectArguments {
+    /// Folder of stored objects
+    #[arg(long, global = true, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(subcommand)]
+    pub command: ObjectCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ObjectCommand {
+    /// Store a mesh under a name
+    Add {
+        /// Name: letters, digits, - and _
+        name: String,
+        /// Mesh file: PLY, OBJ, STL, glTF, GLB
+        mesh: PathBuf,
+        /// Unit of the mesh file: m, cm, mm, in
+        #[arg(long, value_name = "UNIT")]
+        unit: Unit,
+        /// BOP models_info.json to take the symmetries from
+        #[arg(long, value_name = "FILE", requires = "model_id")]
+        models_info: Option<PathBuf>,
+        /// Object id in models_info.json
+        #[arg(long, value_name = "ID")]
+        model_id: Option<u32>,
+        /// The object may turn freely about this axis of its own frame: x, y or z
+        #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
+        turns_about: Option<Axis>,
+        /// Replace an object of the same name
+        #[arg(long)]
+        replace: bool,
+    },
+    /// List the stored objects
+    List,
+    /// Show one object, and draw it
+    Show {
+        /// Its name
+        name: String,
+        /// Picture to write
+        #[arg(long, value_name = "FILE.png")]
+        picture: Option<PathBuf>,
+    },
+    /// Remove one object
+    Remove {
+        /// Its name
+        name: String,
+    },
+}
+
+/// An axis of an object's own frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Axis {
+    X,
+    Y,
+    Z,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CompletionsArguments {
+    /// Which shell
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}

@@ -1,0 +1,197 @@
+//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Result, anyhow, bail};
+use serde::Serialize;
+use sixfold_bop::{
+    BopDataset, EvalOptions, Evaluation, ModelPoints, Models, evaluate, write_recall_curves, write_rgb,
+};
+use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
+
+use crate::Outcome;
+use crate::arguments::DemoArguments;
+use crate::objects::{self, Object};
+use crate::output::report;
+use crate::overlay::{self, Drawn};
+use crate::progress::{Progress, check_interrupt};
+
+#[derive(Serialize)]
+struct Row {
+    image: String,
+    depth: &'static str,
+    object: u32,
+    /// Mean distance of the model's points (nearest points for symmetric objects), millimetres.
+    add_s_mm: f64,
+    /// The same as a share of the diameter.
+    add_s_of_diameter: f64,
+    confidence: f64,
+    seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    poses: Vec<Row>,
+    correct: usize,
+    targets: usize,
+    seconds: f64,
+    pictures: Vec<PathBuf>,
+    evaluation: Evaluation,
+}
+
+/// The samples: given, or found from where the program was started or built.
+fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
+    if let Some(folder) = given {
+        return Ok(folder.to_owned());
+    }
+    let here = std::env::current_dir().unwrap_or_default();
+    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let found = here
+        .ancestors()
+        .map(Path::to_path_buf)
+        .chain([built])
+        .map(|p| p.join("data/demo"))
+        .find(|p| p.is_dir());
+    match found {
+        Some(folder) => Ok(folder),
+        None => bail!(
+            "the sample data (folder data/demo of the repository) is not here: run inside the repository or give --data DIR"
+        ),
+    }
+}
+
+pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
+    let start = Instant::now();
+    let folder = sample_folder(a.data.as_deref())?;
+    let dataset = BopDataset::open(&folder, "test")?;
+    let targets = dataset.object_targets(&dataset.targets(None)?)?;
+    let infos = dataset.models_info(Models::Rendering)?;
+    let mut known: BTreeMap<u32, (Object, sixfold_match::ObjectModel, ModelPoints)> = BTreeMap::new();
+    let mut progress = Progress::new("poses", targets.len());
+    let mut rows = vec![];
+    let mut results = vec![];
+    let mut pictures = vec![];
+    for scene_id in dataset.scene_ids() {
+        let scene = dataset.scene(scene_id)?;
+        for im_id in scene.image_ids() {
+            check_interrupt("run it again")?;
+            let camera = scene.camera(im_id)?;
+            let Some(depth) = scene.depth(im_id)? else { continue };
+            let prepared = Scene::new(&depth, &camera, None, &SceneOptions::default())?;
+            let mut found = vec![];
+            for t in targets.iter().filter(|t| (t.scene_id, t.im_id) == (scene_id, im_id)) {
+                let Some(o) = t.object else { continue };
+                let began = Instant::now();
+                if let std::collections::btree_map::Entry::Vacant(place) = known.entry(o.obj_id) {
+                    let mesh = dataset.model(o.obj_id, Models::Rendering)?;
+                    let points = ModelPoints::new(mesh.vertices())
+                        .ok_or_else(|| anyhow!("object {}: the model has no vertices", o.obj_id))?;
+                    let symmetries = infos
+                        .as_ref()
+                        .and_then(|i| i.0.get(&o.obj_id))
+                        .map(objects::symmetry_poses)
+                        .unwrap_or_default();
+                    let description = a.out.join(format!("objects/{:06}.sixfold-ppf", o.obj_id));
+                    let object = Object { name: o.obj_id.to_string(), mesh, symmetries, description };
+                    let model = object.ppf_model()?;
+                    place.insert((object, model, points));
+                }
+                let Some((object, model, points)) = known.get(&o.obj_id) else { continue };
+                let estimates = estimate(&prepared, model, &EstimateOptions::default());
+                let seconds = began.elapsed().as_secs_f64();
+                progress.step(format!("image {im_id}, object {}", o.obj_id));
+                let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
+                for e in estimates {
+                    results.push(sixfold_bop::Estimate::new(
+                        scene_id,
+                        im_id,
+                        o.obj_id,
+                        e.confidence,
+                        e.camera_from_object,
+                    ));
+                    found.push((o.obj_id, e));
+                    if let Some(truth) = truth {
+                        let estimated = sixfold_bop::Placement::from(e.camera_from_object);
+                        let error = if object.symmetries.is_empty() {
+                            sixfold_bop::add(points, &estimated, &truth.placement())
+                        } else {
+                            sixfold_bop::adi(points, &estimated, &truth.placement())
+                        };
+                        rows.push(Row {
+                            image: format!("{scene_id}/{im_id}"),
+                            depth: if scene_id >= SIMULATED { "simulated" } else { "real" },
+                            object: o.obj_id,
+                            add_s_mm: 1000.0 * error,
+                            add_s_of_diameter: error / model.diameter(),
+                            confidence: e.confidence,
+                            seconds,
+                        });
+                    }
+                }
+            }
+            let background = scene.rgb(im_id)?.unwrap_or_else(|| overlay::depth_picture(&depth));
+            let drawn: Vec<Drawn<'_>> = found
+                .iter()
+                .filter_map(|(id, e)| {
+                    Some(Drawn {
+                        mesh: &known.get(id)?.0.mesh,
+                        camera_from_object: e.camera_from_object,
+                        color: overlay::color(*id as usize),
+                    })
+                })
+                .collect();
+            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}.png"));
+            write_rgb(&picture, &overlay::draw(&background, &camera, &drawn))?;
+            pictures.push(picture);
+        }
+    }
+    progress.finish();
+    let evaluation = evaluate(&dataset, &results, &dataset.targets(None)?, &EvalOptions::default(), &|_| {})?;
+    let curves = a.out.join("recall.png");
+    write_recall_curves(&curves, &evaluation)?;
+    pictures.push(curves);
+    let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
+    let whole = Whole {
+        poses: rows,
+        correct,
+        targets: targets.len(),
+        seconds: start.elapsed().as_secs_f64(),
+        pictures,
+        evaluation,
+    };
+    report(&a.json, &whole, || print_table(&whole))?;
+    Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+/// Scenes of the sample data from this id on have simulated depth.
+const SIMULATED: u32 = 1000;
+
+fn print_table(whole: &Whole) {
+    println!(
+        "{:>10} {:>10} {:>7} {:>12} {:>10} {:>11} {:>8}",
+        "image", "depth", "object", "error (mm)", "of diam.", "confidence", "seconds"
+    );
+    for r in &whole.poses {
+        println!(
+            "{:>10} {:>10} {:>7} {:>12.1} {:>9.1}% {:>11.3} {:>8.2}",
+            r.image,
+            r.depth,
+            r.object,
+            r.add_s_mm,
+            100.0 * r.add_s_of_diameter,
+            r.confidence,
+            r.seconds
+        );
+    }
+    println!();
+    super::eval::print_evaluation(&whole.evaluation);
+    println!(
+        "\n{} of {} poses within 10 % of the diameter, {:.1} s in all. Pictures:",
+        whole.correct, whole.targets, whole.seconds
+    );
+    for p in &whole.pictures {
+        println!("  {}", p.display());
+    }
+}

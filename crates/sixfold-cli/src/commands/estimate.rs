@@ -1,0 +1,204 @@
+//! `sixfold estimate`: one image here, a dataset in `estimate_dataset`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, anyhow, bail};
+use serde::Serialize;
+use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
+use sixfold_geometry::{Camera, Mask, Rect};
+use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
+
+use crate::Outcome;
+use crate::arguments::EstimateArguments;
+use crate::camera_file;
+use crate::objects;
+use crate::output::{pose_rows, report};
+use crate::overlay::{self, Drawn};
+use crate::progress::{Progress, check_interrupt};
+
+pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
+    if a.dataset.is_some() {
+        return super::estimate_dataset::run(a);
+    }
+    let depth_file = a
+        .depth
+        .as_deref()
+        .ok_or_else(|| anyhow!("give --depth FILE (with --camera and --object) or --dataset DIR"))?;
+    let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
+    if a.objects.is_empty() {
+        bail!("--object NAME_OR_MESH is missing: what is to be found?");
+    }
+    let file = camera_file::read(camera_path)?;
+    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
+        anyhow!(
+            "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",
+            camera_path.display()
+        )
+    })?;
+    if !(scale > 0.0 && scale.is_finite()) {
+        bail!("--depth-scale: found {scale}, expected above 0");
+    }
+    let depth = read_depth(depth_file, scale / 1000.0)?;
+    let (width, height) = depth.size();
+    let camera = file.for_image(width, height, camera_path)?;
+    if camera.distortion.is_some() {
+        bail!(
+            "{}: field distortion: depth images are taken as undistorted; undistort the image and leave the field out",
+            camera_path.display()
+        );
+    }
+    let rgb = a.rgb.as_deref().map(read_rgb).transpose()?;
+    if let (Some(image), Some(path)) = (&rgb, &a.rgb) {
+        camera.check_image(image.width(), image.height()).with_context(|| path.display().to_string())?;
+    }
+    let mask = region_mask(a, &camera)?;
+    let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
+        .with_context(|| depth_file.display().to_string())?;
+    let options = estimate_options(a, a.instances.get());
+    let mut progress = Progress::new("objects", a.objects.len());
+    let mut found: Vec<(objects::Object, Vec<Estimate>, f64)> = vec![];
+    for name in &a.objects {
+        check_interrupt("nothing was written")?;
+        let start = std::time::Instant::now();
+        let object = objects::find(name, a.unit, &a.store)?;
+        let model = object.ppf_model()?;
+        let estimates = estimate(&scene, &model, &options);
+        progress.step(object.name.clone());
+        found.push((object, estimates, start.elapsed().as_secs_f64()));
+    }
+    progress.finish();
+    let overlay = match &a.out {
+        None => None,
+        Some(folder) => {
+            let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
+            let drawn: Vec<Drawn<'_>> = found
+                .iter()
+                .enumerate()
+                .flat_map(|(i, (object, estimates, _))| {
+                    estimates.iter().map(move |e| Drawn {
+                        mesh: &object.mesh,
+                        camera_from_object: e.camera_from_object,
+                        color: overlay::color(i),
+                    })
+                })
+                .collect();
+            let path = folder.join("overlay.png");
+            write_rgb(&path, &overlay::draw(&background, &camera, &drawn))?;
+            Some(path)
+        }
+    };
+    let results: Vec<Found> = found
+        .iter()
+        .flat_map(|(object, estimates, seconds)| {
+            estimates.iter().map(|e| Found {
+                object: object.name.clone(),
+                camera_from_object: pose_rows(&e.camera_from_object),
+                confidence: e.confidence,
+                verification: e.score,
+                seconds: *seconds,
+            })
+        })
+        .collect();
+    let missing: Vec<String> = found.iter().filter(|f| f.1.is_empty()).map(|f| f.0.name.clone()).collect();
+    let any = !results.is_empty();
+    let whole = Whole { poses: results, not_found: missing, overlay };
+    if let Some(folder) = &a.out {
+        let text = serde_json::to_string_pretty(&whole)?;
+        crate::output::write_atomically(&folder.join("poses.json"), text.as_bytes())?;
+    }
+    report(&a.json, &whole, || print_table(&whole, a.out.as_deref()))?;
+    Ok(if any { Outcome::Found } else { Outcome::NothingFound })
+}
+
+#[derive(Serialize)]
+struct Found {
+    object: String,
+    camera_from_object: [[f64; 4]; 4],
+    confidence: f64,
+    verification: VerificationScore,
+    seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    poses: Vec<Found>,
+    not_found: Vec<String>,
+    overlay: Option<PathBuf>,
+}
+
+fn print_table(whole: &Whole, folder: Option<&Path>) {
+    println!(
+        "{:<24} {:>10} {:>8} {:>26} {:>8}",
+        "object", "confidence", "visible", "translation (m)", "seconds"
+    );
+    for f in &whole.poses {
+        let t: Vec<String> = f.camera_from_object[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
+        println!(
+            "{:<24} {:>10.3} {:>7.0}% {:>26} {:>8.2}",
+            f.object,
+            f.confidence,
+            100.0 * f.verification.visible_share(),
+            t.join(" "),
+            f.seconds
+        );
+    }
+    for name in &whole.not_found {
+        println!("{name:<24} not found");
+    }
+    if let Some(folder) = folder {
+        println!("poses.json and overlay.png are in {}", folder.display());
+    }
+}
+
+/// The options of the scene preparation that the command line sets.
+pub(super) fn scene_options(a: &EstimateArguments) -> SceneOptions {
+    SceneOptions { remove_plane: !a.keep_plane, seed: a.seed, ..SceneOptions::default() }
+}
+
+/// The options of the estimation that the command line sets.
+pub(super) fn estimate_options(a: &EstimateArguments, instances: usize) -> EstimateOptions {
+    let default = EstimateOptions::default();
+    EstimateOptions {
+        max_instances: instances,
+        min_score: a.min_score.unwrap_or(default.min_score),
+        ..default
+    }
+}
+
+/// The pixels of a box, grown a little: boxes are tight and depth shifts against colour.
+pub(super) fn box_mask(region: &Rect, camera: &Camera) -> Mask {
+    let r = region.scaled(1.1);
+    Mask::from_fn(camera.width, camera.height, |x, y| {
+        let (x, y) = (x as f64, y as f64);
+        x >= r.x && y >= r.y && x < r.x + r.width && y < r.y + r.height
+    })
+}
+
+fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
+    let mut mask = a.mask.as_deref().map(read_mask).transpose()?;
+    if let (Some(m), Some(path)) = (&mask, &a.mask) {
+        camera.check_image(m.width(), m.height()).with_context(|| path.display().to_string())?;
+    }
+    if let Some(r) = &a.region {
+        let [x, y, width, height] = r[..] else { bail!("--box: expected four numbers") };
+        if !(width > 0.0 && height > 0.0 && x.is_finite() && y.is_finite()) {
+            bail!("--box: found {r:?}, expected x, y, width, height with a size above 0");
+        }
+        let region = Rect { x, y, width, height };
+        let image = Rect { x: 0.0, y: 0.0, width: camera.width as f64, height: camera.height as f64 };
+        if region.intersect(&image).is_none() {
+            bail!("--box: {r:?} lies outside the {}x{} image", camera.width, camera.height);
+        }
+        let boxed = box_mask(&region, camera);
+        mask = Some(match mask {
+            None => boxed,
+            Some(m) => Mask::from_fn(m.width(), m.height(), |x, y| m[(x, y)] && boxed[(x, y)]),
+        });
+    }
+    if let Some(m) = &mask
+        && !m.as_slice().contains(&true)
+    {
+        bail!("the mask is empty: no pixel is left in which the object could be");
+    }
+    Ok(mask)
+}

@@ -1,0 +1,353 @@
+//! `sixfold estimate --dataset`: all targets of a BOP dataset into a result CSV, image by image, resumable.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow, bail};
+use serde::{Deserialize, Serialize};
+use sixfold_bop::{
+    BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target, ground_truth_visibility,
+    read_detections, write_rgb,
+};
+use sixfold_geometry::Rect;
+use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
+use sixfold_mesh::Mesh;
+
+use super::estimate::{box_mask, estimate_options, scene_options};
+use crate::Outcome;
+use crate::arguments::EstimateArguments;
+use crate::objects::{self, Object};
+use crate::output::{report, write_atomically};
+use crate::overlay::{self, Drawn};
+use crate::progress::{Progress, check_interrupt};
+
+/// What a result file was made with; kept beside it so that a later run goes on with the same.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct RunRecord {
+    version: String,
+    method: String,
+    dataset: String,
+    split: String,
+    targets: Option<String>,
+    boxes: Option<String>,
+    min_score: Option<f64>,
+    keep_plane: bool,
+    seed: u64,
+    /// Images that are done, `scene/image`.
+    done: BTreeSet<String>,
+}
+
+#[derive(Serialize)]
+struct Summary {
+    images: usize,
+    targets: usize,
+    poses: usize,
+    skipped: Vec<String>,
+    seconds_per_image: Option<f64>,
+    results: String,
+}
+
+enum Boxes {
+    Anywhere,
+    GroundTruth,
+    Detections(Vec<Detection>),
+}
+
+/// A model of the dataset, read and described when it is first needed.
+struct Known {
+    mesh: Mesh,
+    ppf: ObjectModel,
+}
+
+pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
+    let root = a.dataset.as_deref().ok_or_else(|| anyhow!("--dataset is missing"))?;
+    let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.csv is missing"))?;
+    if out.extension().is_none_or(|e| e != "csv") {
+        bail!("--out: found {}, expected a file that ends in .csv", out.display());
+    }
+    let dataset = BopDataset::open(root, &a.split)?;
+    let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
+    let boxes = match a.boxes.as_deref() {
+        None => Boxes::Anywhere,
+        Some("gt") => Boxes::GroundTruth,
+        Some("detect") => {
+            bail!("--boxes detect: no detector is part of this version; give gt or a file of COCO detections")
+        }
+        Some(file) => {
+            let read = read_detections(
+                Path::new(file),
+                &ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() },
+            )?;
+            for note in &read.adjusted {
+                eprintln!("note: {file}: {}", note.message);
+            }
+            Boxes::Detections(read.detections)
+        }
+    };
+    let mut images: BTreeMap<(u32, u32), Vec<Target>> = BTreeMap::new();
+    for t in &targets {
+        images.entry((t.scene_id, t.im_id)).or_default().push(*t);
+    }
+    let record_path = out.with_extension("csv.run.json");
+    let mut record = RunRecord {
+        version: env!("CARGO_PKG_VERSION").into(),
+        method: "ppf".into(),
+        dataset: root.display().to_string(),
+        split: a.split.clone(),
+        targets: a.targets.as_ref().map(|t| t.display().to_string()),
+        boxes: a.boxes.clone(),
+        min_score: a.min_score,
+        keep_plane: a.keep_plane,
+        seed: a.seed,
+        done: BTreeSet::new(),
+    };
+    if out.exists() {
+        let earlier = std::fs::read_to_string(&record_path)
+            .ok()
+            .and_then(|t| serde_json::from_str::<RunRecord>(&t).ok());
+        let Some(earlier) = earlier else {
+            bail!(
+                "{} exists, but {} does not say what it was made with: remove it or choose another --out",
+                out.display(),
+                record_path.display()
+            );
+        };
+        if (RunRecord { done: BTreeSet::new(), ..earlier }) != record {
+            bail!(
+                "{} was made with other options (see {}): remove both or choose another --out",
+                out.display(),
+                record_path.display()
+            );
+        }
+        let text = std::fs::read_to_string(&record_path)?;
+        record.done = serde_json::from_str::<RunRecord>(&text)?.done;
+    } else {
+        save(&record_path, &record)?;
+    }
+    let mut results = ResultsAppender::open(out)?;
+    if let Some(torn) = results.torn() {
+        eprintln!("note: {}: the last line was cut off and is dropped: {torn}", out.display());
+    }
+    for e in results.existing() {
+        record.done.insert(format!("{}/{}", e.scene_id, e.im_id));
+    }
+    let infos = dataset.models_info(Models::Rendering)?;
+    let mut known: BTreeMap<u32, Known> = BTreeMap::new();
+    let mut skipped: Vec<String> = vec![];
+    let mut poses = results.existing().len();
+    let mut seconds = vec![];
+    let mut progress = Progress::new("images", images.len());
+    let mut scenes = BTreeMap::new();
+    for ((scene_id, im_id), targets) in &images {
+        check_interrupt("run the same command again to go on")?;
+        let key = format!("{scene_id}/{im_id}");
+        if record.done.contains(&key) {
+            progress.step(format!("{key} was done"));
+            continue;
+        }
+        for t in targets {
+            let Some(o) = t.object else { continue };
+            if let std::collections::btree_map::Entry::Vacant(place) = known.entry(o.obj_id) {
+                let mesh = dataset.model(o.obj_id, Models::Rendering)?;
+                let info = infos.as_ref().and_then(|i| i.0.get(&o.obj_id));
+                let file = dataset
+                    .models_dir(Models::Rendering)
+                    .unwrap_or_else(|| root.join("models"))
+                    .join(format!("obj_{:06}.ply", o.obj_id));
+                let object = Object {
+                    name: format!("object {}", o.obj_id),
+                    mesh,
+                    symmetries: info.map(objects::symmetry_poses).unwrap_or_default(),
+                    description: objects::description_beside(&file),
+                };
+                let ppf = object.ppf_model()?;
+                place.insert(Known { mesh: object.mesh, ppf });
+            }
+        }
+        let scene = match scenes.entry(*scene_id) {
+            std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
+            std::collections::btree_map::Entry::Vacant(place) => place.insert(dataset.scene(*scene_id)?),
+        };
+        let start = Instant::now();
+        match one_image(a, scene, *im_id, targets, &known, &boxes) {
+            Err(error) => skipped.push(format!("image {key}: {}", crate::describe(&error))),
+            Ok(found) => {
+                let time = start.elapsed().as_secs_f64();
+                seconds.push(time);
+                let rows: Vec<sixfold_bop::Estimate> = found
+                    .iter()
+                    .map(|(obj_id, e)| {
+                        let mut row = sixfold_bop::Estimate::new(
+                            *scene_id,
+                            *im_id,
+                            *obj_id,
+                            e.confidence,
+                            e.camera_from_object,
+                        );
+                        row.time = Some(time);
+                        row
+                    })
+                    .collect();
+                results.append(&rows)?;
+                poses += rows.len();
+                if let Some(folder) = &a.overlays {
+                    draw(folder, scene, *scene_id, *im_id, &found, &known)?;
+                }
+                record.done.insert(key.clone());
+                if rows.is_empty() {
+                    save(&record_path, &record)?;
+                }
+            }
+        }
+        progress.step(key);
+    }
+    progress.finish();
+    save(&record_path, &record)?;
+    for s in &skipped {
+        eprintln!("skipped {s}");
+    }
+    let mean = (!seconds.is_empty()).then(|| seconds.iter().sum::<f64>() / seconds.len() as f64);
+    let any = poses > 0;
+    let incomplete = !skipped.is_empty();
+    let summary = Summary {
+        images: images.len(),
+        targets: targets.len(),
+        poses,
+        skipped,
+        seconds_per_image: mean,
+        results: out.display().to_string(),
+    };
+    report(&a.json, &summary, || {
+        println!(
+            "{} poses for {} targets in {} images: {}",
+            summary.poses, summary.targets, summary.images, summary.results
+        );
+        if let Some(mean) = summary.seconds_per_image {
+            println!("{mean:.2} s per image");
+        }
+    })?;
+    Ok(if incomplete {
+        Outcome::Incomplete
+    } else if any {
+        Outcome::Found
+    } else {
+        Outcome::NothingFound
+    })
+}
+
+fn save(path: &Path, record: &RunRecord) -> Result<()> {
+    write_atomically(path, serde_json::to_string_pretty(record)?.as_bytes())
+}
+
+/// The poses of an image's targets, with their object ids.
+fn one_image(
+    a: &EstimateArguments,
+    scene: &sixfold_bop::Scene,
+    im_id: u32,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+    boxes: &Boxes,
+) -> Result<Vec<(u32, Estimate)>> {
+    let camera = scene.camera(im_id)?;
+    let depth = scene.depth(im_id)?.ok_or_else(|| {
+        anyhow!(
+            "has no depth image: point pair features need depth (simulate it with `sixfold simulate-depth`)"
+        )
+    })?;
+    let options = scene_options(a);
+    let whole = match boxes {
+        Boxes::Anywhere => Some(Scene::new(&depth, &camera, None, &options).context("depth image")?),
+        _ => None,
+    };
+    let mut found = vec![];
+    for target in targets {
+        let Some(o) = target.object else { continue };
+        let Some(k) = known.get(&o.obj_id) else { continue };
+        let regions: Vec<Rect> = match boxes {
+            Boxes::Anywhere => vec![],
+            Boxes::GroundTruth => ground_truth_boxes(scene, im_id, o.obj_id, known)?,
+            Boxes::Detections(all) => {
+                let mut mine: Vec<&Detection> = all
+                    .iter()
+                    .filter(|d| (d.scene_id, d.image_id, d.category_id) == (target.scene_id, im_id, o.obj_id))
+                    .collect();
+                mine.sort_by(|x, y| y.score.total_cmp(&x.score));
+                mine.iter().take(o.inst_count).filter_map(|d| d.bbox).collect()
+            }
+        };
+        if let Some(whole) = &whole {
+            let estimates = estimate(whole, &k.ppf, &estimate_options(a, o.inst_count));
+            found.extend(estimates.into_iter().map(|e| (o.obj_id, e)));
+        }
+        for region in regions {
+            let mask = box_mask(&region, &camera);
+            let scene = Scene::new(&depth, &camera, Some(&mask), &options).context("depth image")?;
+            let estimates = estimate(&scene, &k.ppf, &estimate_options(a, 1));
+            found.extend(estimates.into_iter().map(|e| (o.obj_id, e)));
+        }
+    }
+    Ok(found)
+}
+
+/// The visible boxes of an object's instances: from `scene_gt_info.json`, or rendered.
+fn ground_truth_boxes(
+    scene: &sixfold_bop::Scene,
+    im_id: u32,
+    obj_id: u32,
+    known: &BTreeMap<u32, Known>,
+) -> Result<Vec<Rect>> {
+    let image = scene.image(im_id)?;
+    if let Some(info) = &image.info {
+        return Ok(image
+            .ground_truth
+            .iter()
+            .zip(info)
+            .filter(|(g, _)| g.obj_id == obj_id)
+            .filter_map(|(_, i)| i.bbox_visib)
+            .collect());
+    }
+    let objects: Vec<_> = image
+        .ground_truth
+        .iter()
+        .filter_map(|g| Some((g.obj_id, &known.get(&g.obj_id)?.mesh, g.camera_from_object)))
+        .collect();
+    let meshes: Vec<_> = objects.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
+    let depth = scene.depth(im_id)?;
+    let visible = ground_truth_visibility(&meshes, &scene.camera(im_id)?, depth.as_ref(), 0.015);
+    Ok(objects
+        .iter()
+        .zip(visible)
+        .filter(|((id, ..), _)| *id == obj_id)
+        .filter_map(|(_, v)| v.info.bbox_visib)
+        .collect())
+}
+
+fn draw(
+    folder: &Path,
+    scene: &sixfold_bop::Scene,
+    scene_id: u32,
+    im_id: u32,
+    found: &[(u32, Estimate)],
+    known: &BTreeMap<u32, Known>,
+) -> Result<()> {
+    let camera = scene.camera(im_id)?;
+    let background = match (scene.rgb(im_id)?, scene.depth(im_id)?) {
+        (Some(rgb), _) => rgb,
+        (None, Some(depth)) => overlay::depth_picture(&depth),
+        (None, None) => return Ok(()),
+    };
+    let drawn: Vec<Drawn<'_>> = found
+        .iter()
+        .filter_map(|(id, e)| {
+            Some(Drawn {
+                mesh: &known.get(id)?.mesh,
+                camera_from_object: e.camera_from_object,
+                color: overlay::color(*id as usize),
+            })
+        })
+        .collect();
+    let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
+    write_rgb(&path, &overlay::draw(&background, &camera, &drawn))?;
+    Ok(())
+}

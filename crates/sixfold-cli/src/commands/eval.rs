@@ -1,0 +1,145 @@
+//! `sixfold eval`: scores on the screen, curves as a picture, JSON for scripts.
+
+use anyhow::{Context, Result, anyhow};
+use serde::Serialize;
+use sixfold_bop::{
+    BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType, ReadDetections,
+    evaluate, evaluate_coco, evaluate_detection, read_detections, read_results, read_results_lenient,
+    write_recall_curves,
+};
+
+use crate::Outcome;
+use crate::arguments::EvalArguments;
+use crate::output::report;
+use crate::progress::Progress;
+
+#[derive(Serialize)]
+struct Whole {
+    #[serde(flatten)]
+    localisation: Evaluation,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    detection: Option<DetectionEvaluation>,
+}
+
+pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
+    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    if a.detections.is_some() {
+        return coco(a, &dataset);
+    }
+    let path = a.results.as_deref().ok_or_else(|| anyhow!("--results FILE.csv is missing"))?;
+    let (estimates, bad) =
+        if a.lenient { read_results_lenient(path)? } else { (read_results(path)?, vec![]) };
+    for row in &bad {
+        eprintln!(
+            "skipped {}: line {}, column {}: found {:?}, expected {}",
+            path.display(),
+            row.line,
+            row.column,
+            row.found,
+            row.expected
+        );
+    }
+    let targets = dataset.targets(a.targets.as_deref())?;
+    let options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::default() };
+    let progress = std::sync::Mutex::new(None);
+    let localisation = evaluate(&dataset, &estimates, &targets, &options, &|p| {
+        if let Ok(mut bar) = progress.lock() {
+            bar.get_or_insert_with(|| Progress::new("images", p.total)).set(p.done);
+        }
+    })?;
+    if let Ok(Some(bar)) = progress.into_inner() {
+        bar.finish();
+    }
+    let detection =
+        a.detection_ap.then(|| evaluate_detection(&dataset, &estimates, &targets, &options)).transpose()?;
+    if let Some(picture) = &a.curves {
+        write_recall_curves(picture, &localisation)?;
+    }
+    let any = localisation.estimates > 0;
+    let whole = Whole { localisation, detection };
+    report(&a.json, &whole, || print_table(&whole))?;
+    Ok(if !bad.is_empty() {
+        Outcome::Incomplete
+    } else if any {
+        Outcome::Found
+    } else {
+        Outcome::NothingFound
+    })
+}
+
+/// A score with three digits, `-` where it cannot be computed.
+fn digits(score: Option<f64>) -> String {
+    score.map_or_else(|| "-".into(), |s| format!("{s:.3}"))
+}
+
+pub(super) fn print_evaluation(e: &Evaluation) {
+    println!(
+        "{:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
+        "object", "targets", "AR_VSD", "AR_MSSD", "AR_MSPD", "ADD(-S)<0.1d"
+    );
+    for (id, o) in &e.objects {
+        println!(
+            "{id:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
+            o.targets,
+            digits(o.ar_vsd),
+            digits(o.ar_mssd),
+            digits(o.ar_mspd),
+            digits(o.add_s_recall)
+        );
+    }
+    println!(
+        "{:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
+        "all",
+        e.targets,
+        digits(e.ar_vsd),
+        digits(e.ar_mssd),
+        digits(e.ar_mspd),
+        digits(e.add_s_recall.get("mean").copied().flatten())
+    );
+    println!("AR {}", digits(e.ar));
+    for (score, reason) in &e.reasons {
+        println!("{score} not computed: {reason}");
+    }
+    if let Some(t) = e.average_time_per_image {
+        println!("{t:.2} s per image");
+    }
+}
+
+fn print_table(whole: &Whole) {
+    print_evaluation(&whole.localisation);
+    if let Some(d) = &whole.detection {
+        println!(
+            "6D detection (BOP'24): AP {} AP_MSSD {} AP_MSPD {}",
+            digits(d.ap),
+            digits(d.ap_mssd),
+            digits(d.ap_mspd)
+        );
+        for (score, reason) in &d.reasons {
+            println!("{score} not computed: {reason}");
+        }
+    }
+}
+
+/// Box and mask AP of detections, in COCO's terms.
+fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
+    let path = a.detections.as_deref().ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
+    let read =
+        read_detections(path, &ReadDetections { lenient: a.lenient, image_size: dataset.image_size() })?;
+    for note in &read.adjusted {
+        eprintln!("note: {}: {}", path.display(), note.message);
+    }
+    let mut truth = CocoGroundTruth::default();
+    for scene_id in dataset.scene_ids() {
+        let file = dataset.scene(scene_id)?.dir().join("scene_gt_coco.json");
+        let text = std::fs::read(&file).with_context(|| {
+            format!("{}: the ground truth of detection (BOP's scene_gt_coco.json) is needed", file.display())
+        })?;
+        truth.add_scene(scene_id, &text, &file)?;
+    }
+    let boxes = evaluate_coco(&truth, &read.detections, IouType::Box);
+    let with_masks = read.detections.iter().any(|d| d.segmentation.is_some());
+    let masks = with_masks.then(|| evaluate_coco(&truth, &read.detections, IouType::Mask));
+    let value = serde_json::json!({ "box": boxes, "mask": masks });
+    report(&a.json, &value, || println!("{}", serde_json::to_string_pretty(&value).unwrap_or_default()))?;
+    Ok(if read.detections.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}

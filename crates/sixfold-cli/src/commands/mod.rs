@@ -1,0 +1,10 @@
+//! One file per command.
+
+pub(crate) mod completions;
+pub(crate) mod demo;
+pub(crate) mod estimate;
+mod estimate_dataset;
+pub(crate) mod eval;
+pub(crate) mod object;
+pub(crate) mod render;
+pub(crate) mod simulate;

@@ -1,0 +1,105 @@
+//! `sixfold render`: what the renderer sees of one object, as pictures.
+
+use anyhow::{Context, Result, bail};
+use serde_json::json;
+use sixfold_bop::{write_depth, write_mask, write_rgb};
+use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
+
+use crate::Outcome;
+use crate::arguments::RenderArguments;
+use crate::output::{pose_rows, report};
+use crate::{camera_file, objects, overlay};
+
+pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
+    let object = objects::find(&a.object, a.unit, &a.store)?;
+    let camera = match &a.camera {
+        Some(path) => {
+            let file = camera_file::read(path)?;
+            if !file.sized {
+                bail!("{}: fields width and height are missing: how large is the picture?", path.display());
+            }
+            file.camera.without_distortion()
+        }
+        None => default_camera(640, 480),
+    };
+    let pose = match &a.pose {
+        None => default_pose(&object.mesh, &camera),
+        Some(n) if n.len() == 6 => {
+            if n.iter().any(|v| !v.is_finite()) {
+                bail!("--pose: found {n:?}, expected finite numbers");
+            }
+            let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(n[3], n[4], n[5]));
+            Pose::new(rotation, Vec3::new(n[0], n[1], n[2]))
+        }
+        Some(n) if n.len() == 16 => Pose::from_matrix(&Matrix4::from_row_slice(n)).context("--pose")?,
+        Some(n) => bail!("--pose: found {} numbers, expected 6 or 16", n.len()),
+    };
+    let objects = [SceneObject { mesh: &object.mesh, camera_from_object: pose }];
+    let mut frame = Frame::new(&camera);
+    frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
+    let (low, high) = object.mesh.bounding_box();
+    let scale = BoundingBoxScale::of_corners(&low, &high);
+    let file = |name: &str| a.out.join(name);
+    write_depth(&file("depth.png"), &frame.depth(), 1e-4)?;
+    write_mask(&file("mask.png"), &frame.mask(0))?;
+    write_rgb(&file("normals.png"), &overlay::normal_picture(&frame.normals(&objects)))?;
+    let coordinates = frame.normalised_coordinates(&objects, &[scale]);
+    write_rgb(&file("coordinates.png"), &overlay::coordinate_picture(&coordinates))?;
+    let rgb = shade(&frame, &objects, &Light::default_set(), &Material::default(), None);
+    write_rgb(&file("rgb.png"), &rgb)?;
+    let pixels = frame.mask(0).as_slice().iter().filter(|m| **m).count();
+    let files = ["depth.png", "mask.png", "normals.png", "coordinates.png", "rgb.png"].map(file);
+    let value = json!({
+        "object": object.name,
+        "camera_from_object": pose_rows(&pose),
+        "pixels": pixels,
+        "depth_scale_mm": 0.1,
+        "files": files,
+    });
+    report(&a.json, &value, || {
+        println!(
+            "{pixels} pixels; depth.png (0.1 mm units), mask.png, normals.png, coordinates.png, rgb.png in {}",
+            a.out.display()
+        );
+    })?;
+    Ok(if pixels > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+fn default_camera(width: usize, height: usize) -> Camera {
+    let f = width as f64 / 2.0 / 30f64.to_radians().tan();
+    Camera {
+        fx: f,
+        fy: f,
+        cx: (width as f64 - 1.0) / 2.0,
+        cy: (height as f64 - 1.0) / 2.0,
+        width,
+        height,
+        distortion: None,
+    }
+}
+
+/// From above and in front, so near that the object fills most of the picture.
+fn default_pose(mesh: &Mesh, camera: &Camera) -> Pose {
+    let (low, high) = mesh.bounding_box();
+    let radius = (high - low).norm() / 2.0;
+    let narrow = (camera.width as f64 / camera.fx).min(camera.height as f64 / camera.fy) / 2.0;
+    let distance = radius * (1.0 + 1.0 / narrow);
+    let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), 120f64.to_radians());
+    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
+    let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
+    let centre = (low + high) * 0.5;
+    Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * centre)
+}
+
+/// A picture of the object on its own.
+pub(super) fn portrait(mesh: &Mesh) -> RgbImage {
+    let camera = default_camera(480, 480);
+    let objects = [SceneObject { mesh, camera_from_object: default_pose(mesh, &camera) }];
+    let mut frame = Frame::new(&camera);
+    frame.render(&objects, &RenderOptions::default());
+    let white = RgbImage::filled(480, 480, [255; 3]);
+    shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&white))
+}

@@ -1,0 +1,115 @@
+//! `sixfold simulate-depth`: what a depth camera would have measured in a dataset that has poses but no depth.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use serde_json::json;
+use sixfold_bop::{
+    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
+};
+use sixfold_geometry::Pose;
+use sixfold_mesh::Mesh;
+use sixfold_render::{
+    DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane,
+};
+
+use crate::Outcome;
+use crate::arguments::{Sensor, SimulateArguments};
+use crate::output::report;
+use crate::progress::{Progress, check_interrupt};
+
+/// Width of the simulated table in metres.
+const TABLE: f64 = 3.0;
+
+pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
+    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    if a.out.join(&a.split).exists() {
+        bail!("{} exists already: remove it or choose another --out", a.out.join(&a.split).display());
+    }
+    let wanted = |im_id: u32| a.images.is_empty() || a.images.contains(&im_id);
+    let mut meshes: BTreeMap<u32, Mesh> = BTreeMap::new();
+    let mut images = 0;
+    let mut without_table = vec![];
+    let mut first_camera = None;
+    for scene_id in dataset.scene_ids() {
+        let scene = dataset.scene(scene_id)?;
+        let ids: Vec<u32> = scene.image_ids().into_iter().filter(|i| wanted(*i)).collect();
+        let mut writer = SceneWriter::new(&a.out, &a.split, scene_id);
+        let mut progress = Progress::new("images", ids.len());
+        for im_id in ids {
+            check_interrupt(&format!("remove {} and start again", a.out.display()))?;
+            let image = scene.image(im_id)?;
+            for g in &image.ground_truth {
+                if let std::collections::btree_map::Entry::Vacant(place) = meshes.entry(g.obj_id) {
+                    place.insert(dataset.model(g.obj_id, Models::Rendering)?);
+                }
+            }
+            let camera = scene.camera(im_id)?;
+            let posed: Vec<(&Mesh, Pose)> =
+                image.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
+            let mut objects: Vec<SceneObject<'_>> =
+                posed.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
+            let table = if a.no_table {
+                None
+            } else {
+                support_plane(&objects).and_then(|p| plane_mesh(&p, &camera, TABLE))
+            };
+            match &table {
+                Some(mesh) => objects.push(SceneObject { mesh, camera_from_object: Pose::identity() }),
+                None if !a.no_table => without_table.push(format!("{scene_id}/{im_id}")),
+                None => {}
+            }
+            let mut frame = Frame::new(&camera);
+            frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
+            let ideal = frame.depth();
+            let depth = match a.sensor {
+                Sensor::Ideal => ideal,
+                Sensor::Kinect => {
+                    let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
+                    simulate_depth(&ideal, &frame.normals(&objects), &DepthSensor::kinect(), seed)
+                }
+            };
+            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
+            let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
+            let rgb = if a.rgb { scene.rgb(im_id)? } else { None };
+            writer.add(&NewImage {
+                depth: Some(&depth),
+                rgb: rgb.as_ref(),
+                ground_truth: &image.ground_truth,
+                info: Some(&infos),
+                ..NewImage::new(im_id, &camera)
+            })?;
+            first_camera.get_or_insert(camera);
+            images += 1;
+            progress.step(format!("{scene_id}/{im_id}"));
+        }
+        progress.finish();
+        writer.finish()?;
+    }
+    if let Some(camera) = first_camera {
+        write_camera(&a.out, &camera, 1e-3)?;
+    }
+    let targets: Vec<Target> = dataset.targets(None)?.into_iter().filter(|t| wanted(t.im_id)).collect();
+    write_targets(&a.out.join("test_targets_bop19.json"), &targets)?;
+    if let Some(models) = dataset.models_dir(Models::Rendering) {
+        copy_files(&models, &a.out.join("models"))?;
+    }
+    for image in &without_table {
+        eprintln!("note: image {image}: no plane lies under its objects, simulated without a table");
+    }
+    let value = json!({ "images": images, "without_table": without_table, "out": a.out });
+    report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
+    Ok(if images > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+fn copy_files(from: &Path, to: &Path) -> Result<()> {
+    std::fs::create_dir_all(to).with_context(|| format!("folder {}", to.display()))?;
+    for entry in std::fs::read_dir(from).with_context(|| format!("folder {}", from.display()))? {
+        let path = entry?.path();
+        if let Some(name) = path.file_name().filter(|_| path.is_file()) {
+            std::fs::copy(&path, to.join(name)).with_context(|| format!("cannot copy {}", path.display()))?;
+        }
+    }
+    Ok(())
+}

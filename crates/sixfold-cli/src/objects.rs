@@ -1,0 +1,229 @@
+//! Where objects come from: a mesh file, or the store of named objects.
+//!
+//! The store is a folder with one folder per object: `object.json` (format version, unit, symmetries, where it came from),
+//! `mesh.ply` (metres), and what methods learn about it (`ppf.bin`).
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, anyhow, bail};
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::Pose;
+use sixfold_match::{ModelOptions, ObjectModel};
+use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, read_mesh, write_ply};
+
+/// Step at which a continuous symmetry is cut into poses when hypotheses are joined.
+const SYMMETRY_STEP: f64 = 0.05;
+/// The only version of `object.json` there is.
+const VERSION: u32 = 1;
+
+/// An object ready to be looked for.
+#[derive(Debug)]
+pub(crate) struct Object {
+    pub name: String,
+    pub mesh: Mesh,
+    pub symmetries: Vec<Pose>,
+    /// Where its description is kept.
+    pub description: PathBuf,
+}
+
+impl Object {
+    /// The description for point pair features, from disk or computed (and then kept).
+    pub fn ppf_model(&self) -> Result<ObjectModel> {
+        let (model, note) =
+            ObjectModel::cached(&self.description, &self.mesh, &self.symmetries, &ModelOptions::default())
+                .with_context(|| format!("object {}", self.name))?;
+        if let Some(note) = note {
+            eprintln!("note: description of {} not kept or renewed: {note}", self.name);
+        }
+        Ok(model)
+    }
+}
+
+/// `object.json`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Record {
+    pub version: u32,
+    /// File the mesh was read from.
+    pub source: String,
+    /// Unit of that file.
+    pub source_unit: Unit,
+    /// Diameter in metres.
+    pub diameter: f64,
+    pub vertices: usize,
+    pub faces: usize,
+    /// Transformations that map the object onto itself, as 4x4 matrices in metres, without the identity.
+    pub symmetries_discrete: Vec<[[f64; 4]; 4]>,
+    /// Axes about which the object may turn freely: direction, and a point on the axis in metres.
+    pub symmetries_continuous: Vec<FreeAxis>,
+}
+
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct FreeAxis {
+    pub axis: [f64; 3],
+    pub offset: [f64; 3],
+}
+
+impl Record {
+    fn symmetry_poses(&self, mesh: &Mesh) -> Result<Vec<Pose>> {
+        let mut info = ModelInfo::of_mesh(mesh);
+        for rows in &self.symmetries_discrete {
+            let flat: Vec<f64> = rows.iter().flatten().copied().collect();
+            let matrix = sixfold_geometry::nalgebra::Matrix4::from_row_slice(&flat);
+            info.symmetries_discrete.push(Pose::from_matrix(&matrix).context("field symmetries_discrete")?);
+        }
+        for s in &self.symmetries_continuous {
+            info.symmetries_continuous
+                .push(ContinuousSymmetry { axis: s.axis.into(), offset: s.offset.into() });
+        }
+        Ok(info.symmetry_poses(SYMMETRY_STEP))
+    }
+}
+
+/// The poses of a dataset object's symmetries.
+pub(crate) fn symmetry_poses(info: &ModelInfo) -> Vec<Pose> {
+    info.symmetry_poses(SYMMETRY_STEP)
+}
+
+/// A folder of named objects.
+pub(crate) struct Store<'a> {
+    pub folder: &'a Path,
+}
+
+impl Store<'_> {
+    fn place(&self, name: &str) -> Result<PathBuf> {
+        let good = !name.is_empty()
+            && name.len() <= 100
+            && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+        if !good {
+            bail!("object name {name:?}: expected up to 100 letters, digits, - and _");
+        }
+        Ok(self.folder.join(name))
+    }
+
+    pub fn contains(&self, name: &str) -> bool {
+        self.place(name).is_ok_and(|p| p.join("object.json").is_file())
+    }
+
+    pub fn names(&self) -> Result<Vec<String>> {
+        let entries = match std::fs::read_dir(self.folder) {
+            Ok(entries) => entries,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(vec![]),
+            Err(e) => return Err(e).with_context(|| format!("store {}", self.folder.display())),
+        };
+        let mut names = vec![];
+        for entry in entries {
+            let name = entry.with_context(|| format!("store {}", self.folder.display()))?.file_name();
+            if let Some(name) = name.to_str().filter(|n| self.contains(n)) {
+                names.push(name.to_owned());
+            }
+        }
+        names.sort();
+        Ok(names)
+    }
+
+    pub fn record(&self, name: &str) -> Result<Record> {
+        let path = self.place(name)?.join("object.json");
+        if !path.is_file() {
+            bail!(
+                "no object named {name:?} in {} (there are: {}); add it with `sixfold object add {name} MESH --unit UNIT`",
+                self.folder.display(),
+                self.names()?.join(", ")
+            );
+        }
+        let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        let record: Record = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+        if record.version != VERSION {
+            bail!(
+                "{}: field version: found {}, expected {VERSION}: written by another version of sixfold",
+                path.display(),
+                record.version
+            );
+        }
+        Ok(record)
+    }
+
+    pub fn load(&self, name: &str) -> Result<Object> {
+        let record = self.record(name)?;
+        let place = self.place(name)?;
+        let mesh = read_mesh(place.join("mesh.ply"), Unit::Metre)?;
+        let symmetries = record.symmetry_poses(&mesh)?;
+        Ok(Object { name: name.to_owned(), mesh, symmetries, description: place.join("ppf.bin") })
+    }
+
+    /// Stores a mesh: written beside first, then moved into place as a whole.
+    pub fn add(&self, name: &str, mesh: &Mesh, record: &Record, replace: bool) -> Result<()> {
+        let place = self.place(name)?;
+        if place.exists() && !replace {
+            bail!(
+                "there is an object named {name:?} in {} already: give --replace or another name",
+                self.folder.display()
+            );
+        }
+        std::fs::create_dir_all(self.folder).with_context(|| format!("store {}", self.folder.display()))?;
+        let fresh = self.folder.join(format!(".{name}.{}.new", std::process::id()));
+        let old = self.folder.join(format!(".{name}.{}.old", std::process::id()));
+        let result = (|| -> Result<()> {
+            std::fs::create_dir_all(&fresh)?;
+            write_ply(fresh.join("mesh.ply"), mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)?;
+            std::fs::write(fresh.join("object.json"), serde_json::to_string_pretty(record)?)?;
+            if place.exists() {
+                std::fs::rename(&place, &old)?;
+            }
+            std::fs::rename(&fresh, &place)?;
+            Ok(())
+        })();
+        let _ = std::fs::remove_dir_all(&fresh);
+        let _ = std::fs::remove_dir_all(&old);
+        result.with_context(|| format!("cannot store {}", place.display()))
+    }
+
+    pub fn remove(&self, name: &str) -> Result<()> {
+        self.record(name)?;
+        let place = self.place(name)?;
+        std::fs::remove_dir_all(&place).with_context(|| format!("cannot remove {}", place.display()))
+    }
+}
+
+/// Makes the record of a mesh file.
+pub(crate) fn new_record(source: &Path, unit: Unit, mesh: &Mesh, info: &ModelInfo) -> Record {
+    let array = |v: &sixfold_geometry::Vec3| [v.x, v.y, v.z];
+    Record {
+        version: VERSION,
+        source: source.display().to_string(),
+        source_unit: unit,
+        diameter: mesh.diameter(),
+        vertices: mesh.vertices().len(),
+        faces: mesh.faces().len(),
+        symmetries_discrete: info.symmetries_discrete.iter().map(crate::output::pose_rows).collect(),
+        symmetries_continuous: info
+            .symmetries_continuous
+            .iter()
+            .map(|s| FreeAxis { axis: array(&s.axis), offset: array(&s.offset) })
+            .collect(),
+    }
+}
+
+/// A mesh file (then `unit` is needed) or the name of a stored object.
+pub(crate) fn find(name_or_mesh: &str, unit: Option<Unit>, store: &Path) -> Result<Object> {
+    let store = Store { folder: store };
+    if store.contains(name_or_mesh) {
+        return store.load(name_or_mesh);
+    }
+    let path = Path::new(name_or_mesh);
+    if path.extension().is_none() && !path.exists() {
+        // Reports the names there are.
+        store.record(name_or_mesh)?;
+    }
+    let unit = unit.ok_or_else(|| {
+        anyhow!("{}: a mesh file does not say its unit: give --unit mm (or m, cm, in)", path.display())
+    })?;
+    let mesh = read_mesh(path, unit)?;
+    let name = path.file_stem().map_or_else(|| name_or_mesh.to_owned(), |n| n.to_string_lossy().into_owned());
+    Ok(Object { name, mesh, symmetries: vec![], description: description_beside(path) })
+}
+
+/// `mug.ply` keeps its description in `mug.sixfold-ppf`.
+pub(crate) fn description_beside(mesh: &Path) -> PathBuf {
+    mesh.with_extension("sixfold-ppf")
+}

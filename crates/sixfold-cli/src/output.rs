@@ -1,0 +1,41 @@
+//! What a command prints: a table for people, JSON for scripts.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+use sixfold_geometry::Pose;
+
+use crate::arguments::JsonArguments;
+
+/// A pose as four rows of four numbers, translation in metres.
+pub(crate) fn pose_rows(pose: &Pose) -> [[f64; 4]; 4] {
+    let m = pose.to_matrix();
+    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+}
+
+/// Prints JSON or calls `table`, and writes the JSON file if one was asked for.
+pub(crate) fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).context("cannot write the result as JSON")?;
+    if let Some(path) = json.file() {
+        write_atomically(path, text.as_bytes())?;
+    }
+    if json.on_screen() {
+        println!("{text}");
+    } else {
+        table();
+    }
+    Ok(())
+}
+
+/// Writes a file under another name first, so that no reader sees half of it.
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(parent).with_context(|| format!("folder {}", parent.display()))?;
+    }
+    let mut name = path.as_os_str().to_owned();
+    name.push(format!(".{}.tmp", std::process::id()));
+    std::fs::write(&name, bytes)
+        .and_then(|()| std::fs::rename(&name, path))
+        .with_context(|| format!("cannot write {}", path.display()))
+}
