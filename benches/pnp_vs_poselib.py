@@ -41,19 +41,25 @@ def on_the_object(rng, n):
     return p / np.linalg.norm(p, axis=1, keepdims=True) * [0.05, 0.04, 0.03]
 
 
-def make_case(rng, outliers):
+def in_the_object(rng, n):
+    """Points in a cube of 10 cm (5 cm to each side)."""
+    return rng.uniform(-0.05, 0.05, size=(n, 3))
+
+
+def make_case(rng, outliers, shape):
+    draw = in_the_object if shape == "volume" else on_the_object
     rotation = random_rotation(rng)
     translation = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), rng.uniform(0.6, 1.4)])
     # Only the half that faces the camera is seen.
-    points = on_the_object(rng, 4 * COUNT)
+    points = draw(rng, 4 * COUNT)
     normals = points / np.square([0.05, 0.04, 0.03])
     seen = np.einsum("ij,ij->i", points @ rotation.T + translation, normals @ rotation.T) < 0
-    points = points[seen][:COUNT]
+    points = points[seen if shape == "surface" else slice(None)][:COUNT]
     camera = points @ rotation.T + translation
     pixels = camera[:, :2] / camera[:, 2:] * [FX, FY] + [CX, CY]
     points = points + rng.normal(scale=0.003, size=points.shape)
     wrong = rng.permutation(COUNT)[: int(outliers * COUNT)]
-    points[wrong] = on_the_object(rng, len(wrong))
+    points[wrong] = draw(rng, len(wrong))
     return points, pixels, rotation, translation
 
 
@@ -123,6 +129,7 @@ def main():
     parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--no-opencv", action="store_true")
+    parser.add_argument("--shape", choices=["volume", "surface"], default="volume")
     parser.add_argument("rest", nargs="*")
     arguments = parser.parse_args()
     solvers = {
@@ -139,7 +146,7 @@ def main():
     print("outliers  solver         rotation median   > 10 deg   translation median   mean      median")
     for outliers in (0.3, 0.6, 0.8):
         rng = np.random.default_rng(arguments.seed)
-        cases = [make_case(rng, outliers) for _ in range(arguments.cases)]
+        cases = [make_case(rng, outliers, arguments.shape) for _ in range(arguments.cases)]
         for name, run in solvers.items():
             rotations, translations, times = [], [], []
             for (pose, ms), (_, _, rotation, translation) in zip(run(cases), cases, strict=True):

@@ -1,5 +1,5 @@
 //! Solves the PnP cases of `benches/pnp_vs_poselib.py` and times the solver alone:
-//! `cargo run --release -p sixfold-geometry --example bench_pnp -- CASES [ap3p|epnp] [--option VALUE ...]`.
+//! `cargo run --release -p sixfold-geometry --example bench_pnp -- CASES [ap3p|epnp] [--min N] [--noise-window X] ...`.
 //!
 //! CASES, little-endian: `fx fy cx cy` (f64), number of cases and of correspondences in each (u64), then per case object points
 //! (n x 3 f64, metres) and image points (n x 2 f64, pixels). Prints a line per case: milliseconds (median of three), samples,
@@ -17,6 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         match pair[0].as_str() {
             "--threshold" => options.threshold_px = pair[1].parse()?,
             "--min" => options.min_iterations = pair[1].parse()?,
+            "--noise-window" => options.noise_window = pair[1].parse()?,
             "--local" => options.local_iterations = pair[1].parse()?,
             "--confidence" => options.confidence = pair[1].parse()?,
             _ => {}

@@ -82,7 +82,7 @@ pub fn refine_pose(
 pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -> RefineReport {
     let limit = options.threshold_px * options.threshold_px;
     let mut pose = *initial;
-    let mut equations = linearise(data, &pose, limit);
+    let mut equations = linearise(data, &pose, limit, |_| 1.0);
     let mut lambda = 1e-4;
     let mut iterations = 0;
     while iterations < options.max_iterations && equations.count >= 6 {
@@ -92,7 +92,7 @@ pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -
             if lambda > 1e6 { break } else { continue }
         };
         let next = pose * Pose::exp(&step);
-        let next_equations = linearise(data, &next, limit);
+        let next_equations = linearise(data, &next, limit, |_| 1.0);
         if next_equations.cost < equations.cost {
             let gain = equations.cost - next_equations.cost;
             let small = gain <= options.convergence * equations.cost;
@@ -117,9 +117,57 @@ pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -
     }
 }
 
+/// The most likely pose when errors are normal in both pixel directions for inliers and evenly spread for outliers: the
+/// spread and the outliers' density are estimated from the errors below `window_px`, in turn with the pose
+/// (expectation maximisation, Dempster, Laird and Rubin 1977). Takes the hard edge off the threshold: a point's weight
+/// is the probability that it is an inlier.
+pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64, iterations: usize) -> Pose {
+    let window = window_px * window_px;
+    let mut pose = *initial;
+    // Until the errors say otherwise: a spread of a quarter of the window, half of its points outliers.
+    let (mut variance, mut share) = (window / 16.0, 0.5);
+    let mut squares = Vec::with_capacity(data.points.len());
+    for _ in 0..iterations {
+        squares.clear();
+        linearise(data, &pose, window, |square| {
+            squares.push(square);
+            0.0
+        });
+        let probability = |square: f64, variance: f64, share: f64| {
+            let inlier = share / (2.0 * variance) * (-0.5 * square / variance).exp();
+            inlier / (inlier + (1.0 - share) / window)
+        };
+        for _ in 0..3 {
+            let (mut weights, mut sum) = (0.0, 0.0);
+            for &square in &squares {
+                let w = probability(square, variance, share);
+                weights += w;
+                sum += w * square;
+            }
+            if !(weights > 6.0) {
+                return *initial;
+            }
+            variance = (0.5 * sum / weights).max(1e-12 * window);
+            share = (weights / squares.len() as f64).clamp(0.01, 0.999);
+        }
+        let equations = linearise(data, &pose, window, |square| probability(square, variance, share));
+        let Some(step) = equations.solve(1e-9) else { return *initial };
+        pose = pose * Pose::exp(&step);
+        if step.amax() < 1e-7 {
+            break;
+        }
+    }
+    pose
+}
+
 /// The normal equations of the correspondences within the threshold; their cost counts all. The twist moves the object
 /// in its own frame, about its centroid, where rotation and translation are least coupled.
-fn linearise(data: &Prepared, pose: &Pose, limit: f64) -> NormalEquations {
+fn linearise(
+    data: &Prepared,
+    pose: &Pose,
+    limit: f64,
+    mut weight: impl FnMut(f64) -> f64,
+) -> NormalEquations {
     let r: Mat3 = pose.rotation_matrix();
     let t = pose.translation();
     let (fx, fy) = (data.camera.fx, data.camera.fy);
@@ -130,10 +178,12 @@ fn linearise(data: &Prepared, pose: &Pose, limit: f64) -> NormalEquations {
         let inverse = 1.0 / p.z;
         let (a, b) = (p.x * inverse, p.y * inverse);
         let (ru, rv) = (fx * (a - m.x), fy * (b - m.y));
-        if !(p.z > 0.0 && ru * ru + rv * rv < limit) {
+        let square = ru * ru + rv * rv;
+        if !(p.z > 0.0 && square < limit) {
             outside += 1;
             continue;
         }
+        let weight = weight(square);
         let (su, sv) = (fx * inverse, fy * inverse);
         // Rows of d(pixel)/d(point), turned into the object's frame.
         let gu = Vec3::new(
@@ -147,8 +197,8 @@ fn linearise(data: &Prepared, pose: &Pose, limit: f64) -> NormalEquations {
             sv * (r[(1, 2)] - b * r[(2, 2)]),
         );
         let (wu, wv) = (x.cross(&gu), x.cross(&gv));
-        sum.add(&[gu.x, gu.y, gu.z, wu.x, wu.y, wu.z], ru, 1.0);
-        sum.add(&[gv.x, gv.y, gv.z, wv.x, wv.y, wv.z], rv, 1.0);
+        sum.add(&[gu.x, gu.y, gu.z, wu.x, wu.y, wu.z], ru, weight);
+        sum.add(&[gv.x, gv.y, gv.z, wv.x, wv.y, wv.z], rv, weight);
     }
     sum.cost += outside as f64 * limit;
     sum
