@@ -13,7 +13,7 @@ mod shade;
 mod table;
 
 pub use outputs::{BoundingBoxScale, Surface};
-pub use raster::{Culling, Frame, RenderOptions, SceneObject, render_depth};
+pub use raster::{Canvas, Culling, Frame, RenderOptions, SceneObject, render_depth};
 pub use sensor::{DepthSensor, simulate_depth};
 pub use shade::{Light, Material, shade};
 pub use table::{plane_mesh, support_plane};

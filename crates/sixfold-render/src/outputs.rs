@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use sixfold_geometry::{Image, NormalImage, PointImage, Vec2, Vec3};
 
-use crate::raster::{Frame, SceneObject, face_in_camera};
+use crate::raster::{Canvas, Frame, SceneObject, face_in_camera};
 
 /// What one pixel sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,7 +96,13 @@ impl Frame {
 
     /// The point seen in its object's own frame, metres; NaN where nothing is seen.
     pub fn object_coordinates(&self, objects: &[SceneObject<'_>]) -> PointImage {
-        let mut out = Image::filled(self.width(), self.height(), [f32::NAN; 3]);
+        let mut out = Canvas::new(self.width(), self.height(), [f32::NAN; 3]);
+        self.object_coordinates_into(objects, &mut out);
+        out.into_image()
+    }
+
+    /// As [`Frame::object_coordinates`], into an image that is used again and again; make it with NaN as its empty pixel.
+    pub fn object_coordinates_into(&self, objects: &[SceneObject<'_>], out: &mut Canvas<[f32; 3]>) {
         // object = R^T (z K^-1 (x, y, 1) - t): linear in the pixel, so no barycentrics are needed.
         let maps: Vec<_> = objects
             .iter()
@@ -112,22 +118,23 @@ impl Frame {
         let width = self.width();
         let [x0, y0, x1, y1] = self.covered();
         let single = maps.len() == 1;
-        let data = out.as_mut_slice();
+        let data = out.begin(width, self.height(), [x0, y0, x1, y1]);
         for y in y0..y1 {
-            for x in x0..x1 {
-                let index = y * width + x;
-                let inverse = self.inverse_depth()[index];
+            let row = y * width..(y + 1) * width;
+            let inverses = &self.inverse_depth()[row.clone()][x0..x1];
+            for (i, (out, &inverse)) in data[row][x0..x1].iter_mut().zip(inverses).enumerate() {
                 if inverse <= 0.0 {
+                    *out = [f32::NAN; 3];
                     continue;
                 }
-                let object = if single { 0 } else { self.surface_at(index).map_or(0, |s| s.0) };
+                let x = x0 + i;
+                let object = if single { 0 } else { self.surface_at(y * width + x).map_or(0, |s| s.0) };
                 let (kx, ky, k0, t) = &maps[object];
                 let z = 1.0 / f64::from(inverse);
-                let p = (kx * x as f64 + ky * y as f64 + k0) * z - t;
-                data[index] = [p.x as f32, p.y as f32, p.z as f32];
+                let p = (kx * x as f64 + (ky * y as f64 + k0)) * z - t;
+                *out = [p.x as f32, p.y as f32, p.z as f32];
             }
         }
-        out
     }
 
     /// As [`Frame::object_coordinates`], normalised to -1..1 by one box per object; NaN where nothing is seen.

@@ -14,6 +14,8 @@ const SUBPIXEL: f64 = (1u32 << SUBPIXEL_BITS) as f64;
 const GUARD: f64 = (1u32 << 16) as f64;
 /// Marks a pixel without a triangle.
 const NOTHING: u32 = u32::MAX;
+/// Triangles of at most this many pixels in width and height are filled without branches; their edge functions fit 32 bits.
+const SMALL: u32 = 24;
 /// Rows per parallel band.
 const BAND: usize = 16;
 
@@ -77,6 +79,8 @@ pub struct Frame {
 struct Corner {
     /// In the camera frame.
     point: [f64; 3],
+    /// 1/z.
+    inverse: f64,
     /// Rounded to the sub-pixel grid; meaningless when `clip`.
     x: i32,
     y: i32,
@@ -103,29 +107,73 @@ struct Plane {
 }
 
 impl Plane {
-    fn through(camera: &Camera, p: [&[f64; 3]; 3], near: f64) -> Plane {
+    /// The plane through three points in the camera frame whose 1/z lie between `low` and `high`.
+    fn through(camera: &Camera, focal_inverse: [f64; 2], p: [&[f64; 3]; 3], low: f64, high: f64) -> Plane {
         let e1 = sub(p[1], p[0]);
         let e2 = sub(p[2], p[0]);
         let n = [e1[1] * e2[2] - e1[2] * e2[1], e1[2] * e2[0] - e1[0] * e2[2], e1[0] * e2[1] - e1[1] * e2[0]];
         let d = n[0] * p[0][0] + n[1] * p[0][1] + n[2] * p[0][2];
-        let z = p.map(|q| q[2].max(near));
-        let far = z[0].max(z[1]).max(z[2]);
-        let close = z[0].min(z[1]).min(z[2]);
-        let (low, high) = ((1.0 / far) as f32, (1.0 / close) as f32);
         // Seen exactly edge-on: no pixel's ray meets the plane in one point, take the middle.
         let scale = 1.0 / d;
         if !scale.is_finite() {
-            return Plane { a: 0.0, b: 0.0, c: 0.5 * f64::from(low + high), low, high };
+            return Plane { a: 0.0, b: 0.0, c: 0.5 * (low + high), low: low as f32, high: high as f32 };
         }
-        let a = n[0] * scale / camera.fx;
-        let b = n[1] * scale / camera.fy;
+        let a = n[0] * scale * focal_inverse[0];
+        let b = n[1] * scale * focal_inverse[1];
         let c = n[2] * scale - a * camera.cx - b * camera.cy;
-        Plane { a, b, c, low, high }
+        Plane { a, b, c, low: low as f32, high: high as f32 }
     }
 }
 
 fn sub(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+/// An image that is drawn into again and again: only what the last drawing covered is cleared, and its memory stays,
+/// which for a small object in a large image is most of the cost.
+#[derive(Debug, Clone)]
+pub struct Canvas<T> {
+    image: Image<T>,
+    empty: T,
+    /// Columns and rows that may differ from `empty`, half open.
+    drawn: [usize; 4],
+}
+
+impl<T: Copy> Canvas<T> {
+    /// An image in which every pixel is `empty`. [`Frame::depth_into`] and its like change its size to theirs.
+    pub fn new(width: usize, height: usize, empty: T) -> Canvas<T> {
+        Canvas { image: Image::filled(width, height, empty), empty, drawn: [0; 4] }
+    }
+
+    /// What was drawn last.
+    pub fn image(&self) -> &Image<T> {
+        &self.image
+    }
+
+    /// What was drawn last, as the caller's own.
+    pub fn into_image(self) -> Image<T> {
+        self.image
+    }
+
+    /// Gives the image its size and clears what the last drawing covered and the next does not; the caller writes every pixel
+    /// of `next` (`[x0, y0, x1, y1]`).
+    pub(crate) fn begin(&mut self, width: usize, height: usize, next: [usize; 4]) -> &mut [T] {
+        if self.image.size() != (width, height) {
+            *self = Canvas::new(width, height, self.empty);
+        }
+        let [x0, y0, x1, y1] = self.drawn;
+        for y in y0..y1 {
+            let row = &mut self.image.as_mut_slice()[y * width..(y + 1) * width];
+            if y < next[1] || y >= next[3] {
+                row[x0..x1].fill(self.empty);
+            } else {
+                row[x0..x1.min(next[0]).max(x0)].fill(self.empty);
+                row[x0.max(next[2]).min(x1)..x1].fill(self.empty);
+            }
+        }
+        self.drawn = next;
+        self.image.as_mut_slice()
+    }
 }
 
 impl Frame {
@@ -206,9 +254,9 @@ impl Frame {
             let clip = !(point[2] >= near && x.abs() < GUARD && y.abs() < GUARD);
             any_clip |= clip;
             if clip {
-                Corner { point, x: 0, y: 0, clip }
+                Corner { point, inverse, x: 0, y: 0, clip }
             } else {
-                Corner { point, x: to_grid(x), y: to_grid(y), clip }
+                Corner { point, inverse, x: to_grid(x), y: to_grid(y), clip }
             }
         }));
         let mut extra = std::mem::take(&mut self.extra);
@@ -223,11 +271,11 @@ impl Frame {
         }
         let work = Work {
             camera: &camera,
+            focal_inverse: [1.0 / camera.fx, 1.0 / camera.fy],
             corners: &corners,
             faces: object.mesh.faces(),
             first,
             extra: &extra,
-            near,
             culling: options.culling,
         };
         let width = self.width;
@@ -286,14 +334,22 @@ impl Frame {
 
     /// Depth in metres, 0 where nothing was drawn.
     pub fn depth(&self) -> DepthImage {
-        let mut depth = Image::filled(self.width, self.height, 0.0);
-        self.for_covered(|index| {
-            let inverse = self.inverse_depth[index];
-            if inverse > 0.0 {
-                depth.as_mut_slice()[index] = 1.0 / inverse;
+        let mut depth = Canvas::new(self.width, self.height, 0.0);
+        self.depth_into(&mut depth);
+        depth.into_image()
+    }
+
+    /// As [`Frame::depth`], into an image that is used again and again.
+    pub fn depth_into(&self, depth: &mut Canvas<f32>) {
+        let [x0, y0, x1, y1] = self.covered();
+        let pixels = depth.begin(self.width, self.height, [x0, y0, x1, y1]);
+        for y in y0..y1 {
+            let row = y * self.width;
+            let out = &mut pixels[row + x0..row + x1];
+            for (z, &inverse) in out.iter_mut().zip(&self.inverse_depth[row + x0..row + x1]) {
+                *z = if inverse > 0.0 { 1.0 / inverse } else { 0.0 };
             }
-        });
-        depth
+        }
     }
 
     /// Where object number `object` is seen.
@@ -349,17 +405,19 @@ fn union(a: [usize; 4], b: [usize; 4]) -> [usize; 4] {
 }
 
 fn to_grid(v: f64) -> i32 {
-    (v * SUBPIXEL).round() as i32
+    // Adding 1.5 * 2^52 leaves the rounded number in the low bits; `v` is within the guard band.
+    (v * SUBPIXEL + 6_755_399_441_055_744.0).to_bits() as i32
 }
 
 /// What a band of rows is drawn from.
 struct Work<'a> {
     camera: &'a Camera,
+    /// 1/fx, 1/fy.
+    focal_inverse: [f64; 2],
     corners: &'a [Corner],
     faces: &'a [[u32; 3]],
     first: u32,
     extra: &'a [ClippedTriangle],
-    near: f64,
     culling: Culling,
 }
 
@@ -388,7 +446,9 @@ impl Work<'_> {
             }
             let grid = [(a.x, a.y), (b.x, b.y), (c.x, c.y)];
             target.triangle(grid, self.first + face as u32, self.culling, || {
-                Plane::through(self.camera, [&a.point, &b.point, &c.point], self.near)
+                let low = a.inverse.min(b.inverse).min(c.inverse);
+                let high = a.inverse.max(b.inverse).max(c.inverse);
+                Plane::through(self.camera, self.focal_inverse, [&a.point, &b.point, &c.point], low, high)
             });
         }
         for piece in self.extra {
@@ -442,7 +502,8 @@ impl Band<'_> {
             return;
         }
         // Edge functions at the first pixel, biased so that an edge's own points belong to the
-        // triangle only if it is a top or a left edge; each must be >= 0 inside.
+        // triangle only if it is a top or a left edge; each must be >= 0 inside. From pixel to pixel they change by
+        // multiples of the grid, so their sign is that of their whole part, and only that is stepped.
         let start = (first_x << SUBPIXEL_BITS, first_y << SUBPIXEL_BITS);
         let mut row = [0i64; 3];
         let mut step_x = [0i64; 3];
@@ -451,42 +512,120 @@ impl Band<'_> {
             let (a, b) = (p[(i + 1) % 3], p[(i + 2) % 3]);
             let (dx, dy) = (i64::from(b.0) - i64::from(a.0), i64::from(b.1) - i64::from(a.1));
             let top_left = (dy == 0 && dx > 0) || dy < 0;
-            row[i] = edge(a, b, start) - i64::from(!top_left);
-            step_x[i] = -dy << SUBPIXEL_BITS;
-            step_y[i] = dx << SUBPIXEL_BITS;
+            row[i] = (edge(a, b, start) - i64::from(!top_left)) >> SUBPIXEL_BITS;
+            step_x[i] = -dy;
+            step_y[i] = dx;
         }
         let plane = plane();
-        for y in first_y..=last_y {
-            let offset = (y - self.y0) as usize * self.width;
-            let pixels = offset + first_x as usize..offset + last_x as usize + 1;
-            let base = plane.b * f64::from(y) + plane.c;
-            let mut e = row;
-            let mut inside = false;
-            let depths = &mut self.inverse_depth[pixels.clone()];
-            let numbers = &mut self.triangle[pixels];
-            for (x, (depth, pixel)) in (first_x..).zip(depths.iter_mut().zip(numbers)) {
-                if (e[0] | e[1] | e[2]) >= 0 {
-                    inside = true;
-                    let inverse = ((plane.a * f64::from(x) + base) as f32).max(plane.low).min(plane.high);
-                    if inverse > *depth {
-                        *depth = inverse;
-                        *pixel = number;
-                    }
-                } else if inside {
-                    break;
-                }
-                e[0] += step_x[0];
-                e[1] += step_x[1];
-                e[2] += step_x[2];
-            }
-            row[0] += step_y[0];
-            row[1] += step_y[1];
-            row[2] += step_y[2];
+        let rows = Rows { first_x, first_y, last_x, last_y, number, plane };
+        let small = max_x.abs_diff(min_x).max(max_y.abs_diff(min_y)) <= SMALL << SUBPIXEL_BITS;
+        if small && first_x as usize + 4 * rows.fours() <= self.width {
+            let narrow = |v: [i64; 3]| v.map(|v| v as i32);
+            self.fill_small(&rows, narrow(row), narrow(step_x), narrow(step_y));
+        } else {
+            self.fill_large(&rows, row, step_x, step_y);
         }
         self.covered = union(
             self.covered,
             [first_x as usize, first_y as usize, last_x as usize + 1, last_y as usize + 1],
         );
+    }
+
+    /// Four pixels at a time, without a branch for each: in a triangle of a few pixels nobody can foresee which are
+    /// inside. The last four may reach over the box, where the edge functions know that nothing is inside.
+    #[inline]
+    fn fill_small(&mut self, rows: &Rows, mut row: [i32; 3], step_x: [i32; 3], step_y: [i32; 3]) {
+        let (low, high, a) = (rows.plane.low, rows.plane.high, rows.plane.a as f32);
+        let count = rows.fours() * 4;
+        for y in rows.first_y..=rows.last_y {
+            let (start, base) = rows.row(y, self.y0, self.width);
+            let depths = self.inverse_depth[start..start + count].as_chunks_mut::<4>().0;
+            let numbers = self.triangle[start..start + count].as_chunks_mut::<4>().0;
+            let mut e: [[i32; 4]; 3] =
+                std::array::from_fn(|k| std::array::from_fn(|l| row[k] + l as i32 * step_x[k]));
+            let mut x = [0.0f32, 1.0, 2.0, 3.0];
+            for (depths, numbers) in depths.iter_mut().zip(numbers) {
+                let sign: [i32; 4] = std::array::from_fn(|l| e[0][l] | e[1][l] | e[2][l]);
+                if sign[0] & sign[1] & sign[2] & sign[3] >= 0 {
+                    // Whole arrays in, whole arrays out: this is what the compiler turns into vector code.
+                    let (old, old_number) = (*depths, *numbers);
+                    let inverse: [f32; 4] = std::array::from_fn(|l| a * x[l] + base);
+                    let inverse = inverse.map(|v| if v > low { v } else { low });
+                    let inverse = inverse.map(|v| if v < high { v } else { high });
+                    let seen: [u32; 4] = std::array::from_fn(|l| {
+                        (((sign[l] >= 0) & (inverse[l] > old[l])) as u32).wrapping_neg()
+                    });
+                    *depths = std::array::from_fn(|l| {
+                        f32::from_bits((inverse[l].to_bits() & seen[l]) | (old[l].to_bits() & !seen[l]))
+                    });
+                    *numbers = std::array::from_fn(|l| (rows.number & seen[l]) | (old_number[l] & !seen[l]));
+                }
+                for l in 0..4 {
+                    x[l] += 4.0;
+                    for k in 0..3 {
+                        e[k][l] += 4 * step_x[k];
+                    }
+                }
+            }
+            for k in 0..3 {
+                row[k] += step_y[k];
+            }
+        }
+    }
+
+    fn fill_large(&mut self, rows: &Rows, mut row: [i64; 3], step_x: [i64; 3], step_y: [i64; 3]) {
+        let (low, high, a) = (rows.plane.low, rows.plane.high, rows.plane.a as f32);
+        for y in rows.first_y..=rows.last_y {
+            let (start, base) = rows.row(y, self.y0, self.width);
+            let pixels = start..start + (rows.last_x - rows.first_x) as usize + 1;
+            let mut e = row;
+            let mut inside = false;
+            let depths = &mut self.inverse_depth[pixels.clone()];
+            let numbers = &mut self.triangle[pixels];
+            for (x, (depth, pixel)) in depths.iter_mut().zip(numbers).enumerate() {
+                if (e[0] | e[1] | e[2]) >= 0 {
+                    inside = true;
+                    let inverse = (a * x as f32 + base).max(low).min(high);
+                    if inverse > *depth {
+                        *depth = inverse;
+                        *pixel = rows.number;
+                    }
+                } else if inside {
+                    break;
+                }
+                for k in 0..3 {
+                    e[k] += step_x[k];
+                }
+            }
+            for k in 0..3 {
+                row[k] += step_y[k];
+            }
+        }
+    }
+}
+
+/// The box of a triangle in pixels, both ends within, and what is written.
+struct Rows {
+    first_x: i32,
+    first_y: i32,
+    last_x: i32,
+    last_y: i32,
+    number: u32,
+    plane: Plane,
+}
+
+impl Rows {
+    /// Where row `y` starts in a band that starts at `y0`, and 1/z there.
+    #[inline]
+    fn row(&self, y: i32, y0: i32, width: usize) -> (usize, f32) {
+        let base = self.plane.a * f64::from(self.first_x) + self.plane.b * f64::from(y) + self.plane.c;
+        ((y - y0) as usize * width + self.first_x as usize, base as f32)
+    }
+
+    /// Groups of four pixels in a row.
+    #[inline]
+    fn fours(&self) -> usize {
+        ((self.last_x - self.first_x) as usize >> 2) + 1
     }
 }
 
@@ -527,13 +666,11 @@ fn clip_triangle(camera: &Camera, near: f64, c: [&Corner; 3], number: u32, out: 
             return;
         }
     }
-    let plane = {
-        let full = Plane::through(camera, [&c[0].point, &c[1].point, &c[2].point], near);
-        let depths = polygon.iter().map(|p| p[2].max(near));
-        let far = depths.clone().fold(0.0, f64::max);
-        let close = depths.fold(f64::INFINITY, f64::min);
-        Plane { low: (1.0 / far) as f32, high: (1.0 / close) as f32, ..full }
-    };
+    let inverses = polygon.iter().map(|p| 1.0 / p[2].max(near));
+    let low = inverses.clone().fold(f64::INFINITY, f64::min);
+    let high = inverses.fold(0.0, f64::max);
+    let focal_inverse = [1.0 / camera.fx, 1.0 / camera.fy];
+    let plane = Plane::through(camera, focal_inverse, [&c[0].point, &c[1].point, &c[2].point], low, high);
     let grid: Vec<(i32, i32)> = polygon
         .iter()
         .map(|p| {
