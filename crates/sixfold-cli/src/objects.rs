@@ -146,7 +146,7 @@ impl Store<'_> {
     pub fn load(&self, name: &str) -> Result<Object> {
         let record = self.record(name)?;
         let place = self.place(name)?;
-        let mesh = read_mesh(place.join("mesh.ply"), Unit::Metre)?;
+        let mesh = with_surface(name, read_mesh(place.join("mesh.ply"), Unit::Metre)?)?;
         let symmetries = record.symmetry_poses(&mesh)?;
         Ok(Object { name: name.to_owned(), mesh, symmetries, description: place.join("ppf.bin") })
     }
@@ -218,9 +218,18 @@ pub(crate) fn find(name_or_mesh: &str, unit: Option<Unit>, store: &Path) -> Resu
     let unit = unit.ok_or_else(|| {
         anyhow!("{}: a mesh file does not say its unit: give --unit mm (or m, cm, in)", path.display())
     })?;
-    let mesh = read_mesh(path, unit)?;
+    let mesh = with_surface(name_or_mesh, read_mesh(path, unit)?)?;
     let name = path.file_stem().map_or_else(|| name_or_mesh.to_owned(), |n| n.to_string_lossy().into_owned());
     Ok(Object { name, mesh, symmetries: vec![], description: description_beside(path) })
+}
+
+/// A model that is only points gets a surface of disks.
+fn with_surface(name: &str, mesh: Mesh) -> Result<Mesh> {
+    if !mesh.faces().is_empty() {
+        return Ok(mesh);
+    }
+    eprintln!("note: {name} has points and no faces; a surface of small disks is laid through them");
+    mesh.surfels().with_context(|| format!("{name}: no surface can be laid through its points"))
 }
 
 /// `mug.ply` keeps its description in `mug.sixfold-ppf`.

@@ -30,7 +30,7 @@ pub enum MeshFileError {
     },
     /// The file's name has no ending that is known.
     #[error(
-        "{file}: unknown mesh format \"{found}\", expected a file ending in .ply, .obj, .stl, .gltf or .glb"
+        "{file}: unknown mesh format \"{found}\", expected a file ending in .ply, .obj, .stl, .gltf, .glb or .xyz"
     )]
     Format {
         /// The file.

@@ -27,7 +27,7 @@ pub fn no_resources(_name: &str) -> io::Result<Vec<u8>> {
 
 /// Reads a mesh and tests its size: [`read_mesh_unchecked`], then [`check_size`].
 ///
-/// The format follows from the ending (`.ply .obj .stl .gltf .glb`, upper or lower case). The vertices come
+/// The format follows from the ending (`.ply .obj .stl .gltf .glb .xyz`, upper or lower case). The vertices come
 /// out in metres: the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, and
 /// `unit` multiplies all the same: give [`Unit::Metre`] for a file that keeps to it.
 ///
@@ -54,6 +54,7 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
         "obj" => crate::parse_obj,
         "stl" => crate::parse_stl,
         "gltf" | "glb" => crate::parse_gltf,
+        "xyz" => crate::parse_xyz,
         _ => return Err(MeshFileError::Format { file, found: ending }),
     };
     let bytes = fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;

@@ -26,7 +26,9 @@ mod ply_write;
 mod sample;
 mod simplify;
 mod stl;
+mod surfels;
 mod unit;
+mod xyz;
 
 pub use error::MeshFileError;
 pub use file::{
@@ -42,3 +44,4 @@ pub use sample::SurfaceSamples;
 pub use simplify::simplify;
 pub use stl::parse_stl;
 pub use unit::{Unit, UnitError};
+pub use xyz::parse_xyz;

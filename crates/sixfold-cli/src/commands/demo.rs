@@ -98,7 +98,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     let model = object.ppf_model()?;
                     place.insert((object, model, points));
                 }
-                let Some((object, model, points)) = known.get(&o.obj_id) else { continue };
+                let Some((_, model, points)) = known.get(&o.obj_id) else { continue };
                 let estimates = estimate(&prepared, model, &EstimateOptions::default());
                 let seconds = began.elapsed().as_secs_f64();
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
@@ -114,7 +114,9 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     found.push((o.obj_id, e));
                     if let Some(truth) = truth {
                         let estimated = sixfold_bop::Placement::from(e.camera_from_object);
-                        let error = if object.symmetries.is_empty() {
+                        let symmetric =
+                            infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).is_some_and(|i| i.is_symmetric());
+                        let error = if !symmetric {
                             sixfold_bop::add(points, &estimated, &truth.placement())
                         } else {
                             sixfold_bop::adi(points, &estimated, &truth.placement())

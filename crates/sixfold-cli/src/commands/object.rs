@@ -44,9 +44,7 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
             store.add(name, &loaded, &record, *replace)?;
             // What methods learn about it is learnt now, not at the first estimate.
             let object = store.load(name)?;
-            if !object.mesh.faces().is_empty() {
-                object.ppf_model()?;
-            }
+            object.ppf_model()?;
             let listed = Listed { name: name.clone(), record };
             report(&a.json, &listed, || {
                 println!(
