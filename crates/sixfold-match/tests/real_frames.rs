@@ -144,34 +144,38 @@ fn the_object_of_the_tyol_frame() {
 }
 
 #[test]
-fn four_cups_in_each_bin() {
+fn four_cups_in_each_bin_that_holds_cups() {
     let Some(data) = data() else { return };
     let camera = Camera::new(550.0, 540.0, 316.0, 244.0, 640, 480).unwrap();
     let folder = data.join("icbin_frames");
-    let unit = Unit::Millimetre;
-    let mesh = read_mesh(folder.join("2/model.ply"), unit).unwrap();
+    let mesh = read_mesh(folder.join("2/model.ply"), Unit::Millimetre).unwrap();
+    // There is no ground truth. The overlays of bins 2 and 3 were looked at: their best eight poses all lie on cups.
+    // Bin 1 holds juice cartons and no cup; agreement in depth alone would accept some there, so the confidence counts.
+    const SURE: f64 = 0.4;
     for bin in 1..=3 {
         for frame in 0..3 {
             let depth = read_depth(&folder.join(format!("{bin}/depth/{frame:04}.png")), 1e-3).unwrap();
             let scene = Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap();
             let (found, _) = find(&scene, &mesh, 8, &[]);
-            let good: Vec<_> =
-                found.iter().filter(|e| e.score.depth > 0.6 && e.score.visible_share() > 0.3).collect();
-            println!(
-                "bin {bin}, frame {frame}: {} cups, {} with good depth; {:?}",
-                found.len(),
-                good.len(),
-                found
-                    .iter()
-                    .map(|e| format!(
-                        "{:.2}/{:.2}/{:.2}",
+            let sure: Vec<_> = found.iter().filter(|e| e.confidence > SURE).collect();
+            let each: Vec<_> = found
+                .iter()
+                .map(|e| {
+                    format!(
+                        "{:.2} (S_D {:.2}, seen {:.2})",
                         e.confidence,
                         e.score.depth,
                         e.score.visible_share()
-                    ))
-                    .collect::<Vec<_>>()
-            );
-            assert!(good.len() >= 4, "bin {bin}, frame {frame}: {}", good.len());
+                    )
+                })
+                .collect();
+            println!("bin {bin}, frame {frame}: {} sure: {}", sure.len(), each.join(", "));
+            if bin == 1 {
+                assert!(sure.len() <= 1, "bin 1, frame {frame}: {} false cups", sure.len());
+            } else {
+                assert!(sure.len() >= 4, "bin {bin}, frame {frame}: {}", sure.len());
+                assert!(sure.iter().all(|e| e.score.depth > 0.7), "bin {bin}, frame {frame}");
+            }
         }
     }
 }
