@@ -61,7 +61,7 @@ pub(crate) enum Command {
 #[derive(Debug, Args, Clone)]
 pub(crate) struct JsonArguments {
     /// Print the result as JSON, or write it to FILE and keep the table
-    #[arg(long, value_name = "FILE", num_args = 0..=1)]
+    #[arg(long, global = true, value_name = "FILE", num_args = 0..=1)]
     json: Option<Option<PathBuf>>,
 }
 
@@ -126,7 +126,7 @@ pub(crate) struct EstimateArguments {
         long = "box",
         value_name = "X,Y,W,H",
         value_delimiter = ',',
-        num_args = 4,
+        allow_hyphen_values = true,
         conflicts_with = "dataset"
     )]
     pub region: Option<Vec<f64>>,
@@ -213,7 +213,7 @@ pub(crate) struct RenderArguments {
     pub camera: Option<PathBuf>,
     /// Pose camera_from_object: tx,ty,tz,rx,ry,rz (metres, rotation vector in radians) or 16 numbers of a 4x4 matrix
     /// row by row (default: fills the picture, seen from above)
-    #[arg(long, value_name = "NUMBERS", value_delimiter = ',', allow_hyphen_values = true, num_args = 1..)]
+    #[arg(long, value_name = "NUMBERS", value_delimiter = ',', allow_hyphen_values = true)]
     pub pose: Option<Vec<f64>>,
     /// Folder for the pictures
     #[arg(long, value_name = "DIR", default_value = "out/render")]
@@ -277,6 +277,7 @@ pub(crate) struct ObjectArguments {
 #[derive(Debug, Subcommand)]
 pub(crate) enum ObjectCommand {
     /// Store a mesh under a name
+    #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm --turns-about z")]
     Add {
         /// Name: letters, digits, - and _
         name: String,
@@ -299,8 +300,10 @@ pub(crate) enum ObjectCommand {
         replace: bool,
     },
     /// List the stored objects
+    #[command(after_help = "Example:\n  sixfold object list")]
     List,
     /// Show one object, and draw it
+    #[command(after_help = "Example:\n  sixfold object show mug --picture mug.png")]
     Show {
         /// Its name
         name: String,
@@ -309,6 +312,7 @@ pub(crate) enum ObjectCommand {
         picture: Option<PathBuf>,
     },
     /// Remove one object
+    #[command(after_help = "Example:\n  sixfold object remove mug")]
     Remove {
         /// Its name
         name: String,

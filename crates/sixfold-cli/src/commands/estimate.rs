@@ -180,7 +180,9 @@ fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
         camera.check_image(m.width(), m.height()).with_context(|| path.display().to_string())?;
     }
     if let Some(r) = &a.region {
-        let [x, y, width, height] = r[..] else { bail!("--box: expected four numbers") };
+        let [x, y, width, height] = r[..] else {
+            bail!("--box: found {} numbers, expected x, y, width, height", r.len())
+        };
         if !(width > 0.0 && height > 0.0 && x.is_finite() && y.is_finite()) {
             bail!("--box: found {r:?}, expected x, y, width, height with a size above 0");
         }
@@ -198,7 +200,12 @@ fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
     if let Some(m) = &mask
         && !m.as_slice().contains(&true)
     {
-        bail!("the mask is empty: no pixel is left in which the object could be");
+        let from: Vec<String> = a.mask.iter().map(|p| p.display().to_string()).collect();
+        let from = from.into_iter().chain(a.region.iter().map(|_| "--box".to_owned()));
+        bail!(
+            "{}: the mask is empty: no pixel is left in which the object could be",
+            from.collect::<Vec<_>>().join(" and ")
+        );
     }
     Ok(mask)
 }

@@ -7,8 +7,8 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow, bail};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{
-    BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target, ground_truth_visibility,
-    read_detections, write_rgb,
+    Adjustment, BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target,
+    ground_truth_visibility, read_detections, write_rgb,
 };
 use sixfold_geometry::Rect;
 use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
@@ -68,6 +68,7 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     }
     let dataset = BopDataset::open(root, &a.split)?;
     let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
+    let mut skipped: Vec<String> = vec![];
     let boxes = match a.boxes.as_deref() {
         None => Boxes::Anywhere,
         Some("gt") => Boxes::GroundTruth,
@@ -79,8 +80,11 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
                 Path::new(file),
                 &ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() },
             )?;
-            for note in &read.adjusted {
-                eprintln!("note: {file}: {}", note.message);
+            for changed in read.adjusted {
+                match changed.adjustment {
+                    Adjustment::Clipped => eprintln!("note: {}", changed.message),
+                    _ => skipped.push(changed.message),
+                }
             }
             Boxes::Detections(read.detections)
         }
@@ -129,12 +133,20 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     if let Some(torn) = results.torn() {
         eprintln!("note: {}: the last line was cut off and is dropped: {torn}", out.display());
     }
+    // Rows are written image by image: only the last image can be there in part, and is done again unless it is known to be whole.
+    if let Some(last) = results.existing().last()
+        && !record.done.contains(&format!("{}/{}", last.scene_id, last.im_id))
+    {
+        let image = (last.scene_id, last.im_id);
+        drop(results);
+        drop_last_image(out, image)?;
+        results = ResultsAppender::open(out)?;
+    }
     for e in results.existing() {
         record.done.insert(format!("{}/{}", e.scene_id, e.im_id));
     }
     let infos = dataset.models_info(Models::Rendering)?;
     let mut known: BTreeMap<u32, Known> = BTreeMap::new();
-    let mut skipped: Vec<String> = vec![];
     let mut poses = results.existing().len();
     let mut seconds = vec![];
     let mut progress = Progress::new("images", images.len());
@@ -234,6 +246,20 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     } else {
         Outcome::NothingFound
     })
+}
+
+/// Cuts the rows of this image off the end of a result file.
+fn drop_last_image(path: &Path, (scene_id, im_id): (u32, u32)) -> Result<()> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let of_image = |line: &&str| {
+        let mut columns = line.split(',').map(|c| c.trim().parse::<u32>().ok());
+        columns.next().flatten() == Some(scene_id) && columns.next().flatten() == Some(im_id)
+    };
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    let cut: usize = lines.iter().rev().take_while(|l| of_image(l)).map(|l| l.len()).sum();
+    let file = std::fs::OpenOptions::new().write(true).open(path);
+    file.and_then(|f| f.set_len((text.len() - cut) as u64))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn save(path: &Path, record: &RunRecord) -> Result<()> {

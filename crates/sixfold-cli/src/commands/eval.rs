@@ -3,9 +3,9 @@
 use anyhow::{Context, Result, anyhow};
 use serde::Serialize;
 use sixfold_bop::{
-    BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType, ReadDetections,
-    evaluate, evaluate_coco, evaluate_detection, read_detections, read_results, read_results_lenient,
-    write_recall_curves,
+    Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType,
+    ReadDetections, evaluate, evaluate_coco, evaluate_detection, read_detections, read_results,
+    read_results_lenient, write_recall_curves,
 };
 
 use crate::Outcome;
@@ -77,7 +77,9 @@ pub(super) fn print_evaluation(e: &Evaluation) {
         "{:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
         "object", "targets", "AR_VSD", "AR_MSSD", "AR_MSPD", "ADD(-S)<0.1d"
     );
-    for (id, o) in &e.objects {
+    let mut objects: Vec<_> = e.objects.iter().collect();
+    objects.sort_by_key(|(id, _)| id.parse::<u32>().unwrap_or(u32::MAX));
+    for (id, o) in objects {
         println!(
             "{id:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
             o.targets,
@@ -125,8 +127,11 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     let path = a.detections.as_deref().ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
     let read =
         read_detections(path, &ReadDetections { lenient: a.lenient, image_size: dataset.image_size() })?;
-    for note in &read.adjusted {
-        eprintln!("note: {}: {}", path.display(), note.message);
+    let mut incomplete = false;
+    for changed in &read.adjusted {
+        let clipped = changed.adjustment == Adjustment::Clipped;
+        eprintln!("{} {}", if clipped { "note:" } else { "skipped" }, changed.message);
+        incomplete |= !clipped;
     }
     let mut truth = CocoGroundTruth::default();
     for scene_id in dataset.scene_ids() {
@@ -141,5 +146,11 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     let masks = with_masks.then(|| evaluate_coco(&truth, &read.detections, IouType::Mask));
     let value = serde_json::json!({ "box": boxes, "mask": masks });
     report(&a.json, &value, || println!("{}", serde_json::to_string_pretty(&value).unwrap_or_default()))?;
-    Ok(if read.detections.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    Ok(if incomplete {
+        Outcome::Incomplete
+    } else if read.detections.is_empty() {
+        Outcome::NothingFound
+    } else {
+        Outcome::Found
+    })
 }
