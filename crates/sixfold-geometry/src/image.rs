@@ -170,7 +170,7 @@ impl Rect {
         let y = self.y.max(other.y);
         let right = (self.x + self.width).min(other.x + other.width);
         let bottom = (self.y + self.height).min(other.y + other.height);
-        (right > x && bottom > y).then(|| Rect { x, y, width: right - x, height: bottom - y })
+        (right > x && bottom > y).then_some(Rect { x, y, width: right - x, height: bottom - y })
     }
 
     /// Intersection over union, in `0..=1`.

@@ -640,7 +640,8 @@ fn edge(a: (i32, i32), b: (i32, i32), p: (i32, i32)) -> i64 {
 fn clip_triangle(camera: &Camera, near: f64, c: [&Corner; 3], number: u32, out: &mut Vec<ClippedTriangle>) {
     // Signed distances, inside >= 0; the guard planes are pulled in a little so that rounding cannot leave it.
     let limit = 0.999 * GUARD;
-    let planes: [&dyn Fn(&[f64; 3]) -> f64; 5] = [
+    type Distance<'a> = &'a dyn Fn(&[f64; 3]) -> f64;
+    let planes: [Distance<'_>; 5] = [
         &|p| p[2] - near,
         &|p| camera.fx * p[0] + (camera.cx + limit) * p[2],
         &|p| (limit - camera.cx) * p[2] - camera.fx * p[0],

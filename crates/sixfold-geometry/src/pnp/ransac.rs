@@ -234,7 +234,7 @@ impl Block {
     #[inline]
     fn cost(&self, m: &[[f32; 4]; 3], limit: f32) -> (f32, usize) {
         let mut squares = [0.0f32; BLOCK];
-        for k in 0..BLOCK {
+        for (k, out) in squares.iter_mut().enumerate() {
             let (x, y, z) = (self.x[k], self.y[k], self.z[k]);
             let px = m[0][0] * x + m[0][1] * y + m[0][2] * z + m[0][3];
             let py = m[1][0] * x + m[1][1] * y + m[1][2] * z + m[1][3];
@@ -243,7 +243,7 @@ impl Block {
             let (du, dv) = (px * inverse - self.u[k], py * inverse - self.v[k]);
             let square = du * du + dv * dv;
             // Also false for NaN.
-            squares[k] = if (square < limit) & (pz > 0.0) { square } else { limit };
+            *out = if (square < limit) & (pz > 0.0) { square } else { limit };
         }
         let mut lanes = [0.0f32; 8];
         let mut inliers = [0u32; 8];
