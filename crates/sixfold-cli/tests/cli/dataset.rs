@@ -1,0 +1,144 @@
+//! `sixfold estimate` on a whole dataset.
+
+use std::path::Path;
+
+use serde_json::Value;
+use sixfold_bop::read_results;
+
+use crate::support::*;
+
+const ARGUMENTS: &str = "estimate --dataset tiny --split test --out results.csv --json";
+
+/// Rows without the time, in the order of the file.
+fn rows(file: &Path) -> Vec<String> {
+    let text = std::fs::read_to_string(file).unwrap();
+    assert!(text.ends_with('\n'), "the last line is cut off: {text}");
+    text.lines().map(|l| l.rsplit_once(',').unwrap().0.to_owned()).collect()
+}
+
+fn assert_all_found(tiny: &Tiny, file: &str) {
+    let results = read_results(&tiny.path().join(file)).unwrap();
+    assert_eq!(results.len(), 6, "{results:?}");
+    for r in &results {
+        assert_eq!(r.scene_id, 7);
+        assert!(r.time.unwrap() > 0.0);
+        assert_near(&r.camera_from_object, &tiny.truth_of(r.im_id, r.obj_id));
+    }
+}
+
+#[test]
+fn all_targets_are_estimated_and_score_well() {
+    let tiny = Tiny::new(true);
+    let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --overlays pictures")).expect(0);
+    let json = run.json();
+    assert_eq!((&json["images"], &json["targets"], &json["poses"]), (&3.into(), &6.into(), &6.into()));
+    assert_eq!(json["skipped"].as_array().unwrap().len(), 0);
+    assert_all_found(&tiny, "results.csv");
+    for name in ["000007_000000.png", "000007_000004.png", "000007_000011.png"] {
+        let picture = image::open(tiny.path().join("pictures").join(name)).unwrap().to_rgb8();
+        assert!(picture.pixels().any(|p| p.0[0] != p.0[1]), "{name} shows depth only");
+    }
+    let scores = sixfold(tiny.path(), "eval --dataset tiny --results results.csv --json").expect(0).json();
+    for key in ["ar", "ar_vsd", "ar_mssd", "ar_mspd"] {
+        assert!(scores[key].as_f64().unwrap() > 0.85, "{key}: {scores}");
+    }
+}
+
+#[test]
+fn a_cut_off_run_goes_on_to_the_same_result() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    let whole = rows(&csv);
+    assert_eq!(whole.len(), 7);
+    let record = tiny.path().join("results.csv.run.json");
+    let text = std::fs::read_to_string(&csv).unwrap();
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+
+    // Stopped after the first image, in the middle of writing the second one's first row.
+    let mut value: Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
+    value["done"] = serde_json::json!([]);
+    std::fs::write(&record, value.to_string()).unwrap();
+    std::fs::write(&csv, lines[..3].concat() + &lines[3][..lines[3].len() / 2]).unwrap();
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert!(run.stderr.contains("cut off"), "{}", run.stderr);
+    assert_eq!(rows(&csv), whole);
+
+    // Nothing is left to do: the file stays as it is, to the byte.
+    let before = std::fs::read(&csv).unwrap();
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert_eq!(std::fs::read(&csv).unwrap(), before);
+
+    // Another seed is another run, and not mixed with this one.
+    fails(tiny.path(), &format!("{ARGUMENTS} --seed 5"), &["results.csv", "other options"]);
+    std::fs::remove_file(&record).unwrap();
+    fails(tiny.path(), ARGUMENTS, &["results.csv", "results.csv.run.json"]);
+    assert_eq!(std::fs::read(&csv).unwrap(), before);
+}
+
+#[test]
+fn an_image_torn_between_its_rows_is_done_again() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    let whole = rows(&csv);
+    // The first of two rows of the second image is on disk, the record does not name the image yet.
+    let record = tiny.path().join("results.csv.run.json");
+    let mut value: Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
+    value["done"] = serde_json::json!([]);
+    std::fs::write(&record, value.to_string()).unwrap();
+    let text = std::fs::read_to_string(&csv).unwrap();
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    std::fs::write(&csv, lines[..4].concat() + &lines[4][..20]).unwrap();
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert_eq!(rows(&csv), whole);
+}
+
+#[test]
+fn boxes_of_the_ground_truth_or_of_a_file() {
+    let tiny = Tiny::new(true);
+    let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --boxes gt")).expect(0);
+    assert_eq!(run.json()["poses"], 6);
+    assert_all_found(&tiny, "results.csv");
+
+    // Boxes for one of the objects in one image only.
+    let tiny = Tiny::new(true);
+    let middle = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
+    let detections = serde_json::json!([{
+        "scene_id": 7, "image_id": 4, "category_id": 2, "score": 0.8,
+        "bbox": [middle.x - 45.0, middle.y - 55.0, 90.0, 90.0],
+    }]);
+    std::fs::write(tiny.path().join("boxes.json"), detections.to_string()).unwrap();
+    sixfold(tiny.path(), &format!("{ARGUMENTS} --boxes boxes.json")).expect(0);
+    let results = read_results(&tiny.path().join("results.csv")).unwrap();
+    assert_eq!(results.len(), 1);
+    assert_eq!((results[0].im_id, results[0].obj_id), (4, 2));
+    assert_near(&results[0].camera_from_object, &tiny.truth_of(4, 2));
+}
+
+#[test]
+fn a_broken_image_is_skipped_and_the_rest_finished() {
+    let tiny = Tiny::new(true);
+    truncate(&tiny.file("test/000007/depth/000004.png"), 0.5);
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(2);
+    let line = run.stderr.lines().find(|l| l.starts_with("skipped")).unwrap();
+    assert!(line.contains("7/4") && line.contains("000004.png"), "{line}");
+    assert_eq!(run.json()["skipped"].as_array().unwrap().len(), 1);
+    let done =
+        |file| read_results(&tiny.path().join(file)).unwrap().iter().map(|r| r.im_id).collect::<Vec<_>>();
+    assert_eq!(done("results.csv"), [0, 0, 11, 11]);
+
+    // Once the image is mended, the same command finishes the run.
+    let whole = Tiny::new(true);
+    let name = "test/000007/depth/000004.png";
+    std::fs::copy(whole.file(name), tiny.file(name)).unwrap();
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert_eq!(done("results.csv"), [0, 0, 11, 11, 4, 4]);
+}
+
+#[test]
+fn images_without_depth_are_skipped_with_advice() {
+    let tiny = Tiny::new(false);
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(2);
+    assert_eq!(run.stderr.lines().filter(|l| l.contains("simulate-depth")).count(), 3, "{}", run.stderr);
+}

@@ -1,0 +1,112 @@
+//! `sixfold eval`.
+
+use crate::support::*;
+
+const ARGUMENTS: &str = "eval --dataset tiny --results results.csv";
+
+#[test]
+fn ground_truth_scores_one() {
+    let tiny = Tiny::new(true);
+    tiny.write_truth_as_results("results.csv");
+    let run =
+        sixfold(tiny.path(), &format!("{ARGUMENTS} --json --detection-ap --curves curves.png")).expect(0);
+    let json = run.json();
+    for key in ["ar", "ar_vsd", "ar_mssd", "ar_mspd"] {
+        assert_eq!(json[key], 1.0, "{key}: {json}");
+    }
+    for key in ["1", "2", "mean"] {
+        assert_eq!(json["add_s_recall"][key], 1.0, "{key}: {json}");
+    }
+    assert_eq!(json["targets"], 6);
+    assert_eq!(json["detection"]["ap"], 1.0);
+    // Ground truth takes no time.
+    let reasons: Vec<&String> = json["reasons"].as_object().unwrap().keys().collect();
+    assert_eq!(reasons, ["average_time_per_image"]);
+    let curves = image::open(tiny.path().join("curves.png")).unwrap();
+    assert!(curves.width() > 200 && curves.height() > 200);
+}
+
+#[test]
+fn what_cannot_be_computed_is_null_with_a_reason() {
+    let tiny = Tiny::new(false);
+    tiny.write_truth_as_results("results.csv");
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json")).expect(0).json();
+    for key in ["ar", "ar_vsd"] {
+        assert!(json[key].is_null(), "{json}");
+        assert!(json["reasons"][key].as_str().unwrap().contains("depth"), "{json}");
+    }
+    assert_eq!(json["ar_mssd"], 1.0);
+    assert_eq!(json["ar_mspd"], 1.0);
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert!(run.stdout.contains("ar_vsd not computed"), "{}", run.stdout);
+
+    // The same by request.
+    let tiny = Tiny::new(true);
+    tiny.write_truth_as_results("results.csv");
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json --no-vsd")).expect(0).json();
+    assert!(json["ar_vsd"].is_null() && json["reasons"]["ar_vsd"].is_string(), "{json}");
+}
+
+#[test]
+fn a_wrong_pose_lowers_the_scores_of_its_object_only() {
+    let tiny = Tiny::new(true);
+    tiny.write_truth_as_results("results.csv");
+    let file = tiny.path().join("results.csv");
+    let text = std::fs::read_to_string(&file).unwrap();
+    // One of object 2's three rows is taken out.
+    let kept: Vec<&str> = text.lines().filter(|l| !l.starts_with("7,4,2,")).collect();
+    std::fs::write(&file, kept.join("\n") + "\n").unwrap();
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json scores.json")).expect(0);
+    assert!(json.stdout.contains("AR "));
+    let json: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(tiny.path().join("scores.json")).unwrap()).unwrap();
+    assert_eq!(json["add_s_recall"]["1"], 1.0);
+    assert!((json["add_s_recall"]["2"].as_f64().unwrap() - 2.0 / 3.0).abs() < 1e-12);
+    assert!((json["ar_mssd"].as_f64().unwrap() - 5.0 / 6.0).abs() < 1e-12);
+}
+
+#[test]
+fn no_estimate_is_exit_status_1() {
+    let tiny = Tiny::new(true);
+    std::fs::write(tiny.path().join("results.csv"), "scene_id,im_id,obj_id,score,R,t,time\n").unwrap();
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json")).expect(1).json();
+    assert_eq!(json["ar"], 0.0);
+}
+
+#[test]
+fn lenient_reports_broken_rows_and_scores_the_rest() {
+    let tiny = Tiny::new(true);
+    tiny.write_truth_as_results("results.csv");
+    let file = tiny.path().join("results.csv");
+    replace(&file, "7,4,2,0.9", "7,4,2,NaN");
+    fails(tiny.path(), ARGUMENTS, &["results.csv", "line 5", "score", "NaN"]);
+    let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --lenient --json")).expect(2);
+    assert!(run.stderr.contains("results.csv") && run.stderr.contains("line 5"), "{}", run.stderr);
+    assert!((run.json()["ar_mssd"].as_f64().unwrap() - 5.0 / 6.0).abs() < 1e-12);
+}
+
+#[test]
+fn detections_are_scored_as_coco_does() {
+    let tiny = Tiny::new(true);
+    let truth = serde_json::json!({
+        "images": [{"id": 0, "width": WIDTH, "height": HEIGHT}],
+        "categories": [{"id": 1, "name": "1"}],
+        "annotations": [{
+            "id": 1, "image_id": 0, "category_id": 1, "bbox": [10, 10, 40, 30], "area": 1200, "iscrowd": 0,
+            "ignore": false,
+        }],
+    });
+    std::fs::write(tiny.file("test/000007/scene_gt_coco.json"), truth.to_string()).unwrap();
+    let detection = |x: f64| {
+        serde_json::json!([{
+            "scene_id": 7, "image_id": 0, "category_id": 1, "score": 0.5, "bbox": [x, 10.0, 40.0, 30.0],
+        }])
+    };
+    let scores = |x: f64| {
+        std::fs::write(tiny.path().join("d.json"), detection(x).to_string()).unwrap();
+        sixfold(tiny.path(), "eval --dataset tiny --detections d.json --json").expect(0).json()
+    };
+    assert_eq!(scores(10.0)["box"]["ap"], 1.0);
+    assert_eq!(scores(100.0)["box"]["ap"], 0.0);
+    assert!(scores(10.0)["mask"].is_null());
+}

@@ -1,0 +1,9 @@
+//! The program as a user runs it: the real binary, in a temporary folder, on inputs made by the tests themselves.
+
+mod bad_input;
+mod dataset;
+mod eval;
+mod image;
+mod objects;
+mod simulate;
+mod support;
