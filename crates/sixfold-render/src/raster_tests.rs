@@ -248,3 +248,21 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_used_canvas_gives_what_a_new_image_gives() {
+    let mesh = sphere();
+    let mut frame = Frame::new(&camera());
+    let mut depth = Canvas::new(1, 1, 0.0);
+    let mut points = Canvas::new(1, 1, [f32::NAN; 3]);
+    for t in [[0.0; 3], [0.05, -0.03, -0.2], [0.01, 0.01, 0.5], [50.0, 0.0, 0.0], [-0.1, 0.05, -0.1]] {
+        let object = SceneObject { mesh: &mesh, camera_from_object: Pose::from_translation(t.into()) };
+        frame.render(&[object], &RenderOptions::default());
+        frame.depth_into(&mut depth);
+        frame.object_coordinates_into(&[object], &mut points);
+        assert!(depth.image() == &frame.depth());
+        let bits = |p: &[f32; 3]| p.map(f32::to_bits);
+        let fresh = frame.object_coordinates(&[object]);
+        assert!(points.image().as_slice().iter().map(bits).eq(fresh.as_slice().iter().map(bits)));
+    }
+}
