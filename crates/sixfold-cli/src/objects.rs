@@ -125,10 +125,11 @@ impl Store<'_> {
     pub fn record(&self, name: &str) -> Result<Record> {
         let path = self.place(name)?.join("object.json");
         if !path.is_file() {
+            let names = self.names()?;
+            let there = if names.is_empty() { "there is none yet".into() } else { names.join(", ") };
             bail!(
-                "no object named {name:?} in {} (there are: {}); add it with `sixfold object add {name} MESH --unit UNIT`",
-                self.folder.display(),
-                self.names()?.join(", ")
+                "no object named {name:?} in {} ({there}); add it with `sixfold object add {name} MESH --unit UNIT`",
+                self.folder.display()
             );
         }
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;

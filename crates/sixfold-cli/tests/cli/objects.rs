@@ -30,7 +30,7 @@ fn objects_are_added_listed_shown_used_and_removed() {
     assert_eq!(shown["symmetries_continuous"].as_array().unwrap().len(), 1);
 
     sixfold(dir, "object remove my-part").expect(0);
-    fails(dir, "object show my-part", &["my-part", "sixfold object add"]);
+    fails(dir, "object show my-part", &["my-part", "none yet", "sixfold object add"]);
     fails(dir, "object remove my-part", &["my-part"]);
     sixfold(dir, "object list").expect(1);
     // Nothing of it stays behind, no half-written folder either.
