@@ -151,7 +151,7 @@ pub(crate) struct EstimateArguments {
     /// Folder for overlay pictures of a dataset's images
     #[arg(long, value_name = "DIR", requires = "dataset")]
     pub overlays: Option<PathBuf>,
-    /// Leave out poses with a lower confidence (0 to 1)
+    /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image, 0.05 for a dataset)
     #[arg(long, value_name = "SCORE")]
     pub min_score: Option<f64>,
     /// Match points on the table plane too

@@ -16,6 +16,9 @@ use crate::output::{pose_rows, report};
 use crate::overlay::{self, Drawn};
 use crate::progress::{Progress, check_interrupt};
 
+/// Least confidence of a pose in one image: on real frames most wrong poses lie below, most right ones above.
+const SURE_ENOUGH: f64 = 0.25;
+
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     if a.dataset.is_some() {
         return super::estimate_dataset::run(a);
@@ -54,7 +57,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let mask = region_mask(a, &camera)?;
     let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
         .with_context(|| depth_file.display().to_string())?;
-    let options = estimate_options(a, a.instances.get());
+    let mut options = estimate_options(a, a.instances.get());
+    // A person who asks about one image wants no guesses; a dataset's scores sort them out.
+    options.min_score = a.min_score.unwrap_or(SURE_ENOUGH);
     let mut progress = Progress::new("objects", a.objects.len());
     let mut found: Vec<(objects::Object, Vec<Estimate>, f64)> = vec![];
     for name in &a.objects {
