@@ -36,6 +36,7 @@ fn main() -> ExitCode {
     }
     let result = match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
+        Command::Estimate(a) if a.dataset.is_some() => commands::estimate_dataset::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Eval(a) => commands::eval::run(a),
         Command::Render(a) => commands::render::run(a),

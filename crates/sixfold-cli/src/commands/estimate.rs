@@ -20,9 +20,6 @@ use crate::progress::{Progress, check_interrupt};
 const SURE_ENOUGH: f64 = 0.25;
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
-    if a.dataset.is_some() {
-        return super::estimate_dataset::run(a);
-    }
     let depth_file = a
         .depth
         .as_deref()

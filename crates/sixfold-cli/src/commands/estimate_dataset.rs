@@ -60,7 +60,7 @@ struct Known {
     ppf: ObjectModel,
 }
 
-pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
+pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let root = a.dataset.as_deref().ok_or_else(|| anyhow!("--dataset is missing"))?;
     let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.csv is missing"))?;
     if out.extension().is_none_or(|e| e != "csv") {

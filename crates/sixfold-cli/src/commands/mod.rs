@@ -3,7 +3,7 @@
 pub(crate) mod completions;
 pub(crate) mod demo;
 pub(crate) mod estimate;
-mod estimate_dataset;
+pub(crate) mod estimate_dataset;
 pub(crate) mod eval;
 pub(crate) mod object;
 pub(crate) mod render;
