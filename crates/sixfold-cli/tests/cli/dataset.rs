@@ -142,3 +142,20 @@ fn images_without_depth_are_skipped_with_advice() {
     let run = sixfold(tiny.path(), ARGUMENTS).expect(2);
     assert_eq!(run.stderr.lines().filter(|l| l.contains("simulate-depth")).count(), 3, "{}", run.stderr);
 }
+
+#[test]
+fn the_demo_scores_and_draws_its_samples() {
+    let tiny = Tiny::new(true);
+    let run = sixfold(tiny.path(), "demo --data tiny --out out --json demo.json").expect(0);
+    assert!(run.stdout.contains("6 of 6 poses within 10 %"), "{}", run.stdout);
+    let json: Value = serde_json::from_slice(&std::fs::read(tiny.path().join("demo.json")).unwrap()).unwrap();
+    assert_eq!((&json["correct"], &json["targets"]), (&6.into(), &6.into()));
+    for row in json["poses"].as_array().unwrap() {
+        assert!(row["add_s_mm"].as_f64().unwrap() < 5.0, "{row}");
+    }
+    let pictures = json["pictures"].as_array().unwrap();
+    assert_eq!(pictures.len(), 4);
+    for picture in pictures {
+        assert!(image::open(tiny.path().join(picture.as_str().unwrap())).is_ok(), "{picture}");
+    }
+}

@@ -112,7 +112,7 @@ fn two_instances_and_boxes() {
     assert_near(&both[0], &poses[0]);
     assert_near(&both[1], &poses[1]);
     // A box or a mask says which of the two.
-    let left = found("--box 20,40,130,150");
+    let left = found("--box -10,40,160,150");
     assert_eq!(left.len(), 1);
     assert_near(&left[0], &poses[0]);
     let mask = sixfold_geometry::Mask::from_fn(WIDTH, HEIGHT, |x, _| x >= WIDTH / 2);
