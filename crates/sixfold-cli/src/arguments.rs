@@ -30,7 +30,7 @@ pub(crate) enum Command {
     #[command(after_help = "Examples:\n  \
         sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
         sixfold estimate --dataset lmo --split test --out results.csv")]
-    Estimate(EstimateArguments),
+    Estimate(Box<EstimateArguments>),
     /// Score a result file against the ground truth of a BOP dataset
     #[command(
         after_help = "Example:\n  sixfold eval --dataset lmo --results results.csv --curves curves.png"

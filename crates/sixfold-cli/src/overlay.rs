@@ -72,11 +72,10 @@ pub(crate) fn draw(image: &RgbImage, camera: &Camera, poses: &[Drawn<'_>]) -> Rg
                 });
                 let shade = 0.45 + 0.55 * normals[(x, y)][2].abs();
                 let pixel = &mut out[(x, y)];
-                for k in 0..3 {
-                    let c = f32::from(pose.color[k]);
-                    let old = f32::from(pixel[k]);
-                    let mixed = if border { c } else { 0.55 * old + 0.45 * c * shade };
-                    pixel[k] = mixed.clamp(0.0, 255.0) as u8;
+                for (channel, color) in pixel.iter_mut().zip(pose.color) {
+                    let c = f32::from(color);
+                    let mixed = if border { c } else { 0.55 * f32::from(*channel) + 0.45 * c * shade };
+                    *channel = mixed.clamp(0.0, 255.0) as u8;
                 }
             }
         }
