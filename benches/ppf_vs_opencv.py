@@ -29,6 +29,12 @@ def mssd(pose, truth, symmetries, points):
     return min(errors)
 
 
+def in_unit(cloud, unit):
+    scaled = cloud.copy()
+    scaled[:, :3] /= unit
+    return np.ascontiguousarray(scaled)
+
+
 def main():
     dataset = sys.argv[1]
     every = sys.argv[2] if len(sys.argv) > 2 else "10"
@@ -44,14 +50,19 @@ def main():
         clouds = {f.stem: load(f) for f in (folder / "clouds").iterdir()}
         samples = {int(f.stem): load(f) for f in (folder / "models").iterdir()}
     detectors, training = {}, []
-    for identity, model in samples.items():
+    wanted = {r["object"] for r in ours["results"]}
+    for identity, model in ((i, m) for i, m in samples.items() if i in wanted):
         detector = cv2.ppf_match_3d_PPF3DDetector(STEP, STEP, 30)
         start = time.perf_counter()
-        detector.trainModel(model)
+        # OpenCV joins poses within 0.05 units of whatever the points are in, and Python cannot change that: a unit of
+        # 1.6 diameters makes it 8 % of the diameter, as ours.
+        unit = 1.6 * next(r["diameter"] for r in ours["results"] if r["object"] == identity)
+        detector.trainModel(in_unit(model, unit))
         training.append(time.perf_counter() - start)
         detectors[identity] = detector
     icp = cv2.ppf_match_3d_ICP(100, 0.005, 2.5, 8)
     correct = {"ours": 0, "opencv": 0}
+    any_of_five = 0
     seconds = {"ours": [], "opencv": []}
     errors = {"ours": [], "opencv": []}
     for r in ours["results"]:
@@ -63,20 +74,30 @@ def main():
         scene = clouds[f"{r['scene']}_{r['image']}"]
         model = samples[r["object"]]
         start = time.perf_counter()
-        best = None
+        best, poses = None, []
         try:
+            unit = 1.6 * r["diameter"]
             # The scene is thinned to the same step of the model's diameter that ours uses.
             keys = np.floor(scene[:, :3] / (STEP * r["diameter"])).astype(np.int64)
             _, first = np.unique(keys, axis=0, return_index=True)
-            thinned = np.ascontiguousarray(scene[np.sort(first)])
+            thinned = in_unit(scene[np.sort(first)], unit)
             found = detectors[r["object"]].match(thinned, 0.25, STEP)[:5]
-            _, found = icp.registerModelToScene(model, np.ascontiguousarray(scene), found)
-            best = min(found, key=lambda p: p.residual).pose if found else None
+            _, found = icp.registerModelToScene(in_unit(model, unit), in_unit(scene, unit), found)
+            poses = []
+            for p in found:
+                pose = p.pose.copy()
+                pose[:3, 3] *= unit
+                poses.append((p.residual, pose))
+            best = min(poses, key=lambda p: p[0])[1] if poses else None
         except cv2.error as error:
             print("OpenCV:", error, file=sys.stderr)
         seconds["opencv"].append(time.perf_counter() - start)
         if best is not None:
-            e = mssd(best, np.array(r["truth"]), [np.array(s) for s in r["symmetries"]], model[:, :3].astype(float))
+            error = lambda pose: mssd(
+                pose, np.array(r["truth"]), [np.array(s) for s in r["symmetries"]], model[:, :3].astype(float)
+            )
+            any_of_five += min(error(pose) for _, pose in poses) < limit
+            e = error(best)
             if e < limit:
                 correct["opencv"] += 1
                 errors["opencv"].append(e)
@@ -87,6 +108,7 @@ def main():
     for who in ("ours", "opencv"):
         median = 1000 * np.median(errors[who]) if errors[who] else float("nan")
         print(f"{who:8} {correct[who] / n:9.3f} {median:25.1f} mm {np.median(seconds[who]):9.2f} {np.mean(seconds[who]):8.2f} {models[who]:8.2f}")
+    print(f"opencv: one of its five refined poses is correct in {any_of_five / n:.3f}")
 
 
 if __name__ == "__main__":

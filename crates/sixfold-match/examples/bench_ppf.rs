@@ -69,12 +69,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 let image = scene.image(im_id)?;
                 let Some(truth) = image.ground_truth.iter().find(|g| g.obj_id == o.obj_id) else { continue };
                 let error = found.first().map(|e| {
-                    mssd(
-                        points,
-                        &e.camera_from_object,
-                        &truth.camera_from_object,
-                        model.symmetries(),
-                    )
+                    mssd(points, e.camera_from_object, truth.camera_from_object, model.symmetries())
                 });
                 results.push(json!({
                     "scene": scene_id, "image": im_id, "object": o.obj_id, "seconds": seconds, "timing": timing,

@@ -3,7 +3,7 @@
 //!
 //! The way of one image: a [`Scene`] is prepared once; for every object its [`ObjectModel`] votes for poses
 //! ([`model`], [`voting`]), similar poses are joined ([`clustering`]), the best are refined by ICP and
-//! judged by rendering ([`verification`]); [`estimate`] puts it together.
+//! judged by rendering ([`verification`]); [`estimate()`] puts it together.
 
 pub mod clustering;
 pub mod estimate;

@@ -219,7 +219,10 @@ mod tests {
         fs::write(folder.path().join("thing.mtl"), "newmtl red\nKd 1 0 0\n").unwrap();
         assert_eq!(read_mesh(&path, Unit::Millimetre).unwrap().colors().unwrap(), [[255, 0, 0]; 3]);
         let error = read_mesh(folder.path().join("a.step"), Unit::Metre).unwrap_err().to_string();
-        assert!(error.contains("\"step\"") && error.contains(".ply, .obj, .stl, .gltf or .glb"), "{error}");
+        assert!(
+            error.contains("\"step\"") && error.contains(".ply, .obj, .stl, .gltf, .glb or .xyz"),
+            "{error}"
+        );
         let error = read_mesh(folder.path().join("a.stl"), Unit::Metre).unwrap_err();
         assert!(matches!(error, MeshFileError::Io { .. }), "{error}");
     }

@@ -117,9 +117,9 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                         let symmetric =
                             infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).is_some_and(|i| i.is_symmetric());
                         let error = if !symmetric {
-                            sixfold_bop::add(points, &estimated, &truth.placement())
+                            sixfold_bop::add(points, estimated, truth.placement())
                         } else {
-                            sixfold_bop::adi(points, &estimated, &truth.placement())
+                            sixfold_bop::adi(points, estimated, truth.placement())
                         };
                         rows.push(Row {
                             image: format!("{scene_id}/{im_id}"),
