@@ -41,7 +41,7 @@ pub struct VotingOptions {
 impl Default for VotingOptions {
     fn default() -> Self {
         VotingOptions {
-            reference_stride: 4,
+            reference_stride: 5,
             max_references: 2500,
             bin_margin: 0.25,
             peaks_per_reference: 4,
