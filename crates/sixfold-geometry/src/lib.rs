@@ -18,6 +18,7 @@ mod plane;
 mod pnp;
 mod pose;
 mod solver;
+mod undistort;
 
 pub use camera::{BrownConrady, Camera, CameraError};
 pub use cloud::PointCloud;
@@ -35,6 +36,7 @@ pub use pnp::{
 };
 pub use pose::{Pose, PoseError};
 pub use solver::NormalEquations;
+pub use undistort::{undistort_depth, undistort_rgb};
 
 /// The linear algebra types in this crate's public signatures.
 pub use nalgebra;

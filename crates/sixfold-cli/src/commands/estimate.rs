@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
-use sixfold_geometry::{Camera, Mask, Rect};
+use sixfold_geometry::{Camera, Mask, Rect, undistort_depth, undistort_rgb};
 use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
 
 use crate::Outcome;
@@ -41,16 +41,16 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let depth = read_depth(depth_file, scale / 1000.0)?;
     let (width, height) = depth.size();
     let camera = file.for_image(width, height, camera_path)?;
-    if camera.distortion.is_some() {
-        bail!(
-            "{}: field distortion: depth images are taken as undistorted; undistort the image and leave the field out",
-            camera_path.display()
-        );
-    }
-    let rgb = a.rgb.as_deref().map(read_rgb).transpose()?;
-    if let (Some(image), Some(path)) = (&rgb, &a.rgb) {
-        camera.check_image(image.width(), image.height()).with_context(|| path.display().to_string())?;
-    }
+    // Lens distortion ends here: everything behind works on pinhole images.
+    let depth = undistort_depth(&depth, &camera)?;
+    let rgb = match &a.rgb {
+        None => None,
+        Some(path) => {
+            let raw = read_rgb(path)?;
+            Some(undistort_rgb(&raw, &camera).with_context(|| path.display().to_string())?)
+        }
+    };
+    let camera = camera.without_distortion();
     let mask = region_mask(a, &camera)?;
     let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
         .with_context(|| depth_file.display().to_string())?;

@@ -1,0 +1,112 @@
+//! Undoing lens distortion of whole images, at the edge of the system: behind it every image is a pinhole image.
+//!
+//! Every pinhole pixel looks up where the raw image shows it (Brown 1966); nothing is inverted.
+
+use rayon::prelude::*;
+
+use crate::{Camera, CameraError, DepthImage, Image, RgbImage, Vec2};
+
+/// The depth image a pinhole camera with the same intrinsics would have measured: the nearest raw pixel, because a mean
+/// over a depth edge is a point that does not exist. Missing where the raw image shows nothing.
+///
+/// # Errors
+/// [`CameraError::Resolution`] when the image does not belong to the camera.
+pub fn undistort_depth(raw: &DepthImage, camera: &Camera) -> Result<DepthImage, CameraError> {
+    resample(raw, camera, |image, p| {
+        let (x, y) = (p.x.round(), p.y.round());
+        if x < 0.0 || y < 0.0 { 0.0 } else { image.get(x as usize, y as usize).copied().unwrap_or(0.0) }
+    })
+}
+
+/// The colour image a pinhole camera with the same intrinsics would have taken: bilinear, black where the raw image
+/// shows nothing.
+///
+/// # Errors
+/// [`CameraError::Resolution`] when the image does not belong to the camera.
+pub fn undistort_rgb(raw: &RgbImage, camera: &Camera) -> Result<RgbImage, CameraError> {
+    resample(raw, camera, |image, p| {
+        let (w, h) = (image.width() as f64 - 1.0, image.height() as f64 - 1.0);
+        if !(p.x >= -0.5 && p.y >= -0.5 && p.x <= w + 0.5 && p.y <= h + 0.5) {
+            return [0; 3];
+        }
+        let (x, y) = (p.x.clamp(0.0, w), p.y.clamp(0.0, h));
+        let (x0, y0) = (x.floor(), y.floor());
+        let (fx, fy) = (x - x0, y - y0);
+        let (x0, y0) = (x0 as usize, y0 as usize);
+        let (x1, y1) = ((x0 + 1).min(image.width() - 1), (y0 + 1).min(image.height() - 1));
+        std::array::from_fn(|k| {
+            let at = |x, y| f64::from(image[(x, y)][k]);
+            let top = at(x0, y0) * (1.0 - fx) + at(x1, y0) * fx;
+            let bottom = at(x0, y1) * (1.0 - fx) + at(x1, y1) * fx;
+            (top * (1.0 - fy) + bottom * fy).round() as u8
+        })
+    })
+}
+
+fn resample<T: Clone + Send + Sync>(
+    raw: &Image<T>,
+    camera: &Camera,
+    look: impl Fn(&Image<T>, Vec2) -> T + Sync,
+) -> Result<Image<T>, CameraError> {
+    camera.check_image(raw.width(), raw.height())?;
+    if camera.distortion.is_none() {
+        return Ok(raw.clone());
+    }
+    let mut out = raw.clone();
+    out.as_mut_slice().par_chunks_mut(raw.width()).enumerate().for_each(|(y, row)| {
+        for (x, pixel) in row.iter_mut().enumerate() {
+            *pixel = look(raw, camera.distort_point(&Vec2::new(x as f64, y as f64)));
+        }
+    });
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::BrownConrady;
+
+    fn camera() -> Camera {
+        Camera {
+            distortion: Some(BrownConrady { k1: -0.25, k2: 0.05, p1: 0.001, p2: -0.002, k3: 0.0 }),
+            ..Camera::new(90.0, 92.0, 79.5, 59.5, 160, 120).unwrap()
+        }
+    }
+
+    #[test]
+    fn a_smooth_raw_image_becomes_the_pinhole_image() {
+        // What the scene shows along a ray; the raw image shows it at the distorted pixel.
+        let color = |p: &Vec2| {
+            [128.0 + 0.6 * (p.x - 80.0), 128.0 + 0.9 * (p.y - 60.0), 100.0].map(|v: f64| v.round() as u8)
+        };
+        let c = camera();
+        let raw = RgbImage::from_fn(160, 120, |x, y| {
+            c.undistort_point(&Vec2::new(x as f64, y as f64)).map_or([0; 3], |p| color(&p))
+        });
+        let flat = undistort_rgb(&raw, &c).unwrap();
+        for (x, y) in [(80, 60), (40, 30), (120, 95), (60, 100)] {
+            let expected = color(&Vec2::new(x as f64, y as f64));
+            for k in 0..3 {
+                assert!(
+                    flat[(x, y)][k].abs_diff(expected[k]) <= 2,
+                    "({x}, {y}) {:?} {expected:?}",
+                    flat[(x, y)]
+                );
+            }
+        }
+        // The raw image really is distorted there.
+        assert!(raw[(20, 15)][0].abs_diff(color(&Vec2::new(20.0, 15.0))[0]) > 2);
+    }
+
+    #[test]
+    fn depth_is_taken_whole_and_never_mixed() {
+        let raw = DepthImage::from_fn(160, 120, |x, _| if x < 80 { 1.0 } else { 2.0 });
+        let flat = undistort_depth(&raw, &camera()).unwrap();
+        assert!(flat.as_slice().iter().all(|&z| z == 0.0 || z == 1.0 || z == 2.0));
+        assert_eq!((flat[(20, 60)], flat[(140, 60)]), (1.0, 2.0));
+        let wrong = DepthImage::filled(10, 10, 1.0);
+        assert!(matches!(undistort_depth(&wrong, &camera()), Err(CameraError::Resolution { .. })));
+        let pinhole = camera().without_distortion();
+        assert_eq!(undistort_depth(&raw, &pinhole).unwrap(), raw);
+    }
+}
