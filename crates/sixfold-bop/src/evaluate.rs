@@ -21,7 +21,10 @@ use crate::errors::{Placement, VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
 use crate::points::ModelPoints;
 use crate::results::Estimate;
 use crate::scene_files::{GroundTruth, Target, TargetObject};
-use crate::score::{average_precision, by_falling_score, fractions_05_to_50, greedy_matches, pixels_5_to_50};
+use crate::score::{
+    area_under_accuracy, average_precision, by_falling_score, fractions_05_to_50, greedy_matches,
+    pixels_5_to_50,
+};
 
 /// How an evaluation is done. The default is the BOP Challenge's.
 #[derive(Debug, Clone, PartialEq)]
@@ -164,6 +167,10 @@ pub struct Evaluation {
     /// Recall of ADD (ADI for symmetric objects) at 10 % of the diameter: by object id, `mean` over all targets (each
     /// pose counts the same), `mean_over_objects` (each object counts the same).
     pub add_s_recall: BTreeMap<String, Option<f64>>,
+    /// Area under the accuracy-threshold curve of ADD to 10 cm, over all targets (PoseCNN, Xiang et al. 2018).
+    pub add_auc: Option<f64>,
+    /// The same of ADD-S, taken for every object, symmetric or not.
+    pub add_s_auc: Option<f64>,
     /// Why a score is missing.
     pub reasons: BTreeMap<String, String>,
     /// Poses to be found.
@@ -208,6 +215,8 @@ struct TaskErrors {
     add: Vec<Vec<f64>>,
     /// `[tau][estimate][ground truth]`.
     vsd: Option<Vec<Vec<Vec<f64>>>>,
+    /// Per pose to be found, the smallest ADD and ADI in metres.
+    nearest: Vec<[f64; 2]>,
 }
 
 struct ImageTasks<'a> {
@@ -360,6 +369,9 @@ fn best_of_image<'a>(objects: &ByObject<'a>, most: usize) -> ByObject<'a> {
     best
 }
 
+/// Largest error of the accuracy-threshold curves, metres.
+const LARGEST_AUC_ERROR: f64 = 0.1;
+
 /// Errors of every estimate against every pose of a task.
 fn surface_and_projection(task: &Task<'_>, object: &Object, camera: &Camera, with_add: bool) -> TaskErrors {
     let width = 640.0 / camera.width as f64;
@@ -386,7 +398,24 @@ fn surface_and_projection(task: &Task<'_>, object: &Object, camera: &Camera, wit
             Vec::new()
         },
         vsd: None,
+        nearest: if with_add { nearest_errors(task, object) } else { Vec::new() },
     }
+}
+
+/// For every pose that is to be found, the smallest ADD and the smallest ADI of the task's estimates, metres; infinite
+/// where there is none.
+fn nearest_errors(task: &Task<'_>, object: &Object) -> Vec<[f64; 2]> {
+    let of = |g: &GroundTruth| {
+        task.estimates.iter().fold([f64::INFINITY; 2], |[a, s], e| {
+            let (e, g) = (e.placement(), g.placement());
+            // Neither can be smaller than what separates the centres of two equal point sets by more than both radii.
+            if e.distance_to(&g) >= object.diameter + LARGEST_AUC_ERROR {
+                return [a, s];
+            }
+            [a.min(add(&object.points, e, g)), s.min(adi(&object.points, e, g))]
+        })
+    };
+    task.poses.iter().zip(&task.valid).filter(|(_, valid)| **valid).map(|(g, _)| of(g)).collect()
 }
 
 fn visible_surface(
@@ -662,6 +691,11 @@ pub fn evaluate(
             None
         }
     };
+    let area = |which: usize| -> Option<f64> {
+        let errors: Vec<f64> = scored.iter().flat_map(|(_, e)| &e.nearest).map(|n| n[which]).collect();
+        keep(area_under_accuracy(&errors, LARGEST_AUC_ERROR))
+    };
+    let (add_auc, add_s_auc) = (area(0), area(1));
     let compared: usize = scored.iter().map(|(task, _)| task.estimates.len()).sum();
     Ok(Evaluation {
         ar,
@@ -669,6 +703,8 @@ pub fn evaluate(
         ar_mssd,
         ar_mspd,
         add_s_recall,
+        add_auc,
+        add_s_auc,
         reasons,
         targets: wanted,
         estimates: compared,

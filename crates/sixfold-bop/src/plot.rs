@@ -369,6 +369,8 @@ mod tests {
             ar_mssd: Some(recall),
             ar_mspd: Some(recall),
             add_s_recall: BTreeMap::new(),
+            add_auc: None,
+            add_s_auc: None,
             reasons: BTreeMap::new(),
             targets: 1,
             estimates: 1,

@@ -98,7 +98,12 @@ pub(super) fn print_evaluation(e: &Evaluation) {
         digits(e.ar_mspd),
         digits(e.add_s_recall.get("mean").copied().flatten())
     );
-    println!("AR {}", digits(e.ar));
+    println!(
+        "AR {}   AUC of ADD {}, of ADD-S {} (to 10 cm)",
+        digits(e.ar),
+        digits(e.add_auc),
+        digits(e.add_s_auc)
+    );
     for (score, reason) in &e.reasons {
         println!("{score} not computed: {reason}");
     }
