@@ -119,8 +119,8 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
     let step = model.diameter * model.options.sampling_step;
     let thinned = cloud.voxel_downsample(step, 30f64.to_radians());
     let Some(grid) = Grid::new(&thinned, model.diameter as f32) else { return vec![] };
-    let stride =
-        options.reference_stride.max(1).max(grid.points.len().div_ceil(options.max_references.max(1)));
+    let least = grid.points.len().div_ceil(options.max_references.max(1));
+    let stride = options.reference_stride.max(1).max(least);
     let references: Vec<usize> = (0..grid.points.len()).step_by(stride).collect();
     let model_points: Vec<V3> = model.samples.points.iter().map(|p| p.cast()).collect();
     let model_frames: Vec<[V3; 3]> = model.samples.normals.iter().map(|n| local_frame(&n.cast())).collect();
@@ -281,4 +281,54 @@ fn pose_of(p: &V3, scene: &[V3; 3], q: &V3, model: &[V3; 3], turn: f32) -> Pose 
     quaternion.renormalize();
     let translation = p.cast::<f64>() - quaternion * q.cast::<f64>();
     Pose::new(quaternion, translation)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{Description, ModelOptions};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use sixfold_geometry::Vec3;
+    use sixfold_mesh::Mesh;
+
+    /// Scattered points with random normals: every feature is rare, no reflection and no turn looks alike.
+    fn scattered() -> ObjectModel {
+        let mut random = ChaCha8Rng::seed_from_u64(4);
+        let mut draw = || Vec3::from_fn(|_, _| random.random_range(-1.0..1.0));
+        let points: Vec<Vec3> = (0..80).map(|_| draw() * 0.05).collect();
+        let normals: Vec<Vec3> = (0..80).map(|_| draw().normalize()).collect();
+        let mesh = Mesh::new(points.clone(), vec![]).unwrap();
+        let description = Description {
+            diameter: mesh.diameter(),
+            mesh,
+            options: ModelOptions::default(),
+            centre: Vec3::zeros(),
+            visible_from: vec![u64::MAX; points.len()],
+            samples: PointCloud { points, normals },
+        };
+        ObjectModel::assemble(description, &[])
+    }
+
+    #[test]
+    fn scattered_points_vote_for_the_pose_they_were_moved_by() {
+        let model = scattered();
+        for twist in [[0.1, -0.2, 0.8, 0.5, -1.0, 0.3], [0.0, 0.1, 1.2, -2.0, 0.4, 1.1]] {
+            let truth = Pose::exp(&twist.into());
+            let cloud = model.samples.transformed(&truth);
+            let options = VotingOptions { reference_stride: 1, ..VotingOptions::default() };
+            let votes = vote(&model, &cloud, &options);
+            // Every point is a reference point here, and the best vote of most of them is the truth.
+            let best = votes.iter().map(|h| h.votes).fold(0.0, f32::max);
+            let strong: Vec<_> = votes.iter().filter(|h| h.votes > 0.5 * best).collect();
+            let right = strong
+                .iter()
+                .filter(|h| {
+                    h.camera_from_object.rotation_angle_to(&truth) < 0.15
+                        && h.camera_from_object.distance_to(&truth) < 0.015
+                })
+                .count();
+            assert!(strong.len() >= 20 && right * 10 > strong.len() * 9, "{right} of {}", strong.len());
+        }
+    }
 }

