@@ -114,6 +114,19 @@ impl PointCloud {
     }
 }
 
+/// `n` evenly spread unit directions: a Fibonacci sphere (Gonzalez 2010).
+pub fn sphere_directions(n: usize) -> Vec<Vec3> {
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    (0..n)
+        .map(|i| {
+            let z = 1.0 - (2.0 * i as f64 + 1.0) / n as f64;
+            let r = (1.0 - z * z).sqrt();
+            let a = golden * i as f64;
+            Vec3::new(r * a.cos(), r * a.sin(), z)
+        })
+        .collect()
+}
+
 /// A small, fast, seedless hasher: voxel keys come from our own data, so nobody can attack it, and the same
 /// input always gives the same order of work.
 #[derive(Default, Clone, Copy)]

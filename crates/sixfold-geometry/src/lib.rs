@@ -21,7 +21,7 @@ mod solver;
 mod undistort;
 
 pub use camera::{BrownConrady, Camera, CameraError};
-pub use cloud::PointCloud;
+pub use cloud::{PointCloud, sphere_directions};
 pub use icp::{
     CorrespondenceSource, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, icp,
 };

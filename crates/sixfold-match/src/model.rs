@@ -8,7 +8,7 @@
 //!   one depth image cannot show them.
 
 use rayon::prelude::*;
-use sixfold_geometry::{Camera, PointCloud, Pose, Vec3};
+use sixfold_geometry::{Camera, PointCloud, Pose, Vec3, sphere_directions};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 use thiserror::Error;
@@ -180,19 +180,6 @@ pub(crate) fn local_frame(n: &V3) -> [V3; 3] {
 pub(crate) fn turn_about_normal(frame: &[V3; 3], d: &V3) -> u8 {
     let (y, z) = (frame[1].dot(d), frame[2].dot(d));
     (z.atan2(y) * (128.0 / std::f32::consts::PI)).round() as i32 as u8
-}
-
-/// Evenly spread unit directions (Fibonacci sphere).
-pub(crate) fn sphere_directions(n: usize) -> Vec<Vec3> {
-    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-    (0..n)
-        .map(|i| {
-            let z = 1.0 - (2.0 * i as f64 + 1.0) / n as f64;
-            let r = (1.0 - z * z).sqrt();
-            let a = golden * i as f64;
-            Vec3::new(r * a.cos(), r * a.sin(), z)
-        })
-        .collect()
 }
 
 /// A camera pose that looks at `centre` from `direction`, `distance` metres away.

@@ -1,7 +1,7 @@
 //! The table under a set of posed objects: the plane that most of them touch from above. Ground truth of real
 //! scenes knows the objects but not what they stand on; simulated depth needs both.
 
-use sixfold_geometry::{Camera, Plane, Vec2, Vec3};
+use sixfold_geometry::{Camera, Plane, Vec2, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
 
 use crate::raster::SceneObject;
@@ -13,7 +13,7 @@ const GAP_LIMIT: f64 = 0.02;
 /// taken to be held upright (its y axis points down, within 80 degrees) and above the table.
 /// `None` when there is no object.
 pub fn support_plane(objects: &[SceneObject<'_>]) -> Option<Plane> {
-    let directions = sphere(1500);
+    let directions = sphere_directions(1500);
     // The corners that matter: each object's extreme vertices over many directions.
     let extremes: Vec<Vec<Vec3>> = objects
         .iter()
@@ -88,17 +88,6 @@ pub fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
     let v = plane.normal.cross(&u);
     let corners = vec![centre - u - v, centre + u - v, centre + u + v, centre - u + v];
     Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok()
-}
-
-fn sphere(n: usize) -> Vec<Vec3> {
-    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-    (0..n)
-        .map(|i| {
-            let z = 1.0 - (2.0 * i as f64 + 1.0) / n as f64;
-            let r = (1.0 - z * z).sqrt();
-            Vec3::new(r * (golden * i as f64).cos(), r * (golden * i as f64).sin(), z)
-        })
-        .collect()
 }
 
 #[cfg(test)]
