@@ -1,0 +1,1 @@
+//! Image augmentation, occluders, procedural backgrounds and textures.

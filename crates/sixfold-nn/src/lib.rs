@@ -1,0 +1,1 @@
+//! Backbones, fast convolutions, weight files and the training loop on Burn.

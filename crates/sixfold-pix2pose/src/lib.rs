@@ -1,0 +1,1 @@
+//! Pix2Pose (Park, Patten, Vincze 2019; dissertation chapter 3).
