@@ -1,0 +1,256 @@
+//! Dense convolutions as matrix products: pointwise ones directly on the image, others through patches laid out as
+//! columns (im2col), a band of rows at a time so that the patches stay in the cache.
+
+use super::shared::{Shared, View, activate, before_activation, multiply, sum};
+use super::{ConvGradients, ConvShape, ConvSpec};
+use rayon::prelude::*;
+use std::cell::RefCell;
+
+/// Patch matrices are kept below this many numbers (1 MiB).
+const BAND: usize = 1 << 18;
+
+/// Groups of images whose weight gradients are summed apart and then together: fixed, so that the sum does not depend
+/// on the number of threads.
+const GROUPS: usize = 8;
+
+thread_local! {
+    static COLUMNS: RefCell<[Vec<f32>; 3]> = const { RefCell::new([Vec::new(), Vec::new(), Vec::new()]) };
+}
+
+/// A buffer of at least `length` numbers; what it held is undefined.
+fn sized(buffer: &mut Vec<f32>, length: usize) -> &mut [f32] {
+    if buffer.len() < length {
+        buffer.resize(length, 0.0);
+    }
+    &mut buffer[..length]
+}
+
+struct Plan {
+    /// Rows and columns of the output.
+    out: [usize; 2],
+    /// Numbers in a patch.
+    patch: usize,
+    /// Output rows in a band.
+    rows: usize,
+    /// A 1x1 convolution with stride 1: the image itself is the patch matrix.
+    pointwise: bool,
+}
+
+impl Plan {
+    fn new(shape: &ConvShape, spec: &ConvSpec) -> Self {
+        let out = shape.output_size(spec);
+        let patch = shape.inputs * shape.kernel * shape.kernel;
+        let pointwise = shape.kernel == 1 && spec.stride == 1 && spec.padding == [0, 0];
+        let longest = if pointwise { BAND / (shape.inputs + shape.outputs) } else { BAND / patch };
+        Self { out, patch, rows: (longest / out[1]).clamp(1, out[0]), pointwise }
+    }
+
+    fn pixels(&self) -> usize {
+        self.out[0] * self.out[1]
+    }
+
+    fn bands(&self) -> usize {
+        self.out[0].div_ceil(self.rows)
+    }
+
+    /// First row and number of rows of a band.
+    fn band(&self, index: usize) -> (usize, usize) {
+        let first = index * self.rows;
+        (first, self.rows.min(self.out[0] - first))
+    }
+}
+
+/// Output columns for which column `kx` of the kernel lies inside the image: `[first, last)`.
+fn inside(kx: usize, width: usize, out: usize, spec: &ConvSpec) -> (usize, usize) {
+    let first = spec.padding[0].saturating_sub(kx).div_ceil(spec.stride);
+    let last = (width + spec.padding[0]).saturating_sub(kx).div_ceil(spec.stride);
+    (first.min(out), last.min(out))
+}
+
+/// Lays the patches of output rows `first..first + rows` of one image out as columns: `patch x (rows * out columns)`.
+fn columns(x: &[f32], shape: &ConvShape, spec: &ConvSpec, plan: &Plan, (first, rows): (usize, usize), out: &mut [f32]) {
+    let [height, width] = shape.size;
+    let n = rows * plan.out[1];
+    let k = shape.kernel;
+    for (channel, image) in x.chunks_exact(shape.pixels()).enumerate() {
+        for ky in 0..k {
+            for kx in 0..k {
+                let line = &mut out[((channel * k + ky) * k + kx) * n..][..n];
+                let (from, to) = inside(kx, width, plan.out[1], spec);
+                for (row, target) in line.chunks_exact_mut(plan.out[1]).enumerate() {
+                    let y = ((first + row) * spec.stride + ky).wrapping_sub(spec.padding[0]);
+                    if y >= height || from >= to {
+                        target.fill(0.0);
+                        continue;
+                    }
+                    let source = &image[y * width..][..width];
+                    target[..from].fill(0.0);
+                    target[to..].fill(0.0);
+                    let start = from * spec.stride + kx - spec.padding[0];
+                    if spec.stride == 1 {
+                        target[from..to].copy_from_slice(&source[start..start + to - from]);
+                    } else {
+                        for (value, s) in target[from..to].iter_mut().zip(source[start..].iter().step_by(spec.stride)) {
+                            *value = *s;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The transpose of [`columns`]: adds each number of the patches to the pixel it came from.
+fn add_columns(
+    patches: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+    plan: &Plan,
+    (first, rows): (usize, usize),
+    dx: &mut [f32],
+) {
+    let [height, width] = shape.size;
+    let n = rows * plan.out[1];
+    let k = shape.kernel;
+    for (channel, image) in dx.chunks_exact_mut(shape.size[0] * shape.size[1]).enumerate() {
+        for ky in 0..k {
+            for kx in 0..k {
+                let line = &patches[((channel * k + ky) * k + kx) * n..][..n];
+                let (from, to) = inside(kx, width, plan.out[1], spec);
+                if from >= to {
+                    continue;
+                }
+                for (row, source) in line.chunks_exact(plan.out[1]).enumerate() {
+                    let y = ((first + row) * spec.stride + ky).wrapping_sub(spec.padding[0]);
+                    if y >= height {
+                        continue;
+                    }
+                    let start = from * spec.stride + kx - spec.padding[0];
+                    let target = &mut image[y * width..][start..width];
+                    if spec.stride == 1 {
+                        for (t, s) in target.iter_mut().zip(&source[from..to]) {
+                            *t += s;
+                        }
+                    } else {
+                        for (t, s) in target.iter_mut().step_by(spec.stride).zip(&source[from..to]) {
+                            *t += s;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+pub(super) fn dense_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+    let plan = Plan::new(shape, spec);
+    let pixels = plan.pixels();
+    let mut y = vec![0.0; shape.batch * shape.outputs * pixels];
+    let shared = Shared::new(&mut y);
+    let image = shape.inputs * shape.pixels();
+    // Several images keep both cores busy; a single one is cut into bands (at least four where it can be).
+    let plan = if shape.batch == 1 { Plan { rows: plan.rows.min(plan.out[0].div_ceil(4)), ..plan } } else { plan };
+    (0..shape.batch * plan.bands()).into_par_iter().for_each(|task| {
+        let (b, band) = (task / plan.bands(), plan.band(task % plan.bands()));
+        let (start, n) = (band.0 * plan.out[1], band.1 * plan.out[1]);
+        let x = &x[b * image..][..image];
+        COLUMNS.with_borrow_mut(|[patches, result, _]| {
+            let result = sized(result, shape.outputs * n);
+            for (line, bias) in result.chunks_exact_mut(n).zip(bias) {
+                line.fill(*bias);
+            }
+            let left = View { data: weight, strides: [plan.patch, 1] };
+            let right = if plan.pointwise {
+                View { data: &x[start..], strides: [pixels, 1] }
+            } else {
+                let patches = sized(patches, plan.patch * n);
+                columns(x, shape, spec, &plan, band, patches);
+                View { data: patches, strides: [n, 1] }
+            };
+            multiply([shape.outputs, n, plan.patch], result, n, true, left, right);
+            activate(result, spec.activation);
+            for (channel, line) in result.chunks_exact(n).enumerate() {
+                // SAFETY: every task writes its own image and rows.
+                #[allow(unsafe_code)]
+                let target = unsafe { shared.slice((b * shape.outputs + channel) * pixels + start, n) };
+                target.copy_from_slice(line);
+            }
+        });
+    });
+    y
+}
+
+pub(super) fn dense_backward(
+    x: &[f32],
+    weight: &[f32],
+    y: &[f32],
+    dy: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+    [want_x, want_weight]: [bool; 2],
+) -> ConvGradients {
+    let plan = Plan::new(shape, spec);
+    let pixels = plan.pixels();
+    let image = shape.inputs * shape.pixels();
+    let mut dx = vec![0.0; if want_x { x.len() } else { 0 }];
+    let shared = Shared::new(&mut dx);
+    let group_size = shape.batch.div_ceil(GROUPS).max(1);
+    let groups: Vec<(Vec<f32>, Vec<f32>)> = (0..shape.batch.div_ceil(group_size))
+        .into_par_iter()
+        .map(|group| {
+            let mut dweight = vec![0.0; if want_weight { weight.len() } else { 0 }];
+            let mut dbias = vec![0.0; if want_weight { shape.outputs } else { 0 }];
+            for b in group * group_size..((group + 1) * group_size).min(shape.batch) {
+                let x = &x[b * image..][..image];
+                // SAFETY: every image belongs to one group.
+                #[allow(unsafe_code)]
+                let dx = if want_x { unsafe { shared.slice(b * image, image) } } else { &mut [] };
+                for band in (0..plan.bands()).map(|i| plan.band(i)) {
+                    let (start, n) = (band.0 * plan.out[1], band.1 * plan.out[1]);
+                    COLUMNS.with_borrow_mut(|[patches, gradient, dpatches]| {
+                        let gradient = sized(gradient, shape.outputs * n);
+                        for (channel, line) in gradient.chunks_exact_mut(n).enumerate() {
+                            let range = (b * shape.outputs + channel) * pixels + start..;
+                            before_activation(line, &y[range.clone()][..n], &dy[range][..n], spec.activation);
+                        }
+                        if want_weight {
+                            for (bias, line) in dbias.iter_mut().zip(gradient.chunks_exact(n)) {
+                                *bias += sum(line);
+                            }
+                            // The patches, transposed: n x patch.
+                            let right = if plan.pointwise {
+                                View { data: &x[start..], strides: [1, pixels] }
+                            } else {
+                                let patches = sized(patches, plan.patch * n);
+                                columns(x, shape, spec, &plan, band, patches);
+                                View { data: patches, strides: [1, n] }
+                            };
+                            let left = View { data: gradient, strides: [n, 1] };
+                            multiply([shape.outputs, plan.patch, n], &mut dweight, plan.patch, true, left, right);
+                        }
+                        if want_x {
+                            let left = View { data: weight, strides: [1, plan.patch] };
+                            let right = View { data: gradient, strides: [n, 1] };
+                            let size = [plan.patch, n, shape.outputs];
+                            if plan.pointwise {
+                                multiply(size, &mut dx[start..], pixels, false, left, right);
+                            } else {
+                                let dpatches = sized(dpatches, plan.patch * n);
+                                multiply(size, dpatches, n, false, left, right);
+                                add_columns(dpatches, shape, spec, &plan, band, dx);
+                            }
+                        }
+                    });
+                }
+            }
+            (dweight, dbias)
+        })
+        .collect();
+    let mut total = groups.into_iter();
+    let (mut dweight, mut dbias) = total.next().unwrap_or_default();
+    for (w, b) in total {
+        dweight.iter_mut().zip(&w).for_each(|(t, v)| *t += v);
+        dbias.iter_mut().zip(&b).for_each(|(t, v)| *t += v);
+    }
+    ConvGradients { x: dx, weight: dweight, bias: dbias }
+}

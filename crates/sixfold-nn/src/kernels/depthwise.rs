@@ -1,0 +1,214 @@
+//! Depthwise convolutions (one kernel a channel), directly, a row at a time.
+//!
+//! Each channel is copied into a padded buffer; with a stride of two its even and odd columns are kept apart, so that
+//! every inner loop runs over neighbouring numbers.
+
+use super::shared::{Shared, activate, before_activation, sum, vectorised};
+use super::{ConvGradients, ConvShape, ConvSpec};
+use rayon::prelude::*;
+
+/// The padded channel: `stride` phases of columns, each `rows x columns`.
+struct Padded {
+    rows: usize,
+    columns: usize,
+    stride: usize,
+}
+
+impl Padded {
+    fn new(shape: &ConvShape, spec: &ConvSpec) -> Self {
+        let padding = spec.padding[0] + spec.padding[1];
+        // Sixteen more columns than needed: the last vector of a row may read past its end.
+        let columns = (shape.size[1] + padding).div_ceil(spec.stride) + 16;
+        Self { rows: shape.size[0] + padding, columns, stride: spec.stride }
+    }
+
+    fn len(&self) -> usize {
+        self.rows * self.columns * self.stride
+    }
+
+    /// Where kernel column `kx` of padded row `row` begins.
+    fn start(&self, row: usize, kx: usize) -> usize {
+        ((kx % self.stride) * self.rows + row) * self.columns + kx / self.stride
+    }
+
+    fn fill(&self, buffer: &mut [f32], image: &[f32], width: usize, spec: &ConvSpec) {
+        for (y, line) in image.chunks_exact(width).enumerate() {
+            let row = y + spec.padding[0];
+            if self.stride == 1 {
+                buffer[self.start(row, 0) + spec.padding[0]..][..width].copy_from_slice(line);
+            } else {
+                for (x, value) in line.iter().enumerate() {
+                    let column = x + spec.padding[0];
+                    buffer[self.start(row, column % self.stride) + column / self.stride] = *value;
+                }
+            }
+        }
+    }
+
+    fn unfill(&self, buffer: &[f32], image: &mut [f32], width: usize, spec: &ConvSpec) {
+        for (y, line) in image.chunks_exact_mut(width).enumerate() {
+            let row = y + spec.padding[0];
+            if self.stride == 1 {
+                line.copy_from_slice(&buffer[self.start(row, 0) + spec.padding[0]..][..width]);
+            } else {
+                for (x, value) in line.iter_mut().enumerate() {
+                    let column = x + spec.padding[0];
+                    *value = buffer[self.start(row, column % self.stride) + column / self.stride];
+                }
+            }
+        }
+    }
+}
+
+vectorised! {
+    /// One output row: the sum over the taps of `weight * source[start..]`, in blocks of sixteen columns.
+    fn row(out: &mut [f32], source: &[f32], starts: &[usize], weights: &[f32], bias: f32) {
+        let width = out.len();
+        let mut x = 0;
+        while x < width {
+            let mut lanes = [bias; 16];
+            for (start, weight) in starts.iter().zip(weights) {
+                let values = &source[start + x..start + x + 16];
+                for (lane, v) in lanes.iter_mut().zip(values) {
+                    *lane += weight * v;
+                }
+            }
+            let n = 16.min(width - x);
+            out[x..x + n].copy_from_slice(&lanes[..n]);
+            x += 16;
+        }
+    }
+}
+
+vectorised! {
+    /// Weight gradient of one channel: for every tap the sum over the rows of `gradient * source`. `starts` holds the
+    /// taps of each row, `gradient` rows of `wide` columns, a multiple of sixteen.
+    fn weight_gradient(dweight: &mut [f32], gradient: &[f32], wide: usize, source: &[f32], starts: &[usize]) {
+        let area = dweight.len();
+        for (tap, d) in dweight.iter_mut().enumerate() {
+            let mut lanes = [0.0f32; 16];
+            for (line, gradient) in gradient.chunks_exact(wide).enumerate() {
+                let source = &source[starts[line * area + tap]..][..wide];
+                for (a, b) in gradient.chunks_exact(16).zip(source.chunks_exact(16)) {
+                    for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+                        *lane += a * b;
+                    }
+                }
+            }
+            *d += lanes.iter().sum::<f32>();
+        }
+    }
+}
+
+vectorised! {
+    /// Input gradient of one channel: adds `weight * gradient` at every tap of every row.
+    fn input_gradient(out: &mut [f32], gradient: &[f32], wide: usize, weights: &[f32], starts: &[usize]) {
+        let area = weights.len();
+        for (line, gradient) in gradient.chunks_exact(wide).enumerate() {
+            for (weight, start) in weights.iter().zip(&starts[line * area..]) {
+                let out = &mut out[*start..][..wide];
+                for (o, g) in out.chunks_exact_mut(16).zip(gradient.chunks_exact(16)) {
+                    for (o, g) in o.iter_mut().zip(g) {
+                        *o += weight * g;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Starts of all taps of every output row, in the order of the weights.
+fn taps(padded: &Padded, kernel: usize, rows: usize) -> Vec<usize> {
+    let mut starts = Vec::with_capacity(rows * kernel * kernel);
+    for y in 0..rows {
+        for ky in 0..kernel {
+            starts.extend((0..kernel).map(|kx| padded.start(y * padded.stride + ky, kx)));
+        }
+    }
+    starts
+}
+
+pub(super) fn depthwise_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+    let [rows, columns] = shape.output_size(spec);
+    let padded = Padded::new(shape, spec);
+    let area = shape.kernel * shape.kernel;
+    let starts = taps(&padded, shape.kernel, rows);
+    let mut y = vec![0.0; shape.batch * shape.outputs * rows * columns];
+    y.par_chunks_mut(rows * columns).zip(x.par_chunks(shape.pixels())).enumerate().with_min_len(8).for_each_init(
+        || vec![0.0; padded.len()],
+        |buffer, (plane, (out, image))| {
+            let channel = plane % shape.outputs;
+            padded.fill(buffer, image, shape.size[1], spec);
+            for (out, starts) in out.chunks_exact_mut(columns).zip(starts.chunks_exact(area)) {
+                row(out, buffer, starts, &weight[channel * area..][..area], bias[channel]);
+            }
+            activate(out, spec.activation);
+        },
+    );
+    y
+}
+
+pub(super) fn depthwise_backward(
+    x: &[f32],
+    weight: &[f32],
+    y: &[f32],
+    dy: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+    [want_x, want_weight]: [bool; 2],
+) -> ConvGradients {
+    let [rows, columns] = shape.output_size(spec);
+    let padded = Padded::new(shape, spec);
+    let area = shape.kernel * shape.kernel;
+    let (pixels, out_pixels) = (shape.pixels(), rows * columns);
+    let mut dx = vec![0.0; if want_x { x.len() } else { 0 }];
+    let shared = Shared::new(&mut dx);
+    let starts = taps(&padded, shape.kernel, rows);
+    // Rows of the gradient, filled up with zeros to whole vectors.
+    let wide = columns.next_multiple_of(16);
+    let gradients: Vec<(Vec<f32>, f32)> = (0..shape.outputs)
+        .into_par_iter()
+        .with_min_len(4)
+        .map_init(
+            || (vec![0.0; padded.len()], vec![0.0; padded.len()], vec![0.0; rows * wide]),
+            |(buffer, dbuffer, gradient), channel| {
+                let weight = &weight[channel * area..][..area];
+                let mut dweight = vec![0.0; area];
+                let mut dbias = 0.0;
+                for b in 0..shape.batch {
+                    let plane = b * shape.outputs + channel;
+                    let out = plane * out_pixels..(plane + 1) * out_pixels;
+                    for ((g, y), dy) in gradient
+                        .chunks_exact_mut(wide)
+                        .zip(y[out.clone()].chunks_exact(columns))
+                        .zip(dy[out].chunks_exact(columns))
+                    {
+                        before_activation(&mut g[..columns], y, dy, spec.activation);
+                    }
+                    if want_weight {
+                        dbias += sum(gradient);
+                        padded.fill(buffer, &x[plane * pixels..][..pixels], shape.size[1], spec);
+                        weight_gradient(&mut dweight, gradient, wide, buffer, &starts);
+                    }
+                    if want_x {
+                        dbuffer.fill(0.0);
+                        input_gradient(dbuffer, gradient, wide, weight, &starts);
+                    }
+                    if want_x {
+                        // SAFETY: every channel of every image belongs to one task.
+                        #[allow(unsafe_code)]
+                        let dx = unsafe { shared.slice(plane * pixels, pixels) };
+                        padded.unfill(dbuffer, dx, shape.size[1], spec);
+                    }
+                }
+                (dweight, dbias)
+            },
+        )
+        .collect();
+    let (weight, bias): (Vec<Vec<f32>>, Vec<f32>) = gradients.into_iter().unzip();
+    if want_weight {
+        ConvGradients { x: dx, weight: weight.concat(), bias }
+    } else {
+        ConvGradients { x: dx, ..Default::default() }
+    }
+}

@@ -1,0 +1,83 @@
+//! Convolution kernels on plain `f32` slices: forward and backward of dense, pointwise and depthwise convolutions
+//! with bias and activation in one pass.
+//!
+//! All images are `channels x height x width`, row-major, batches one image after the other. Every sum runs in an
+//! order that the thread count does not change.
+
+mod dense;
+mod depthwise;
+mod shared;
+mod upsample;
+
+pub use shared::{Activation, ConvSpec};
+pub use upsample::{upsample_2x, upsample_2x_backward};
+
+use dense::{dense_backward, dense_forward};
+use depthwise::{depthwise_backward, depthwise_forward};
+
+/// Sizes of one convolution: `x` is `batch x inputs x height x width`, the weights are
+/// `outputs x inputs / groups x kernel x kernel`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConvShape {
+    /// Images.
+    pub batch: usize,
+    /// Input channels.
+    pub inputs: usize,
+    /// Output channels.
+    pub outputs: usize,
+    /// Input rows and columns.
+    pub size: [usize; 2],
+    /// Side of the kernel in pixels.
+    pub kernel: usize,
+}
+
+impl ConvShape {
+    /// Rows and columns of the output.
+    pub fn output_size(&self, spec: &ConvSpec) -> [usize; 2] {
+        let side = |i: usize| (self.size[i] + spec.padding[0] + spec.padding[1] - self.kernel) / spec.stride + 1;
+        [side(0), side(1)]
+    }
+
+    fn pixels(&self) -> usize {
+        self.size[0] * self.size[1]
+    }
+}
+
+/// Gradients of a convolution; those that were not asked for are empty.
+#[derive(Debug, Default)]
+pub struct ConvGradients {
+    /// With respect to the input, in its shape.
+    pub x: Vec<f32>,
+    /// With respect to the weights, in their shape.
+    pub weight: Vec<f32>,
+    /// With respect to the bias.
+    pub bias: Vec<f32>,
+}
+
+/// `activation(conv(x, weight) + bias)`.
+pub fn conv_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+    if spec.groups == 1 {
+        dense_forward(x, weight, bias, shape, spec)
+    } else {
+        depthwise_forward(x, weight, bias, shape, spec)
+    }
+}
+
+/// Gradients of [`conv_forward`], from its output `y` and the gradient `dy` with respect to it.
+///
+/// `wanted` says which of input, and weight with bias, are needed.
+pub fn conv_backward(
+    x: &[f32],
+    weight: &[f32],
+    y: &[f32],
+    dy: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+    wanted: [bool; 2],
+) -> ConvGradients {
+    if spec.groups == 1 {
+        dense_backward(x, weight, y, dy, shape, spec, wanted)
+    } else {
+        depthwise_backward(x, weight, y, dy, shape, spec, wanted)
+    }
+}

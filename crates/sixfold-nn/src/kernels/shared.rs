@@ -1,0 +1,199 @@
+//! What all convolution kernels share: their options, the activation, vector code for several processors, and
+//! writing to disjoint parts of one output from several threads.
+
+/// Non-linearity applied to the output of a convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Activation {
+    /// None.
+    Linear,
+    /// `max(0, x)`.
+    Relu,
+    /// `min(max(0, x), 6)`.
+    Relu6,
+}
+
+/// Options of a square convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConvSpec {
+    /// Step in both directions, in pixels.
+    pub stride: usize,
+    /// Zeros before and after each row and column. They differ for TensorFlow's `SAME` rule with a stride of two.
+    pub padding: [usize; 2],
+    /// 1, or the number of channels for a depthwise convolution.
+    pub groups: usize,
+    /// Applied to the result.
+    pub activation: Activation,
+}
+
+impl ConvSpec {
+    /// TensorFlow's `SAME` padding for an input side, kernel and stride.
+    pub fn same(side: usize, kernel: usize, stride: usize) -> [usize; 2] {
+        let total = ((side.div_ceil(stride) - 1) * stride + kernel).saturating_sub(side);
+        [total / 2, total - total / 2]
+    }
+}
+
+/// Compiles the body once for AVX-512, once for AVX2 and once for any processor, and calls the best one.
+/// Multiplication and addition stay apart, so that all of them give the same bits.
+macro_rules! vectorised {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block) => {
+        $(#[$meta])*
+        #[allow(clippy::too_many_arguments)]
+        $vis fn $name($($arg: $type),*) $(-> $out)? {
+            #[inline(always)]
+            #[allow(clippy::too_many_arguments)]
+            fn body($($arg: $type),*) $(-> $out)? $body
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+                #[allow(clippy::too_many_arguments)]
+                fn avx512($($arg: $type),*) $(-> $out)? {
+                    body($($arg),*)
+                }
+                #[target_feature(enable = "avx2")]
+                #[allow(clippy::too_many_arguments)]
+                fn avx2($($arg: $type),*) $(-> $out)? {
+                    body($($arg),*)
+                }
+                if std::arch::is_x86_feature_detected!("avx512f")
+                    && std::arch::is_x86_feature_detected!("avx512vl")
+                    && std::arch::is_x86_feature_detected!("avx512dq")
+                    && std::arch::is_x86_feature_detected!("avx512bw")
+                {
+                    // SAFETY: the processor has the features that the function was compiled for.
+                    #[allow(unsafe_code)]
+                    return unsafe { avx512($($arg),*) };
+                }
+                if std::arch::is_x86_feature_detected!("avx2") {
+                    // SAFETY: as above.
+                    #[allow(unsafe_code)]
+                    return unsafe { avx2($($arg),*) };
+                }
+            }
+            body($($arg),*)
+        }
+    };
+}
+pub(super) use vectorised;
+
+vectorised! {
+    /// Applies an activation in place.
+    pub(super) fn activate(values: &mut [f32], activation: Activation) {
+        match activation {
+            Activation::Linear => {}
+            Activation::Relu => values.iter_mut().for_each(|v| *v = v.max(0.0)),
+            Activation::Relu6 => values.iter_mut().for_each(|v| *v = v.max(0.0).min(6.0)),
+        }
+    }
+}
+
+vectorised! {
+    /// Gradient before the activation: `dy` where the output `y` is inside the activation's linear part, else 0.
+    pub(super) fn before_activation(out: &mut [f32], y: &[f32], dy: &[f32], activation: Activation) {
+        match activation {
+            Activation::Linear => out.copy_from_slice(dy),
+            Activation::Relu => {
+                for ((o, y), d) in out.iter_mut().zip(y).zip(dy) {
+                    *o = if *y > 0.0 { *d } else { 0.0 };
+                }
+            }
+            Activation::Relu6 => {
+                for ((o, y), d) in out.iter_mut().zip(y).zip(dy) {
+                    *o = if *y > 0.0 && *y < 6.0 { *d } else { 0.0 };
+                }
+            }
+        }
+    }
+}
+
+vectorised! {
+    /// Sum of a slice, in sixteen lanes.
+    pub(super) fn sum(values: &[f32]) -> f32 {
+        let mut lanes = [0.0f32; 16];
+        let chunks = values.chunks_exact(16);
+        let rest: f32 = chunks.remainder().iter().sum();
+        for chunk in chunks {
+            for (lane, v) in lanes.iter_mut().zip(chunk) {
+                *lane += v;
+            }
+        }
+        lanes.iter().sum::<f32>() + rest
+    }
+}
+
+/// A mutable buffer that several threads write to, each its own part.
+#[derive(Clone, Copy)]
+pub(super) struct Shared(*mut f32, usize);
+
+// SAFETY: the pointer is only used through `slice` and `pointer`, whose callers keep to disjoint parts.
+#[allow(unsafe_code)]
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+#[allow(unsafe_code)]
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    pub(super) fn new(buffer: &mut [f32]) -> Self {
+        Self(buffer.as_mut_ptr(), buffer.len())
+    }
+
+    /// Part of the buffer.
+    ///
+    /// # Safety
+    /// No other thread may use this range while the slice lives.
+    #[allow(unsafe_code, clippy::mut_from_ref)]
+    pub(super) unsafe fn slice(&self, start: usize, length: usize) -> &mut [f32] {
+        assert!(start + length <= self.1);
+        // SAFETY: within the buffer by the assertion; disjoint by the caller's promise.
+        unsafe { std::slice::from_raw_parts_mut(self.0.add(start), length) }
+    }
+}
+
+/// A matrix in a slice: start, row stride and column stride.
+#[derive(Clone, Copy)]
+pub(super) struct View<'a> {
+    pub(super) data: &'a [f32],
+    pub(super) strides: [usize; 2],
+}
+
+/// `out = add * out + left * right` on one thread. `out` is `m x n` with unit column stride and row stride
+/// `out_stride`, `left` is `m x k`, `right` is `k x n`.
+pub(super) fn multiply(
+    [m, n, k]: [usize; 3],
+    out: &mut [f32],
+    out_stride: usize,
+    add: bool,
+    left: View<'_>,
+    right: View<'_>,
+) {
+    let last = |rows: usize, columns: usize, strides: [usize; 2]| (rows - 1) * strides[0] + (columns - 1) * strides[1];
+    assert!(m > 0 && n > 0 && k > 0);
+    assert!(last(m, n, [out_stride, 1]) < out.len());
+    assert!(last(m, k, left.strides) < left.data.len());
+    assert!(last(k, n, right.strides) < right.data.len());
+    // SAFETY: the assertions keep every element inside its slice; `out` does not overlap the others, being `&mut`.
+    #[allow(unsafe_code)]
+    unsafe {
+        gemm::gemm(
+            m,
+            n,
+            k,
+            out.as_mut_ptr(),
+            1,
+            out_stride as isize,
+            add,
+            left.data.as_ptr(),
+            left.strides[1] as isize,
+            left.strides[0] as isize,
+            right.data.as_ptr(),
+            right.strides[1] as isize,
+            right.strides[0] as isize,
+            1.0,
+            1.0,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
+}
