@@ -1,1 +1,4 @@
 //! Pix2Pose (Park, Patten, Vincze 2019; dissertation chapter 3).
+
+pub mod networks;
+pub mod samples;

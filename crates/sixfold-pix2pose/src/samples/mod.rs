@@ -1,0 +1,23 @@
+//! Training samples for Pix2Pose: crops of few posed photographs and renders, augmented, with the coordinates, the
+//! silhouette and the visible part of the object (dissertation, section 3.4.1, tables 3.2 and 3.3).
+//!
+//! [`SampleSource`] draws sample after sample. Each is a function of seed, object and number alone, so that any number
+//! of threads makes the same training run.
+
+mod composition;
+mod error;
+mod options;
+mod poses;
+mod real;
+mod rendering;
+mod second_stage;
+mod source;
+mod symmetry;
+#[cfg(test)]
+mod tests;
+mod window;
+
+pub use error::SampleError;
+pub use options::SampleOptions;
+pub use real::{RealCrop, read_real_crops};
+pub use source::{Sample, SampleSource, TrainingObject};

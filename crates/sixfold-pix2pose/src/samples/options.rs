@@ -1,0 +1,183 @@
+//! What samples look like.
+
+use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
+
+use sixfold_augment::ColorAugmentation;
+use sixfold_geometry::Camera;
+
+use super::error::SampleError;
+
+/// Sizes, shares and ranges. The defaults are for few real images of objects on a table, with occlusion.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SampleOptions {
+    /// Side of the input image, pixels.
+    pub size: usize,
+    /// Side of coordinates and masks, pixels; `None` for the input's.
+    pub target_size: Option<usize>,
+    /// Share of rendered samples of an object that has photographs and can be rendered, 0..1.
+    pub render_share: f32,
+    /// Side of the crop over the longer side of the object's box (dissertation: 1.5).
+    pub crop_factor: f64,
+    /// The crop's centre moves by up to this fraction of the box.
+    pub centre_jitter: f64,
+    /// The crop's side changes by up to this fraction.
+    pub size_jitter: f64,
+    /// Chance that the box is that of the visible part; otherwise that of the whole object.
+    pub visible_box_chance: f32,
+    /// Largest turn in the image plane to either side, radians (table 3.3: 45 degrees).
+    pub rotation: f32,
+    /// Chance that a photograph keeps its own background.
+    pub keep_background_chance: f32,
+    /// Chance of an added occluder.
+    pub occlusion_chance: f32,
+    /// Fraction of the visible object that occluders hide (table 3.3).
+    pub occlusion: [f32; 2],
+    /// Chance that an occluder is a picture of another object, where there are others.
+    pub object_occluder_chance: f32,
+    /// Most pictures of other objects pasted behind the object.
+    pub clutter: u32,
+    /// Sigma of the blur along the border of a pasted object, pixels.
+    pub border_blur: [f32; 2],
+    /// Share of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
+    pub second_stage_share: f32,
+    /// So many consecutive sample numbers belong to the same stage: 1 mixes both within a batch, the batch size makes
+    /// whole batches alternate as in the dissertation.
+    pub second_stage_block: u64,
+    /// Colours of the finished image.
+    pub color: ColorAugmentation,
+    /// Colours of a rendered object before it is pasted.
+    pub render_color: ColorAugmentation,
+    /// Share of rendered poses that lie near one of a photograph; the others look from anywhere within `elevation`.
+    pub near_real_share: f32,
+    /// Largest turn about each axis away from a photograph's pose, radians.
+    pub pose_noise: f64,
+    /// Elevation of the camera over the object's xy plane, radians: `[0, pi/2]` is the upper hemisphere.
+    pub elevation: [f32; 2],
+    /// Largest turn about the view axis from upright for poses that are not near a photograph's, radians.
+    pub view_turn: f32,
+    /// Distance of rendered objects, metres; `None` takes the photographs' range (without any: 4 to 12 diameters).
+    pub distance: Option<[f64; 2]>,
+    /// Camera of rendered objects; `None` takes the photographs' (without any: 640x480, focal length 600).
+    pub camera: Option<Camera>,
+    /// Chance that a rendered object has random colours instead of its mesh's (always, when the mesh has none).
+    pub random_color_chance: f32,
+    /// Meshes with more faces are simplified to about so many before they are drawn.
+    pub faces: usize,
+    /// Seed of the pictures that are made once (renders used as occluders).
+    pub seed: u64,
+}
+
+impl Default for SampleOptions {
+    fn default() -> Self {
+        SampleOptions {
+            size: 128,
+            target_size: None,
+            render_share: 0.5,
+            crop_factor: 1.5,
+            centre_jitter: 0.07,
+            size_jitter: 0.2,
+            visible_box_chance: 0.5,
+            rotation: FRAC_PI_4,
+            keep_background_chance: 0.5,
+            occlusion_chance: 0.7,
+            occlusion: [0.04, 0.5],
+            object_occluder_chance: 0.5,
+            clutter: 3,
+            border_blur: [0.4, 1.5],
+            second_stage_share: 0.5,
+            second_stage_block: 1,
+            color: ColorAugmentation::real_images(),
+            render_color: ColorAugmentation::renders(),
+            near_real_share: 0.5,
+            pose_noise: 25f64.to_radians(),
+            elevation: [0.0, FRAC_PI_2],
+            view_turn: std::f32::consts::PI,
+            distance: None,
+            camera: None,
+            random_color_chance: 0.0,
+            faces: 6000,
+            seed: 0,
+        }
+    }
+}
+
+impl SampleOptions {
+    /// The side of coordinates and masks, pixels.
+    pub fn target(&self) -> usize {
+        self.target_size.unwrap_or(self.size)
+    }
+
+    /// Whether sample `number` imitates the second stage.
+    pub fn is_second_stage(&self, number: u64) -> bool {
+        let block = (number / self.second_stage_block.max(1)) as f64;
+        let share = f64::from(self.second_stage_share);
+        ((block + 1.0) * share).floor() > (block * share).floor()
+    }
+
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`SampleError::Option`] and [`SampleError::Augment`].
+    pub fn check(&self) -> Result<(), SampleError> {
+        let wrong = |field, found: String, expected| Err(SampleError::Option { field, found, expected });
+        for (field, size) in [("size", self.size), ("target_size", self.target())] {
+            if !(8..=1024).contains(&size) {
+                return wrong(field, size.to_string(), "8 to 1024 pixels");
+            }
+        }
+        let probability = "a number between 0 and 1";
+        for (field, value) in [
+            ("render_share", self.render_share),
+            ("visible_box_chance", self.visible_box_chance),
+            ("keep_background_chance", self.keep_background_chance),
+            ("occlusion_chance", self.occlusion_chance),
+            ("object_occluder_chance", self.object_occluder_chance),
+            ("second_stage_share", self.second_stage_share),
+            ("near_real_share", self.near_real_share),
+            ("random_color_chance", self.random_color_chance),
+        ] {
+            if !(0.0..=1.0).contains(&value) {
+                return wrong(field, value.to_string(), probability);
+            }
+        }
+        let numbers = [
+            ("crop_factor", self.crop_factor, 1.0, 4.0, "a factor from 1 to 4"),
+            ("centre_jitter", self.centre_jitter, 0.0, 0.5, "a fraction from 0 to 0.5"),
+            ("size_jitter", self.size_jitter, 0.0, 0.9, "a fraction from 0 to 0.9"),
+            ("rotation", f64::from(self.rotation), 0.0, 3.15, "an angle from 0 to pi, radians"),
+            ("view_turn", f64::from(self.view_turn), 0.0, 3.15, "an angle from 0 to pi, radians"),
+            ("pose_noise", self.pose_noise, 0.0, 3.15, "an angle from 0 to pi, radians"),
+        ];
+        for (field, value, low, high, expected) in numbers {
+            if !(value >= low && value <= high) {
+                return wrong(field, value.to_string(), expected);
+            }
+        }
+        let ranges = [
+            ("occlusion", self.occlusion, 0.0, 0.95, "two fractions in order from 0 to 0.95"),
+            ("border_blur", self.border_blur, 0.0, 8.0, "two sigmas in order from 0 to 8 pixels"),
+            ("elevation", self.elevation, -1.58, 1.58, "two angles in order from -pi/2 to pi/2, radians"),
+        ];
+        for (field, range, low, high, expected) in ranges {
+            if !(range[0] >= low && range[0] <= range[1] && range[1] <= high) {
+                return wrong(field, format!("{range:?}"), expected);
+            }
+        }
+        if let Some(range) = self.distance
+            && !(range[0] > 0.01 && range[0] <= range[1] && range[1] < 100.0)
+        {
+            return wrong("distance", format!("{range:?}"), "two distances in order from 0.01 to 100 metres");
+        }
+        if self.faces < 100 {
+            return wrong("faces", self.faces.to_string(), "at least 100");
+        }
+        if let Some(camera) = &self.camera
+            && let Err(error) = camera.check()
+        {
+            return wrong("camera", error.to_string(), "a usable camera");
+        }
+        self.color.check()?;
+        self.render_color.check()?;
+        Ok(())
+    }
+}

@@ -1,0 +1,125 @@
+//! Drawing an object: its coordinates and silhouette as targets, and its colours under random light.
+
+use rand::RngExt;
+use sixfold_augment::{Coverage, Patch, Random, uniform};
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
+
+/// Coordinates (3 planes, normalised, 0 outside) and silhouette (0 or 1) of the whole object.
+pub(super) fn targets(
+    mesh: &Mesh,
+    scale: &BoundingBoxScale,
+    camera: &Camera,
+    camera_from_object: &Pose,
+) -> (Vec<f32>, Coverage) {
+    let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
+    let mut frame = Frame::new(camera);
+    frame.render(&objects, &RenderOptions::default());
+    let points = frame.object_coordinates(&objects);
+    let pixels = camera.width * camera.height;
+    let mut coordinates = vec![0.0; 3 * pixels];
+    let mut silhouette = Coverage::filled(camera.width, camera.height, 0.0);
+    let centre = scale.centre.map(|c| c as f32);
+    let inverse = scale.half_size.map(|h| (1.0 / h) as f32);
+    for (i, p) in points.as_slice().iter().enumerate() {
+        if p[0].is_nan() {
+            continue;
+        }
+        silhouette.data[i] = 1.0;
+        for c in 0..3 {
+            coordinates[c * pixels + i] = ((p[c] - centre[c]) * inverse[c]).clamp(-1.0, 1.0);
+        }
+    }
+    (coordinates, silhouette)
+}
+
+/// The object's colours and silhouette.
+pub(super) fn colors(
+    mesh: &Mesh,
+    camera: &Camera,
+    camera_from_object: &Pose,
+    lights: &[Light],
+    material: &Material,
+) -> (RgbImage, Coverage) {
+    let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
+    let mut frame = Frame::new(camera);
+    frame.render(&objects, &RenderOptions::default());
+    let image = shade(&frame, &objects, lights, material, None);
+    let data = frame.inverse_depth().iter().map(|z| f32::from(*z > 0.0)).collect();
+    (image, Coverage { width: camera.width, height: camera.height, data })
+}
+
+/// As [`colors`], in planes.
+pub(super) fn color_patch(
+    mesh: &Mesh,
+    camera: &Camera,
+    camera_from_object: &Pose,
+    random: &mut Random,
+) -> (Patch, Coverage) {
+    let lights = random_lights(random);
+    let material = random_material(random);
+    let (image, silhouette) = colors(mesh, camera, camera_from_object, &lights, &material);
+    (Patch::from_rgb(&image), silhouette)
+}
+
+/// Light from everywhere and one to three lamps on the camera's side.
+pub(super) fn random_lights(random: &mut Random) -> Vec<Light> {
+    let tint = |strength: f32, random: &mut Random| -> [f32; 3] {
+        std::array::from_fn(|_| strength * uniform(random, [0.9, 1.1]))
+    };
+    let ambient = uniform(random, [0.25, 0.8]);
+    let mut lights = vec![Light::Ambient { color: tint(ambient, random) }];
+    let lamps = random.random_range(1..4u32);
+    for _ in 0..lamps {
+        let strength = uniform(random, [0.1, 0.9]) / lamps as f32;
+        // Travels away from the camera and, more often than not, down.
+        let direction = Vec3::new(
+            f64::from(uniform(random, [-1.0, 1.0])),
+            f64::from(uniform(random, [-0.5, 1.3])),
+            f64::from(uniform(random, [0.1, 1.0])),
+        );
+        lights.push(Light::Directional { direction, color: tint(strength, random) });
+    }
+    lights
+}
+
+pub(super) fn random_material(random: &mut Random) -> Material {
+    let shiny = random.random::<f32>() < 0.4;
+    Material {
+        specular: if shiny { uniform(random, [0.05, 0.5]) } else { 0.0 },
+        shininess: uniform(random, [5.0, 60.0]),
+        plain: std::array::from_fn(|_| random.random_range(20..=235u8)),
+    }
+}
+
+/// The mesh in random colours that change slowly over its surface, for shapes without colours.
+pub(super) fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
+    let (low, high) = mesh.bounding_box();
+    let size = (high - low).norm().max(1e-9);
+    let base: [f32; 3] = std::array::from_fn(|_| uniform(random, [0.1, 0.9]));
+    let waves: Vec<(Vec3, f64, [f32; 3])> = (0..random.random_range(1..5u32))
+        .map(|_| {
+            let k = Vec3::from_fn(|_, _| f64::from(uniform(random, [-25.0, 25.0]))) / size;
+            let phase = f64::from(uniform(random, [0.0, std::f32::consts::TAU]));
+            (k, phase, std::array::from_fn(|_| uniform(random, [-0.25, 0.25])))
+        })
+        .collect();
+    let colors = mesh
+        .vertices()
+        .iter()
+        .map(|v| {
+            let mut color = base;
+            for (k, phase, amount) in &waves {
+                let wave = (k.dot(v) + phase).sin() as f32;
+                (0..3).for_each(|c| color[c] += amount[c] * wave);
+            }
+            color.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8)
+        })
+        .collect();
+    // One colour per vertex always fits. The texture would win over it, so only the shape is kept.
+    Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())
+        .and_then(|shape| shape.with_normals(mesh.vertex_normals()))
+        .and_then(|shape| shape.with_colors(colors))
+        .unwrap_or_else(|_| mesh.clone())
+}

@@ -1,0 +1,49 @@
+//! The input of the second stage, imitated: everything outside what the first stage took for the object is grey
+//! (dissertation, section 3.3). The first stage errs, so the mask is disturbed: its border grows, shrinks and wobbles,
+//! rectangles are missing or added, holes appear.
+
+use rand::RngExt;
+use sixfold_augment::{Coverage, Patch, Random, uniform};
+
+/// Value of what is masked out, in images of 0..1.
+pub(super) const GREY: f32 = 0.5;
+
+/// Greys out all but a disturbed form of `visible`; `whole` is the silhouette with its hidden parts, which the first
+/// stage sometimes keeps.
+pub(super) fn imitate(image: &mut Patch, visible: &Coverage, whole: &Coverage, random: &mut Random) {
+    let side = image.width as f32;
+    let scale = side / 128.0;
+    let base = if random.random::<f32>() < 0.25 { whole } else { visible };
+    let grow = uniform(random, [-3.0, 5.0]) * scale;
+    let wobble = uniform(random, [0.3, 4.0]) * scale;
+    let mut kept = base.disturbed(grow, wobble, random);
+    if random.random::<f32>() < 0.4 {
+        fill(&mut kept, 0.5, 0.0, random);
+    }
+    if random.random::<f32>() < 0.4 {
+        fill(&mut kept, 0.4, 1.0, random);
+    }
+    if random.random::<f32>() < 0.25 {
+        // Holes where noise, fine against the object, is high.
+        let field = Coverage::filled(kept.width, kept.height, 0.5);
+        let holes = field.disturbed(-uniform(random, [1.5, 3.5]) * scale, 4.0 * scale, random);
+        kept.data.iter_mut().zip(&holes.data).for_each(|(k, h)| *k *= 1.0 - h);
+    }
+    let pixels = image.width * image.height;
+    for plane in image.data.chunks_exact_mut(pixels.max(1)) {
+        plane.iter_mut().zip(&kept.data).for_each(|(v, k)| *v = GREY + (*v - GREY) * k);
+    }
+}
+
+/// Sets a random rectangle, its sides at most `largest` of the crop.
+fn fill(mask: &mut Coverage, largest: f32, value: f32, random: &mut Random) {
+    let mut span = |size: usize| {
+        let length = uniform(random, [0.05, largest]) * size as f32;
+        let start = uniform(random, [0.0, size as f32 - length]);
+        start as usize..((start + length) as usize).min(size)
+    };
+    let (columns, rows) = (span(mask.width), span(mask.height));
+    for y in rows {
+        mask.data[y * mask.width..(y + 1) * mask.width][columns.clone()].fill(value);
+    }
+}

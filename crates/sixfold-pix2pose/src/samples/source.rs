@@ -1,0 +1,381 @@
+//! The source of training samples: objects, photographs and backgrounds go in, samples come out.
+
+use std::collections::BTreeMap;
+
+use rand::RngExt;
+use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, stream, uniform};
+use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3, sphere_directions};
+use sixfold_mesh::{Mesh, ModelInfo, simplify};
+use sixfold_render::BoundingBoxScale;
+
+use super::composition::{Composition, Scenery, gain};
+use super::error::SampleError;
+use super::options::SampleOptions;
+use super::poses::PoseRange;
+use super::real::RealCrop;
+use super::rendering::{color_patch, colors, random_lights, random_material, randomly_colored, targets};
+use super::second_stage;
+use super::symmetry::canonical;
+use super::window::{Extent, Window, turned, turned_pixel};
+
+/// Renders of each object that serve as clutter and occluders, and their side in pixels.
+const CUTOUTS_PER_OBJECT: u64 = 16;
+const CUTOUT_SIDE: usize = 96;
+/// The camera of renders where nobody gives one.
+const DEFAULT_CAMERA: Camera =
+    Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+
+/// One training sample. All arrays are row-major, channel first; S is the input's side, T the targets'
+/// ([`SampleOptions::target`]). Target pixel `(x, y)` stands for the centre of its block of input pixels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// The input image, 3 x S x S, in 0..1.
+    pub rgb: Vec<f32>,
+    /// Normalised object coordinates, 3 x T x T, in -1..1, 0 outside the object; also where it is hidden.
+    pub coordinates: Vec<f32>,
+    /// 1 within the silhouette, hidden parts included, T x T.
+    pub object: Vec<f32>,
+    /// 1 where the object is visible in the input, T x T.
+    pub visible: Vec<f32>,
+    /// Place of the object in the list given to [`SampleSource::new`].
+    pub object_index: usize,
+}
+
+/// An object to be learnt.
+#[derive(Debug, Clone)]
+pub struct TrainingObject {
+    /// Its id in the dataset.
+    pub id: u32,
+    /// Its surface, with colours or texture if it is to be rendered in its own colours.
+    pub mesh: Mesh,
+    /// Diameter and symmetries.
+    pub info: ModelInfo,
+    /// How coordinates are normalised.
+    pub scale: BoundingBoxScale,
+}
+
+/// A training object made ready.
+struct Prepared {
+    id: u32,
+    info: ModelInfo,
+    scale: BoundingBoxScale,
+    /// What targets are drawn from.
+    mesh: Mesh,
+    /// The textured mesh, where there is one: the simplified mesh has lost its texture.
+    textured: Option<Mesh>,
+    /// Whether the mesh has colours or texture of its own.
+    colored: bool,
+    /// Vertices that decide about the object's box from any side.
+    extremes: Vec<Vec3>,
+    centre: Vec3,
+    real: Vec<RealCrop>,
+    real_poses: Vec<Pose>,
+    distance: [f64; 2],
+    camera: Camera,
+}
+
+/// Draws training samples; shared between threads by reference.
+pub struct SampleSource {
+    objects: Vec<Prepared>,
+    backgrounds: Backgrounds,
+    cutouts: Vec<(usize, Cutout)>,
+    options: SampleOptions,
+}
+
+impl SampleSource {
+    /// Makes objects and photographs ready. Meshes are simplified and a few pictures of each object drawn, which takes
+    /// seconds for large meshes.
+    ///
+    /// # Errors
+    /// [`SampleError`] for options out of range, a mesh without surface, a photograph of an unknown object, and an
+    /// object that can neither be cut from a photograph nor rendered.
+    pub fn new(
+        objects: Vec<TrainingObject>,
+        real: Vec<RealCrop>,
+        backgrounds: Backgrounds,
+        options: SampleOptions,
+    ) -> Result<Self, SampleError> {
+        options.check()?;
+        if objects.is_empty() {
+            return Err(SampleError::NoObjects);
+        }
+        let mut real_of: BTreeMap<u32, Vec<RealCrop>> = BTreeMap::new();
+        for crop in real {
+            if !objects.iter().any(|o| o.id == crop.object_id()) {
+                let known: Vec<String> = objects.iter().map(|o| o.id.to_string()).collect();
+                return Err(SampleError::UnknownObject { id: crop.object_id(), known: known.join(", ") });
+            }
+            real_of.entry(crop.object_id()).or_default().push(crop);
+        }
+        // Distances and camera of an object without photographs: those of the others.
+        let any_real: Vec<&RealCrop> = real_of.values().flatten().collect();
+        let common_camera = options.camera.or_else(|| any_real.first().map(|c| *c.camera()));
+        let camera = common_camera.unwrap_or(DEFAULT_CAMERA).without_distortion();
+        let range_of = |crops: &[&RealCrop]| -> Option<[f64; 2]> {
+            let distances = crops.iter().map(|c| c.camera_from_object().translation().norm());
+            let (low, high) =
+                distances.fold((f64::INFINITY, 0.0f64), |(low, high), d| (low.min(d), high.max(d)));
+            (low <= high).then_some([0.9 * low, 1.1 * high])
+        };
+        let common_distance = range_of(&any_real);
+        drop(any_real);
+        let mut prepared = Vec::with_capacity(objects.len());
+        for object in objects {
+            let real = real_of.remove(&object.id).unwrap_or_default();
+            let own = range_of(&real.iter().collect::<Vec<_>>());
+            let diameter = object.info.diameter;
+            let distance = options
+                .distance
+                .or(own)
+                .or(common_distance)
+                .unwrap_or([4.0 * diameter, 12.0 * diameter])
+                .map(|d| d.max(diameter));
+            prepared.push(Prepared::new(object, real, distance, camera, &options)?);
+        }
+        let mut source = SampleSource { objects: prepared, backgrounds, cutouts: Vec::new(), options };
+        source.cutouts = source.draw_cutouts();
+        Ok(source)
+    }
+
+    /// The options.
+    pub fn options(&self) -> &SampleOptions {
+        &self.options
+    }
+
+    /// How many objects there are.
+    pub fn objects(&self) -> usize {
+        self.objects.len()
+    }
+
+    /// How many photographs show an object.
+    ///
+    /// # Panics
+    /// When there is no such object.
+    pub fn photographs(&self, object_index: usize) -> usize {
+        self.objects[object_index].real.len()
+    }
+
+    /// Draws a sample: the same for the same arguments, on any thread.
+    ///
+    /// # Panics
+    /// When there is no such object.
+    pub fn sample(&self, object_index: usize, seed: u64, number: u64) -> Sample {
+        let object = &self.objects[object_index];
+        let options = &self.options;
+        // Objects draw different samples under the same number.
+        let mut random = stream(seed ^ (object_index as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15), number);
+        let can_render = object.colored || options.random_color_chance > 0.0;
+        let rendered =
+            can_render && (object.real.is_empty() || random.random::<f32>() < options.render_share);
+        let scenery =
+            Scenery { options, backgrounds: &self.backgrounds, cutouts: &self.cutouts, object_index };
+        let (mut composition, coordinates, object_mask) = if rendered {
+            self.render(object, &scenery, &mut random)
+        } else {
+            self.photograph(object, &scenery, &mut random)
+        };
+        scenery.occlude(&mut composition, &mut random);
+        let Composition { mut image, visible } = composition;
+        options.color.apply(&mut image, &mut random);
+        if options.is_second_stage(number) {
+            let whole = object_mask.resampled(options.size, options.size);
+            second_stage::imitate(&mut image, &visible, &whole, &mut random);
+        }
+        let mut seen = visible.resampled(options.target(), options.target());
+        for (seen, object) in seen.data.iter_mut().zip(&object_mask.data) {
+            *seen = if *seen > 0.5 && *object > 0.5 { 1.0 } else { 0.0 };
+        }
+        Sample { rgb: image.data, coordinates, object: object_mask.data, visible: seen.data, object_index }
+    }
+
+    fn photograph(
+        &self,
+        object: &Prepared,
+        scenery: &Scenery<'_>,
+        random: &mut Random,
+    ) -> (Composition, Vec<f32>, Coverage) {
+        let options = &self.options;
+        let crop = &object.real[random.random_range(0..object.real.len())];
+        let camera = crop.camera();
+        let turn = f64::from(uniform(random, [-options.rotation, options.rotation]));
+        let pose = turned(crop.camera_from_object(), turn);
+        let of_visible = || Extent::of(crop.outline().iter().map(|p| turned_pixel(camera, p, turn)));
+        let whole = object.extent(camera, &pose);
+        let extent = if random.random::<f32>() < options.visible_box_chance { of_visible() } else { None };
+        let extent =
+            extent.or(whole).or_else(of_visible).unwrap_or(Extent::at(Vec2::new(camera.cx, camera.cy)));
+        let window = Window::around(&extent, options, random);
+        let map = window.map(camera, options.size, turn);
+        let (mut patch, inside) =
+            Patch::warp(crop.image(), &map, options.size, options.size, [second_stage::GREY; 3]);
+        let visible = crop.visible(&map, options.size);
+        let (coordinates, mask) = targets(
+            &object.mesh,
+            &object.scale,
+            &window.camera(camera, options.target()),
+            &canonical(&pose, &object.info),
+        );
+        let composition = if random.random::<f32>() < options.keep_background_chance {
+            scenery.keep(patch, &inside, visible, random)
+        } else {
+            gain(&mut patch, uniform(random, [0.8, 1.2]));
+            scenery.paste(&patch, visible, random)
+        };
+        (composition, coordinates, mask)
+    }
+
+    fn render(
+        &self,
+        object: &Prepared,
+        scenery: &Scenery<'_>,
+        random: &mut Random,
+    ) -> (Composition, Vec<f32>, Coverage) {
+        let options = &self.options;
+        let pose = object.pose_range().draw(options, random);
+        let extent = object
+            .extent(&object.camera, &pose)
+            .unwrap_or(Extent::at(Vec2::new(object.camera.cx, object.camera.cy)));
+        let window = Window::around(&extent, options, random);
+        let (coordinates, mask) = targets(
+            &object.mesh,
+            &object.scale,
+            &window.camera(&object.camera, options.target()),
+            &canonical(&pose, &object.info),
+        );
+        let camera = window.camera(&object.camera, options.size);
+        let random_colors = !object.colored || random.random::<f32>() < options.random_color_chance;
+        let (mut patch, silhouette) = if random_colors {
+            color_patch(&randomly_colored(&object.mesh, random), &camera, &pose, random)
+        } else {
+            color_patch(object.textured.as_ref().unwrap_or(&object.mesh), &camera, &pose, random)
+        };
+        options.render_color.apply(&mut patch, random);
+        let mut composition = scenery.paste(&patch, silhouette, random);
+        // A photograph's crop of fewer pixels than the input is enlarged, and so less sharp.
+        let enlarged = options.size as f64 / window.side;
+        if enlarged > 1.0 && random.random::<f32>() < 0.7 {
+            composition.image.blur((0.4 * enlarged) as f32);
+        }
+        (composition, coordinates, mask)
+    }
+
+    /// The visible parts of photographs and a few renders of each object.
+    fn draw_cutouts(&self) -> Vec<(usize, Cutout)> {
+        let mut cutouts = Vec::new();
+        if self.objects.len() < 2 {
+            return cutouts;
+        }
+        for (index, object) in self.objects.iter().enumerate() {
+            cutouts.extend(object.real.iter().filter_map(RealCrop::cutout).map(|c| (index, c)));
+            if !object.colored {
+                continue;
+            }
+            for number in 0..CUTOUTS_PER_OBJECT {
+                let mut random = stream(self.options.seed, index as u64 * CUTOUTS_PER_OBJECT + number);
+                let pose = object.pose_range().draw(&self.options, &mut random);
+                let Some(extent) = object.extent(&object.camera, &pose) else { continue };
+                let window = Window { centre: extent.centre(), side: extent.longest() * 1.02 };
+                let camera = window.camera(&object.camera, CUTOUT_SIDE);
+                let mesh = object.textured.as_ref().unwrap_or(&object.mesh);
+                let lights = random_lights(&mut random);
+                let (image, silhouette) =
+                    colors(mesh, &camera, &pose, &lights, &random_material(&mut random));
+                let mask = Mask::from_fn(CUTOUT_SIDE, CUTOUT_SIDE, |x, y| {
+                    silhouette.data[y * CUTOUT_SIDE + x] > 0.5
+                });
+                cutouts.extend(Cutout::new(&image, &mask).map(|c| (index, c)));
+            }
+        }
+        cutouts
+    }
+}
+
+impl Prepared {
+    fn new(
+        object: TrainingObject,
+        real: Vec<RealCrop>,
+        distance: [f64; 2],
+        camera: Camera,
+        options: &SampleOptions,
+    ) -> Result<Self, SampleError> {
+        let TrainingObject { id, mesh, info, scale } = object;
+        if mesh.faces().is_empty() {
+            return Err(SampleError::NoFaces { id, vertices: mesh.vertices().len() });
+        }
+        if !(info.diameter.is_finite() && info.diameter > 0.0) {
+            let found = info.diameter.to_string();
+            return Err(SampleError::Extent { id, field: "diameter", found });
+        }
+        if !(scale.half_size.iter().all(|h| h.is_finite() && *h > 0.0)
+            && scale.centre.iter().all(|c| c.is_finite()))
+        {
+            return Err(SampleError::Extent { id, field: "scale", found: format!("{scale:?}") });
+        }
+        let has_texture = mesh.texture().is_some() && mesh.texcoords().is_some();
+        let colored = has_texture || mesh.colors().is_some();
+        if !colored && real.is_empty() && options.random_color_chance <= 0.0 {
+            return Err(SampleError::NoPictures { id });
+        }
+        let (low, high) = mesh.bounding_box();
+        let small =
+            if mesh.faces().len() > options.faces { simplify(&mesh, options.faces) } else { mesh.clone() };
+        // Normals looked up per sample would be computed anew every time.
+        let normals = small.vertex_normals();
+        let small = small.clone().with_normals(normals).unwrap_or(small);
+        Ok(Prepared {
+            id,
+            extremes: extremes(&mesh),
+            centre: (low + high) * 0.5,
+            mesh: small,
+            textured: has_texture.then_some(mesh),
+            colored,
+            real_poses: real.iter().map(|c| *c.camera_from_object()).collect(),
+            real,
+            info,
+            scale,
+            distance,
+            camera,
+        })
+    }
+
+    fn pose_range(&self) -> PoseRange<'_> {
+        PoseRange {
+            camera: &self.camera,
+            centre: self.centre,
+            distance: self.distance,
+            real: &self.real_poses,
+        }
+    }
+
+    /// The box of the whole object in the image; `None` when a part of it is behind the camera.
+    fn extent(&self, camera: &Camera, pose: &Pose) -> Option<Extent> {
+        let pixels: Option<Vec<Vec2>> =
+            self.extremes.iter().map(|v| camera.project(&pose.transform_point(v))).collect();
+        Extent::of(pixels?)
+    }
+}
+
+impl std::fmt::Debug for SampleSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SampleSource")
+            .field("objects", &self.objects.iter().map(|o| o.id).collect::<Vec<_>>())
+            .field("photographs", &self.objects.iter().map(|o| o.real.len()).sum::<usize>())
+            .field("cutouts", &self.cutouts.len())
+            .field("options", &self.options)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Vertices that are outermost in some direction.
+fn extremes(mesh: &Mesh) -> Vec<Vec3> {
+    let vertices = mesh.vertices();
+    let mut chosen: Vec<usize> = sphere_directions(300)
+        .iter()
+        .filter_map(|d| {
+            (0..vertices.len()).max_by(|&a, &b| d.dot(&vertices[a]).total_cmp(&d.dot(&vertices[b])))
+        })
+        .collect();
+    chosen.sort_unstable();
+    chosen.dedup();
+    chosen.into_iter().map(|i| vertices[i]).collect()
+}

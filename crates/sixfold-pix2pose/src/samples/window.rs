@@ -1,0 +1,123 @@
+//! The square window that a crop shows, and how crop pixels relate to those of a photograph that is turned about its
+//! principal point.
+//!
+//! A turn of the image about the principal point by `R_z` is exactly a turn of the scene about the camera's axis: the
+//! photograph of pose `P` becomes that of `R_z P` (for `fx != fy` with a small shear, which is kept). So targets are
+//! rendered at `R_z P` with the window's camera, and nothing but colour is ever interpolated.
+
+use rand::RngExt;
+use sixfold_augment::{AffineMap, Random};
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
+
+use super::options::SampleOptions;
+
+/// A square part of the image plane; pixel centres at whole numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Window {
+    pub centre: Vec2,
+    pub side: f64,
+}
+
+/// Smallest and largest corner of a set of points in the image.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Extent {
+    low: Vec2,
+    high: Vec2,
+}
+
+impl Extent {
+    pub fn of(points: impl IntoIterator<Item = Vec2>) -> Option<Extent> {
+        let mut points = points.into_iter();
+        let first = points.next()?;
+        let (low, high) = points.fold((first, first), |(low, high), p| (low.inf(&p), high.sup(&p)));
+        Some(Extent { low, high })
+    }
+
+    pub fn centre(&self) -> Vec2 {
+        (self.low + self.high) * 0.5
+    }
+
+    pub fn longest(&self) -> f64 {
+        (self.high - self.low).max()
+    }
+
+    /// A box of one point, for want of a better one.
+    pub fn at(point: Vec2) -> Extent {
+        Extent { low: point, high: point }
+    }
+}
+
+impl Window {
+    /// A crop about a box, moved and scaled at random.
+    pub fn around(extent: &Extent, options: &SampleOptions, random: &mut Random) -> Window {
+        let mut symmetric = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
+        let longest = extent.longest().max(2.0);
+        let shift = Vec2::new(symmetric(options.centre_jitter), symmetric(options.centre_jitter)) * longest;
+        let side = longest * options.crop_factor * (1.0 + symmetric(options.size_jitter));
+        Window { centre: extent.centre() + shift, side }
+    }
+
+    /// The camera of the crop at `size x size` pixels.
+    pub fn camera(&self, camera: &Camera, size: usize) -> Camera {
+        let scale = size as f64 / self.side;
+        let corner = self.centre - Vec2::repeat(0.5 * self.side);
+        Camera {
+            fx: camera.fx * scale,
+            fy: camera.fy * scale,
+            cx: (camera.cx - corner.x) * scale - 0.5,
+            cy: (camera.cy - corner.y) * scale - 0.5,
+            width: size,
+            height: size,
+            distortion: None,
+        }
+    }
+
+    /// From pixels of the crop (`size x size`, of the photograph turned by `turn` radians) to the photograph's.
+    pub fn map(&self, camera: &Camera, size: usize, turn: f64) -> AffineMap {
+        let step = self.side / size as f64;
+        let (s, c) = turn.sin_cos();
+        let (across, down) = (s * camera.fx / camera.fy, s * camera.fy / camera.fx);
+        // Offset of the turned pixel of crop pixel (0, 0) from the principal point.
+        let q = self.centre - Vec2::repeat(0.5 * self.side - 0.5 * step) - Vec2::new(camera.cx, camera.cy);
+        AffineMap {
+            x: [(c * step) as f32, (across * step) as f32, (camera.cx + c * q.x + across * q.y) as f32],
+            y: [(-down * step) as f32, (c * step) as f32, (camera.cy - down * q.x + c * q.y) as f32],
+        }
+    }
+}
+
+/// The scene turned about the camera's axis.
+pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
+    Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn), Vec3::zeros()) * *pose
+}
+
+/// Where a pixel of the photograph lies after its turn about the principal point.
+pub(super) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
+    let (s, c) = turn.sin_cos();
+    let (x, y) = ((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy);
+    Vec2::new(camera.cx + camera.fx * (c * x - s * y), camera.cy + camera.fy * (s * x + c * y))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crop_pixels_and_the_turned_scene_agree() {
+        let camera = Camera::new(572.4, 540.0, 325.3, 242.0, 640, 480).unwrap();
+        let point = Vec3::new(0.11, -0.07, 0.9);
+        let turn = 0.7;
+        let window = Window { centre: Vec2::new(290.0, 310.0), side: 137.0 };
+        let turned_point = turned(&Pose::from_translation(point), turn).translation();
+        let in_crop = window.camera(&camera, 64).project(&turned_point).unwrap();
+        let [x, y] = window.map(&camera, 64, turn).apply(in_crop.x as f32, in_crop.y as f32);
+        let expected = camera.project(&point).unwrap();
+        assert!((Vec2::new(f64::from(x), f64::from(y)) - expected).norm() < 1e-3, "{x} {y} {expected}");
+        let turned_in_image = camera.project(&turned_point).unwrap();
+        assert!((turned_pixel(&camera, &expected, turn) - turned_in_image).norm() < 1e-9);
+        // Half the resolution: the centre of a block of four pixels.
+        let fine = window.camera(&camera, 128).project(&turned_point).unwrap();
+        assert!((((fine + Vec2::repeat(0.5)) * 0.5 - Vec2::repeat(0.5)) - in_crop).norm() < 1e-9);
+    }
+}
