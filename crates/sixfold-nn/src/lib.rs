@@ -1,1 +1,12 @@
 //! Backbones, fast convolutions, weight files and the training loop on Burn.
+
+pub mod kernels;
+pub mod layers;
+pub mod lite0;
+pub mod ops;
+
+pub mod checkpoint;
+mod files;
+pub mod schedule;
+pub mod training_log;
+pub mod weights;
