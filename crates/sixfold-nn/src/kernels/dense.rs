@@ -1,7 +1,7 @@
 //! Dense convolutions as matrix products: pointwise ones directly on the image, others through patches laid out as
 //! columns (im2col), a band of rows at a time so that the patches stay in the cache.
 
-use super::shared::{Shared, View, activate, before_activation, multiply, sum};
+use super::shared::{Shared, View, activate, before_activation, multiply, sum, unwritten};
 use super::{ConvGradients, ConvShape, ConvSpec};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -145,7 +145,7 @@ fn add_columns(
 pub(super) fn dense_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
     let plan = Plan::new(shape, spec);
     let pixels = plan.pixels();
-    let mut y = vec![0.0; shape.batch * shape.outputs * pixels];
+    let mut y = unwritten(shape.batch * shape.outputs * pixels);
     let shared = Shared::new(&mut y);
     let image = shape.inputs * shape.pixels();
     // Several images keep both cores busy; a single one is cut into bands (at least four where it can be).
@@ -154,11 +154,14 @@ pub(super) fn dense_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &Con
         let (b, band) = (task / plan.bands(), plan.band(task % plan.bands()));
         let (start, n) = (band.0 * plan.out[1], band.1 * plan.out[1]);
         let x = &x[b * image..][..image];
-        COLUMNS.with_borrow_mut(|[patches, result, _]| {
-            let result = sized(result, shape.outputs * n);
-            for (line, bias) in result.chunks_exact_mut(n).zip(bias) {
-                line.fill(*bias);
-            }
+        let begin = b * shape.outputs * pixels + start;
+        // SAFETY: every task writes its own image and rows.
+        #[allow(unsafe_code)]
+        let line = |channel: usize| unsafe { shared.slice(begin + channel * pixels, n) };
+        for (channel, bias) in bias.iter().enumerate() {
+            line(channel).fill(*bias);
+        }
+        COLUMNS.with_borrow_mut(|[patches, ..]| {
             let left = View { data: weight, strides: [plan.patch, 1] };
             let right = if plan.pointwise {
                 View { data: &x[start..], strides: [pixels, 1] }
@@ -167,15 +170,13 @@ pub(super) fn dense_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &Con
                 columns(x, shape, spec, &plan, band, patches);
                 View { data: patches, strides: [n, 1] }
             };
-            multiply([shape.outputs, n, plan.patch], result, n, true, left, right);
-            activate(result, spec.activation);
-            for (channel, line) in result.chunks_exact(n).enumerate() {
-                // SAFETY: every task writes its own image and rows.
-                #[allow(unsafe_code)]
-                let target = unsafe { shared.slice((b * shape.outputs + channel) * pixels + start, n) };
-                target.copy_from_slice(line);
-            }
+            // SAFETY: as above.
+            #[allow(unsafe_code)]
+            unsafe {
+                multiply([shape.outputs, n, plan.patch], (shared, begin, pixels), true, left, right)
+            };
         });
+        (0..shape.outputs).for_each(|channel| activate(line(channel), spec.activation));
     });
     y
 }
@@ -192,7 +193,11 @@ pub(super) fn dense_backward(
     let plan = Plan::new(shape, spec);
     let pixels = plan.pixels();
     let image = shape.inputs * shape.pixels();
-    let mut dx = vec![0.0; if want_x { x.len() } else { 0 }];
+    let mut dx = match (want_x, plan.pointwise) {
+        (false, _) => Vec::new(),
+        (true, true) => unwritten(x.len()),
+        (true, false) => vec![0.0; x.len()],
+    };
     let shared = Shared::new(&mut dx);
     let group_size = shape.batch.div_ceil(GROUPS).max(1);
     let groups: Vec<(Vec<f32>, Vec<f32>)> = (0..shape.batch.div_ceil(group_size))
@@ -202,9 +207,6 @@ pub(super) fn dense_backward(
             let mut dbias = vec![0.0; if want_weight { shape.outputs } else { 0 }];
             for b in group * group_size..((group + 1) * group_size).min(shape.batch) {
                 let x = &x[b * image..][..image];
-                // SAFETY: every image belongs to one group.
-                #[allow(unsafe_code)]
-                let dx = if want_x { unsafe { shared.slice(b * image, image) } } else { &mut [] };
                 for band in (0..plan.bands()).map(|i| plan.band(i)) {
                     let (start, n) = (band.0 * plan.out[1], band.1 * plan.out[1]);
                     COLUMNS.with_borrow_mut(|[patches, gradient, dpatches]| {
@@ -226,17 +228,25 @@ pub(super) fn dense_backward(
                                 View { data: patches, strides: [1, n] }
                             };
                             let left = View { data: gradient, strides: [n, 1] };
-                            multiply([shape.outputs, plan.patch, n], &mut dweight, plan.patch, true, left, right);
+                            let out = (Shared::new(&mut dweight), 0, plan.patch);
+                            // SAFETY: these sums belong to this group alone.
+                            #[allow(unsafe_code)]
+                            unsafe {
+                                multiply([shape.outputs, plan.patch, n], out, true, left, right)
+                            };
                         }
                         if want_x {
                             let left = View { data: weight, strides: [1, plan.patch] };
                             let right = View { data: gradient, strides: [n, 1] };
                             let size = [plan.patch, n, shape.outputs];
+                            // SAFETY: every image belongs to one group, every band to one turn of its loop.
+                            #[allow(unsafe_code)]
                             if plan.pointwise {
-                                multiply(size, &mut dx[start..], pixels, false, left, right);
+                                unsafe { multiply(size, (shared, b * image + start, pixels), false, left, right) };
                             } else {
                                 let dpatches = sized(dpatches, plan.patch * n);
-                                multiply(size, dpatches, n, false, left, right);
+                                unsafe { multiply(size, (Shared::new(dpatches), 0, n), false, left, right) };
+                                let dx = unsafe { shared.slice(b * image, image) };
                                 add_columns(dpatches, shape, spec, &plan, band, dx);
                             }
                         }

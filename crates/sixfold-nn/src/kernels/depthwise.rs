@@ -3,7 +3,7 @@
 //! Each channel is copied into a padded buffer; with a stride of two its even and odd columns are kept apart, so that
 //! every inner loop runs over neighbouring numbers.
 
-use super::shared::{Shared, activate, before_activation, sum, vectorised};
+use super::shared::{Shared, activate, before_activation, sum, unwritten, vectorised};
 use super::{ConvGradients, ConvShape, ConvSpec};
 use rayon::prelude::*;
 
@@ -31,15 +31,22 @@ impl Padded {
         ((kx % self.stride) * self.rows + row) * self.columns + kx / self.stride
     }
 
+    /// First image column that lies in a phase of a padded row, and its place in the buffer.
+    fn phase(&self, row: usize, phase: usize, spec: &ConvSpec) -> (usize, usize) {
+        let first = (phase + self.stride - spec.padding[0] % self.stride) % self.stride;
+        (first, self.start(row, phase) + (first + spec.padding[0]) / self.stride)
+    }
+
     fn fill(&self, buffer: &mut [f32], image: &[f32], width: usize, spec: &ConvSpec) {
         for (y, line) in image.chunks_exact(width).enumerate() {
             let row = y + spec.padding[0];
             if self.stride == 1 {
                 buffer[self.start(row, 0) + spec.padding[0]..][..width].copy_from_slice(line);
             } else {
-                for (x, value) in line.iter().enumerate() {
-                    let column = x + spec.padding[0];
-                    buffer[self.start(row, column % self.stride) + column / self.stride] = *value;
+                for phase in 0..self.stride {
+                    let (first, start) = self.phase(row, phase, spec);
+                    let source = line[first.min(width)..].iter().step_by(self.stride);
+                    buffer[start..].iter_mut().zip(source).for_each(|(b, v)| *b = *v);
                 }
             }
         }
@@ -51,9 +58,10 @@ impl Padded {
             if self.stride == 1 {
                 line.copy_from_slice(&buffer[self.start(row, 0) + spec.padding[0]..][..width]);
             } else {
-                for (x, value) in line.iter_mut().enumerate() {
-                    let column = x + spec.padding[0];
-                    *value = buffer[self.start(row, column % self.stride) + column / self.stride];
+                for phase in 0..self.stride {
+                    let (first, start) = self.phase(row, phase, spec);
+                    let target = line[first.min(width)..].iter_mut().step_by(self.stride);
+                    target.zip(&buffer[start..]).for_each(|(v, b)| *v = *b);
                 }
             }
         }
@@ -133,7 +141,7 @@ pub(super) fn depthwise_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: 
     let padded = Padded::new(shape, spec);
     let area = shape.kernel * shape.kernel;
     let starts = taps(&padded, shape.kernel, rows);
-    let mut y = vec![0.0; shape.batch * shape.outputs * rows * columns];
+    let mut y = unwritten(shape.batch * shape.outputs * rows * columns);
     y.par_chunks_mut(rows * columns).zip(x.par_chunks(shape.pixels())).enumerate().with_min_len(8).for_each_init(
         || vec![0.0; padded.len()],
         |buffer, (plane, (out, image))| {
@@ -161,7 +169,13 @@ pub(super) fn depthwise_backward(
     let padded = Padded::new(shape, spec);
     let area = shape.kernel * shape.kernel;
     let (pixels, out_pixels) = (shape.pixels(), rows * columns);
-    let mut dx = vec![0.0; if want_x { x.len() } else { 0 }];
+    let mut dx = unwritten(if want_x { x.len() } else { 0 });
+    // With a stride of one the input gradient is a convolution of the gradient with the kernel turned round.
+    let turned = spec.stride == 1 && spec.padding.iter().all(|p| *p < shape.kernel);
+    let turned_spec = ConvSpec { padding: spec.padding.map(|p| (shape.kernel - 1).saturating_sub(p)), ..*spec };
+    let turned_shape = ConvShape { size: [rows, columns], ..*shape };
+    let turned_padded = Padded::new(&turned_shape, &turned_spec);
+    let turned_starts = if turned { taps(&turned_padded, shape.kernel, shape.size[0]) } else { Vec::new() };
     let shared = Shared::new(&mut dx);
     let starts = taps(&padded, shape.kernel, rows);
     // Rows of the gradient, filled up with zeros to whole vectors.
@@ -170,9 +184,10 @@ pub(super) fn depthwise_backward(
         .into_par_iter()
         .with_min_len(4)
         .map_init(
-            || (vec![0.0; padded.len()], vec![0.0; padded.len()], vec![0.0; rows * wide]),
+            || (vec![0.0; padded.len()], vec![0.0; padded.len().max(turned_padded.len())], vec![0.0; rows * wide]),
             |(buffer, dbuffer, gradient), channel| {
                 let weight = &weight[channel * area..][..area];
+                let turned_weight: Vec<f32> = weight.iter().rev().copied().collect();
                 let mut dweight = vec![0.0; area];
                 let mut dbias = 0.0;
                 for b in 0..shape.batch {
@@ -191,14 +206,21 @@ pub(super) fn depthwise_backward(
                         weight_gradient(&mut dweight, gradient, wide, buffer, &starts);
                     }
                     if want_x {
-                        dbuffer.fill(0.0);
-                        input_gradient(dbuffer, gradient, wide, weight, &starts);
-                    }
-                    if want_x {
                         // SAFETY: every channel of every image belongs to one task.
                         #[allow(unsafe_code)]
                         let dx = unsafe { shared.slice(plane * pixels, pixels) };
-                        padded.unfill(dbuffer, dx, shape.size[1], spec);
+                        if turned {
+                            for (y, g) in gradient.chunks_exact(wide).enumerate() {
+                                let start = turned_padded.start(y + turned_spec.padding[0], 0) + turned_spec.padding[0];
+                                dbuffer[start..start + columns].copy_from_slice(&g[..columns]);
+                            }
+                            let lines = dx.chunks_exact_mut(shape.size[1]).zip(turned_starts.chunks_exact(area));
+                            lines.for_each(|(dx, starts)| row(dx, dbuffer, starts, &turned_weight, 0.0));
+                        } else {
+                            dbuffer.fill(0.0);
+                            input_gradient(dbuffer, gradient, wide, weight, &starts);
+                            padded.unfill(dbuffer, dx, shape.size[1], spec);
+                        }
                     }
                 }
                 (dweight, dbias)

@@ -149,6 +149,17 @@ impl Shared {
     }
 }
 
+/// A buffer whose every number is written before it is read: zeroing large outputs first takes as long as a layer.
+pub(super) fn unwritten(length: usize) -> Vec<f32> {
+    let mut buffer = Vec::with_capacity(length);
+    // SAFETY: the capacity is there, any bits are an `f32`, and the kernels write each element before anyone reads it.
+    #[allow(unsafe_code, clippy::uninit_vec)]
+    unsafe {
+        buffer.set_len(length)
+    };
+    buffer
+}
+
 /// A matrix in a slice: start, row stride and column stride.
 #[derive(Clone, Copy)]
 pub(super) struct View<'a> {
@@ -157,28 +168,30 @@ pub(super) struct View<'a> {
 }
 
 /// `out = add * out + left * right` on one thread. `out` is `m x n` with unit column stride and row stride
-/// `out_stride`, `left` is `m x k`, `right` is `k x n`.
-pub(super) fn multiply(
+/// `out_stride`, beginning at `start` of the shared buffer; `left` is `m x k`, `right` is `k x n`.
+///
+/// # Safety
+/// No other thread may use these `n` columns of `out` meanwhile.
+#[allow(unsafe_code)]
+pub(super) unsafe fn multiply(
     [m, n, k]: [usize; 3],
-    out: &mut [f32],
-    out_stride: usize,
+    (out, start, out_stride): (Shared, usize, usize),
     add: bool,
     left: View<'_>,
     right: View<'_>,
 ) {
     let last = |rows: usize, columns: usize, strides: [usize; 2]| (rows - 1) * strides[0] + (columns - 1) * strides[1];
     assert!(m > 0 && n > 0 && k > 0);
-    assert!(last(m, n, [out_stride, 1]) < out.len());
+    assert!(start + last(m, n, [out_stride, 1]) < out.1);
     assert!(last(m, k, left.strides) < left.data.len());
     assert!(last(k, n, right.strides) < right.data.len());
-    // SAFETY: the assertions keep every element inside its slice; `out` does not overlap the others, being `&mut`.
-    #[allow(unsafe_code)]
+    // SAFETY: the assertions keep every element inside its buffer; nobody else uses the output, as the caller promises.
     unsafe {
         gemm::gemm(
             m,
             n,
             k,
-            out.as_mut_ptr(),
+            out.0.add(start),
             1,
             out_stride as isize,
             add,
