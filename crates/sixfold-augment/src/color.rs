@@ -27,7 +27,8 @@ pub struct ColorAugmentation {
     pub noise: [f32; 2],
     /// Chance of a second, stronger contrast.
     pub strong_contrast_chance: f32,
-    /// The stronger contrast about 0.5; per channel with chance 0.3.
+    /// The stronger contrast, about the patch's mean (about 0.5, dark objects would become black); per channel with
+    /// chance 0.3.
     pub strong_contrast: [f32; 2],
     /// Chance of the three changes below.
     pub tone_chance: f32,
@@ -85,7 +86,7 @@ impl ColorAugmentation {
     /// For rendered objects, whose light and camera are not the real ones.
     pub fn renders() -> Self {
         ColorAugmentation {
-            multiply: [0.6, 1.4],
+            multiply: [0.7, 1.3],
             multiply_per_channel: 0.5,
             blur: [0.0, 1.5],
             noise_chance: 0.3,
@@ -94,7 +95,7 @@ impl ColorAugmentation {
             strong_contrast: [0.5, 1.8],
             tone_chance: 0.8,
             gamma: [0.7, 1.5],
-            hue: [-0.15, 0.15],
+            hue: [-0.1, 0.1],
             saturation: [0.5, 1.6],
             ..ColorAugmentation::table_3_2()
         }
@@ -135,7 +136,7 @@ impl ColorAugmentation {
         for step in order {
             match step {
                 Step::Add => linear.then([1.0; 3], std::array::from_fn(|_| uniform(random, self.add))),
-                Step::Contrast => linear.contrast([uniform(random, self.contrast); 3]),
+                Step::Contrast => linear.contrast([uniform(random, self.contrast); 3], 0.5),
                 Step::Multiply => {
                     let each = random.random::<f32>() < self.multiply_per_channel;
                     linear.then(factors(self.multiply, each, random), [0.0; 3]);
@@ -143,7 +144,8 @@ impl ColorAugmentation {
                 Step::Strong => {
                     if random.random::<f32>() < self.strong_contrast_chance {
                         let each = random.random::<f32>() < 0.3;
-                        linear.contrast(factors(self.strong_contrast, each, random));
+                        linear.flush(patch);
+                        linear.contrast(factors(self.strong_contrast, each, random), mean(patch));
                     }
                 }
                 Step::Blur => {
@@ -205,8 +207,8 @@ impl Linear {
         }
     }
 
-    fn contrast(&mut self, factor: [f32; 3]) {
-        self.then(factor, factor.map(|f| 0.5 - 0.5 * f));
+    fn contrast(&mut self, factor: [f32; 3], about: f32) {
+        self.then(factor, factor.map(|f| about - about * f));
     }
 
     fn flush(&mut self, patch: &mut Patch) {
@@ -217,6 +219,12 @@ impl Linear {
         }
         *self = Linear::identity();
     }
+}
+
+/// The mean of all channels, over a part of the pixels.
+fn mean(patch: &Patch) -> f32 {
+    let (sum, count) = patch.data.iter().step_by(7).fold((0.0f32, 0.0f32), |(s, n), v| (s + v, n + 1.0));
+    sum / count.max(1.0)
 }
 
 /// Noise that is nearly Gaussian: the sum of four uniform bytes.

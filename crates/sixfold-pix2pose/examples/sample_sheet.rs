@@ -2,15 +2,16 @@
 //! takes.
 //!
 //! ```text
-//! sample_sheet DATASET SPLIT FRAMES OUT.png [BACKGROUND_FOLDER] [real|render|both] [OBJECT_IDS]
+//! sample_sheet DATASET SPLIT FRAMES OUT.png [BACKGROUND_FOLDER|-] [real|render|both] [OBJECT_IDS|-] [close]
 //! ```
+//! `close` draws few samples large, without changes of colour, occluders and second stage: to check borders.
 //! `FRAMES` is `scene:image,image,...` (only these images are opened), or `scene:/N` for every N-th.
 
 use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
 
-use sixfold_augment::{Backgrounds, PhotographOptions};
+use sixfold_augment::{Backgrounds, ColorAugmentation, PhotographOptions};
 use sixfold_bop::{BopDataset, Models, write_rgb};
 use sixfold_geometry::RgbImage;
 use sixfold_mesh::ModelInfo;
@@ -41,7 +42,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             .collect::<Result<_, std::num::ParseIntError>>()?,
     };
     let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
-    let ids: Vec<u32> = match rest.get(2) {
+    let ids: Vec<u32> = match rest.get(2).filter(|list| *list != "-") {
         Some(list) => list.split(',').map(str::parse).collect::<Result<_, _>>()?,
         None => infos.0.keys().copied().collect(),
     };
@@ -67,21 +68,31 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some("render") => 1.0,
         _ => 0.5,
     };
-    let options = SampleOptions { target_size: Some(64), render_share, ..SampleOptions::default() };
+    let close = rest.get(3).is_some_and(|word| word == "close");
+    let mut options = SampleOptions { target_size: Some(64), render_share, ..SampleOptions::default() };
+    if close {
+        options.color = ColorAugmentation::none();
+        options.render_color = ColorAugmentation::none();
+        options.occlusion_chance = 0.0;
+        options.second_stage_share = 0.0;
+    }
     let started = Instant::now();
     let source = SampleSource::new(objects, real, backgrounds, options)?;
     println!("{source:?}\nready after {:.1} s", started.elapsed().as_secs_f64());
 
-    const COLUMNS: usize = 8;
-    const ROWS: usize = 8;
     let size = source.options().size;
     let target = source.options().target();
-    // Colour and coordinates above, coordinates over colour and both masks below.
-    let mut sheet = RgbImage::filled(COLUMNS * (2 * size + 8), ROWS * (size + 8), [255; 3]);
-    for i in 0..COLUMNS * ROWS {
+    let (columns, rows, zoom) = if close { (3, 4, 3) } else { (8, 8, 1) };
+    let mut sheet = RgbImage::filled(columns * (2 * size * zoom + 8), rows * (size * zoom + 8), [255; 3]);
+    for i in 0..columns * rows {
         let sample = source.sample(i % source.objects(), 1, i as u64);
-        let (left, top) = (i % COLUMNS * (2 * size + 8), i / COLUMNS * (size + 8));
-        draw(&mut sheet, left, top, size, target, &sample);
+        let drawn = if close { outlined(size, target, &sample) } else { quarters(size, target, &sample) };
+        let (left, top) = (i % columns * (2 * size * zoom + 8), i / columns * (size * zoom + 8));
+        for y in 0..size * zoom {
+            for x in 0..2 * size * zoom {
+                sheet[(left + x, top + y)] = drawn[(x / zoom, y / zoom)];
+            }
+        }
     }
     write_rgb(Path::new(out), &sheet)?;
 
@@ -93,38 +104,57 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Left: the input. Right: coordinates; silhouette in red with its visible part in green; the input dimmed where the
-/// object is not visible.
-fn draw(sheet: &mut RgbImage, left: usize, top: usize, size: usize, target: usize, sample: &Sample) {
-    let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-    let rgb = |x: usize, y: usize| -> [u8; 3] {
-        std::array::from_fn(|c| byte(sample.rgb[c * size * size + y * size + x]))
-    };
+fn byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn color(sample: &Sample, size: usize, x: usize, y: usize) -> [u8; 3] {
+    std::array::from_fn(|c| byte(sample.rgb[c * size * size + y * size + x]))
+}
+
+fn coordinate(sample: &Sample, target: usize, at: usize) -> [u8; 3] {
+    std::array::from_fn(|c| byte(0.5 * (sample.coordinates[c * target * target + at] + 1.0)))
+}
+
+/// Whether the silhouette ends right of or below a target pixel.
+fn border(sample: &Sample, target: usize, u: usize, v: usize) -> bool {
+    let inside = |u: usize, v: usize| sample.object[v.min(target - 1) * target + u.min(target - 1)] > 0.5;
+    inside(u, v) != inside(u + 1, v) || inside(u, v) != inside(u, v + 1)
+}
+
+/// Left: the input. Right: coordinates; silhouette in red, its visible part in yellow; the input dimmed where the object
+/// is not visible; the input with the silhouette's outline.
+fn quarters(size: usize, target: usize, sample: &Sample) -> RgbImage {
     let half = size / 2;
-    for y in 0..size {
-        for x in 0..size {
-            sheet[(left + x, top + y)] = rgb(x, y);
-            let (qx, qy) = (x % half, y % half);
-            let (u, v) = (qx * target / half, qy * target / half);
-            let at = v * target + u;
-            let coordinate =
-                || std::array::from_fn(|c| byte(0.5 * (sample.coordinates[c * target * target + at] + 1.0)));
-            let color = match (x < half, y < half) {
-                (true, true) => coordinate(),
-                (false, true) => [byte(sample.object[at]), byte(sample.visible[at]), 0],
-                (true, false) => {
-                    let c = rgb(qx * 2, qy * 2);
-                    if sample.visible[at] > 0.5 { c } else { c.map(|v| v / 4) }
-                }
-                (false, false) => {
-                    let inside = |u: usize, v: usize| {
-                        sample.object[v.min(target - 1) * target + u.min(target - 1)] > 0.5
-                    };
-                    let border = inside(u, v) != inside(u + 1, v) || inside(u, v) != inside(u, v + 1);
-                    if border { [255, 0, 255] } else { rgb(qx * 2, qy * 2) }
-                }
-            };
-            sheet[(left + size + x, top + y)] = color;
+    RgbImage::from_fn(2 * size, size, |x, y| {
+        if x < size {
+            return color(sample, size, x, y);
         }
-    }
+        let x = x - size;
+        let (qx, qy) = (x % half, y % half);
+        let (u, v) = (qx * target / half, qy * target / half);
+        let at = v * target + u;
+        let small = color(sample, size, qx * 2, qy * 2);
+        match (x < half, y < half) {
+            (true, true) => coordinate(sample, target, at),
+            (false, true) => [byte(sample.object[at]), byte(sample.visible[at]), 0],
+            (true, false) if sample.visible[at] > 0.5 => small,
+            (true, false) => small.map(|v| v / 4),
+            (false, false) if border(sample, target, u, v) => [255, 0, 255],
+            (false, false) => small,
+        }
+    })
+}
+
+/// Left: the input with the outline of the silhouette. Right: coordinates over the input where the object is visible.
+fn outlined(size: usize, target: usize, sample: &Sample) -> RgbImage {
+    RgbImage::from_fn(2 * size, size, |x, y| {
+        let (px, left) = (x % size, x < size);
+        let (u, v) = (px * target / size, y * target / size);
+        let input = color(sample, size, px, y);
+        if left {
+            return if border(sample, target, u, v) { [255, 0, 255] } else { input };
+        }
+        if sample.visible[v * target + u] > 0.5 { coordinate(sample, target, v * target + u) } else { input }
+    })
 }

@@ -2,7 +2,8 @@
 
 use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
 
-use sixfold_augment::ColorAugmentation;
+use rand::RngExt;
+use sixfold_augment::{ColorAugmentation, Random};
 use sixfold_geometry::Camera;
 
 use super::error::SampleError;
@@ -40,9 +41,9 @@ pub struct SampleOptions {
     pub border_blur: [f32; 2],
     /// Share of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
     pub second_stage_share: f32,
-    /// So many consecutive sample numbers belong to the same stage: 1 mixes both within a batch, the batch size makes
-    /// whole batches alternate as in the dissertation.
-    pub second_stage_block: u64,
+    /// `None` draws the stage of every sample by itself, which mixes both within a batch. `Some(n)` gives `n` consecutive
+    /// sample numbers the same stage: the batch size makes whole batches alternate as in the dissertation.
+    pub second_stage_block: Option<u64>,
     /// Colours of the finished image.
     pub color: ColorAugmentation,
     /// Colours of a rendered object before it is pasted.
@@ -85,8 +86,12 @@ impl Default for SampleOptions {
             clutter: 3,
             border_blur: [0.4, 1.5],
             second_stage_share: 0.5,
-            second_stage_block: 1,
-            color: ColorAugmentation::real_images(),
+            second_stage_block: None,
+            color: ColorAugmentation {
+                strong_contrast_chance: 0.4,
+                strong_contrast: [0.5, 1.8],
+                ..ColorAugmentation::real_images()
+            },
             render_color: ColorAugmentation::renders(),
             near_real_share: 0.5,
             pose_noise: 25f64.to_radians(),
@@ -108,9 +113,10 @@ impl SampleOptions {
     }
 
     /// Whether sample `number` imitates the second stage.
-    pub fn is_second_stage(&self, number: u64) -> bool {
-        let block = (number / self.second_stage_block.max(1)) as f64;
+    pub(super) fn is_second_stage(&self, number: u64, random: &mut Random) -> bool {
         let share = f64::from(self.second_stage_share);
+        let Some(block) = self.second_stage_block else { return random.random::<f64>() < share };
+        let block = (number / block.max(1)) as f64;
         ((block + 1.0) * share).floor() > (block * share).floor()
     }
 

@@ -14,25 +14,35 @@ pub(super) fn imitate(image: &mut Patch, visible: &Coverage, whole: &Coverage, r
     let side = image.width as f32;
     let scale = side / 128.0;
     let base = if random.random::<f32>() < 0.25 { whole } else { visible };
-    let grow = uniform(random, [-3.0, 5.0]) * scale;
+    let grow = uniform(random, [-2.0, 5.0]) * scale;
     let wobble = uniform(random, [0.3, 4.0]) * scale;
     let mut kept = base.disturbed(grow, wobble, random);
+    let before = common(&kept, visible);
+    let mut cut = kept.clone();
     if random.random::<f32>() < 0.4 {
-        fill(&mut kept, 0.5, 0.0, random);
-    }
-    if random.random::<f32>() < 0.4 {
-        fill(&mut kept, 0.4, 1.0, random);
+        fill(&mut cut, 0.5, 0.0, random);
     }
     if random.random::<f32>() < 0.25 {
         // Holes where noise, fine against the object, is high.
         let field = Coverage::filled(kept.width, kept.height, 0.5);
         let holes = field.disturbed(-uniform(random, [1.5, 3.5]) * scale, 4.0 * scale, random);
-        kept.data.iter_mut().zip(&holes.data).for_each(|(k, h)| *k *= 1.0 - h);
+        cut.remove(&holes);
+    }
+    // What is left has to be enough to tell a pose.
+    if common(&cut, visible) > 0.4 * before {
+        kept = cut;
+    }
+    if random.random::<f32>() < 0.4 {
+        fill(&mut kept, 0.4, 1.0, random);
     }
     let pixels = image.width * image.height;
     for plane in image.data.chunks_exact_mut(pixels.max(1)) {
         plane.iter_mut().zip(&kept.data).for_each(|(v, k)| *v = GREY + (*v - GREY) * k);
     }
+}
+
+fn common(a: &Coverage, b: &Coverage) -> f32 {
+    a.data.iter().zip(&b.data).map(|(a, b)| a * b).sum()
 }
 
 /// Sets a random rectangle, its sides at most `largest` of the crop.

@@ -177,7 +177,7 @@ impl SampleSource {
         scenery.occlude(&mut composition, &mut random);
         let Composition { mut image, visible } = composition;
         options.color.apply(&mut image, &mut random);
-        if options.is_second_stage(number) {
+        if options.is_second_stage(number, &mut random) {
             let whole = object_mask.resampled(options.size, options.size);
             second_stage::imitate(&mut image, &visible, &whole, &mut random);
         }
