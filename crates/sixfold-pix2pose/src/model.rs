@@ -1,0 +1,181 @@
+//! A trained model: the network with the objects it knows, as one file.
+
+use crate::loss::OutputKind;
+use crate::networks::{Compact, CompactConfig};
+use crate::object::ObjectEntry;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
+use sixfold_nn::weights::{ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown};
+use std::path::{Path, PathBuf};
+
+/// Name of the compact network in weight files.
+pub const COMPACT: &str = "pix2pose-compact";
+
+/// Why a model could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The weight file.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The card does not describe its objects.
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is not a Pix2Pose model of this version", file.display())]
+    Card {
+        /// The file.
+        file: PathBuf,
+        /// Field of the card.
+        field: &'static str,
+        /// What it should hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+    /// The model was not trained on this object.
+    #[error("the model knows the objects {known}, not object {id}; train it (`sixfold train pix2pose`) or give other weights")]
+    UnknownObject {
+        /// The object that was asked for.
+        id: u32,
+        /// Those it knows.
+        known: String,
+    },
+}
+
+/// Sizes of a network's images, part of the card.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ImageSizes {
+    /// Side of the input in pixels.
+    pub input: usize,
+    /// Side of the output in pixels.
+    pub output: usize,
+}
+
+impl Default for ImageSizes {
+    fn default() -> Self {
+        Self { input: 128, output: 64 }
+    }
+}
+
+/// A network and what it was trained on.
+#[derive(Debug, Clone)]
+pub struct Pix2PoseModel {
+    network: Compact,
+    objects: Vec<ObjectEntry>,
+    sizes: ImageSizes,
+    card: ModelCard,
+    device: Device,
+}
+
+/// What the network says of one crop, `side x side` pixels each.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Prediction {
+    /// Pixels along a side.
+    pub side: usize,
+    /// Normalised coordinates, pixel by pixel.
+    pub coordinates: Vec<[f32; 3]>,
+    /// Expected error of the coordinates, 0 to 1 in normalised units.
+    pub error: Vec<f32>,
+    /// Probability that the object is visible there.
+    pub visible: Vec<f32>,
+}
+
+impl Pix2PoseModel {
+    /// A model of a trained network. `card` gets architecture, objects and sizes filled in.
+    pub fn new(network: Compact, objects: Vec<ObjectEntry>, sizes: ImageSizes, card: ModelCard) -> Self {
+        let objects_json = objects.iter().map(|o| serde_json::to_value(o).unwrap_or_default()).collect();
+        let mut extra = card.extra.clone();
+        if !extra.is_object() {
+            extra = serde_json::json!({});
+        }
+        extra["image_sizes"] = serde_json::to_value(sizes).unwrap_or_default();
+        let card = ModelCard { architecture: COMPACT.to_string(), objects: objects_json, extra, ..card };
+        Self { network: network.valid(), objects, sizes, card, device: Device::flex() }
+    }
+
+    /// Reads a weight file.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let device = Device::flex();
+        let card = read_card(path)?;
+        let wrong = |field, expected, found: String| ModelError::Card { file: path.to_path_buf(), field, expected, found };
+        let objects = card
+            .objects
+            .iter()
+            .map(|value| {
+                serde_json::from_value(value.clone())
+                    .map_err(|error| wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string()))
+            })
+            .collect::<Result<Vec<ObjectEntry>, _>>()?;
+        let sizes: ImageSizes = serde_json::from_value(card.extra["image_sizes"].clone())
+            .map_err(|error| wrong("extra.image_sizes", "input and output in pixels", error.to_string()))?;
+        let network = CompactConfig { objects: objects.len() }.init_random(0, &device);
+        let (network, card) = load_weights(network, path, COMPACT)?;
+        Ok(Self { network: network.no_grad(), objects, sizes, card, device })
+    }
+
+    /// Writes the weight file and, beside it, the card as text.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        save_weights(&self.network, &self.card, path)?;
+        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+    }
+
+    /// The objects, in the order of the network's decoders.
+    pub fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
+    }
+
+    /// Place and entry of an object.
+    pub fn object(&self, id: u32) -> Result<(usize, &ObjectEntry), ModelError> {
+        self.objects.iter().enumerate().find(|(_, o)| o.id == id).ok_or_else(|| ModelError::UnknownObject {
+            id,
+            known: self.objects.iter().map(|o| o.id.to_string()).collect::<Vec<_>>().join(", "),
+        })
+    }
+
+    /// Sizes of input and output.
+    pub fn sizes(&self) -> ImageSizes {
+        self.sizes
+    }
+
+    /// The card.
+    pub fn card(&self) -> &ModelCard {
+        &self.card
+    }
+
+    /// The card, to add scores to.
+    pub fn card_mut(&mut self) -> &mut ModelCard {
+        &mut self.card
+    }
+
+    /// Runs the network on crops of one object: `count` images of `3 x side x side` values in 0..1, one after another.
+    ///
+    /// # Panics
+    /// If the length does not fit or there is no such object.
+    pub fn predict(&self, object_index: usize, crops: &[f32]) -> Vec<Prediction> {
+        let side = self.sizes.input;
+        let count = crops.len() / (3 * side * side);
+        assert!(count > 0 && crops.len() == count * 3 * side * side);
+        let input = Tensor::<4>::from_data(TensorData::new(network_input(crops), [count, 3, side, side]), &self.device);
+        let output = self.network.forward(input, &[(object_index, count)]).remove(0);
+        let [.., rows, columns] = output.dims();
+        assert_eq!((rows, columns), (self.sizes.output, self.sizes.output));
+        let raw: Vec<f32> = output.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
+        let pixels = rows * columns;
+        raw.chunks_exact(OutputKind::Compact.channels() * pixels)
+            .map(|raw| {
+                let sigmoid = |v: &f32| 1.0 / (1.0 + (-v).exp());
+                Prediction {
+                    side: rows,
+                    coordinates: (0..pixels)
+                        .map(|p| [0, 1, 2].map(|c| raw[c * pixels + p].clamp(-1.2, 1.2)))
+                        .collect(),
+                    error: raw[3 * pixels..4 * pixels].iter().map(sigmoid).collect(),
+                    visible: raw[4 * pixels..5 * pixels].iter().map(sigmoid).collect(),
+                }
+            })
+            .collect()
+    }
+}
+
+/// Values in 0..1 as EfficientNet-Lite0 takes them: `(255 v - 127) / 128`.
+pub fn network_input(rgb: &[f32]) -> Vec<f32> {
+    rgb.iter().map(|v| (v * 255.0 - 127.0) / 128.0).collect()
+}

@@ -1,0 +1,110 @@
+//! What a network has to know of an object: how its coordinates are normalised and under which turns it looks the same.
+
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_mesh::ModelInfo;
+use sixfold_render::BoundingBoxScale;
+
+/// One object of a model, as it stands in the weight file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ObjectEntry {
+    /// Id in the dataset.
+    pub id: u32,
+    /// Diameter in metres.
+    pub diameter: f64,
+    /// Centre of the coordinates, metres.
+    pub centre: [f64; 3],
+    /// What coordinates are divided by, metres per axis.
+    pub half_size: [f64; 3],
+    /// Outlier thresholds on the expected error that are tried, the dissertation's theta_o.
+    pub thresholds: Vec<f32>,
+}
+
+impl ObjectEntry {
+    /// The entry of an object with the thresholds of the BOP entries (section 3.4.4).
+    pub fn new(id: u32, info: &ModelInfo, scale: &BoundingBoxScale) -> Self {
+        Self {
+            id,
+            diameter: info.diameter,
+            centre: scale.centre.into(),
+            half_size: scale.half_size.into(),
+            thresholds: BOP_THRESHOLDS.to_vec(),
+        }
+    }
+
+    /// How coordinates are normalised.
+    pub fn scale(&self) -> BoundingBoxScale {
+        BoundingBoxScale { centre: Vec3::from(self.centre), half_size: Vec3::from(self.half_size) }
+    }
+}
+
+/// Outlier thresholds of the entries to the BOP challenge (section 3.4.4).
+pub const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
+
+/// Outlier thresholds of appendix A.2 for the objects of LM-O, by BOP's object ids.
+pub fn lmo_threshold(id: u32) -> Option<f32> {
+    match id {
+        1 | 9 | 10 => Some(0.2),
+        5 | 6 | 8 | 11 | 12 => Some(0.3),
+        _ => None,
+    }
+}
+
+/// A symmetry as a map of normalised coordinates: `linear * n + offset`.
+///
+/// The transformation is applied in metres and normalised again, because the axes have different scales; multiplying
+/// normalised coordinates by the rotation, as the author's code does, is right only for axes of equal scale or half
+/// turns about the centre.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SymmetryMap {
+    /// Row-major.
+    pub linear: [[f32; 3]; 3],
+    /// Added.
+    pub offset: [f32; 3],
+}
+
+impl SymmetryMap {
+    /// The map of a transformation under which the object looks the same.
+    pub fn new(object_from_object: &Pose, scale: &BoundingBoxScale) -> Self {
+        let map = |n: Vec3| scale.normalise(&object_from_object.transform_point(&scale.restore(&n)));
+        let offset = map(Vec3::zeros());
+        let columns = [Vec3::x(), Vec3::y(), Vec3::z()].map(|axis| map(axis) - offset);
+        Self {
+            linear: std::array::from_fn(|row| std::array::from_fn(|column| columns[column][row] as f32)),
+            offset: std::array::from_fn(|row| offset[row] as f32),
+        }
+    }
+
+    /// The transformed coordinates.
+    pub fn apply(&self, n: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|row| {
+            let line = self.linear[row];
+            line[0] * n[0] + line[1] * n[1] + line[2] * n[2] + self.offset[row]
+        })
+    }
+
+    /// The identity and all discrete symmetries of an object. Continuous ones are taken out of the targets instead.
+    pub fn pool(info: &ModelInfo, scale: &BoundingBoxScale) -> Vec<Self> {
+        let discrete = ModelInfo { symmetries_continuous: Vec::new(), ..info.clone() };
+        discrete.symmetry_poses(0.01).iter().map(|pose| Self::new(pose, scale)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_turn_of_a_box_with_unequal_sides_is_applied_in_metres() {
+        let scale = BoundingBoxScale { centre: Vec3::new(0.01, -0.02, 0.0), half_size: Vec3::new(0.1, 0.2, 0.05) };
+        let turn = Pose::exp(&[0.0, 0.0, std::f64::consts::FRAC_PI_2, 0.0, 0.0, 0.0].into());
+        let point = Vec3::new(0.03, 0.05, -0.01);
+        let map = SymmetryMap::new(&turn, &scale);
+        let normalised = scale.normalise(&point);
+        let found = map.apply([normalised.x as f32, normalised.y as f32, normalised.z as f32]);
+        let expected = scale.normalise(&turn.transform_point(&point));
+        for (f, e) in found.iter().zip(expected.iter()) {
+            assert!((f64::from(*f) - e).abs() < 1e-5, "{found:?} {expected:?}");
+        }
+    }
+}
