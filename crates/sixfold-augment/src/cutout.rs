@@ -72,23 +72,45 @@ impl Cutout {
         for y in span(centre[1], height) {
             for x in span(centre[0], width) {
                 let (dx, dy) = ((x as f32 - centre[0]) * scale, (y as f32 - centre[1]) * scale);
-                let u = (c * dx + s * dy + middle_x).round();
-                let v = (c * dy - s * dx + middle_y).round();
-                if !(u >= 0.0 && v >= 0.0 && (u as usize) < self.width && (v as usize) < self.height) {
-                    continue;
-                }
-                let pixel = self.pixels[v as usize * self.width + u as usize];
-                if pixel[3] == 0 {
+                let (u, v) = (c * dx + s * dy + middle_x, c * dy - s * dx + middle_y);
+                let (color, covered) = self.sample(u, v);
+                if covered <= 0.0 {
                     continue;
                 }
                 let at = y * width + x;
-                cover.data[at] = f32::from(pixel[3]) * (1.0 / 255.0);
+                cover.data[at] = covered;
                 for channel in 0..3 {
-                    patch.data[channel * pixels + at] = f32::from(pixel[channel]) * (1.0 / 255.0);
+                    patch.data[channel * pixels + at] = color[channel];
                 }
             }
         }
         (patch, cover)
+    }
+
+    /// Bilinear colour and coverage; what is not covered has no say in the colour.
+    fn sample(&self, u: f32, v: f32) -> ([f32; 3], f32) {
+        let (x, y) = (u.floor(), v.floor());
+        if !(x >= -1.0 && y >= -1.0 && x < self.width as f32 && y < self.height as f32) {
+            return ([0.0; 3], 0.0);
+        }
+        let (fx, fy) = (u - x, v - y);
+        let (mut color, mut covered) = ([0.0f32; 3], 0.0f32);
+        for (dx, dy, weight) in [
+            (0.0, 0.0, (1.0 - fx) * (1.0 - fy)),
+            (1.0, 0.0, fx * (1.0 - fy)),
+            (0.0, 1.0, (1.0 - fx) * fy),
+            (1.0, 1.0, fx * fy),
+        ] {
+            let (x, y) = (x + dx, y + dy);
+            if x < 0.0 || y < 0.0 || x as usize >= self.width || y as usize >= self.height {
+                continue;
+            }
+            let pixel = self.pixels[y as usize * self.width + x as usize];
+            let weight = weight * f32::from(pixel[3]) * (1.0 / 255.0);
+            covered += weight;
+            (0..3).for_each(|c| color[c] += weight * f32::from(pixel[c]));
+        }
+        (color.map(|c| c / (255.0 * covered.max(1e-6))), covered)
     }
 
     /// Draws the cut-out so that it hides about `fraction` of what `visible` shows: among places from outside the

@@ -99,6 +99,13 @@ impl Patch {
         let source = image.as_slice();
         let taps = map.taps();
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
+        let offsets: Vec<[f32; 2]> = (0..taps * taps)
+            .map(|k| {
+                let at = |k: usize| (k as f32 + 0.5) / taps as f32 - 0.5;
+                let (i, j) = (at(k % taps), at(k / taps));
+                [map.x[0] * i + map.x[1] * j, map.y[0] * i + map.y[1] * j]
+            })
+            .collect();
         let (largest_x, largest_y) = ((w - 1) as f32, (h - 1) as f32);
         for y in 0..height {
             for x in 0..width {
@@ -107,27 +114,26 @@ impl Patch {
                     continue;
                 }
                 let mut sum = [0.0f32; 3];
-                for j in 0..taps {
-                    for i in 0..taps {
-                        let (u, v) = if taps == 1 {
-                            (u, v)
-                        } else {
-                            let offset = |k: usize| (k as f32 + 0.5) / taps as f32 - 0.5;
-                            let [u, v] = map.apply(x as f32 + offset(i), y as f32 + offset(j));
-                            (u, v)
-                        };
-                        let (u, v) = (u.clamp(0.0, largest_x), v.clamp(0.0, largest_y));
-                        let (x0, y0) = ((u as usize).min(w - 2), (v as usize).min(h - 2));
-                        let (fx, fy) = (u - x0 as f32, v - y0 as f32);
-                        let top = &source[y0 * w + x0..y0 * w + x0 + 2];
-                        let bottom = &source[(y0 + 1) * w + x0..(y0 + 1) * w + x0 + 2];
-                        let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-                        for c in 0..3 {
-                            sum[c] += f32::from(top[0][c]) * weights[0]
-                                + f32::from(top[1][c]) * weights[1]
-                                + f32::from(bottom[0][c]) * weights[2]
-                                + f32::from(bottom[1][c]) * weights[3];
-                        }
+                if taps == 1 {
+                    let (u, v) = (u.clamp(0.0, largest_x), v.clamp(0.0, largest_y));
+                    let (x0, y0) = ((u as usize).min(w - 2), (v as usize).min(h - 2));
+                    let (fx, fy) = (u - x0 as f32, v - y0 as f32);
+                    let top = &source[y0 * w + x0..y0 * w + x0 + 2];
+                    let bottom = &source[(y0 + 1) * w + x0..(y0 + 1) * w + x0 + 2];
+                    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+                    for c in 0..3 {
+                        sum[c] = f32::from(top[0][c]) * weights[0]
+                            + f32::from(top[1][c]) * weights[1]
+                            + f32::from(bottom[0][c]) * weights[2]
+                            + f32::from(bottom[1][c]) * weights[3];
+                    }
+                } else {
+                    // The taps lie about a pixel apart: the nearest pixel of each will do.
+                    for [du, dv] in &offsets {
+                        let x0 = (u + du + 0.5).clamp(0.0, largest_x) as usize;
+                        let y0 = (v + dv + 0.5).clamp(0.0, largest_y) as usize;
+                        let pixel = source[y0 * w + x0];
+                        (0..3).for_each(|c| sum[c] += f32::from(pixel[c]));
                     }
                 }
                 let at = y * width + x;

@@ -37,6 +37,8 @@ pub struct SampleOptions {
     pub object_occluder_chance: f32,
     /// Most pictures of other objects pasted behind the object.
     pub clutter: u32,
+    /// Factor on the brightness of an object cut from a photograph, against its new background.
+    pub paste_gain: [f32; 2],
     /// Sigma of the blur along the border of a pasted object, pixels.
     pub border_blur: [f32; 2],
     /// Share of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
@@ -84,6 +86,7 @@ impl Default for SampleOptions {
             occlusion: [0.04, 0.5],
             object_occluder_chance: 0.5,
             clutter: 3,
+            paste_gain: [0.8, 1.2],
             border_blur: [0.4, 1.5],
             second_stage_share: 0.5,
             second_stage_block: None,
@@ -161,6 +164,7 @@ impl SampleOptions {
         }
         let ranges = [
             ("occlusion", self.occlusion, 0.0, 0.95, "two fractions in order from 0 to 0.95"),
+            ("paste_gain", self.paste_gain, 0.0, 4.0, "two factors in order from 0 to 4"),
             ("border_blur", self.border_blur, 0.0, 8.0, "two sigmas in order from 0 to 8 pixels"),
             ("elevation", self.elevation, -1.58, 1.58, "two angles in order from -pi/2 to pi/2, radians"),
         ];

@@ -183,7 +183,8 @@ impl SampleSource {
         }
         let mut seen = visible.resampled(options.target(), options.target());
         for (seen, object) in seen.data.iter_mut().zip(&object_mask.data) {
-            *seen = if *seen > 0.5 && *object > 0.5 { 1.0 } else { 0.0 };
+            // A little below one half: a pixel on the object's own border counts as the silhouette counts it.
+            *seen = if *seen > 0.4 && *object > 0.5 { 1.0 } else { 0.0 };
         }
         Sample { rgb: image.data, coordinates, object: object_mask.data, visible: seen.data, object_index }
     }
@@ -218,7 +219,7 @@ impl SampleSource {
         let composition = if random.random::<f32>() < options.keep_background_chance {
             scenery.keep(patch, &inside, visible, random)
         } else {
-            gain(&mut patch, uniform(random, [0.8, 1.2]));
+            gain(&mut patch, uniform(random, options.paste_gain));
             scenery.paste(&patch, visible, random)
         };
         (composition, coordinates, mask)
