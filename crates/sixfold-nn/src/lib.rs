@@ -5,6 +5,7 @@ pub mod layers;
 pub mod lite0;
 pub mod ops;
 
+pub mod batch_norm;
 pub mod checkpoint;
 mod files;
 pub mod schedule;
