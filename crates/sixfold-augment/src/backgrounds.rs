@@ -23,7 +23,7 @@ pub struct PhotographOptions {
 
 impl Default for PhotographOptions {
     fn default() -> Self {
-        PhotographOptions { longest_side: 480, most: 2000 }
+        PhotographOptions { longest_side: 400, most: 2000 }
     }
 }
 
@@ -192,7 +192,7 @@ mod tests {
         photograph.save(folder.path().join("a.png")).unwrap();
         let backgrounds = Backgrounds::from_folder(folder.path(), &PhotographOptions::default()).unwrap();
         assert_eq!(backgrounds.images(), 1);
-        assert_eq!(backgrounds.sources[0].image.size(), (480, 16));
+        assert_eq!(backgrounds.sources[0].image.size(), (400, 13));
         let patch = backgrounds.patch(20, 20, &mut stream(1, 1));
         assert!((patch.data[400] - 90.0 / 255.0).abs() < 0.01);
         assert!(Backgrounds::from_folder("/nowhere/at/all", &PhotographOptions::default()).is_err());

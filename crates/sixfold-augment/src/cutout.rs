@@ -79,8 +79,8 @@ impl Cutout {
                 }
                 let at = y * width + x;
                 cover.data[at] = covered;
-                for channel in 0..3 {
-                    patch.data[channel * pixels + at] = color[channel];
+                for (plane, value) in patch.data.chunks_exact_mut(pixels).zip(color) {
+                    plane[at] = value;
                 }
             }
         }

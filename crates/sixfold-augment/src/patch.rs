@@ -5,6 +5,9 @@ use sixfold_geometry::RgbImage;
 use crate::blur::gaussian;
 use crate::coverage::Coverage;
 
+/// Half a pixel in fixed point.
+const HALF: i64 = 1 << 15;
+
 /// An affine map from patch pixels to image pixels; pixel centres at whole numbers on both sides.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AffineMap {
@@ -99,48 +102,56 @@ impl Patch {
         let source = image.as_slice();
         let taps = map.taps();
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
-        let offsets: Vec<[f32; 2]> = (0..taps * taps)
+        // Fixed point with 16 bits behind the point: conversions of floats cost more than the rest of a pixel.
+        let fixed = |v: f32| (f64::from(v) * 65536.0) as i64;
+        let offsets: Vec<[i64; 2]> = (0..taps * taps)
             .map(|k| {
                 let at = |k: usize| (k as f32 + 0.5) / taps as f32 - 0.5;
                 let (i, j) = (at(k % taps), at(k / taps));
-                [map.x[0] * i + map.x[1] * j, map.y[0] * i + map.y[1] * j]
+                // Half a pixel on top, so that cutting rounds.
+                [fixed(map.x[0] * i + map.x[1] * j + 0.5), fixed(map.y[0] * i + map.y[1] * j + 0.5)]
             })
             .collect();
-        let (largest_x, largest_y) = ((w - 1) as f32, (h - 1) as f32);
+        let (step_u, step_v) = (fixed(map.x[0]), fixed(map.y[0]));
+        let (largest_u, largest_v) = (((w - 1) as i64) << 16, ((h - 1) as i64) << 16);
+        let (red, rest) = patch.data.split_at_mut(pixels);
+        let (green, blue) = rest.split_at_mut(pixels);
         for y in 0..height {
+            let [start_u, start_v] = map.apply(0.0, y as f32).map(fixed);
             for x in 0..width {
-                let [u, v] = map.apply(x as f32, y as f32);
-                if !(u >= -0.5 && v >= -0.5 && u <= largest_x + 0.5 && v <= largest_y + 0.5) {
+                let (u, v) = (start_u + x as i64 * step_u, start_v + x as i64 * step_v);
+                if u < -HALF || v < -HALF || u > largest_u + HALF || v > largest_v + HALF {
                     continue;
                 }
                 let mut sum = [0.0f32; 3];
                 if taps == 1 {
-                    let (u, v) = (u.clamp(0.0, largest_x), v.clamp(0.0, largest_y));
-                    let (x0, y0) = ((u as usize).min(w - 2), (v as usize).min(h - 2));
-                    let (fx, fy) = (u - x0 as f32, v - y0 as f32);
+                    let (u, v) = (u.clamp(0, largest_u), v.clamp(0, largest_v));
+                    let (x0, y0) = (((u >> 16) as usize).min(w - 2), ((v >> 16) as usize).min(h - 2));
+                    let fx = (u - ((x0 as i64) << 16)) as f32 * (1.0 / 65536.0);
+                    let fy = (v - ((y0 as i64) << 16)) as f32 * (1.0 / 65536.0);
                     let top = &source[y0 * w + x0..y0 * w + x0 + 2];
                     let bottom = &source[(y0 + 1) * w + x0..(y0 + 1) * w + x0 + 2];
-                    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-                    for c in 0..3 {
-                        sum[c] = f32::from(top[0][c]) * weights[0]
-                            + f32::from(top[1][c]) * weights[1]
-                            + f32::from(bottom[0][c]) * weights[2]
-                            + f32::from(bottom[1][c]) * weights[3];
-                    }
+                    sum = std::array::from_fn(|c| {
+                        let above = f32::from(top[0][c]) * (1.0 - fx) + f32::from(top[1][c]) * fx;
+                        let below = f32::from(bottom[0][c]) * (1.0 - fx) + f32::from(bottom[1][c]) * fx;
+                        above * (1.0 - fy) + below * fy
+                    });
                 } else {
                     // The taps lie about a pixel apart: the nearest pixel of each will do.
+                    let mut total = [0u32; 3];
                     for [du, dv] in &offsets {
-                        let x0 = (u + du + 0.5).clamp(0.0, largest_x) as usize;
-                        let y0 = (v + dv + 0.5).clamp(0.0, largest_y) as usize;
+                        let x0 = ((u + du).clamp(0, largest_u) >> 16) as usize;
+                        let y0 = ((v + dv).clamp(0, largest_v) >> 16) as usize;
                         let pixel = source[y0 * w + x0];
-                        (0..3).for_each(|c| sum[c] += f32::from(pixel[c]));
+                        (0..3).for_each(|c| total[c] += u32::from(pixel[c]));
                     }
+                    (0..3).for_each(|c| sum[c] = total[c] as f32);
                 }
                 let at = y * width + x;
                 inside.data[at] = 1.0;
-                for c in 0..3 {
-                    patch.data[c * pixels + at] = sum[c] * weight;
-                }
+                red[at] = sum[0] * weight;
+                green[at] = sum[1] * weight;
+                blue[at] = sum[2] * weight;
             }
         }
         (patch, inside)
@@ -165,7 +176,7 @@ impl Patch {
     /// Blurs only the borderline of something drawn into the patch: the band where the coverage, blurred by `sigma`,
     /// is neither 0 nor 1 (dissertation, section 3.4.1: the borderlines are blurred to make smooth boundaries).
     pub fn soften_border(&mut self, coverage: &Coverage, sigma: f32) {
-        if !(sigma >= crate::blur::LEAST_SIGMA) {
+        if sigma.is_nan() || sigma < crate::blur::LEAST_SIGMA {
             return;
         }
         let mut band = coverage.clone();

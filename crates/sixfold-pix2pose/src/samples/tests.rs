@@ -144,9 +144,9 @@ fn turned_crops_show_the_coordinates_that_are_to_be_learnt() {
         let sample = source.sample(0, 3, number);
         for (u, v) in inner(&sample, 64, 1) {
             let color = block_color(&sample, 128, 64, u, v);
-            for c in 0..3 {
+            for (c, color) in color.iter().enumerate() {
                 let expected = 0.5 + 0.5 * sample.coordinates[c * 4096 + v * 64 + u];
-                let error = (color[c] - expected).abs();
+                let error = (color - expected).abs();
                 worst = worst.max(error);
                 sum += error;
                 count += 1;
