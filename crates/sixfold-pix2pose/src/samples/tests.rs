@@ -416,3 +416,19 @@ fn photographs_that_do_not_fit_are_refused() {
     let broken = Camera { fx: 0.0, ..camera() };
     assert!(message(&image, broken, pose, &full).contains("fx"));
 }
+
+#[test]
+fn a_texture_is_drawn_also_when_the_mesh_is_simplified() {
+    let mesh = colored_box();
+    let corners = vec![[0.5f32, 0.5]; mesh.vertices().len()];
+    let textured = mesh.with_texture(corners, RgbImage::filled(4, 4, [200, 0, 0])).unwrap();
+    let options = SampleOptions { faces: 500, ..plain() };
+    let source = SampleSource::new(vec![object(7, textured)], vec![], grey_background(), options).unwrap();
+    let sample = source.sample(0, 2, 2);
+    let pixels = inner(&sample, 64, 2);
+    assert!(pixels.len() > 200);
+    for (u, v) in pixels {
+        let [red, green, blue] = block_color(&sample, 128, 64, u, v);
+        assert!(red > 0.2 && green < 0.35 && (green - blue).abs() < 0.1, "{red} {green} {blue}");
+    }
+}
