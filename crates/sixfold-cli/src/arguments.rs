@@ -47,6 +47,9 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold simulate-depth --dataset lmo --split test --out lmo-simulated"
     )]
     SimulateDepth(SimulateArguments),
+    /// Train a network on a few posed photographs and renders
+    #[command(after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo")]
+    Train(TrainArguments),
     /// Keep objects under a name: add, list, show, remove
     #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
     Object(ObjectArguments),
@@ -261,6 +264,97 @@ pub(crate) struct SimulateArguments {
     pub seed: u64,
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainArguments {
+    #[command(subcommand)]
+    pub command: TrainCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum TrainCommand {
+    /// Per-pixel object coordinates from RGB: poses with `sixfold estimate --method pix2pose`
+    #[command(after_help = "Examples:\n  \
+        sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo\n  \
+        sixfold train pix2pose --object mug.ply --unit mm --out out/mug\n\n\
+        Interrupted, it goes on when the same command is given again.")]
+    Pix2pose(Box<TrainPix2PoseArguments>),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainPix2PoseArguments {
+    /// BOP dataset folder with models and posed photographs
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub frames: Option<PathBuf>,
+    /// Open no photograph, learn from renders of the dataset's models alone
+    #[arg(long, requires = "dataset", conflicts_with = "frames")]
+    pub renders_only: bool,
+    /// Object ids of the dataset (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
+    pub ids: Vec<u32>,
+    /// Objects to learn from renders: mesh files, or names given with `sixfold object add`; they get the ids 1, 2, ...
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
+    pub objects: Vec<String>,
+    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// Folder of photographs for backgrounds (default: made-up textures)
+    #[arg(long, value_name = "DIR")]
+    pub backgrounds: Option<PathBuf>,
+    /// Folder for checkpoints, learning curves and the finished model
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Training steps; each takes so many images of every object
+    #[arg(long, value_name = "N", default_value = "8000")]
+    pub steps: u64,
+    /// Images of every object in a step
+    #[arg(long, value_name = "N", default_value = "4")]
+    pub per_object: usize,
+    /// Highest learning rate
+    #[arg(long, value_name = "RATE", default_value = "0.002")]
+    pub learning_rate: f64,
+    /// Stages of the ImageNet encoder that stay as they are, of five
+    #[arg(long, value_name = "N", default_value = "2")]
+    pub frozen_stages: usize,
+    /// Share of renders among the images, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub render_share: f32,
+    /// Share of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub near_photographs: f32,
+    /// Largest turn of photographs in the image plane, degrees
+    #[arg(long, value_name = "DEGREES", default_value = "45")]
+    pub rotation: f32,
+    /// Side of the network's input in pixels; the output has half of it
+    #[arg(long, value_name = "PIXELS", default_value = "128")]
+    pub size: usize,
+    /// Go on from the weights of another training instead of ImageNet's
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
+    /// Draw the meshes in random colours, as untextured CAD models
+    #[arg(long)]
+    pub no_mesh_colors: bool,
+    /// Plain L1 for symmetric objects instead of the transformer loss
+    #[arg(long)]
+    pub no_transformer_loss: bool,
+    /// Outlier thresholds of the dissertation's LM-O experiment instead of the three of its BOP entry
+    #[arg(long)]
+    pub lmo_thresholds: bool,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    /// Seed of weights and samples
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
 }
 
 #[derive(Debug, Args)]

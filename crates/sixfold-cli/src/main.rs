@@ -41,6 +41,7 @@ fn main() -> ExitCode {
         Command::Eval(a) => commands::eval::run(a),
         Command::Render(a) => commands::render::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),
+        Command::Train(a) => commands::train::run(a),
         Command::Object(a) => commands::object::run(a),
         Command::Completions(a) => commands::completions::run(a),
     };

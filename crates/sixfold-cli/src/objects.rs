@@ -21,7 +21,8 @@ const VERSION: u32 = 1;
 pub(crate) struct Object {
     pub name: String,
     pub mesh: Mesh,
-    pub symmetries: Vec<Pose>,
+    /// Diameter and symmetries.
+    pub info: ModelInfo,
     /// Where its description is kept.
     pub description: PathBuf,
 }
@@ -30,7 +31,7 @@ impl Object {
     /// The description for point pair features, from disk or computed (and then kept).
     pub fn ppf_model(&self) -> Result<ObjectModel> {
         let (model, note) =
-            ObjectModel::cached(&self.description, &self.mesh, &self.symmetries, &ModelOptions::default())
+            ObjectModel::cached(&self.description, &self.mesh, &self.info.symmetry_poses(SYMMETRY_STEP), &ModelOptions::default())
                 .with_context(|| format!("object {}", self.name))?;
         if let Some(note) = note {
             eprintln!("note: description of {} not kept or renewed: {note}", self.name);
@@ -65,7 +66,7 @@ pub(crate) struct FreeAxis {
 }
 
 impl Record {
-    fn symmetry_poses(&self, mesh: &Mesh) -> Result<Vec<Pose>> {
+    fn info(&self, mesh: &Mesh) -> Result<ModelInfo> {
         let mut info = ModelInfo::of_mesh(mesh);
         for rows in &self.symmetries_discrete {
             let flat: Vec<f64> = rows.iter().flatten().copied().collect();
@@ -76,13 +77,8 @@ impl Record {
             info.symmetries_continuous
                 .push(ContinuousSymmetry { axis: s.axis.into(), offset: s.offset.into() });
         }
-        Ok(info.symmetry_poses(SYMMETRY_STEP))
+        Ok(info)
     }
-}
-
-/// The poses of a dataset object's symmetries.
-pub(crate) fn symmetry_poses(info: &ModelInfo) -> Vec<Pose> {
-    info.symmetry_poses(SYMMETRY_STEP)
 }
 
 /// A folder of named objects.
@@ -148,8 +144,8 @@ impl Store<'_> {
         let record = self.record(name)?;
         let place = self.place(name)?;
         let mesh = with_surface(name, read_mesh(place.join("mesh.ply"), Unit::Metre)?)?;
-        let symmetries = record.symmetry_poses(&mesh)?;
-        Ok(Object { name: name.to_owned(), mesh, symmetries, description: place.join("ppf.bin") })
+        let info = record.info(&mesh)?;
+        Ok(Object { name: name.to_owned(), mesh, info, description: place.join("ppf.bin") })
     }
 
     /// Stores a mesh: written beside first, then moved into place as a whole.
@@ -221,7 +217,8 @@ pub(crate) fn find(name_or_mesh: &str, unit: Option<Unit>, store: &Path) -> Resu
     })?;
     let mesh = with_surface(name_or_mesh, read_mesh(path, unit)?)?;
     let name = path.file_stem().map_or_else(|| name_or_mesh.to_owned(), |n| n.to_string_lossy().into_owned());
-    Ok(Object { name, mesh, symmetries: vec![], description: description_beside(path) })
+    let info = ModelInfo::of_mesh(&mesh);
+    Ok(Object { name, mesh, info, description: description_beside(path) })
 }
 
 /// A model that is only points gets a surface of disks.

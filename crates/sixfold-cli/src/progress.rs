@@ -19,6 +19,11 @@ pub(crate) fn catch_interrupts() {
     });
 }
 
+/// Set once the user has asked to stop, for jobs that look at it themselves.
+pub(crate) fn interrupted() -> &'static AtomicBool {
+    &INTERRUPTED
+}
+
 /// An error once the user has asked to stop; `how` says how to go on.
 pub(crate) fn check_interrupt(how: &str) -> Result<()> {
     if INTERRUPTED.load(Ordering::SeqCst) {
@@ -49,6 +54,16 @@ impl Progress {
     /// One step is done.
     pub fn step(&mut self, message: String) {
         self.set(self.bar.position() as usize + 1);
+        self.bar.set_message(message);
+    }
+
+    /// What is shown behind the bar.
+    pub fn message(&mut self, message: String) {
+        if let Some((last, _)) = &self.plain
+            && last.elapsed() < Duration::from_millis(100)
+        {
+            eprintln!("  {message}");
+        }
         self.bar.set_message(message);
     }
 

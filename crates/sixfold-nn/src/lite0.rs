@@ -6,12 +6,19 @@
 
 use crate::kernels::Activation;
 use crate::layers::{Conv, ConvConfig};
+use crate::weights::{WeightsError, load_weights_from_bytes};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use pytorch_reader::PytorchReader;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::{Path, PathBuf};
+
+/// Name of the five-stage encoder in weight files.
+pub const ENCODER_ARCHITECTURE: &str = "efficientnet-lite0-5-stages";
+
+/// The ImageNet encoder that this crate carries (1.4 MB, Apache-2.0; its card lies beside it).
+const ENCODER: &[u8] = include_bytes!("../weights/efficientnet-lite0-encoder.safetensors");
 
 /// Batch normalisation's epsilon in the published weights.
 const EPSILON: f32 = 1e-3;
@@ -139,6 +146,16 @@ impl Source for File<'_> {
         let bias = shift.iter().zip(&mean).zip(&factor).map(|((s, m), f)| s - m * f).collect();
         Ok(config.with_values(weights, bias, self.2))
     }
+}
+
+/// The five-stage encoder with ImageNet weights, from within the program.
+///
+/// # Errors
+/// [`WeightsError`] if the program carries other weights than its own version's.
+pub fn imagenet_encoder(device: &Device) -> Result<Lite0, WeightsError> {
+    let network = Lite0Config::default().init(0, device);
+    let name = Path::new("efficientnet-lite0-encoder.safetensors");
+    Ok(load_weights_from_bytes(network, name, ENCODER, ENCODER_ARCHITECTURE)?.0)
 }
 
 impl Lite0Config {

@@ -227,7 +227,29 @@ pub fn load_weights<M: Module>(
     path: &Path,
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
-    let card = read_card(path)?;
+    // The card first: it is small, and says best what is wrong with a file of another kind.
+    read_card(path)?;
+    let bytes = fs::read(path).map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
+    load_weights_from_bytes(module, path, &bytes, expected_architecture)
+}
+
+/// [`load_weights`] from the content of a file, for weights that are part of the program; `path` names them in errors.
+///
+/// # Errors
+/// As [`load_weights`].
+pub fn load_weights_from_bytes<M: Module>(
+    module: M,
+    path: &Path,
+    bytes: &[u8],
+    expected_architecture: &str,
+) -> Result<(M, ModelCard), WeightsError> {
+    let broken = |reason: String| WeightsError::Broken { file: path.to_owned(), reason };
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| broken(e.to_string()))?;
+    let card = header.metadata().as_ref().and_then(|m| m.get(CARD_KEY));
+    let card_error = |found: String| WeightsError::Card { file: path.to_owned(), found };
+    let card = card.ok_or_else(|| card_error("none".to_owned()))?;
+    let card: ModelCard =
+        serde_json::from_str(card).map_err(|e| card_error(format!("one that is not readable ({e})")))?;
     if card.format_version != FORMAT_VERSION {
         return Err(WeightsError::Version { file: path.to_owned(), found: card.format_version });
     }
@@ -238,9 +260,7 @@ pub fn load_weights<M: Module>(
             found: card.architecture,
         });
     }
-    let bytes = fs::read(path).map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
-    let file = SafeTensors::deserialize(&bytes)
-        .map_err(|e| WeightsError::Broken { file: path.to_owned(), reason: e.to_string() })?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| broken(e.to_string()))?;
     let tensors = file.tensors().into_iter().collect();
     // Running statistics that still wait for their threads would replace the loaded ones later.
     drop(module.valid());

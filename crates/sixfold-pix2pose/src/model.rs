@@ -111,6 +111,16 @@ impl Pix2PoseModel {
         Ok(Self { network: network.no_grad(), objects, sizes, card, device })
     }
 
+    /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
+    pub fn network_for_training(path: &Path, ids: &[u32], device: &Device) -> Result<Compact, ModelError> {
+        let model = Self::load(path)?;
+        let places = ids.iter().map(|id| Ok(model.object(*id)?.0)).collect::<Result<Vec<_>, ModelError>>()?;
+        let network = CompactConfig { objects: model.objects.len() }.init_random(0, device);
+        let (network, _) = load_weights(network, path, COMPACT)?;
+        let decoders = places.iter().map(|place| network.decoders[*place].clone()).collect();
+        Ok(Compact { decoders, ..network })
+    }
+
     /// Writes the weight file and, beside it, the card as text.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
         save_weights(&self.network, &self.card, path)?;

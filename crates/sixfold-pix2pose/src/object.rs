@@ -1,8 +1,8 @@
 //! What a network has to know of an object: how its coordinates are normalised and under which turns it looks the same.
 
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::{Pose, Vec3};
-use sixfold_mesh::ModelInfo;
+use sixfold_geometry::{KdTree, Pose, Vec3};
+use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::BoundingBoxScale;
 
 /// One object of a model, as it stands in the weight file.
@@ -88,6 +88,17 @@ impl SymmetryMap {
         let discrete = ModelInfo { symmetries_continuous: Vec::new(), ..info.clone() };
         discrete.symmetry_poses(0.01).iter().map(|pose| Self::new(pose, scale)).collect()
     }
+}
+
+/// Mean distance in metres from the moved surface to the surface itself, over 500 of its points: near zero where the
+/// object has the symmetry.
+pub fn symmetry_deviation(mesh: &Mesh, object_from_object: &Pose) -> f64 {
+    let surface = mesh.sample_surface(5000, 0).points;
+    let tree = KdTree::new(&surface);
+    let probes = surface.iter().step_by(10);
+    let distances = probes.filter_map(|p| tree.nearest(&object_from_object.transform_point(p))).map(|n| n.distance);
+    let (sum, count) = distances.fold((0.0, 0usize), |(sum, n), d| (sum + d, n + 1));
+    sum / count.max(1) as f64
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::network_input;
-use crate::networks::{Compact, CompactConfig};
+use crate::networks::Compact;
 use crate::object::SymmetryMap;
 use crate::samples::SampleSource;
 use burn::module::Module;
@@ -10,7 +10,6 @@ use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use sixfold_nn::lite0::Lite0;
 use sixfold_nn::schedule::{LearningRate, LearningRateError};
 use sixfold_nn::training_log::{TrainingLog, TrainingLogError, TrainingRecord, draw_curves, read_training_log};
 use std::collections::BTreeMap;
@@ -215,7 +214,7 @@ impl State {
     }
 }
 
-/// Trains a compact network on `source`; `pools` holds every object's symmetries, the identity first.
+/// Trains a compact network, whose tensors are on the autodiff `device`, on `source`; `pools` holds every object's symmetries, the identity first.
 ///
 /// Checkpoints, log and learning curves go to `folder`; a training that was interrupted there goes on, with the same
 /// result as one that was not. `stop` ends it after the current step.
@@ -225,17 +224,20 @@ impl State {
 pub fn train(
     source: &SampleSource,
     pools: &[Vec<SymmetryMap>],
-    encoder: impl FnOnce(&Device) -> Lite0,
+    network: Compact,
+    device: &Device,
     folder: &Path,
     options: &TrainingOptions,
     stop: &AtomicBool,
     mut progress: impl FnMut(&TrainingRecord),
 ) -> Result<TrainingOutcome, TrainingError> {
     let schedule = check(source, pools, options)?;
-    let device = Device::flex().autodiff();
     let optimiser = || AdamWConfig::new().with_weight_decay(options.weight_decay).init();
-    let network = CompactConfig { objects: pools.len() }.init(encoder(&device), options.seed, &device);
     let mut state = State { network, encoder: optimiser(), decoders: optimiser() };
+    if state.network.decoders.len() != pools.len() {
+        let found = format!("{} decoders for {} objects", state.network.decoders.len(), pools.len());
+        return Err(TrainingError::Option { field: "network", expected: "one decoder an object", found });
+    }
     let (mut step, mut before) = (0, 0.0);
     if let Some(checkpoint) = Checkpoint::latest(folder)? {
         let found: TrainingOptions = checkpoint.state("options")?;
@@ -283,7 +285,7 @@ pub fn train(
                 };
                 let rate = schedule.at(step);
                 let side = source.options().size;
-                let losses = state.step(batch, pools, side, options, rate, &device);
+                let losses = state.step(batch, pools, side, options, rate, device);
                 if losses.values().any(|v| !v.is_finite()) {
                     return Err(TrainingError::NotFinite { step, rate });
                 }

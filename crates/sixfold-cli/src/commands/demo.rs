@@ -10,10 +10,11 @@ use sixfold_bop::{
     BopDataset, EvalOptions, Evaluation, ModelPoints, Models, evaluate, write_recall_curves, write_rgb,
 };
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
+use sixfold_mesh::ModelInfo;
 
 use crate::Outcome;
 use crate::arguments::DemoArguments;
-use crate::objects::{self, Object};
+use crate::objects::Object;
 use crate::output::report;
 use crate::overlay::{self, Drawn};
 use crate::progress::{Progress, check_interrupt};
@@ -88,13 +89,10 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     let mesh = dataset.model(o.obj_id, Models::Rendering)?;
                     let points = ModelPoints::new(mesh.vertices())
                         .ok_or_else(|| anyhow!("object {}: the model has no vertices", o.obj_id))?;
-                    let symmetries = infos
-                        .as_ref()
-                        .and_then(|i| i.0.get(&o.obj_id))
-                        .map(objects::symmetry_poses)
-                        .unwrap_or_default();
+                    let info = infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).cloned();
+                    let info = info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
                     let description = a.out.join(format!("objects/{:06}.sixfold-ppf", o.obj_id));
-                    let object = Object { name: o.obj_id.to_string(), mesh, symmetries, description };
+                    let object = Object { name: o.obj_id.to_string(), mesh, info, description };
                     let model = object.ppf_model()?;
                     place.insert((object, model, points));
                 }

@@ -12,7 +12,7 @@ use sixfold_bop::{
 };
 use sixfold_geometry::Rect;
 use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, ModelInfo};
 
 use super::estimate::{box_mask, estimate_options, scene_options};
 use crate::Outcome;
@@ -162,15 +162,15 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             let Some(o) = t.object else { continue };
             if let std::collections::btree_map::Entry::Vacant(place) = known.entry(o.obj_id) {
                 let mesh = dataset.model(o.obj_id, Models::Rendering)?;
-                let info = infos.as_ref().and_then(|i| i.0.get(&o.obj_id));
+                let info = infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).cloned();
                 let file = dataset
                     .models_dir(Models::Rendering)
                     .unwrap_or_else(|| root.join("models"))
                     .join(format!("obj_{:06}.ply", o.obj_id));
                 let object = Object {
                     name: format!("object {}", o.obj_id),
+                    info: info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh)),
                     mesh,
-                    symmetries: info.map(objects::symmetry_poses).unwrap_or_default(),
                     description: objects::description_beside(&file),
                 };
                 let ppf = object.ppf_model()?;

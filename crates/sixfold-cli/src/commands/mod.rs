@@ -8,3 +8,4 @@ pub(crate) mod eval;
 pub(crate) mod object;
 pub(crate) mod render;
 pub(crate) mod simulate;
+pub(crate) mod train;
