@@ -7,7 +7,11 @@ pub mod ops;
 
 pub mod batch_norm;
 pub mod checkpoint;
+pub mod conv_norm;
+pub mod densenet;
 mod files;
+pub mod pretrained;
+pub mod resnet;
 pub mod schedule;
 pub mod training_log;
 pub mod weights;

@@ -1,5 +1,8 @@
 //! Batch normalisation as an operation of Burn, with its gradient: a backend extension like [`crate::ops`].
 
+// Burn's extensions take every tensor as an argument of its own.
+#![allow(clippy::too_many_arguments)]
+
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;

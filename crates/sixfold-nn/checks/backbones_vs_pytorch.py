@@ -1,0 +1,162 @@
+"""Compares ResNet-50 and DenseNet-121 of sixfold-nn with torchvision's, with the same weights and images.
+
+    pip install torch torchvision safetensors
+    cargo build --release -p sixfold-nn --example backbone_outputs
+    python crates/sixfold-nn/checks/backbones_vs_pytorch.py target/release/examples/backbone_outputs
+
+Weights are random with uneven batch normalisation; files are written in every form that users have: .pth, .pth inside a
+dictionary and behind a wrapper's prefix, .safetensors, and DenseNet's older names. Inference: feature maps and logits differ
+by at most 1e-4 of their largest value. One training step: running statistics by at most 1e-4, gradients by at most 1e-3 of
+their norm. For the gradients every normalised value is far from the rectifier's edge (offset 2 or -2, deviation 0.3): a value
+near zero that rounding puts on the other side changes gradients at once, by several per cent in PyTorch itself.
+The exit status is 1 otherwise."""
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+import torchvision
+from safetensors.torch import load_file, save_file
+
+OUTPUT_BOUND = 1e-4
+GRADIENT_BOUND = 1e-3
+
+
+def make_uneven(network):
+    """Batch normalisation as after a training, without changing the scale of the maps much."""
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.weight.data.uniform_(0.6, 1.2)
+            module.bias.data.normal_(0, 0.2)
+            module.running_mean.normal_(0, 0.3)
+            module.running_var.uniform_(0.5, 2.0)
+
+
+def decide_rectifiers(network):
+    """No value near a rectifier's edge, half of the channels on either side."""
+    for name, module in network.named_modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.weight.data.uniform_(0.2, 0.3)
+            module.bias.data.fill_(2.0)
+            # A ResNet's shortcut comes in between here; above zero it stays above zero.
+            if "bn3" not in name and "downsample" not in name:
+                module.bias.data[::2] = -2.0
+
+
+def maps_of(network, x):
+    """The feature maps that sixfold-nn returns."""
+    maps = {}
+    if hasattr(network, "layer1"):
+        names = ["relu", "layer1", "layer2", "layer3", "layer4"]
+        x = network.relu(network.bn1(network.conv1(x)))
+        maps["map0"] = x
+        x = network.maxpool(x)
+        for i, name in enumerate(names[1:], 1):
+            x = getattr(network, name)(x)
+            maps[f"map{i}"] = x
+        return maps
+    f = network.features
+    maps["map0"] = x = f.relu0(f.norm0(f.conv0(x)))
+    x = f.pool0(x)
+    for i in range(1, 5):
+        x = f.get_submodule(f"denseblock{i}")(x)
+        maps[f"map{i}"] = torch.relu(f.norm5(x)) if i == 4 else x
+        x = f.get_submodule(f"transition{i}")(x) if i < 4 else x
+    return maps
+
+
+def torch_name(name):
+    """torchvision's name of a tensor of sixfold-nn."""
+    count = lambda m: f"{m[1]}{int(m[2]) + 1}"
+    return re.sub(r"(denseblock|denselayer|transition)\.(\d+)", count, name)
+
+
+def difference(ours, theirs):
+    scale = theirs.abs().max().item()
+    return (ours - theirs).abs().max().item() / max(scale, 1e-12)
+
+
+def norm_difference(ours, theirs, floor):
+    return ((ours - theirs).norm() / max(theirs.norm().item(), floor)).item()
+
+
+def gradients(network, x, factor):
+    """Of a loss that normalisation does not make constant."""
+    network.train()
+    network.zero_grad()
+    last = maps_of(network, x)["map4"]
+    logits = getattr(network, "fc", None) or network.classifier
+    ((last * factor).mean() + logits(last.mean((2, 3))).square().mean()).backward()
+    return {name: p.grad.detach().clone() for name, p in network.named_parameters()}
+
+
+def run(program, name, weights, x, factor, folder):
+    save_file({"x": x, "factor": factor}, folder / "x.safetensors")
+    subprocess.run([program, name, weights, folder / "x.safetensors", folder / "out.safetensors"], check=True)
+    return load_file(folder / "out.safetensors")
+
+
+def report(what, value, bound):
+    print(f"  {what}: {value:.1e} (at most {bound:.0e}){'' if value <= bound else '  TOO LARGE'}")
+    return value <= bound
+
+
+def check(name, program, folder):
+    torch.manual_seed(1)
+    network = getattr(torchvision.models, name)(weights=None)
+    make_uneven(network)
+    x = torch.randn(2, 3, 96, 128)
+    state = {k: v.clone() for k, v in network.state_dict().items()}
+    torch.save(state, folder / "plain.pth")
+    torch.save({"epoch": 3, "state_dict": {f"module.{k}": v for k, v in state.items()}}, folder / "wrapped.pth")
+    save_file(state, folder / "plain.safetensors")
+    files = ["plain.pth", "wrapped.pth", "plain.safetensors"]
+    if name == "densenet121":
+        old = lambda k: re.sub(r"(denselayer\d+)\.(norm|conv)(\d)\.", r"\1.\2.\3.", k)
+        torch.save({old(k): v for k, v in state.items()}, folder / "old.pth")
+        files.append("old.pth")
+
+    print(f"{name}: files {', '.join(files)}")
+    with torch.no_grad():
+        network.eval()
+        expected = maps_of(network, x) | {"logits": network(x)}
+    factor = torch.randn_like(expected["map4"])
+    outputs = [run(program, name, folder / file, x, factor, folder) for file in files]
+    good = [report(k, max(difference(o[k], expected[k]) for o in outputs), OUTPUT_BOUND) for k in expected]
+
+    decide_rectifiers(network)
+    save_file(network.state_dict(), folder / "decided.safetensors")
+    ours = run(program, name, folder / "decided.safetensors", x, factor, folder)
+    theirs = gradients(network, x, factor)
+    # Many gradients are zero but for rounding, because a later normalisation takes an offset out again; those are
+    # measured against a tenth of the typical one.
+    floor = 0.1 * sorted(g.norm().item() for g in theirs.values())[len(theirs) // 2]
+    trained = network.state_dict()
+    found = {"gradient": [], "statistic": []}
+    for key, value in ours.items():
+        kind, _, rest = key.partition(" ")
+        if kind == "gradient":
+            value = value.T if rest in ("fc.weight", "classifier.weight") else value
+            found[kind].append(norm_difference(value, theirs[torch_name(rest)], floor))
+        elif kind == "statistic":
+            found[kind].append(difference(value, trained[torch_name(rest)]))
+    assert len(found["gradient"]) == len(theirs), f"{len(found['gradient'])} gradients, expected {len(theirs)}"
+    good.append(report(f"{len(theirs)} gradients", max(found["gradient"]), GRADIENT_BOUND))
+    good.append(report("running statistics", max(found["statistic"]), OUTPUT_BOUND))
+    return all(good)
+
+
+def main():
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    torch.set_num_threads(2)
+    with tempfile.TemporaryDirectory() as folder:
+        good = [check(name, sys.argv[1], Path(folder)) for name in ("resnet50", "densenet121")]
+    sys.exit(0 if all(good) else 1)
+
+
+if __name__ == "__main__":
+    main()

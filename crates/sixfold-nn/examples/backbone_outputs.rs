@@ -1,0 +1,127 @@
+//! Feature maps, logits and gradients of a backbone with given PyTorch weights, for `checks/backbones_vs_pytorch.py`.
+//!
+//! `backbone_outputs resnet50|densenet121 WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
+//! (`batch x 3 x height x width`) and `factor` (of the last map's shape), the output the maps (`map0` ..) and the `logits`; of a
+//! training step the `loss` (mean of last map times factor, plus mean of the squared logits), every parameter's gradient and
+//! every running statistic's new value.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::path::Path;
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor, TensorData};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use sixfold_nn::densenet::DenseNet121Config;
+use sixfold_nn::resnet::ResNet50Config;
+
+type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [network, weights, input, output] = arguments.as_slice() else {
+        return Err("expected resnet50|densenet121 WEIGHTS INPUT.safetensors OUTPUT.safetensors".into());
+    };
+    let bytes = std::fs::read(input)?;
+    let file = SafeTensors::deserialize(&bytes)?;
+    let read = |name: &str| -> Result<TensorData, Box<dyn Error>> {
+        let x = file.tensor(name)?;
+        let values: Vec<f32> = x.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        Ok(TensorData::new(values, [x.shape()[0], x.shape()[1], x.shape()[2], x.shape()[3]]))
+    };
+    let data = [read("x")?, read("factor")?];
+
+    let mut outputs = Outputs::new();
+    let device = Device::default().autodiff();
+    match network.as_str() {
+        "resnet50" => {
+            let network = ResNet50Config::imagenet().from_pytorch(Path::new(weights), &device)?;
+            run(network, data, |n, x| n.features(x), |n, m| n.classify_map(m), &mut outputs)?;
+        }
+        "densenet121" => {
+            let network = DenseNet121Config::imagenet().from_pytorch(Path::new(weights), &device)?;
+            run(network, data, |n, x| n.features(x), |n, m| n.classify_map(m), &mut outputs)?;
+        }
+        other => return Err(format!("expected resnet50 or densenet121, found {other}").into()),
+    }
+    write(&outputs, Path::new(output))
+}
+
+fn run<M: Module>(
+    network: M,
+    [x, factor]: [TensorData; 2],
+    features: impl Fn(&M, Tensor<4>) -> Vec<Tensor<4>>,
+    classify: impl Fn(&M, Tensor<4>) -> Option<Tensor<2>>,
+    outputs: &mut Outputs,
+) -> Result<(), Box<dyn Error>> {
+    let forward = |network: &M, device: &Device| {
+        let maps = features(network, Tensor::from_data(x.clone(), device));
+        let last = maps.last().cloned().ok_or("no maps")?;
+        let logits = classify(network, last.clone()).ok_or("no classifier")?;
+        Ok::<_, Box<dyn Error>>((maps, last, logits))
+    };
+    let device = Device::default();
+    let (maps, _, logits) = forward(&network.valid(), &device)?;
+    for (i, map) in maps.into_iter().enumerate() {
+        keep(outputs, format!("map{i}"), map)?;
+    }
+    keep(outputs, "logits".to_owned(), logits)?;
+
+    let device = device.autodiff();
+    let (_, last, logits) = forward(&network, &device)?;
+    let loss = (last * Tensor::from_data(factor, &device)).mean() + logits.square().mean();
+    keep(outputs, "loss".to_owned(), loss.clone())?;
+    let gradients = GradientsParams::from_grads(loss.backward(), &network);
+    // A validation copy settles the running statistics.
+    drop(network.valid());
+    let mut collector = Collector { path: Vec::new(), gradients, outputs, error: None };
+    network.visit(&mut collector);
+    collector.error.map_or(Ok(()), Err)
+}
+
+fn keep<const D: usize>(outputs: &mut Outputs, name: String, t: Tensor<D>) -> Result<(), Box<dyn Error>> {
+    outputs.insert(name, (t.dims().to_vec(), t.try_into_vec_as()?));
+    Ok(())
+}
+
+struct Collector<'a> {
+    path: Vec<String>,
+    gradients: GradientsParams,
+    outputs: &'a mut Outputs,
+    error: Option<Box<dyn Error>>,
+}
+
+impl ModuleVisitor for Collector<'_> {
+    fn enter_module(&mut self, name: &str, _container_type: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container_type: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let name = self.path.join(".");
+        let kept = match self.gradients.remove::<D>(param.id) {
+            Some(gradient) => keep(self.outputs, format!("gradient {name}"), gradient),
+            None => keep(self.outputs, format!("statistic {name}"), param.val()),
+        };
+        if let Err(error) = kept {
+            self.error.get_or_insert(error);
+        }
+    }
+}
+
+fn write(outputs: &Outputs, path: &Path) -> Result<(), Box<dyn Error>> {
+    let bytes: Vec<(&String, &Vec<usize>, Vec<u8>)> = outputs
+        .iter()
+        .map(|(name, (shape, values))| (name, shape, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
+        .collect();
+    let mut views = Vec::new();
+    for (name, shape, bytes) in &bytes {
+        views.push((*name, TensorView::new(Dtype::F32, (*shape).clone(), bytes)?));
+    }
+    std::fs::write(path, safetensors::serialize(views, None)?)?;
+    Ok(())
+}
