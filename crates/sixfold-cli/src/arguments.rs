@@ -96,6 +96,18 @@ pub(crate) struct DemoArguments {
 pub(crate) enum Method {
     /// Point pair features on depth, no training
     Ppf,
+    /// Object coordinates from colour by a trained network, in boxes
+    Pix2pose,
+}
+
+impl Method {
+    /// As it is typed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Method::Ppf => "ppf",
+            Method::Pix2pose => "pix2pose",
+        }
+    }
 }
 
 #[derive(Debug, Args)]
@@ -103,7 +115,13 @@ pub(crate) struct EstimateArguments {
     /// How poses are found
     #[arg(long, value_enum, default_value = "ppf")]
     pub method: Method,
-    /// Colour image, for the overlay
+    /// Trained model for --method pix2pose: a file that `sixfold train pix2pose` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: Option<PathBuf>,
+    /// Leave out the last step of --method pix2pose, which aligns the rendered mesh with the image
+    #[arg(long)]
+    pub no_refine: bool,
+    /// Colour image: what pix2pose works on, else for the overlay
     #[arg(long, value_name = "FILE", requires = "camera")]
     pub rgb: Option<PathBuf>,
     /// Depth image: PNG, one channel of 16 bits
@@ -168,6 +186,13 @@ pub(crate) struct EstimateArguments {
     pub seed: u64,
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+impl EstimateArguments {
+    /// Whether poses from colour are aligned with the image.
+    pub fn refines(&self) -> bool {
+        self.method == Method::Pix2pose && !self.no_refine
+    }
 }
 
 #[derive(Debug, Args)]
@@ -349,6 +374,9 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Outlier thresholds of the dissertation's LM-O experiment instead of the three of its BOP entry
     #[arg(long)]
     pub lmo_thresholds: bool,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
     /// Folder of stored objects
     #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
     pub store: PathBuf,

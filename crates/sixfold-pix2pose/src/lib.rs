@@ -1,9 +1,11 @@
 //! Pix2Pose (Park, Patten, Vincze 2019; dissertation chapter 3): per-pixel object coordinates and their expected error
 //! from an RGB crop, and poses from them.
 
+pub mod estimate;
 pub mod loss;
 pub mod model;
 pub mod networks;
 pub mod object;
+pub mod refine;
 pub mod samples;
 pub mod training;

@@ -331,6 +331,16 @@ pub fn train(
     })
 }
 
+/// The network of the last checkpoint in `folder`, filled into `network`, and the steps it has done; `None` if there is
+/// no checkpoint.
+///
+/// # Errors
+/// [`TrainingError::Checkpoint`].
+pub fn last_checkpoint(folder: &Path, network: Compact) -> Result<Option<(Compact, u64)>, TrainingError> {
+    let Some(checkpoint) = Checkpoint::latest(folder)? else { return Ok(None) };
+    Ok(Some((checkpoint.module("network", network)?.valid(), checkpoint.step())))
+}
+
 fn check(
     source: &SampleSource,
     pools: &[Vec<SymmetryMap>],

@@ -7,16 +7,17 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow, bail};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{
-    Adjustment, BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target,
+    Adjustment, BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target, TargetObject,
     ground_truth_visibility, read_detections, write_rgb,
 };
-use sixfold_geometry::Rect;
+use sixfold_geometry::{Pose, Rect};
 use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
 use sixfold_mesh::{Mesh, ModelInfo};
 
 use super::estimate::{box_mask, estimate_options, scene_options};
+use super::pix2pose::Pix2Pose;
 use crate::Outcome;
-use crate::arguments::EstimateArguments;
+use crate::arguments::{EstimateArguments, Method};
 use crate::objects::{self, Object};
 use crate::output::{report, write_atomically};
 use crate::overlay::{self, Drawn};
@@ -27,6 +28,8 @@ use crate::progress::{Progress, check_interrupt};
 struct RunRecord {
     version: String,
     method: String,
+    weights: Option<String>,
+    refine: bool,
     dataset: String,
     split: String,
     targets: Option<String>,
@@ -57,7 +60,15 @@ enum Boxes {
 /// A model of the dataset, read and described when it is first needed.
 struct Known {
     mesh: Mesh,
-    ppf: ObjectModel,
+    /// Its point pair features, for that method.
+    ppf: Option<ObjectModel>,
+}
+
+/// A pose of an object with its confidence.
+struct Posed {
+    obj_id: u32,
+    camera_from_object: Pose,
+    confidence: f64,
 }
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
@@ -89,6 +100,13 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             Boxes::Detections(read.detections)
         }
     };
+    let pix2pose = match a.method {
+        Method::Pix2pose if matches!(boxes, Boxes::Anywhere) => {
+            bail!("--method pix2pose needs boxes: give --boxes gt or a file of COCO detections")
+        }
+        Method::Pix2pose => Some(Pix2Pose::new(a)?),
+        Method::Ppf => None,
+    };
     let mut images: BTreeMap<(u32, u32), Vec<Target>> = BTreeMap::new();
     for t in &targets {
         images.entry((t.scene_id, t.im_id)).or_default().push(*t);
@@ -96,7 +114,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let record_path = out.with_extension("csv.run.json");
     let mut record = RunRecord {
         version: env!("CARGO_PKG_VERSION").into(),
-        method: "ppf".into(),
+        method: a.method.name().into(),
+        weights: a.weights.as_ref().map(|w| w.display().to_string()),
+        refine: a.refines(),
         dataset: root.display().to_string(),
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
@@ -173,7 +193,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                     mesh,
                     description: objects::description_beside(&file),
                 };
-                let ppf = object.ppf_model()?;
+                let ppf = if a.method == Method::Ppf { Some(object.ppf_model()?) } else { None };
                 place.insert(Known { mesh: object.mesh, ppf });
             }
         }
@@ -182,18 +202,22 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             std::collections::btree_map::Entry::Vacant(place) => place.insert(dataset.scene(*scene_id)?),
         };
         let start = Instant::now();
-        match one_image(a, scene, *im_id, targets, &known, &boxes) {
+        let found = match &pix2pose {
+            Some(pix2pose) => by_pix2pose(pix2pose, scene, *im_id, targets, &known, &boxes),
+            None => by_ppf(a, scene, *im_id, targets, &known, &boxes),
+        };
+        match found {
             Err(error) => skipped.push(format!("image {key}: {}", crate::describe(&error))),
             Ok(found) => {
                 let time = start.elapsed().as_secs_f64();
                 seconds.push(time);
                 let rows: Vec<sixfold_bop::Estimate> = found
                     .iter()
-                    .map(|(obj_id, e)| {
+                    .map(|e| {
                         let mut row = sixfold_bop::Estimate::new(
                             *scene_id,
                             *im_id,
-                            *obj_id,
+                            e.obj_id,
                             e.confidence,
                             e.camera_from_object,
                         );
@@ -266,15 +290,69 @@ fn save(path: &Path, record: &RunRecord) -> Result<()> {
     write_atomically(path, serde_json::to_string_pretty(record)?.as_bytes())
 }
 
-/// The poses of an image's targets, with their object ids.
-fn one_image(
+/// Boxes of a target: detections best first, as many as there are instances, or the ground truth's.
+fn target_boxes(
+    boxes: &Boxes,
+    scene: &sixfold_bop::Scene,
+    target: &Target,
+    object: &TargetObject,
+    known: &BTreeMap<u32, Known>,
+) -> Result<Vec<(Rect, f64)>> {
+    Ok(match boxes {
+        Boxes::Anywhere => vec![],
+        Boxes::GroundTruth => ground_truth_boxes(scene, target.im_id, object.obj_id, known)?
+            .into_iter()
+            .map(|region| (region, 1.0))
+            .collect(),
+        Boxes::Detections(all) => {
+            let mut mine: Vec<&Detection> = all
+                .iter()
+                .filter(|d| {
+                    (d.scene_id, d.image_id, d.category_id) == (target.scene_id, target.im_id, object.obj_id)
+                })
+                .collect();
+            mine.sort_by(|x, y| y.score.total_cmp(&x.score));
+            mine.iter().take(object.inst_count).filter_map(|d| Some((d.bbox?, d.score))).collect()
+        }
+    })
+}
+
+/// The poses of an image's targets from colour alone.
+fn by_pix2pose(
+    pix2pose: &Pix2Pose,
+    scene: &sixfold_bop::Scene,
+    im_id: u32,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+    boxes: &Boxes,
+) -> Result<Vec<Posed>> {
+    let camera = scene.camera(im_id)?;
+    let image = scene.rgb(im_id)?.ok_or_else(|| anyhow!("has no colour image, which Pix2Pose needs"))?;
+    let mut found = vec![];
+    for target in targets {
+        let Some(o) = target.object else { continue };
+        let Some(k) = known.get(&o.obj_id) else { continue };
+        for (region, detection) in target_boxes(boxes, scene, target, &o, known)? {
+            let posed = pix2pose.estimate(&image, &camera, o.obj_id, &region, &k.mesh)?;
+            found.extend(posed.map(|p| Posed {
+                obj_id: o.obj_id,
+                camera_from_object: p.camera_from_object,
+                confidence: p.score * detection,
+            }));
+        }
+    }
+    Ok(found)
+}
+
+/// The poses of an image's targets by point pair features.
+fn by_ppf(
     a: &EstimateArguments,
     scene: &sixfold_bop::Scene,
     im_id: u32,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
     boxes: &Boxes,
-) -> Result<Vec<(u32, Estimate)>> {
+) -> Result<Vec<Posed>> {
     let camera = scene.camera(im_id)?;
     let depth = scene.depth(im_id)?.ok_or_else(|| {
         anyhow!(
@@ -290,27 +368,20 @@ fn one_image(
     for target in targets {
         let Some(o) = target.object else { continue };
         let Some(k) = known.get(&o.obj_id) else { continue };
-        let regions: Vec<Rect> = match boxes {
-            Boxes::Anywhere => vec![],
-            Boxes::GroundTruth => ground_truth_boxes(scene, im_id, o.obj_id, known)?,
-            Boxes::Detections(all) => {
-                let mut mine: Vec<&Detection> = all
-                    .iter()
-                    .filter(|d| (d.scene_id, d.image_id, d.category_id) == (target.scene_id, im_id, o.obj_id))
-                    .collect();
-                mine.sort_by(|x, y| y.score.total_cmp(&x.score));
-                mine.iter().take(o.inst_count).filter_map(|d| d.bbox).collect()
-            }
+        let Some(ppf) = &k.ppf else { continue };
+        let regions = target_boxes(boxes, scene, target, &o, known)?;
+        let posed = |e: Estimate| Posed {
+            obj_id: o.obj_id,
+            camera_from_object: e.camera_from_object,
+            confidence: e.confidence,
         };
         if let Some(whole) = &whole {
-            let estimates = estimate(whole, &k.ppf, &estimate_options(a, o.inst_count));
-            found.extend(estimates.into_iter().map(|e| (o.obj_id, e)));
+            found.extend(estimate(whole, ppf, &estimate_options(a, o.inst_count)).into_iter().map(posed));
         }
-        for region in regions {
+        for (region, _) in regions {
             let mask = box_mask(&region, &camera);
             let scene = Scene::new(&depth, &camera, Some(&mask), &options).context("depth image")?;
-            let estimates = estimate(&scene, &k.ppf, &estimate_options(a, 1));
-            found.extend(estimates.into_iter().map(|e| (o.obj_id, e)));
+            found.extend(estimate(&scene, ppf, &estimate_options(a, 1)).into_iter().map(posed));
         }
     }
     Ok(found)
@@ -354,7 +425,7 @@ fn draw(
     scene: &sixfold_bop::Scene,
     scene_id: u32,
     im_id: u32,
-    found: &[(u32, Estimate)],
+    found: &[Posed],
     known: &BTreeMap<u32, Known>,
 ) -> Result<()> {
     let camera = scene.camera(im_id)?;
@@ -365,11 +436,11 @@ fn draw(
     };
     let drawn: Vec<Drawn<'_>> = found
         .iter()
-        .filter_map(|(id, e)| {
+        .filter_map(|e| {
             Some(Drawn {
-                mesh: &known.get(id)?.mesh,
+                mesh: &known.get(&e.obj_id)?.mesh,
                 camera_from_object: e.camera_from_object,
-                color: overlay::color(*id as usize),
+                color: overlay::color(e.obj_id as usize),
             })
         })
         .collect();

@@ -6,6 +6,7 @@ pub(crate) mod estimate;
 pub(crate) mod estimate_dataset;
 pub(crate) mod eval;
 pub(crate) mod object;
+pub(crate) mod pix2pose;
 pub(crate) mod render;
 pub(crate) mod simulate;
 pub(crate) mod train;

@@ -17,7 +17,7 @@ use sixfold_pix2pose::model::{ImageSizes, Pix2PoseModel};
 use sixfold_pix2pose::networks::CompactConfig;
 use sixfold_pix2pose::object::{ObjectEntry, SymmetryMap, lmo_threshold};
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject, read_real_crops};
-use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, train};
+use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 use sixfold_render::BoundingBoxScale;
 
 use crate::Outcome;
@@ -90,6 +90,29 @@ fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Ou
         })
         .collect();
     let pools: Vec<Vec<SymmetryMap>> = objects.iter().map(|o| SymmetryMap::pool(&o.info, &o.scale)).collect();
+    let ids: Vec<u32> = entries.iter().map(|e| e.id).collect();
+    // Tells of wrong weights before anything else begins.
+    let device = Device::flex().autodiff();
+    let network = match &a.init {
+        Some(file) => Pix2PoseModel::network_for_training(file, &ids, &device)?,
+        None => CompactConfig { objects: ids.len() }.init(imagenet_encoder(&device)?, a.seed, &device),
+    };
+    let folder = a.out.join("training");
+    let mut card = ModelCard::new("", "Pix2Pose, compact network");
+    card.data = description;
+    card.seed = options.seed;
+    card.command = command_line();
+    card.extra = serde_json::json!({ "training": options });
+    let path = a.out.join("model.safetensors");
+    if a.export {
+        let Some((network, step)) = last_checkpoint(&folder, network)? else {
+            bail!("{}: holds no checkpoint; train first", folder.display());
+        };
+        card.steps = step;
+        Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
+        println!("the model after {step} steps: {}", path.display());
+        return Ok(Outcome::Found);
+    }
     let sample_options = SampleOptions {
         size: sizes.input,
         target_size: Some(sizes.output),
@@ -104,19 +127,12 @@ fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Ou
     let source = SampleSource::new(objects, real, backgrounds, sample_options)?;
     let mut progress = Progress::new("steps", options.steps as usize);
     let mut last = TrainingRecord::default();
-    let ids: Vec<u32> = entries.iter().map(|e| e.id).collect();
-    // Tells of wrong weights before anything else begins.
-    let device = Device::flex().autodiff();
-    let network = match &a.init {
-        Some(file) => Pix2PoseModel::network_for_training(file, &ids, &device)?,
-        None => CompactConfig { objects: ids.len() }.init(imagenet_encoder(&device)?, a.seed, &device),
-    };
     let outcome = train(
         &source,
         &pools,
         network,
         &device,
-        &a.out.join("training"),
+        &folder,
         &options,
         interrupted(),
         |record| {
@@ -136,13 +152,7 @@ fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Ou
             bail!("interrupted after step {step}, which is kept; run the same command again to go on")
         }
     };
-    let mut card = ModelCard::new("", "Pix2Pose, compact network");
-    card.data = description;
     card.steps = options.steps;
-    card.seed = options.seed;
-    card.command = command_line();
-    card.extra = serde_json::json!({ "training": options });
-    let path = a.out.join("model.safetensors");
     Pix2PoseModel::new(*network, entries, sizes, card).save(&path)?;
     let summary = Summary {
         model: path.display().to_string(),

@@ -10,12 +10,12 @@ mod options;
 mod poses;
 mod real;
 mod rendering;
-mod second_stage;
+pub(crate) mod second_stage;
 mod source;
 mod symmetry;
 #[cfg(test)]
 mod tests;
-mod window;
+pub(crate) mod window;
 
 pub use error::SampleError;
 pub use options::SampleOptions;

@@ -6,7 +6,7 @@ use rand::RngExt;
 use sixfold_augment::{Coverage, Patch, Random, uniform};
 
 /// Value of what is masked out, in images of 0..1.
-pub(super) const GREY: f32 = 0.5;
+pub(crate) const GREY: f32 = 0.5;
 
 /// Greys out all but a disturbed form of `visible`; `whole` is the silhouette with its hidden parts, which the first
 /// stage sometimes keeps.

@@ -14,14 +14,14 @@ use super::options::SampleOptions;
 
 /// A square part of the image plane; pixel centres at whole numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Window {
+pub(crate) struct Window {
     pub centre: Vec2,
     pub side: f64,
 }
 
 /// Smallest and largest corner of a set of points in the image.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Extent {
+pub(crate) struct Extent {
     low: Vec2,
     high: Vec2,
 }

@@ -1,0 +1,379 @@
+//! Poses from an image and boxes: two passes of the network, PnP with RANSAC, a score (section 3.3).
+//!
+//! The first pass sees the box with its surroundings, finds the object's pixels and centres the crop on them. The second
+//! sees the crop without background, once for every outlier threshold, all in one batch. The candidate with most inliers
+//! wins; the others stay as hypotheses.
+
+use crate::model::{ModelError, Pix2PoseModel, Prediction};
+use crate::object::ObjectEntry;
+use crate::samples::second_stage::GREY;
+use crate::samples::window::Window;
+use sixfold_augment::Patch;
+use sixfold_geometry::{Camera, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac};
+
+/// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EstimateOptions {
+    /// Outlier thresholds on the expected error; empty for those of the model's object.
+    pub thresholds: Vec<f32>,
+    /// Two passes; otherwise poses come from the first.
+    pub two_stages: bool,
+    /// Side of the crop over the longer side of the box.
+    pub crop_factor: f64,
+    /// Inlier threshold of PnP in pixels of the network's output; at least 1.5 image pixels are allowed.
+    pub reprojection: f64,
+    /// Seed of RANSAC.
+    pub seed: u64,
+    /// The author's bugs, one by one.
+    pub quirks: Quirks,
+}
+
+impl Default for EstimateOptions {
+    fn default() -> Self {
+        Self {
+            thresholds: Vec::new(),
+            two_stages: true,
+            crop_factor: 1.5,
+            reprojection: 1.5,
+            seed: 0,
+            quirks: Quirks::default(),
+        }
+    }
+}
+
+/// What the author's code does differently from the dissertation, to measure what each costs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Quirks {
+    /// The second crop's shift is measured in network pixels and added to image pixels.
+    pub unscaled_recentring: bool,
+    /// Coordinates pass through 8 bits.
+    pub eight_bits: bool,
+    /// The candidate with the least (projected centre - mask centroid)^2 / inliers wins instead of the one with most
+    /// inliers.
+    pub centre_choice: bool,
+    /// EPnP with 5 px, 100 iterations and no final refinement.
+    pub plain_pnp: bool,
+}
+
+impl Quirks {
+    /// All of them.
+    pub fn all() -> Self {
+        Self { unscaled_recentring: true, eight_bits: true, centre_choice: true, plain_pnp: true }
+    }
+}
+
+/// Why no estimate could be tried. Finding nothing is no error.
+#[derive(Debug, thiserror::Error)]
+pub enum EstimateError {
+    /// The model does not know the object.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A box without area or numbers.
+    #[error("box: found x {x}, y {y}, width {width}, height {height}; expected finite numbers and at least 2 pixels a side", x = .0.x, y = .0.y, width = .0.width, height = .0.height)]
+    Box(Rect),
+    /// The box shows nothing of the image.
+    #[error("box: {box_:?} lies outside the {width}x{height} image")]
+    Outside {
+        /// The box.
+        box_: Rect,
+        /// The image's width.
+        width: usize,
+        /// The image's height.
+        height: usize,
+    },
+    /// Image and camera differ in size.
+    #[error("image has {width}x{height} pixels, the camera is for {camera_width}x{camera_height}")]
+    Size {
+        /// The image's width.
+        width: usize,
+        /// The image's height.
+        height: usize,
+        /// The camera's width.
+        camera_width: usize,
+        /// The camera's height.
+        camera_height: usize,
+    },
+    /// The image is distorted.
+    #[error("the camera has lens distortion: undistort image and camera first")]
+    Distorted,
+}
+
+/// A pose with what speaks for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hypothesis {
+    /// The pose, metres.
+    pub camera_from_object: Pose,
+    /// The outlier threshold of its second pass.
+    pub threshold: f32,
+    /// Correspondences that fit the pose.
+    pub inliers: usize,
+    /// Inliers over the object's pixels of the first pass, 0 to 1: the score of the dissertation.
+    pub score: f64,
+}
+
+/// What was found in one box.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// Best first, never empty.
+    pub hypotheses: Vec<Hypothesis>,
+    /// What the network saw and said last, for the best hypothesis.
+    pub view: View,
+    /// Object and image points of the best hypothesis' correspondences, metres and pixels.
+    pub object_points: Vec<Vec3>,
+    /// In the order of `object_points`.
+    pub image_points: Vec<Vec2>,
+}
+
+/// A crop with its prediction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// The crop's square in the image.
+    pub window: Rect,
+    /// The network's input.
+    pub input: RgbImage,
+    /// Its output.
+    pub prediction: Prediction,
+}
+
+/// Least pixels of an object after the first pass.
+const LEAST_PIXELS: usize = 10;
+/// A visible pixel has at least this probability.
+const VISIBLE: f32 = 0.5;
+
+/// Looks for one object in a box of a pinhole image; `None` if its pixels are not in it.
+///
+/// # Errors
+/// [`EstimateError`] for an object the model does not know, a box without area or outside the image, and an image that
+/// does not fit its camera.
+pub fn estimate(
+    model: &Pix2PoseModel,
+    image: &RgbImage,
+    camera: &Camera,
+    object_id: u32,
+    region: &Rect,
+    options: &EstimateOptions,
+) -> Result<Option<Found>, EstimateError> {
+    let (index, object) = model.object(object_id)?;
+    check(image, camera, region)?;
+    let centre = Vec2::new(region.x + 0.5 * (region.width - 1.0), region.y + 0.5 * (region.height - 1.0));
+    let window = Window { centre, side: region.width.max(region.height).max(8.0) * options.crop_factor };
+    let crop = Crop::cut(image, camera, window, model.sizes().input);
+    let Some(first) = model.predict(index, &crop.pixels).pop() else { return Ok(None) };
+    let mask = object_mask(&first, f32::INFINITY);
+    let visible = mask.iter().filter(|m| **m).count();
+    if visible < LEAST_PIXELS {
+        return Ok(None);
+    }
+    let thresholds = if options.thresholds.is_empty() { &object.thresholds } else { &options.thresholds };
+    let context = Context { camera, object, options, visible };
+    if !options.two_stages {
+        return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)]));
+    }
+    // The crop follows the object's pixels; it does not grow.
+    let window = recentred(&window, &mask, first.side, options);
+    let scaled = Crop::cut(image, camera, window, model.sizes().input);
+    let mut candidates: Vec<(f32, Crop)> = Vec::new();
+    for &threshold in thresholds {
+        let mask = object_mask(&first, threshold);
+        if mask.iter().filter(|m| **m).count() >= LEAST_PIXELS {
+            candidates.push((threshold, scaled.without_background(&crop.window, &mask, first.side)));
+        }
+    }
+    if candidates.is_empty() {
+        return Ok(None);
+    }
+    let batch: Vec<f32> = candidates.iter().flat_map(|(_, crop)| crop.pixels.iter().copied()).collect();
+    let predictions = model.predict(index, &batch);
+    let views = candidates.into_iter().zip(predictions).map(|((t, crop), p)| (t, crop, p)).collect();
+    Ok(context.best(views))
+}
+
+fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), EstimateError> {
+    let (width, height) = image.size();
+    if (width, height) != (camera.width, camera.height) {
+        let (camera_width, camera_height) = (camera.width, camera.height);
+        return Err(EstimateError::Size { width, height, camera_width, camera_height });
+    }
+    if camera.distortion.is_some() {
+        return Err(EstimateError::Distorted);
+    }
+    let finite = [region.x, region.y, region.width, region.height].iter().all(|v| v.is_finite());
+    if !finite || region.width < 2.0 || region.height < 2.0 {
+        return Err(EstimateError::Box(*region));
+    }
+    let whole = Rect { x: 0.0, y: 0.0, width: width as f64, height: height as f64 };
+    if region.intersect(&whole).is_none() {
+        return Err(EstimateError::Outside { box_: *region, width, height });
+    }
+    Ok(())
+}
+
+/// Where the first pass sees the object, less certain pixels left out.
+fn object_mask(prediction: &Prediction, threshold: f32) -> Vec<bool> {
+    prediction.visible.iter().zip(&prediction.error).map(|(v, e)| *v > VISIBLE && *e < threshold).collect()
+}
+
+/// The window about the object's pixels: their box and the crop factor, no larger than before.
+fn recentred(window: &Window, mask: &[bool], side: usize, options: &EstimateOptions) -> Window {
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for index in (0..mask.len()).filter(|i| mask[*i]) {
+        let pixel = Vec2::new((index % side) as f64, (index / side) as f64);
+        (low, high) = (low.inf(&pixel), high.sup(&pixel));
+    }
+    let step = window.side / side as f64;
+    let shift = (low + high) * 0.5 - Vec2::repeat(0.5 * (side as f64 - 1.0));
+    if options.quirks.unscaled_recentring {
+        // In the author's code the network's output has 128 pixels.
+        return Window { centre: window.centre + shift * (128.0 / side as f64), side: window.side };
+    }
+    let longest = (high - low).max() + 1.0;
+    let new_side = (longest * step * options.crop_factor).clamp(0.6 * window.side, window.side);
+    Window { centre: window.centre + shift * step, side: new_side }
+}
+
+/// A square crop at the network's size.
+#[derive(Debug, Clone)]
+struct Crop {
+    window: Window,
+    side: usize,
+    pixels: Vec<f32>,
+}
+
+impl Crop {
+    fn cut(image: &RgbImage, camera: &Camera, window: Window, side: usize) -> Self {
+        let (patch, _) = Patch::warp(image, &window.map(camera, side, 0.0), side, side, [GREY; 3]);
+        Self { window, side, pixels: patch.data }
+    }
+
+    /// The crop with everything grey that a mask (`side x side` over the square `of`) leaves out.
+    fn without_background(&self, of: &Window, mask: &[bool], side: usize) -> Self {
+        let mut pixels = self.pixels.clone();
+        let corner = |window: &Window| window.centre - Vec2::repeat(0.5 * window.side);
+        let (here, there) = (corner(&self.window), corner(of));
+        let inside = |x: usize, y: usize| {
+            let image = here + Vec2::new(x as f64 + 0.5, y as f64 + 0.5) * (self.window.side / self.side as f64);
+            let at = (image - there) * (side as f64 / of.side);
+            // Bilinear between the mask's pixels, as far as half.
+            let at = at - Vec2::repeat(0.5);
+            let (x, y) = (at.x.floor(), at.y.floor());
+            let (fx, fy) = (at.x - x, at.y - y);
+            let value = |dx: f64, dy: f64| {
+                let (x, y) = (x + dx, y + dy);
+                let within = x >= 0.0 && y >= 0.0 && x < side as f64 && y < side as f64;
+                if within && mask[y as usize * side + x as usize] { 1.0 } else { 0.0 }
+            };
+            (1.0 - fy) * ((1.0 - fx) * value(0.0, 0.0) + fx * value(1.0, 0.0))
+                + fy * ((1.0 - fx) * value(0.0, 1.0) + fx * value(1.0, 1.0))
+                > 0.4
+        };
+        let area = self.side * self.side;
+        for y in 0..self.side {
+            for x in 0..self.side {
+                if !inside(x, y) {
+                    for plane in 0..3 {
+                        pixels[plane * area + y * self.side + x] = GREY;
+                    }
+                }
+            }
+        }
+        Self { pixels, ..*self }
+    }
+
+    fn picture(&self) -> RgbImage {
+        let area = self.side * self.side;
+        RgbImage::from_fn(self.side, self.side, |x, y| {
+            [0, 1, 2].map(|c| (self.pixels[c * area + y * self.side + x] * 255.0).round().clamp(0.0, 255.0) as u8)
+        })
+    }
+}
+
+struct Context<'a> {
+    camera: &'a Camera,
+    object: &'a ObjectEntry,
+    options: &'a EstimateOptions,
+    /// Pixels of the object in the first pass.
+    visible: usize,
+}
+
+/// A hypothesis with its correspondences and how far its centre lies from the mask's, image pixels.
+struct Candidate {
+    hypothesis: Hypothesis,
+    object_points: Vec<Vec3>,
+    image_points: Vec<Vec2>,
+    off_centre: f64,
+}
+
+impl Context<'_> {
+    fn best(&self, views: Vec<(f32, Crop, Prediction)>) -> Option<Found> {
+        let mut all: Vec<(Candidate, usize)> = Vec::new();
+        for (index, (threshold, crop, prediction)) in views.iter().enumerate() {
+            all.extend(self.pose(*threshold, crop, prediction).map(|c| (c, index)));
+        }
+        if self.options.quirks.centre_choice {
+            let cost = |c: &Candidate| c.off_centre.powi(2) / c.hypothesis.inliers.max(1) as f64;
+            all.sort_by(|a, b| cost(&a.0).total_cmp(&cost(&b.0)));
+        } else {
+            all.sort_by(|a, b| b.0.hypothesis.inliers.cmp(&a.0.hypothesis.inliers));
+        }
+        let (first, view) = all.first().map(|(_, view)| *view).and_then(|v| Some((all.first()?, &views[v])))?;
+        let (_, crop, prediction) = view;
+        let corner = crop.window.centre - Vec2::repeat(0.5 * (crop.window.side - 1.0));
+        let window =
+            Rect { x: corner.x - 0.5, y: corner.y - 0.5, width: crop.window.side, height: crop.window.side };
+        Some(Found {
+            view: View { window, input: crop.picture(), prediction: prediction.clone() },
+            object_points: first.0.object_points.clone(),
+            image_points: first.0.image_points.clone(),
+            hypotheses: all.into_iter().map(|(candidate, _)| candidate.hypothesis).collect(),
+        })
+    }
+
+    fn pose(&self, threshold: f32, crop: &Crop, prediction: &Prediction) -> Option<Candidate> {
+        let side = prediction.side;
+        let step = crop.window.side / side as f64;
+        let corner = crop.window.centre - Vec2::repeat(0.5 * crop.window.side);
+        let scale = self.object.scale();
+        let mask = object_mask(prediction, threshold.max(0.3));
+        let (mut object_points, mut image_points) = (Vec::new(), Vec::new());
+        for index in (0..mask.len()).filter(|i| mask[*i]) {
+            let mut n = prediction.coordinates[index];
+            if self.options.quirks.eight_bits {
+                n = n.map(|v| ((v.clamp(-1.0, 1.0) + 1.0) * 127.5).floor() / 127.5 - 1.0);
+            }
+            object_points.push(scale.restore(&Vec3::new(n[0].into(), n[1].into(), n[2].into())));
+            let pixel = Vec2::new((index % side) as f64 + 0.5, (index / side) as f64 + 0.5);
+            image_points.push(corner + pixel * step);
+        }
+        let pnp = if self.options.quirks.plain_pnp {
+            PnpOptions {
+                threshold_px: 5.0,
+                max_iterations: 100,
+                min_iterations: 100,
+                seed: self.options.seed,
+                solver: PnpSolver::Epnp,
+                local_iterations: 0,
+                refine: false,
+                noise_window: 0.0,
+                ..PnpOptions::default()
+            }
+        } else {
+            PnpOptions {
+                threshold_px: (self.options.reprojection * step).max(1.5),
+                max_iterations: 1000,
+                seed: self.options.seed,
+                ..PnpOptions::default()
+            }
+        };
+        let report = pnp_ransac(&object_points, &image_points, self.camera, &pnp).ok()?;
+        let inliers = report.inlier_count;
+        let centroid = image_points.iter().sum::<Vec2>() / image_points.len() as f64;
+        let centre = self.camera.project(&report.camera_from_object.transform_point(&scale.centre))?;
+        let score = (inliers as f64 / self.visible.max(object_points.len()) as f64).min(1.0);
+        Some(Candidate {
+            hypothesis: Hypothesis { camera_from_object: report.camera_from_object, threshold, inliers, score },
+            object_points,
+            image_points,
+            off_centre: (centre - centroid).norm(),
+        })
+    }
+}

@@ -1,0 +1,80 @@
+//! The discriminator of the dissertation's adversarial training (section 3.3): is an image of object coordinates a rendered
+//! one or the generator's? It sees the coordinates alone, not the photograph.
+
+use burn::module::Module;
+use burn::nn::{Linear, LinearConfig};
+use burn::tensor::{Device, Tensor};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use sixfold_nn::batch_norm::{BatchNorm, BatchNormConfig};
+use sixfold_nn::conv_norm::{BareConv, BareConvConfig};
+use sixfold_nn::kernels::ConvSpec;
+
+const CHANNELS: [usize; 8] = [3, 64, 128, 256, 512, 512, 512, 512];
+const KERNEL: usize = 3;
+const SLOPE: f32 = 0.2;
+
+/// The discriminator. It has no options but its seed.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct DiscriminatorConfig {
+    /// Seed of the random weights.
+    pub seed: u64,
+}
+
+impl DiscriminatorConfig {
+    /// The network with random weights (He et al. 2015).
+    pub fn init(&self, device: &Device) -> Discriminator {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        let padding = ConvSpec::same(2, KERNEL, 2);
+        let stages = CHANNELS
+            .windows(2)
+            .map(|c| {
+                let conv = BareConvConfig::new([c[0], c[1]], KERNEL).with_stride(2).with_padding(padding);
+                Stage { conv: conv.init(&mut rng, device), norm: BatchNormConfig::new(c[1]).init(device) }
+            })
+            .collect();
+        Discriminator { stages, judge: LinearConfig::new(CHANNELS[CHANNELS.len() - 1], 1).init(device) }
+    }
+}
+
+/// The discriminator, made by [`DiscriminatorConfig`].
+#[derive(Module, Debug)]
+pub struct Discriminator {
+    stages: Vec<Stage>,
+    judge: Linear,
+}
+
+#[derive(Module, Debug)]
+struct Stage {
+    conv: BareConv,
+    norm: BatchNorm,
+}
+
+impl Discriminator {
+    /// Coordinates in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones.
+    pub fn forward(&self, coordinates: Tensor<4>) -> Tensor<2> {
+        let stages = self.stages.iter();
+        let x = stages.fold(coordinates, |x, stage| stage.conv.forward_norm(x, &stage.norm, None, SLOPE));
+        let [batch, channels, height, width] = x.dims();
+        self.judge.forward(x.reshape([batch, channels * height * width]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::optim::GradientsParams;
+
+    #[test]
+    fn it_gives_a_logit_an_image_and_passes_gradients_on() {
+        let device = Device::default().autodiff();
+        let network = DiscriminatorConfig::default().init(&device);
+        let x = Tensor::<4>::random([3, 3, 128, 128], burn::tensor::Distribution::Default, &device)
+            .require_grad();
+        let logits = network.forward(x.clone());
+        assert_eq!(logits.dims(), [3, 1]);
+        let gradients = logits.square().mean().backward();
+        assert!(x.grad(&gradients).unwrap().abs().max().into_scalar::<f32>() > 0.0);
+        assert_eq!(GradientsParams::from_grads(gradients, &network).len(), 7 * 3 + 2);
+    }
+}
