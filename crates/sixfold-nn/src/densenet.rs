@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use burn::nn::{Linear, LinearConfig};
+use burn::nn::Linear;
 use burn::tensor::module::{avg_pool2d, max_pool2d};
 use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
 use burn::tensor::{Device, Tensor};
@@ -12,6 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::batch_norm::{BatchNorm, BatchNormConfig};
 use crate::conv_norm::{BareConv, BareConvConfig};
+use crate::dense::dense;
 use crate::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
 
 /// Layers of the four dense blocks.
@@ -67,7 +68,7 @@ impl DenseNet121Config {
         let whole = built == BLOCKS.len();
         let norm5 = whole.then(|| BatchNormConfig::new(channels).init(device));
         let classifier =
-            self.classes.filter(|_| whole).map(|classes| LinearConfig::new(channels, classes).init(device));
+            self.classes.filter(|_| whole).map(|classes| dense([channels, classes], &mut rng, device));
         let features = Features { conv0, norm0, denseblock, transition, norm5 };
         DenseNet121 { features, classifier }
     }

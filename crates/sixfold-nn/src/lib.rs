@@ -8,6 +8,8 @@ pub mod ops;
 pub mod batch_norm;
 pub mod checkpoint;
 pub mod conv_norm;
+pub mod conv_transpose;
+pub mod dense;
 pub mod densenet;
 mod files;
 pub mod pretrained;

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use burn::module::Module;
-use burn::nn::{Linear, LinearConfig};
+use burn::nn::Linear;
 use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
@@ -13,6 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::batch_norm::{BatchNorm, BatchNormConfig};
 use crate::conv_norm::{BareConv, BareConvConfig};
+use crate::dense::dense;
 use crate::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
 
 /// Bottlenecks and inner channels of the four layers. A layer's output has four times as many channels.
@@ -59,7 +60,7 @@ impl ResNet50Config {
         let fc = self
             .classes
             .filter(|_| self.layers == LAYERS.len())
-            .map(|classes| LinearConfig::new(inputs, classes).init(device));
+            .map(|classes| dense([inputs, classes], &mut rng, device));
         ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc }
     }
 

@@ -2,12 +2,13 @@
 //! one or the generator's? It sees the coordinates alone, not the photograph.
 
 use burn::module::Module;
-use burn::nn::{Linear, LinearConfig};
+use burn::nn::Linear;
 use burn::tensor::{Device, Tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_nn::batch_norm::{BatchNorm, BatchNormConfig};
 use sixfold_nn::conv_norm::{BareConv, BareConvConfig};
+use sixfold_nn::dense::dense;
 use sixfold_nn::kernels::ConvSpec;
 
 const CHANNELS: [usize; 8] = [3, 64, 128, 256, 512, 512, 512, 512];
@@ -33,7 +34,8 @@ impl DiscriminatorConfig {
                 Stage { conv: conv.init(&mut rng, device), norm: BatchNormConfig::new(c[1]).init(device) }
             })
             .collect();
-        Discriminator { stages, judge: LinearConfig::new(CHANNELS[CHANNELS.len() - 1], 1).init(device) }
+        let judge = dense([CHANNELS[CHANNELS.len() - 1], 1], &mut rng, device);
+        Discriminator { stages, judge }
     }
 }
 
