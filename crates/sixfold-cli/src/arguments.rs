@@ -29,7 +29,9 @@ pub(crate) enum Command {
     /// Estimate the 6D pose of known objects, in one image or in a whole dataset
     #[command(after_help = "Examples:\n  \
         sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
-        sixfold estimate --dataset lmo --split test --out results.csv")]
+        sixfold estimate --method pix2pose --weights model.safetensors --rgb c.png --camera camera.json --object mug.ply --unit mm --box 210,140,90,120 --out out\n  \
+        sixfold estimate --dataset lmo --split test --out results.csv\n  \
+        sixfold estimate --method pix2pose --weights model.safetensors --dataset lmo --boxes gt --out results.csv")]
     Estimate(Box<EstimateArguments>),
     /// Score a result file against the ground truth of a BOP dataset
     #[command(
@@ -50,6 +52,9 @@ pub(crate) enum Command {
     /// Train a network on a few posed photographs and renders
     #[command(after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo")]
     Train(TrainArguments),
+    /// Measure a method on a dataset as its paper does, with its ablations: one table from one command
+    #[command(after_help = "Example:\n  sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --out out/reproduce")]
+    Reproduce(ReproduceArguments),
     /// Keep objects under a name: add, list, show, remove
     #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
     Object(ObjectArguments),
@@ -121,6 +126,12 @@ pub(crate) struct EstimateArguments {
     /// Leave out the last step of --method pix2pose, which aligns the rendered mesh with the image
     #[arg(long)]
     pub no_refine: bool,
+    /// Which of the model's objects --method pix2pose looks for in one image (default: its only one)
+    #[arg(long, value_name = "ID", conflicts_with = "dataset")]
+    pub object_id: Option<u32>,
+    /// Align the poses of --method pix2pose with the depth image (ICP)
+    #[arg(long)]
+    pub icp: bool,
     /// Colour image: what pix2pose works on, else for the overlay
     #[arg(long, value_name = "FILE", requires = "camera")]
     pub rgb: Option<PathBuf>,
@@ -172,7 +183,8 @@ pub(crate) struct EstimateArguments {
     /// Folder for overlay pictures of a dataset's images
     #[arg(long, value_name = "DIR", requires = "dataset")]
     pub overlays: Option<PathBuf>,
-    /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image, 0.05 for a dataset)
+    /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image, 0.05 for a dataset, 0
+    /// with --method pix2pose)
     #[arg(long, value_name = "SCORE")]
     pub min_score: Option<f64>,
     /// Match points on the table plane too
@@ -381,6 +393,66 @@ pub(crate) struct TrainPix2PoseArguments {
     #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
     pub store: PathBuf,
     /// Seed of weights and samples
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReproduceArguments {
+    #[command(subcommand)]
+    pub command: ReproduceCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ReproduceCommand {
+    /// Recall and AR of Pix2Pose per object, what each part of the method is worth, and times
+    #[command(after_help = "Example:\n  \
+        sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
+        Every row is kept; interrupted, it goes on when the same command is given again.")]
+    Pix2pose(Box<ReproducePix2PoseArguments>),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReproducePix2PoseArguments {
+    /// BOP dataset folder with ground truth
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Frames that the model was trained on, which are left out: JSON as for `sixfold train pix2pose`
+    #[arg(long, value_name = "FILE")]
+    pub frames: PathBuf,
+    /// Trained model
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: PathBuf,
+    /// Folder for the table, its JSON, and the rows done so far
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Also with the boxes of this file of COCO detections
+    #[arg(long, value_name = "FILE.json")]
+    pub detections: Option<PathBuf>,
+    /// Score these published results (BOP's CSV) on the same targets, for comparison
+    #[arg(long, value_name = "FILE.csv")]
+    pub published: Option<PathBuf>,
+    /// Every eighth frame only
+    #[arg(long)]
+    pub quick: bool,
+    /// Also train the networks of the training ablations (hours)
+    #[arg(long)]
+    pub train: bool,
+    /// Steps of these trainings
+    #[arg(long, value_name = "N", default_value = "1500", requires = "train")]
+    pub steps: u64,
+    /// Side of these networks' input in pixels
+    #[arg(long, value_name = "PIXELS", default_value = "96", requires = "train")]
+    pub size: usize,
+    /// Folder of photographs for the backgrounds of these trainings (default: made-up textures)
+    #[arg(long, value_name = "DIR", requires = "train")]
+    pub backgrounds: Option<PathBuf>,
+    /// Seed of the boxes' noise, of RANSAC and of the trainings
     #[arg(long, default_value = "0")]
     pub seed: u64,
 }

@@ -14,7 +14,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::arguments::{Arguments, Command};
+use crate::arguments::{Arguments, Command, Method};
 
 /// What a command that went through tells the shell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,11 +37,13 @@ fn main() -> ExitCode {
     let result = match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) if a.dataset.is_some() => commands::estimate_dataset::run(a),
+        Command::Estimate(a) if a.method == Method::Pix2pose => commands::estimate_rgb::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Eval(a) => commands::eval::run(a),
         Command::Render(a) => commands::render::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),
         Command::Train(a) => commands::train::run(a),
+        Command::Reproduce(a) => commands::reproduce::run(a),
         Command::Object(a) => commands::object::run(a),
         Command::Completions(a) => commands::completions::run(a),
     };

@@ -10,7 +10,7 @@ use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, Verification
 
 use crate::Outcome;
 use crate::arguments::EstimateArguments;
-use crate::camera_file;
+use crate::camera_file::{self, CameraFile};
 use crate::objects;
 use crate::output::{pose_rows, report};
 use crate::overlay::{self, Drawn};
@@ -20,6 +20,9 @@ use crate::progress::{Progress, check_interrupt};
 const SURE_ENOUGH: f64 = 0.25;
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
+    if a.weights.is_some() || a.object_id.is_some() || a.icp {
+        bail!("--weights, --object-id and --icp belong to --method pix2pose; point pair features need none of them");
+    }
     let depth_file = a
         .depth
         .as_deref()
@@ -29,15 +32,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         bail!("--object NAME_OR_MESH is missing: what is to be found?");
     }
     let file = camera_file::read(camera_path)?;
-    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
-        anyhow!(
-            "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",
-            camera_path.display()
-        )
-    })?;
-    if !(scale > 0.0 && scale.is_finite()) {
-        bail!("--depth-scale: found {scale}, expected above 0");
-    }
+    let scale = depth_scale(a, &file, camera_path)?;
     let depth = read_depth(depth_file, scale / 1000.0)?;
     let (width, height) = depth.size();
     let camera = file.for_image(width, height, camera_path)?;
@@ -152,6 +147,20 @@ fn print_table(whole: &Whole, folder: Option<&Path>) {
     }
 }
 
+/// Millimetres per unit of the depth image.
+pub(super) fn depth_scale(a: &EstimateArguments, file: &CameraFile, camera_path: &Path) -> Result<f64> {
+    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
+        anyhow!(
+            "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",
+            camera_path.display()
+        )
+    })?;
+    if !(scale > 0.0 && scale.is_finite()) {
+        bail!("--depth-scale: found {scale}, expected above 0");
+    }
+    Ok(scale)
+}
+
 /// The options of the scene preparation that the command line sets.
 pub(super) fn scene_options(a: &EstimateArguments) -> SceneOptions {
     SceneOptions { remove_plane: !a.keep_plane, seed: a.seed, ..SceneOptions::default() }
@@ -176,23 +185,29 @@ pub(super) fn box_mask(region: &Rect, camera: &Camera) -> Mask {
     })
 }
 
+/// `--box`, which has a size and shows something of the image.
+pub(super) fn given_box(a: &EstimateArguments, camera: &Camera) -> Result<Option<Rect>> {
+    let Some(r) = &a.region else { return Ok(None) };
+    let [x, y, width, height] = r[..] else {
+        bail!("--box: found {} numbers, expected x, y, width, height", r.len())
+    };
+    if !(width > 0.0 && height > 0.0 && r.iter().all(|v| v.is_finite())) {
+        bail!("--box: found {r:?}, expected x, y, width, height with a size above 0");
+    }
+    let region = Rect { x, y, width, height };
+    let image = Rect { x: 0.0, y: 0.0, width: camera.width as f64, height: camera.height as f64 };
+    if region.intersect(&image).is_none() {
+        bail!("--box: {r:?} lies outside the {}x{} image", camera.width, camera.height);
+    }
+    Ok(Some(region))
+}
+
 fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
     let mut mask = a.mask.as_deref().map(read_mask).transpose()?;
     if let (Some(m), Some(path)) = (&mask, &a.mask) {
         camera.check_image(m.width(), m.height()).with_context(|| path.display().to_string())?;
     }
-    if let Some(r) = &a.region {
-        let [x, y, width, height] = r[..] else {
-            bail!("--box: found {} numbers, expected x, y, width, height", r.len())
-        };
-        if !(width > 0.0 && height > 0.0 && x.is_finite() && y.is_finite()) {
-            bail!("--box: found {r:?}, expected x, y, width, height with a size above 0");
-        }
-        let region = Rect { x, y, width, height };
-        let image = Rect { x: 0.0, y: 0.0, width: camera.width as f64, height: camera.height as f64 };
-        if region.intersect(&image).is_none() {
-            bail!("--box: {r:?} lies outside the {}x{} image", camera.width, camera.height);
-        }
+    if let Some(region) = given_box(a, camera)? {
         let boxed = box_mask(&region, camera);
         mask = Some(match mask {
             None => boxed,

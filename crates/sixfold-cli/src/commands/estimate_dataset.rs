@@ -6,14 +6,14 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::{Deserialize, Serialize};
-use sixfold_bop::{
-    Adjustment, BopDataset, Detection, Models, ReadDetections, ResultsAppender, Target, TargetObject,
-    ground_truth_visibility, read_detections, write_rgb,
-};
-use sixfold_geometry::{Pose, Rect};
+use sixfold_bop::{BopDataset, Models, ResultsAppender, Target, write_rgb};
+use sixfold_geometry::Pose;
 use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
 use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_pix2pose::depth::DepthScene;
+use sixfold_pix2pose::estimate::EstimateError;
 
+use super::boxes::Boxes;
 use super::estimate::{box_mask, estimate_options, scene_options};
 use super::pix2pose::Pix2Pose;
 use crate::Outcome;
@@ -30,6 +30,8 @@ struct RunRecord {
     method: String,
     weights: Option<String>,
     refine: bool,
+    #[serde(default)]
+    icp: bool,
     dataset: String,
     split: String,
     targets: Option<String>,
@@ -49,12 +51,6 @@ struct Summary {
     skipped: Vec<String>,
     seconds_per_image: Option<f64>,
     results: String,
-}
-
-enum Boxes {
-    Anywhere,
-    GroundTruth,
-    Detections(Vec<Detection>),
 }
 
 /// A model of the dataset, read and described when it is first needed.
@@ -87,17 +83,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             bail!("--boxes detect: no detector is part of this version; give gt or a file of COCO detections")
         }
         Some(file) => {
-            let read = read_detections(
-                Path::new(file),
-                &ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() },
-            )?;
-            for changed in read.adjusted {
-                match changed.adjustment {
-                    Adjustment::Clipped => eprintln!("note: {}", changed.message),
-                    _ => skipped.push(changed.message),
-                }
-            }
-            Boxes::Detections(read.detections)
+            let (boxes, left_out) = Boxes::read(&dataset, Path::new(file))?;
+            skipped.extend(left_out);
+            boxes
         }
     };
     let pix2pose = match a.method {
@@ -105,6 +93,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             bail!("--method pix2pose needs boxes: give --boxes gt or a file of COCO detections")
         }
         Method::Pix2pose => Some(Pix2Pose::new(a)?),
+        Method::Ppf if a.weights.is_some() || a.icp => {
+            bail!("--weights and --icp belong to --method pix2pose; point pair features need neither")
+        }
         Method::Ppf => None,
     };
     let mut images: BTreeMap<(u32, u32), Vec<Target>> = BTreeMap::new();
@@ -117,6 +108,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         method: a.method.name().into(),
         weights: a.weights.as_ref().map(|w| w.display().to_string()),
         refine: a.refines(),
+        icp: a.icp,
         dataset: root.display().to_string(),
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
@@ -193,6 +185,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                     mesh,
                     description: objects::description_beside(&file),
                 };
+                if let Some(pix2pose) = &pix2pose {
+                    pix2pose.check_mesh(o.obj_id, &object.mesh, &file.display().to_string())?;
+                }
                 let ppf = if a.method == Method::Ppf { Some(object.ppf_model()?) } else { None };
                 place.insert(Known { mesh: object.mesh, ppf });
             }
@@ -203,7 +198,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         };
         let start = Instant::now();
         let found = match &pix2pose {
-            Some(pix2pose) => by_pix2pose(pix2pose, scene, *im_id, targets, &known, &boxes),
+            Some(pix2pose) => by_pix2pose(a, pix2pose, scene, *im_id, targets, &known, &boxes),
             None => by_ppf(a, scene, *im_id, targets, &known, &boxes),
         };
         match found {
@@ -290,35 +285,9 @@ fn save(path: &Path, record: &RunRecord) -> Result<()> {
     write_atomically(path, serde_json::to_string_pretty(record)?.as_bytes())
 }
 
-/// Boxes of a target: detections best first, as many as there are instances, or the ground truth's.
-fn target_boxes(
-    boxes: &Boxes,
-    scene: &sixfold_bop::Scene,
-    target: &Target,
-    object: &TargetObject,
-    known: &BTreeMap<u32, Known>,
-) -> Result<Vec<(Rect, f64)>> {
-    Ok(match boxes {
-        Boxes::Anywhere => vec![],
-        Boxes::GroundTruth => ground_truth_boxes(scene, target.im_id, object.obj_id, known)?
-            .into_iter()
-            .map(|region| (region, 1.0))
-            .collect(),
-        Boxes::Detections(all) => {
-            let mut mine: Vec<&Detection> = all
-                .iter()
-                .filter(|d| {
-                    (d.scene_id, d.image_id, d.category_id) == (target.scene_id, target.im_id, object.obj_id)
-                })
-                .collect();
-            mine.sort_by(|x, y| y.score.total_cmp(&x.score));
-            mine.iter().take(object.inst_count).filter_map(|d| Some((d.bbox?, d.score))).collect()
-        }
-    })
-}
-
 /// The poses of an image's targets from colour alone.
 fn by_pix2pose(
+    a: &EstimateArguments,
     pix2pose: &Pix2Pose,
     scene: &sixfold_bop::Scene,
     im_id: u32,
@@ -328,20 +297,44 @@ fn by_pix2pose(
 ) -> Result<Vec<Posed>> {
     let camera = scene.camera(im_id)?;
     let image = scene.rgb(im_id)?.ok_or_else(|| anyhow!("has no colour image, which Pix2Pose needs"))?;
+    let depth = match (a.icp, scene.depth(im_id)?) {
+        (true, Some(depth)) => Some(DepthScene::new(&depth, &camera)),
+        (true, None) => bail!("has no depth image, which --icp needs"),
+        (false, _) => None,
+    };
     let mut found = vec![];
     for target in targets {
         let Some(o) = target.object else { continue };
         let Some(k) = known.get(&o.obj_id) else { continue };
-        for (region, detection) in target_boxes(boxes, scene, target, &o, known)? {
-            let posed = pix2pose.estimate(&image, &camera, o.obj_id, &region, &k.mesh)?;
-            found.extend(posed.map(|p| Posed {
-                obj_id: o.obj_id,
-                camera_from_object: p.camera_from_object,
-                confidence: p.score * detection,
-            }));
+        for (region, detection) in boxes.of_target(scene, target, &o, |id| known.get(&id).map(|k| &k.mesh))? {
+            let posed = match pix2pose.estimate(&image, &camera, o.obj_id, &region, Some(&k.mesh)) {
+                Ok(Some(posed)) => posed,
+                Ok(None) => continue,
+                // One bad box costs its own target only.
+                Err(error) if error.downcast_ref::<EstimateError>().is_some_and(is_of_box) => {
+                    eprintln!("note: image {}/{im_id}, object {}: {}", target.scene_id, o.obj_id, crate::describe(&error));
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
+            let confidence = posed.score * detection;
+            if confidence < a.min_score.unwrap_or(0.0) {
+                continue;
+            }
+            let aligned = match &depth {
+                Some(depth) => pix2pose.align(depth, o.obj_id, &k.mesh, &posed)?,
+                None => None,
+            };
+            let camera_from_object = aligned.map_or(posed.camera_from_object, |i| i.camera_from_object);
+            found.push(Posed { obj_id: o.obj_id, camera_from_object, confidence });
         }
     }
     Ok(found)
+}
+
+/// Whether only the box is to blame.
+fn is_of_box(error: &EstimateError) -> bool {
+    matches!(error, EstimateError::Box(_) | EstimateError::Outside { .. })
 }
 
 /// The poses of an image's targets by point pair features.
@@ -369,7 +362,7 @@ fn by_ppf(
         let Some(o) = target.object else { continue };
         let Some(k) = known.get(&o.obj_id) else { continue };
         let Some(ppf) = &k.ppf else { continue };
-        let regions = target_boxes(boxes, scene, target, &o, known)?;
+        let regions = boxes.of_target(scene, target, &o, |id| known.get(&id).map(|k| &k.mesh))?;
         let posed = |e: Estimate| Posed {
             obj_id: o.obj_id,
             camera_from_object: e.camera_from_object,
@@ -385,39 +378,6 @@ fn by_ppf(
         }
     }
     Ok(found)
-}
-
-/// The visible boxes of an object's instances: from `scene_gt_info.json`, or rendered.
-fn ground_truth_boxes(
-    scene: &sixfold_bop::Scene,
-    im_id: u32,
-    obj_id: u32,
-    known: &BTreeMap<u32, Known>,
-) -> Result<Vec<Rect>> {
-    let image = scene.image(im_id)?;
-    if let Some(info) = &image.info {
-        return Ok(image
-            .ground_truth
-            .iter()
-            .zip(info)
-            .filter(|(g, _)| g.obj_id == obj_id)
-            .filter_map(|(_, i)| i.bbox_visib)
-            .collect());
-    }
-    let objects: Vec<_> = image
-        .ground_truth
-        .iter()
-        .filter_map(|g| Some((g.obj_id, &known.get(&g.obj_id)?.mesh, g.camera_from_object)))
-        .collect();
-    let meshes: Vec<_> = objects.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
-    let depth = scene.depth(im_id)?;
-    let visible = ground_truth_visibility(&meshes, &scene.camera(im_id)?, depth.as_ref(), 0.015);
-    Ok(objects
-        .iter()
-        .zip(visible)
-        .filter(|((id, ..), _)| *id == obj_id)
-        .filter_map(|(_, v)| v.info.bbox_visib)
-        .collect())
 }
 
 fn draw(

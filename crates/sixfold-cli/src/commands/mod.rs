@@ -1,12 +1,15 @@
 //! One file per command.
 
+pub(crate) mod boxes;
 pub(crate) mod completions;
 pub(crate) mod demo;
 pub(crate) mod estimate;
 pub(crate) mod estimate_dataset;
+pub(crate) mod estimate_rgb;
 pub(crate) mod eval;
 pub(crate) mod object;
 pub(crate) mod pix2pose;
 pub(crate) mod render;
+pub(crate) mod reproduce;
 pub(crate) mod simulate;
 pub(crate) mod train;

@@ -1,15 +1,20 @@
-//! Pix2Pose as the commands use it: model, options and refinement in one.
+//! Pix2Pose as the commands use it: model, options, refinement and alignment with depth in one.
 
-use anyhow::{Result, anyhow};
-use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
+use std::path::Path;
+
+use anyhow::{Result, anyhow, bail};
+use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
-use sixfold_pix2pose::estimate::{EstimateOptions, Found, estimate};
+use sixfold_pix2pose::depth::{AlignedToDepth, DepthScene};
+use sixfold_pix2pose::estimate::{EstimateOptions, Found, View, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
+use sixfold_pix2pose::object::ObjectEntry;
 use sixfold_pix2pose::refine::{RefineOptions, refine};
 
 use crate::arguments::EstimateArguments;
 
 /// A model ready to be used.
+#[derive(Clone)]
 pub(crate) struct Pix2Pose {
     model: Pix2PoseModel,
     options: EstimateOptions,
@@ -20,37 +25,136 @@ pub(crate) struct Pix2Pose {
 pub(crate) struct Pix2PosePose {
     pub camera_from_object: Pose,
     pub score: f64,
+    /// Whether the outline was aligned with the image.
+    pub refined: bool,
     pub found: Found,
 }
 
+/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
+const SAME_BOX: f64 = 0.05;
+
 impl Pix2Pose {
     pub fn new(a: &EstimateArguments) -> Result<Pix2Pose> {
-        let weights = a
-            .weights
-            .as_deref()
-            .ok_or_else(|| anyhow!("--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes"))?;
-        let model = Pix2PoseModel::load(weights)?;
+        let weights = a.weights.as_deref().ok_or_else(|| {
+            anyhow!("--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes")
+        })?;
+        let pix2pose = Pix2Pose::load(weights)?;
         let options = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
-        Ok(Pix2Pose { model, options, refine: a.refines().then(RefineOptions::default) })
+        Ok(pix2pose.varied(options, a.refines()))
     }
 
-    /// The best pose of an object in a box of a pinhole image, `None` if it is not seen there.
+    /// The model of a weight file with the default options.
+    pub fn load(weights: &Path) -> Result<Pix2Pose> {
+        let (options, refine) = (EstimateOptions::default(), Some(RefineOptions::default()));
+        Ok(Pix2Pose { model: Pix2PoseModel::load(weights)?, options, refine })
+    }
+
+    /// The same model used in another way.
+    pub fn varied(&self, options: EstimateOptions, refines: bool) -> Pix2Pose {
+        Pix2Pose { model: self.model.clone(), options, refine: refines.then(RefineOptions::default) }
+    }
+
+    pub fn model(&self) -> &Pix2PoseModel {
+        &self.model
+    }
+
+    /// What the model knows of an object; without an id, of its only one.
+    pub fn entry(&self, id: Option<u32>) -> Result<&ObjectEntry> {
+        match (id, self.model.objects()) {
+            (Some(id), _) => Ok(self.model.object(id)?.1),
+            (None, [only]) => Ok(only),
+            (None, several) => {
+                let ids: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
+                bail!("--object-id N is missing: the model knows the objects {}", ids.join(", "))
+            }
+        }
+    }
+
+    /// An error unless the mesh is that of the model's object `id`: same place and size in its frame.
+    pub fn check_mesh(&self, id: u32, mesh: &Mesh, name: &str) -> Result<()> {
+        let entry = self.entry(Some(id))?;
+        let scale = entry.scale();
+        let (low, high) = mesh.bounding_box();
+        let off = (low - (scale.centre - scale.half_size)).amax().max((high - (scale.centre + scale.half_size)).amax());
+        if off > SAME_BOX * entry.diameter {
+            let size = high - low;
+            let expected = 2.0 * scale.half_size;
+            bail!(
+                "{name}: its box measures {:.1} x {:.1} x {:.1} mm, that of object {id} in the model {:.1} x {:.1} x {:.1} mm, \
+                 and corners differ by {:.1} mm: another object, unit or origin? Give the mesh that the model was trained on",
+                1000.0 * size.x,
+                1000.0 * size.y,
+                1000.0 * size.z,
+                1000.0 * expected.x,
+                1000.0 * expected.y,
+                1000.0 * expected.z,
+                1000.0 * off
+            );
+        }
+        Ok(())
+    }
+
+    /// The best pose of an object in a box of a pinhole image, `None` if it is not seen there. Without a mesh the outline
+    /// is not aligned.
     pub fn estimate(
         &self,
         image: &RgbImage,
         camera: &Camera,
         object_id: u32,
         region: &Rect,
-        mesh: &Mesh,
+        mesh: Option<&Mesh>,
     ) -> Result<Option<Pix2PosePose>> {
         let Some(found) = estimate(&self.model, image, camera, object_id, region, &self.options)? else {
             return Ok(None);
         };
         let Some(best) = found.hypotheses.first() else { return Ok(None) };
-        let camera_from_object = match &self.refine {
-            Some(options) => refine(image, camera, mesh, &found, options).camera_from_object,
-            None => best.camera_from_object,
-        };
-        Ok(Some(Pix2PosePose { camera_from_object, score: best.score, found }))
+        let (score, mut camera_from_object, mut refined) = (best.score, best.camera_from_object, false);
+        if let (Some(options), Some(mesh)) = (&self.refine, mesh) {
+            let aligned = refine(image, camera, mesh, &found, options);
+            (camera_from_object, refined) = (aligned.camera_from_object, aligned.improved);
+        }
+        Ok(Some(Pix2PosePose { camera_from_object, score, refined, found }))
     }
+
+    /// The pose brought to a depth image; `None` where too little depth is measured on the object.
+    pub fn align(
+        &self,
+        depth: &DepthScene,
+        object_id: u32,
+        mesh: &Mesh,
+        posed: &Pix2PosePose,
+    ) -> Result<Option<AlignedToDepth>> {
+        let diameter = self.entry(Some(object_id))?.diameter;
+        Ok(depth.align(mesh, diameter, &posed.camera_from_object, &posed.found).ok())
+    }
+}
+
+/// Side of each of the four pictures beside one another.
+const TILE: usize = 256;
+
+/// What the network saw and said: input, coordinates (black where the object is not seen), expected error and visibility
+/// (black 0, white 1), side by side.
+pub(crate) fn view_picture(view: &View) -> RgbImage {
+    let (input, p) = (&view.input, &view.prediction);
+    let gap = 4;
+    Image::from_fn(4 * TILE + 3 * gap, TILE, |x, y| {
+        let (tile, x) = (x / (TILE + gap), x % (TILE + gap));
+        if x >= TILE {
+            return [255; 3];
+        }
+        let at = |side: usize| (x * side / TILE, y * side / TILE);
+        let (px, py) = at(p.side);
+        let index = py * p.side + px;
+        let grey = |v: f32| [(255.0 * v).clamp(0.0, 255.0) as u8; 3];
+        match tile {
+            0 => {
+                let (ix, iy) = (x * input.width() / TILE, y * input.height() / TILE);
+                input[(ix, iy)]
+            }
+            1 if p.visible[index] > 0.5 => p.coordinates[index].map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8),
+            1 => [0; 3],
+            2 => grey(p.error[index]),
+            _ => grey(p.visible[index]),
+        }
+    })
 }

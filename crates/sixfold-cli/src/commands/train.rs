@@ -31,17 +31,29 @@ const LEAST_VISIBLE: f64 = 0.25;
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
     match &a.command {
-        TrainCommand::Pix2pose(pix2pose) => run_pix2pose(pix2pose, a),
+        TrainCommand::Pix2pose(pix2pose) => {
+            let summary = train_pix2pose(pix2pose)?;
+            report(&a.json, &summary, || match summary.seconds {
+                Some(seconds) => {
+                    println!("{} steps in {seconds:.0} s: {}", summary.steps, summary.model);
+                    println!("learning curves: {}", pix2pose.out.join("training/curves.png").display());
+                }
+                None => println!("the model after {} steps: {}", summary.steps, summary.model),
+            })?;
+            Ok(Outcome::Found)
+        }
     }
 }
 
+/// What a training came to.
 #[derive(Serialize)]
-struct Summary {
-    model: String,
+pub(super) struct Summary {
+    pub model: String,
     objects: Vec<u32>,
     photographs: usize,
     steps: u64,
-    seconds: f64,
+    /// Of training; `None` where a model was only exported.
+    seconds: Option<f64>,
     losses: std::collections::BTreeMap<String, f64>,
 }
 
@@ -52,7 +64,8 @@ struct Material {
     description: String,
 }
 
-fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Outcome> {
+/// Trains, or goes on with a training, and writes the model.
+pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     let material = match &a.dataset {
         Some(root) => from_dataset(a, root)?,
         None => from_objects(a)?,
@@ -110,8 +123,9 @@ fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Ou
         };
         card.steps = step;
         Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
-        println!("the model after {step} steps: {}", path.display());
-        return Ok(Outcome::Found);
+        let (seconds, losses) = (None, std::collections::BTreeMap::new());
+        let model = path.display().to_string();
+        return Ok(Summary { model, objects: ids, photographs, steps: step, seconds, losses });
     }
     let sample_options = SampleOptions {
         size: sizes.input,
@@ -154,19 +168,14 @@ fn run_pix2pose(a: &TrainPix2PoseArguments, whole: &TrainArguments) -> Result<Ou
     };
     card.steps = options.steps;
     Pix2PoseModel::new(*network, entries, sizes, card).save(&path)?;
-    let summary = Summary {
+    Ok(Summary {
         model: path.display().to_string(),
         objects: ids,
         photographs,
         steps: options.steps,
-        seconds: last.seconds,
+        seconds: Some(last.seconds),
         losses: last.losses,
-    };
-    report(&whole.json, &summary, || {
-        println!("{} steps in {:.0} s: {}", summary.steps, summary.seconds, summary.model);
-        println!("learning curves: {}", a.out.join("training/curves.png").display());
-    })?;
-    Ok(Outcome::Found)
+    })
 }
 
 fn from_dataset(a: &TrainPix2PoseArguments, root: &Path) -> Result<Material> {

@@ -1,0 +1,298 @@
+//! `sixfold reproduce pix2pose`: the method's tables on a dataset from one command, row by row, resumable.
+//!
+//! Test targets are those of the dataset outside the frames that the model was trained on. Every row is one way of using
+//! the model; its poses (`rows/KEY.csv`, BOP's format) and scores (`rows/KEY.json`) stay in the output folder and are not
+//! computed again.
+
+mod row;
+mod table;
+mod trainings;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use serde::Serialize;
+use sixfold_bop::{BopDataset, Models, Target, read_results};
+use sixfold_geometry::Rect;
+use sixfold_mesh::Mesh;
+use sixfold_pix2pose::estimate::{EstimateOptions, Quirks};
+
+use self::row::{Row, Setting};
+use super::boxes::Boxes;
+use super::pix2pose::Pix2Pose;
+use crate::Outcome;
+use crate::arguments::{ReproduceArguments, ReproduceCommand, ReproducePix2PoseArguments};
+use crate::output::{report, write_atomically};
+use crate::progress::check_interrupt;
+
+pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
+    match &a.command {
+        ReproduceCommand::Pix2pose(pix2pose) => run_pix2pose(pix2pose, a),
+    }
+}
+
+/// What all rows have in common. Rows made with something else are not mixed with these.
+#[derive(Debug, PartialEq, Serialize)]
+struct Inputs {
+    version: &'static str,
+    dataset: String,
+    split: String,
+    weights: String,
+    /// FNV-1a of the weight file.
+    weights_hash: String,
+    /// Frames left out, `scene/image`.
+    trained_on: Vec<String>,
+    detections: Option<String>,
+    published: Option<String>,
+    quick: bool,
+    seed: u64,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    inputs: Inputs,
+    frames: usize,
+    targets: usize,
+    rows: Vec<Row>,
+    /// What the dissertation and the challenge report, not measured here.
+    literature: BTreeMap<&'static str, f64>,
+}
+
+/// Dataset, test targets and boxes.
+struct Bench {
+    dataset: BopDataset,
+    targets: Vec<Target>,
+    meshes: BTreeMap<u32, Mesh>,
+    /// Visible ground-truth boxes by scene, image and object.
+    truth: Regions,
+    detections: Option<Regions>,
+    seed: u64,
+}
+
+/// Boxes and their scores by scene, image and object.
+type Regions = BTreeMap<(u32, u32, u32), Vec<(Rect, f64)>>;
+
+/// Every so manieth frame with `--quick`.
+const QUICK: usize = 8;
+
+fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> Result<Outcome> {
+    let pix2pose = Pix2Pose::load(&a.weights)?;
+    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let trained_on: BTreeSet<(u32, u32)> =
+        dataset.targets(Some(&a.frames))?.iter().map(|t| (t.scene_id, t.im_id)).collect();
+    let targets = test_targets(a, &dataset, &trained_on, &pix2pose)?;
+    let inputs = Inputs {
+        version: env!("CARGO_PKG_VERSION"),
+        dataset: a.dataset.display().to_string(),
+        split: a.split.clone(),
+        weights: a.weights.display().to_string(),
+        weights_hash: format!(
+            "{:016x}",
+            fnv(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
+        ),
+        trained_on: trained_on.iter().map(|(scene, image)| format!("{scene}/{image}")).collect(),
+        detections: a.detections.as_ref().map(|f| f.display().to_string()),
+        published: a.published.as_ref().map(|f| f.display().to_string()),
+        quick: a.quick,
+        seed: a.seed,
+    };
+    same_inputs(&a.out, &inputs)?;
+    let bench = Bench::new(a, dataset, targets, &pix2pose)?;
+    let mut rows = vec![];
+    for setting in settings(a) {
+        check_interrupt("the rows done so far are kept; run the same command again to go on")?;
+        let used = pix2pose.varied(EstimateOptions { seed: a.seed, ..setting.options.clone() }, setting.refine);
+        rows.push(row::kept_or_made(&a.out, setting.key, || bench.measure(&used, &setting, &a.out))?);
+    }
+    if let Some(file) = &a.published {
+        rows.push(row::kept_or_made(&a.out, "published", || {
+            let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            bench.scored("published", &format!("published: {name}"), "its own", &read_results(file)?, vec![], 0)
+        })?);
+    }
+    if a.train {
+        rows.extend(trainings::rows(a, &bench)?);
+    }
+    let frames: BTreeSet<(u32, u32)> = bench.targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
+    let literature = BTreeMap::from([
+        ("dissertation, LM-O, Pix2Pose: mean over objects of ADD(-S) recall", 0.320),
+        ("BOP Challenge 2020, LM-O, Pix2Pose from RGB: AR (VSD, MSSD, MSPD)", 0.363),
+    ]);
+    let result =
+        Whole { inputs, frames: frames.len(), targets: bench.targets.len(), rows, literature };
+    let text = table::markdown(&result);
+    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
+    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&result)?.as_bytes())?;
+    report(&whole.json, &result, || {
+        println!("{text}");
+        println!("table.md, reproduce.json and the rows are in {}", a.out.display());
+    })?;
+    let any = result.rows.first().is_some_and(|r| r.found > 0);
+    Ok(if any { Outcome::Found } else { Outcome::NothingFound })
+}
+
+/// The ways of using the model that are compared.
+fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
+    let plain = |key, title: &str| Setting {
+        key,
+        title: title.to_string(),
+        options: EstimateOptions::default(),
+        refine: false,
+        noise: None,
+        detections: false,
+    };
+    let mut all = vec![
+        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned (default)") },
+        plain("no-refinement", "two stages, PnP (the dissertation's method)"),
+    ];
+    let mut one_stage = plain("one-stage", "one stage, PnP");
+    one_stage.options.two_stages = false;
+    all.push(one_stage);
+    let none = Quirks::default();
+    let quirks = [
+        ("bug-recentring", "two stages, PnP, author's code: shift of the second crop not scaled", Quirks { unscaled_recentring: true, ..none }),
+        ("bug-eight-bits", "two stages, PnP, author's code: coordinates in 8 bits", Quirks { eight_bits: true, ..none }),
+        ("bug-centre-choice", "two stages, PnP, author's code: candidate chosen by its centre", Quirks { centre_choice: true, ..none }),
+        ("bug-plain-pnp", "two stages, author's code: EPnP, 5 px, 100 iterations", Quirks { plain_pnp: true, ..none }),
+        ("bugs-all", "two stages, author's code: all four", Quirks::all()),
+    ];
+    for (key, title, quirks) in quirks {
+        let mut setting = plain(key, title);
+        setting.options.quirks = quirks;
+        all.push(setting);
+    }
+    for (key, percent) in [("noise-05", 5), ("noise-10", 10), ("noise-20", 20)] {
+        let title = format!("default, boxes moved and scaled by up to {percent} % of their size");
+        all.push(Setting { refine: true, noise: Some(f64::from(percent) / 100.0), ..plain(key, &title) });
+    }
+    if a.detections.is_some() {
+        all.push(Setting { refine: true, detections: true, ..plain("detections", "default, boxes of the detections") });
+        all.push(Setting {
+            detections: true,
+            ..plain("detections-no-refinement", "two stages, PnP, boxes of the detections")
+        });
+    }
+    all
+}
+
+/// The dataset's targets outside the training frames, for objects that the model knows.
+fn test_targets(
+    a: &ReproducePix2PoseArguments,
+    dataset: &BopDataset,
+    trained_on: &BTreeSet<(u32, u32)>,
+    pix2pose: &Pix2Pose,
+) -> Result<Vec<Target>> {
+    let mut targets = dataset.object_targets(&dataset.targets(None)?)?;
+    targets.retain(|t| !trained_on.contains(&(t.scene_id, t.im_id)));
+    let known = |t: &Target| t.object.is_some_and(|o| pix2pose.entry(Some(o.obj_id)).is_ok());
+    let others = targets.iter().filter(|t| !known(t)).count();
+    if others > 0 {
+        eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
+        targets.retain(known);
+    }
+    // The model's card says what it was trained on: scores on those frames would be worth nothing.
+    let card = &pix2pose.model().card().data;
+    let words: BTreeSet<&str> = card.split(|c: char| !(c.is_ascii_digit() || c == '/')).collect();
+    if let Some(t) = targets.iter().find(|t| words.contains(format!("{}/{}", t.scene_id, t.im_id).as_str())) {
+        bail!(
+            "{}: the model was trained on frame {}/{}, which {} does not list; give the frames of its training (its card says: {card})",
+            a.weights.display(),
+            t.scene_id,
+            t.im_id,
+            a.frames.display()
+        );
+    }
+    if a.quick {
+        let frames: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
+        let some: BTreeSet<(u32, u32)> = frames.into_iter().step_by(QUICK).collect();
+        targets.retain(|t| some.contains(&(t.scene_id, t.im_id)));
+    }
+    if targets.is_empty() {
+        bail!(
+            "{}: no target is left to test on: all frames are in {}, or none shows an object of the model",
+            a.dataset.display(),
+            a.frames.display()
+        );
+    }
+    Ok(targets)
+}
+
+/// An error if the folder holds rows of something else.
+fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
+    let path = folder.join("inputs.json");
+    let now = serde_json::to_value(inputs)?;
+    if let Ok(text) = std::fs::read_to_string(&path) {
+        let before: serde_json::Value =
+            serde_json::from_str(&text).with_context(|| format!("{}: not JSON; remove the folder", path.display()))?;
+        if let (Some(before), Some(now)) = (before.as_object(), now.as_object())
+            && let Some((field, was)) = before.iter().find(|(field, was)| now.get(*field) != Some(*was))
+        {
+            bail!(
+                "{}: holds rows with other inputs ({field} was {was}, is {}); choose another --out, or remove it",
+                folder.display(),
+                now.get(field).cloned().unwrap_or_default()
+            );
+        }
+        return Ok(());
+    }
+    write_atomically(&path, serde_json::to_string_pretty(&now)?.as_bytes())
+}
+
+/// 64-bit FNV-1a: tells files apart, nothing more.
+fn fnv(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+impl Bench {
+    fn new(
+        a: &ReproducePix2PoseArguments,
+        dataset: BopDataset,
+        targets: Vec<Target>,
+        pix2pose: &Pix2Pose,
+    ) -> Result<Bench> {
+        let mut meshes = BTreeMap::new();
+        for id in targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect::<BTreeSet<_>>() {
+            let mesh = dataset.model(id, Models::Rendering)?;
+            pix2pose.check_mesh(id, &mesh, &format!("{}: model {id}", a.dataset.display()))?;
+            meshes.insert(id, mesh);
+        }
+        let regions = |boxes: &Boxes| -> Result<Regions> {
+            let mut all = Regions::new();
+            let mut scenes = BTreeMap::new();
+            for t in &targets {
+                let Some(o) = t.object else { continue };
+                if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(t.scene_id) {
+                    place.insert(dataset.scene(t.scene_id)?);
+                }
+                let Some(scene) = scenes.get(&t.scene_id) else { continue };
+                let found = boxes.of_target(scene, t, &o, |id| meshes.get(&id))?;
+                all.insert((t.scene_id, t.im_id, o.obj_id), found);
+            }
+            Ok(all)
+        };
+        let truth = regions(&Boxes::GroundTruth)?;
+        let detections = match &a.detections {
+            None => None,
+            Some(file) => {
+                let (boxes, skipped) = Boxes::read(&dataset, file)?;
+                for s in skipped {
+                    eprintln!("skipped {s}");
+                }
+                Some(regions(&boxes)?)
+            }
+        };
+        Ok(Bench { dataset, targets, meshes, truth, detections, seed: a.seed })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_hash_is_fnv_1a() {
+        assert_eq!(fnv(b""), 0xcbf2_9ce4_8422_2325);
+        assert_eq!(fnv(b"foobar"), 0x8594_4171_f739_67e8);
+    }
+}

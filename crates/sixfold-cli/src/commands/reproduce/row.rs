@@ -1,0 +1,245 @@
+//! One row of the table: a way of using the model, what it scored and how long it took.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sixfold_bop::{Estimate, EvalOptions, Target, evaluate, write_results};
+use sixfold_geometry::Rect;
+use sixfold_pix2pose::estimate::EstimateOptions;
+
+use super::Bench;
+use crate::commands::pix2pose::Pix2Pose;
+use crate::output::write_atomically;
+use crate::progress::{Progress, check_interrupt};
+
+/// A way of using the model.
+pub(super) struct Setting {
+    /// Name of its files.
+    pub key: &'static str,
+    /// What the table says.
+    pub title: String,
+    pub options: EstimateOptions,
+    /// Whether the outline is aligned at the end.
+    pub refine: bool,
+    /// Ground-truth boxes are moved and scaled by up to this share of their size.
+    pub noise: Option<f64>,
+    /// Boxes of the file of detections instead of the ground truth's.
+    pub detections: bool,
+}
+
+/// A row as it is kept.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Row {
+    pub key: String,
+    pub title: String,
+    pub boxes: String,
+    pub scores: Scores,
+    /// Boxes looked into.
+    pub regions: usize,
+    /// Poses found in them.
+    pub found: usize,
+    /// Per box: crops, both stages, PnP and, where it is done, refinement.
+    pub milliseconds: Option<Times>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Scores {
+    pub targets: usize,
+    pub ar_mssd: Option<f64>,
+    pub ar_mspd: Option<f64>,
+    /// ADD(-S) below a tenth of the diameter, over all targets.
+    pub add_s: Option<f64>,
+    /// The mean of the objects' recalls.
+    pub add_s_mean_of_objects: Option<f64>,
+    pub objects: BTreeMap<u32, ObjectScore>,
+}
+
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(super) struct ObjectScore {
+    pub targets: usize,
+    pub ar_mssd: Option<f64>,
+    pub ar_mspd: Option<f64>,
+    pub add_s: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(super) struct Times {
+    pub mean: f64,
+    pub median: f64,
+    pub slowest: f64,
+    /// Threads that were used.
+    pub threads: usize,
+}
+
+/// The row of an earlier run, or a new one, which is kept.
+pub(super) fn kept_or_made(folder: &Path, key: &str, make: impl FnOnce() -> Result<Row>) -> Result<Row> {
+    let path = folder.join("rows").join(format!("{key}.json"));
+    if let Ok(text) = std::fs::read_to_string(&path) {
+        return serde_json::from_str(&text)
+            .with_context(|| format!("{}: not a row of this version; remove it to have it made again", path.display()));
+    }
+    eprintln!("row {key}");
+    let row = make()?;
+    write_atomically(&path, serde_json::to_string_pretty(&row)?.as_bytes())?;
+    Ok(row)
+}
+
+impl Bench {
+    /// Estimates all targets in one way, keeps the poses and scores them.
+    pub(super) fn measure(&self, pix2pose: &Pix2Pose, setting: &Setting, folder: &Path) -> Result<Row> {
+        let boxes = if setting.detections { self.detections.as_ref() } else { Some(&self.truth) };
+        let boxes = boxes.ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
+        let mut images: BTreeMap<(u32, u32), Vec<&Target>> = BTreeMap::new();
+        for t in &self.targets {
+            images.entry((t.scene_id, t.im_id)).or_default().push(t);
+        }
+        let (mut estimates, mut times, mut regions) = (vec![], vec![], 0);
+        let mut scenes = BTreeMap::new();
+        let mut progress = Progress::new("images", images.len());
+        for ((scene_id, im_id), targets) in &images {
+            check_interrupt("the rows done so far are kept; run the same command again to go on")?;
+            if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(*scene_id) {
+                place.insert(self.dataset.scene(*scene_id)?);
+            }
+            let Some(scene) = scenes.get(scene_id) else { continue };
+            let camera = scene.camera(*im_id)?;
+            let image = scene.rgb(*im_id)?.ok_or_else(|| {
+                anyhow!("image {scene_id}/{im_id} has no colour image, which Pix2Pose needs")
+            })?;
+            let begin = (estimates.len(), Instant::now());
+            for o in targets.iter().filter_map(|t| t.object) {
+                let none = vec![];
+                let mine = boxes.get(&(*scene_id, *im_id, o.obj_id)).unwrap_or(&none);
+                for (number, (region, score)) in mine.iter().enumerate() {
+                    let region = match setting.noise {
+                        Some(share) => moved(region, share, [self.seed, (*scene_id).into(), (*im_id).into(), o.obj_id.into(), number as u64]),
+                        None => *region,
+                    };
+                    regions += 1;
+                    let start = Instant::now();
+                    let posed = pix2pose.estimate(&image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
+                    times.push(start.elapsed().as_secs_f64());
+                    match posed {
+                        Ok(Some(p)) => estimates.push(Estimate::new(
+                            *scene_id,
+                            *im_id,
+                            o.obj_id,
+                            p.score * score,
+                            p.camera_from_object,
+                        )),
+                        Ok(None) => {}
+                        Err(error) => {
+                            eprintln!("note: image {scene_id}/{im_id}, object {}: {}", o.obj_id, crate::describe(&error));
+                        }
+                    }
+                }
+            }
+            let seconds = begin.1.elapsed().as_secs_f64();
+            for estimate in &mut estimates[begin.0..] {
+                estimate.time = Some(seconds);
+            }
+            progress.step(format!("{scene_id}/{im_id}"));
+        }
+        progress.finish();
+        let csv = folder.join("rows").join(format!("{}.csv", setting.key));
+        std::fs::create_dir_all(folder.join("rows")).with_context(|| folder.display().to_string())?;
+        write_results(&csv, &estimates)?;
+        let name = match (setting.detections, setting.noise) {
+            (true, _) => "detections".to_string(),
+            (false, None) => "ground truth".to_string(),
+            (false, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
+        };
+        self.scored(setting.key, &setting.title, &name, &estimates, times, regions)
+    }
+
+    /// A row of estimates.
+    pub(super) fn scored(
+        &self,
+        key: &str,
+        title: &str,
+        boxes: &str,
+        estimates: &[Estimate],
+        mut seconds: Vec<f64>,
+        regions: usize,
+    ) -> Result<Row> {
+        let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
+        let e = evaluate(&self.dataset, estimates, &self.targets, &options, &|_| {})?;
+        let objects: BTreeMap<u32, ObjectScore> = e
+            .objects
+            .iter()
+            .filter_map(|(id, o)| {
+                let (targets, add_s) = (o.targets, o.add_s_recall);
+                Some((id.parse().ok()?, ObjectScore { targets, ar_mssd: o.ar_mssd, ar_mspd: o.ar_mspd, add_s }))
+            })
+            .filter(|(_, o): &(u32, ObjectScore)| o.targets > 0)
+            .collect();
+        let each: Vec<f64> = objects.values().filter_map(|o| o.add_s).collect();
+        seconds.sort_by(f64::total_cmp);
+        let milliseconds = (!seconds.is_empty()).then(|| Times {
+            mean: 1000.0 * seconds.iter().sum::<f64>() / seconds.len() as f64,
+            median: 1000.0 * seconds[seconds.len() / 2],
+            slowest: 1000.0 * seconds[seconds.len() - 1],
+            threads: rayon::current_num_threads(),
+        });
+        Ok(Row {
+            key: key.to_string(),
+            title: title.to_string(),
+            boxes: boxes.to_string(),
+            scores: Scores {
+                targets: e.targets,
+                ar_mssd: e.ar_mssd,
+                ar_mspd: e.ar_mspd,
+                add_s: e.add_s_recall.get("mean").copied().flatten(),
+                add_s_mean_of_objects: (!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64),
+                objects,
+            },
+            regions,
+            found: e.estimates.saturating_sub(e.estimates_left_out),
+            milliseconds,
+        })
+    }
+}
+
+/// The box with centre and sides moved by up to `share` of its sides; a box and a seed always give the same.
+fn moved(region: &Rect, share: f64, seed: [u64; 5]) -> Rect {
+    let number = seed.iter().fold(0u64, |sum, v| sum.wrapping_mul(1_000_003).wrapping_add(*v));
+    let mut random = ChaCha8Rng::seed_from_u64(number);
+    let mut next = || random.random_range(-share..=share);
+    let (dx, dy, dw, dh) = (next(), next(), next(), next());
+    let (width, height) = (region.width * (1.0 + dw), region.height * (1.0 + dh));
+    Rect {
+        x: region.x + dx * region.width + 0.5 * (region.width - width),
+        y: region.y + dy * region.height + 0.5 * (region.height - height),
+        width,
+        height,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn noise_is_bounded_repeatable_and_different_for_every_box() {
+        let region = Rect { x: 100.0, y: 50.0, width: 40.0, height: 20.0 };
+        let centre = |r: &Rect| (r.x + 0.5 * r.width, r.y + 0.5 * r.height);
+        let mut seen = vec![];
+        for image in 0..200 {
+            let m = moved(&region, 0.2, [0, 2, image, 5, 0]);
+            assert_eq!(m, moved(&region, 0.2, [0, 2, image, 5, 0]));
+            let (dx, dy) = (centre(&m).0 - 120.0, centre(&m).1 - 60.0);
+            assert!(dx.abs() <= 8.0 + 1e-9 && dy.abs() <= 4.0 + 1e-9, "{m:?}");
+            assert!((m.width - 40.0).abs() <= 8.0 + 1e-9 && (m.height - 20.0).abs() <= 4.0 + 1e-9, "{m:?}");
+            assert!(!seen.contains(&m));
+            seen.push(m);
+        }
+        let furthest = seen.iter().map(|m| (centre(m).0 - 120.0).abs()).fold(0.0, f64::max);
+        assert!(furthest > 6.0, "{furthest}");
+        assert_eq!(moved(&region, 0.0, [0; 5]), region);
+    }
+}
