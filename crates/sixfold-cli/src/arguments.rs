@@ -50,10 +50,14 @@ pub(crate) enum Command {
     )]
     SimulateDepth(SimulateArguments),
     /// Train a network on a few posed photographs and renders
-    #[command(after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo")]
+    #[command(
+        after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo"
+    )]
     Train(TrainArguments),
     /// Measure a method on a dataset as its paper does, with its ablations: one table from one command
-    #[command(after_help = "Example:\n  sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --out out/reproduce")]
+    #[command(
+        after_help = "Example:\n  sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --out out/reproduce"
+    )]
     Reproduce(ReproduceArguments),
     /// Keep objects under a name: add, list, show, remove
     #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
@@ -93,6 +97,9 @@ pub(crate) struct DemoArguments {
     /// Folder of the sample data (default: data/demo of this repository)
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
+    /// Weights for poses from colour (default: weights/pix2pose-lmo.safetensors of this repository)
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArguments,
 }

@@ -30,9 +30,13 @@ pub(crate) struct Object {
 impl Object {
     /// The description for point pair features, from disk or computed (and then kept).
     pub fn ppf_model(&self) -> Result<ObjectModel> {
-        let (model, note) =
-            ObjectModel::cached(&self.description, &self.mesh, &self.info.symmetry_poses(SYMMETRY_STEP), &ModelOptions::default())
-                .with_context(|| format!("object {}", self.name))?;
+        let (model, note) = ObjectModel::cached(
+            &self.description,
+            &self.mesh,
+            &self.info.symmetry_poses(SYMMETRY_STEP),
+            &ModelOptions::default(),
+        )
+        .with_context(|| format!("object {}", self.name))?;
         if let Some(note) = note {
             eprintln!("note: description of {} not kept or renewed: {note}", self.name);
         }

@@ -7,11 +7,14 @@ use std::time::Instant;
 use anyhow::{Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{
-    BopDataset, EvalOptions, Evaluation, ModelPoints, Models, evaluate, write_recall_curves, write_rgb,
+    BopDataset, EvalOptions, Evaluation, GroundTruth, ModelPoints, Models, evaluate, write_recall_curves,
+    write_rgb,
 };
+use sixfold_geometry::Pose;
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
 use sixfold_mesh::ModelInfo;
 
+use super::demo_rgb::{self, Colour};
 use crate::Outcome;
 use crate::arguments::DemoArguments;
 use crate::objects::Object;
@@ -40,26 +43,41 @@ struct Whole {
     seconds: f64,
     pictures: Vec<PathBuf>,
     evaluation: Evaluation,
+    /// Poses from colour alone.
+    colour: Colour,
 }
 
-/// The samples: given, or found from where the program was started or built.
-fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
-    if let Some(folder) = given {
-        return Ok(folder.to_owned());
-    }
+/// An object of the samples, described for point pair features.
+pub(super) struct Known {
+    pub object: Object,
+    model: sixfold_match::ObjectModel,
+    points: ModelPoints,
+}
+
+/// A file or folder of the repository, found from where the program was started or built.
+pub(super) fn found_upwards(name: &Path) -> Option<PathBuf> {
     let here = std::env::current_dir().unwrap_or_default();
     let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let found = here
-        .ancestors()
-        .map(Path::to_path_buf)
-        .chain([built])
-        .map(|p| p.join("data/demo"))
-        .find(|p| p.is_dir());
-    match found {
+    here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists())
+}
+
+/// The samples: given, or found.
+fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
+    match given.map(Path::to_owned).or_else(|| found_upwards(Path::new("data/demo"))) {
         Some(folder) => Ok(folder),
         None => bail!(
             "the sample data (folder data/demo of the repository) is not here: run inside the repository or give --data DIR"
         ),
+    }
+}
+
+/// ADD, or ADI for symmetric objects, in metres.
+pub(super) fn add_s(known: &Known, camera_from_object: Pose, truth: &GroundTruth) -> f64 {
+    let estimated = sixfold_bop::Placement::from(camera_from_object);
+    if known.object.info.is_symmetric() {
+        sixfold_bop::adi(&known.points, estimated, truth.placement())
+    } else {
+        sixfold_bop::add(&known.points, estimated, truth.placement())
     }
 }
 
@@ -69,7 +87,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
     let infos = dataset.models_info(Models::Rendering)?;
-    let mut known: BTreeMap<u32, (Object, sixfold_match::ObjectModel, ModelPoints)> = BTreeMap::new();
+    let mut known: BTreeMap<u32, Known> = BTreeMap::new();
     let mut progress = Progress::new("poses", targets.len());
     let mut rows = vec![];
     let mut results = vec![];
@@ -94,10 +112,10 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     let description = a.out.join(format!("objects/{:06}.sixfold-ppf", o.obj_id));
                     let object = Object { name: o.obj_id.to_string(), mesh, info, description };
                     let model = object.ppf_model()?;
-                    place.insert((object, model, points));
+                    place.insert(Known { object, model, points });
                 }
-                let Some((_, model, points)) = known.get(&o.obj_id) else { continue };
-                let estimates = estimate(&prepared, model, &EstimateOptions::default());
+                let Some(k) = known.get(&o.obj_id) else { continue };
+                let estimates = estimate(&prepared, &k.model, &EstimateOptions::default());
                 let seconds = began.elapsed().as_secs_f64();
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
@@ -111,20 +129,13 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     ));
                     found.push((o.obj_id, e));
                     if let Some(truth) = truth {
-                        let estimated = sixfold_bop::Placement::from(e.camera_from_object);
-                        let symmetric =
-                            infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).is_some_and(|i| i.is_symmetric());
-                        let error = if !symmetric {
-                            sixfold_bop::add(points, estimated, truth.placement())
-                        } else {
-                            sixfold_bop::adi(points, estimated, truth.placement())
-                        };
+                        let error = add_s(k, e.camera_from_object, truth);
                         rows.push(Row {
                             image: format!("{scene_id}/{im_id}"),
                             depth: if scene_id >= SIMULATED { "simulated" } else { "real" },
                             object: o.obj_id,
                             add_s_mm: 1000.0 * error,
-                            add_s_of_diameter: error / model.diameter(),
+                            add_s_of_diameter: error / k.model.diameter(),
                             confidence: e.confidence,
                             seconds,
                         });
@@ -136,7 +147,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 .iter()
                 .filter_map(|(id, e)| {
                     Some(Drawn {
-                        mesh: &known.get(id)?.0.mesh,
+                        mesh: &known.get(id)?.object.mesh,
                         camera_from_object: e.camera_from_object,
                         color: overlay::color(*id as usize),
                     })
@@ -152,6 +163,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let curves = a.out.join("recall.png");
     write_recall_curves(&curves, &evaluation)?;
     pictures.push(curves);
+    let colour = demo_rgb::run(a, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
     let whole = Whole {
         poses: rows,
@@ -160,6 +172,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
         seconds: start.elapsed().as_secs_f64(),
         pictures,
         evaluation,
+        colour,
     };
     report(&a.json, &whole, || print_table(&whole))?;
     Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
@@ -187,11 +200,12 @@ fn print_table(whole: &Whole) {
     }
     println!();
     super::eval::print_evaluation(&whole.evaluation);
-    println!(
-        "\n{} of {} poses within 10 % of the diameter, {:.1} s in all. Pictures:",
-        whole.correct, whole.targets, whole.seconds
-    );
-    for p in &whole.pictures {
+    println!("\n{} of {} poses within 10 % of the diameter", whole.correct, whole.targets);
+    demo_rgb::print_table(&whole.colour, |image, object| {
+        whole.poses.iter().find(|r| r.image == image && r.object == object).map(|r| r.add_s_of_diameter)
+    });
+    println!("\n{:.1} s in all. Pictures:", whole.seconds);
+    for p in whole.pictures.iter().chain(&whole.colour.pictures) {
         println!("  {}", p.display());
     }
 }

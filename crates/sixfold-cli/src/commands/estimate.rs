@@ -21,7 +21,9 @@ const SURE_ENOUGH: f64 = 0.25;
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     if a.weights.is_some() || a.object_id.is_some() || a.icp {
-        bail!("--weights, --object-id and --icp belong to --method pix2pose; point pair features need none of them");
+        bail!(
+            "--weights, --object-id and --icp belong to --method pix2pose; point pair features need none of them"
+        );
     }
     let depth_file = a
         .depth

@@ -312,7 +312,12 @@ fn by_pix2pose(
                 Ok(None) => continue,
                 // One bad box costs its own target only.
                 Err(error) if error.downcast_ref::<EstimateError>().is_some_and(is_of_box) => {
-                    eprintln!("note: image {}/{im_id}, object {}: {}", target.scene_id, o.obj_id, crate::describe(&error));
+                    eprintln!(
+                        "note: image {}/{im_id}, object {}: {}",
+                        target.scene_id,
+                        o.obj_id,
+                        crate::describe(&error)
+                    );
                     continue;
                 }
                 Err(error) => return Err(error),

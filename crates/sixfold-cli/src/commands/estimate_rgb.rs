@@ -67,7 +67,10 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     })?;
     let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
     if a.objects.len() > 1 {
-        bail!("--object: found {} of them; --method pix2pose takes one object and its --box at a time", a.objects.len());
+        bail!(
+            "--object: found {} of them; --method pix2pose takes one object and its --box at a time",
+            a.objects.len()
+        );
     }
     if a.icp && (a.depth.is_none() || a.objects.is_empty()) {
         bail!("--icp needs the depth image (--depth FILE) and the mesh (--object NAME_OR_MESH)");
@@ -80,7 +83,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             Some(object)
         }
         None => {
-            eprintln!("note: without --object NAME_OR_MESH the outline is not aligned, and the overlay shows a box");
+            eprintln!(
+                "note: without --object NAME_OR_MESH the outline is not aligned, and the overlay shows a box"
+            );
             None
         }
     };
@@ -168,7 +173,10 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
 }
 
 fn print_table(whole: &Whole, folder: Option<&Path>) {
-    println!("{:<24} {:>10} {:>8} {:>26} {:>8}", "object", "confidence", "inliers", "translation (m)", "seconds");
+    println!(
+        "{:<24} {:>10} {:>8} {:>26} {:>8}",
+        "object", "confidence", "inliers", "translation (m)", "seconds"
+    );
     for f in &whole.poses {
         let t: Vec<String> = f.camera_from_object[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
         println!(
@@ -195,11 +203,14 @@ fn region(a: &EstimateArguments, lens: &Camera) -> Result<Rect> {
         (None, Some(path)) => {
             let mask = read_mask(path)?;
             lens.check_image(mask.width(), mask.height()).with_context(|| path.display().to_string())?;
-            box_of_mask(&mask)
-                .ok_or_else(|| anyhow!("{}: the mask is empty: it has to be above zero on the object", path.display()))?
+            box_of_mask(&mask).ok_or_else(|| {
+                anyhow!("{}: the mask is empty: it has to be above zero on the object", path.display())
+            })?
         }
         (Some(_), Some(_)) => bail!("--box and --mask: give one of them, --method pix2pose needs one box"),
-        (None, None) => bail!("--method pix2pose needs to know where the object is: give --box X,Y,W,H or --mask FILE"),
+        (None, None) => {
+            bail!("--method pix2pose needs to know where the object is: give --box X,Y,W,H or --mask FILE")
+        }
     };
     Ok(undistorted(&region, lens))
 }
@@ -239,7 +250,8 @@ fn undistorted(region: &Rect, lens: &Camera) -> Rect {
 /// The box of the model's coordinates, for an overlay without a mesh.
 fn box_of(entry: &ObjectEntry) -> Result<Mesh> {
     let scale = entry.scale();
-    let corner = |i: usize| scale.restore(&Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { -1.0 } else { 1.0 }));
+    let corner =
+        |i: usize| scale.restore(&Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { -1.0 } else { 1.0 }));
     let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
     let faces = sides.iter().flat_map(|s| [[s[0], s[1], s[2]], [s[0], s[2], s[3]]]).collect();
     Ok(Mesh::new((0..8).map(corner).collect(), faces)?)

@@ -3,6 +3,7 @@
 pub(crate) mod boxes;
 pub(crate) mod completions;
 pub(crate) mod demo;
+pub(crate) mod demo_rgb;
 pub(crate) mod estimate;
 pub(crate) mod estimate_dataset;
 pub(crate) mod estimate_rgb;

@@ -36,7 +36,9 @@ const SAME_BOX: f64 = 0.05;
 impl Pix2Pose {
     pub fn new(a: &EstimateArguments) -> Result<Pix2Pose> {
         let weights = a.weights.as_deref().ok_or_else(|| {
-            anyhow!("--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes")
+            anyhow!(
+                "--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes"
+            )
         })?;
         let pix2pose = Pix2Pose::load(weights)?;
         let options = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
@@ -58,6 +60,13 @@ impl Pix2Pose {
         &self.model
     }
 
+    /// Whether the model's card names a frame (`scene/image`) among those of its training.
+    pub fn was_trained_on(&self, scene_id: u32, im_id: u32) -> bool {
+        let name = format!("{scene_id}/{im_id}");
+        let card = &self.model.card().data;
+        card.split(|c: char| !(c.is_ascii_digit() || c == '/')).any(|word| word == name)
+    }
+
     /// What the model knows of an object; without an id, of its only one.
     pub fn entry(&self, id: Option<u32>) -> Result<&ObjectEntry> {
         match (id, self.model.objects()) {
@@ -75,7 +84,9 @@ impl Pix2Pose {
         let entry = self.entry(Some(id))?;
         let scale = entry.scale();
         let (low, high) = mesh.bounding_box();
-        let off = (low - (scale.centre - scale.half_size)).amax().max((high - (scale.centre + scale.half_size)).amax());
+        let off = (low - (scale.centre - scale.half_size))
+            .amax()
+            .max((high - (scale.centre + scale.half_size)).amax());
         if off > SAME_BOX * entry.diameter {
             let size = high - low;
             let expected = 2.0 * scale.half_size;
@@ -151,7 +162,9 @@ pub(crate) fn view_picture(view: &View) -> RgbImage {
                 let (ix, iy) = (x * input.width() / TILE, y * input.height() / TILE);
                 input[(ix, iy)]
             }
-            1 if p.visible[index] > 0.5 => p.coordinates[index].map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8),
+            1 if p.visible[index] > 0.5 => {
+                p.coordinates[index].map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8)
+            }
             1 => [0; 3],
             2 => grey(p.error[index]),
             _ => grey(p.visible[index]),

@@ -202,6 +202,13 @@ fn from_dataset(a: &TrainPix2PoseArguments, root: &Path) -> Result<Material> {
                 let shown = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
                 all.extend(shown.map(|im_id| (scene_id, im_id)));
             }
+            if all.is_empty() {
+                bail!(
+                    "{}: split {} has no colour images to learn from; give another --split, or train with --renders-only",
+                    root.display(),
+                    a.split
+                );
+            }
             all
         }
     };

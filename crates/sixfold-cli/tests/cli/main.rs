@@ -5,5 +5,6 @@ mod dataset;
 mod eval;
 mod image;
 mod objects;
+mod pix2pose;
 mod simulate;
 mod support;

@@ -6,9 +6,9 @@ use std::process::Command;
 use serde_json::Value;
 use sixfold_bop::{GroundTruth, NewImage, SceneWriter, Target, TargetObject, write_camera, write_targets};
 use sixfold_geometry::nalgebra::{Matrix4, UnitQuaternion};
-use sixfold_geometry::{Camera, DepthImage, Pose, Vec3};
+use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
 use tempfile::TempDir;
 
 pub const WIDTH: usize = 320;
@@ -145,6 +145,20 @@ pub fn depth_of(objects: &[(&Mesh, Pose)]) -> DepthImage {
     frame.depth()
 }
 
+/// A colour image of objects on a table: all of one material, under one lamp.
+pub fn picture_of(objects: &[(&Mesh, Pose)]) -> RgbImage {
+    let table = table();
+    let objects: Vec<SceneObject<'_>> = objects
+        .iter()
+        .copied()
+        .chain([(&table, on_table(0.0, 0.0, 0.0))])
+        .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
+        .collect();
+    let mut frame = Frame::new(&camera());
+    frame.render(&objects, &RenderOptions::default());
+    shade(&frame, &objects, &Light::default_set(), &Material::default(), None)
+}
+
 /// A folder with `depth.png`, `rgb.png`, `camera.json` and the object `part.ply` in millimetres.
 pub struct OneImage {
     pub dir: TempDir,
@@ -202,6 +216,15 @@ pub struct Tiny {
 
 impl Tiny {
     pub fn new(with_depth: bool) -> Tiny {
+        Tiny::with(with_depth, false)
+    }
+
+    /// With colour images and depth.
+    pub fn coloured() -> Tiny {
+        Tiny::with(true, true)
+    }
+
+    fn with(with_depth: bool, with_colour: bool) -> Tiny {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path().join("tiny");
         let meshes = [part(), other_part()];
@@ -222,11 +245,13 @@ impl Tiny {
             let poses = [on_table(-0.08, 0.01, turn), on_table(0.09, -0.03, 2.0 - turn)];
             let posed: Vec<(&Mesh, Pose)> = meshes.iter().zip(poses).collect();
             let depth = depth_of(&posed);
+            let colour = with_colour.then(|| picture_of(&posed));
             let here: Vec<GroundTruth> =
                 (1..).zip(poses).map(|(id, pose)| GroundTruth::new(id, pose)).collect();
             writer
                 .add(&NewImage {
                     depth: with_depth.then_some(&depth),
+                    rgb: colour.as_ref(),
                     depth_scale: DEPTH_SCALE,
                     ground_truth: &here,
                     ..NewImage::new(im_id, &camera)

@@ -102,13 +102,21 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
     let mut rows = vec![];
     for setting in settings(a) {
         check_interrupt("the rows done so far are kept; run the same command again to go on")?;
-        let used = pix2pose.varied(EstimateOptions { seed: a.seed, ..setting.options.clone() }, setting.refine);
+        let used =
+            pix2pose.varied(EstimateOptions { seed: a.seed, ..setting.options.clone() }, setting.refine);
         rows.push(row::kept_or_made(&a.out, setting.key, || bench.measure(&used, &setting, &a.out))?);
     }
     if let Some(file) = &a.published {
         rows.push(row::kept_or_made(&a.out, "published", || {
             let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-            bench.scored("published", &format!("published: {name}"), "its own", &read_results(file)?, vec![], 0)
+            bench.scored(
+                "published",
+                &format!("published: {name}"),
+                "its own",
+                &read_results(file)?,
+                vec![],
+                0,
+            )
         })?);
     }
     if a.train {
@@ -119,8 +127,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
         ("dissertation, LM-O, Pix2Pose: mean over objects of ADD(-S) recall", 0.320),
         ("BOP Challenge 2020, LM-O, Pix2Pose from RGB: AR (VSD, MSSD, MSPD)", 0.363),
     ]);
-    let result =
-        Whole { inputs, frames: frames.len(), targets: bench.targets.len(), rows, literature };
+    let result = Whole { inputs, frames: frames.len(), targets: bench.targets.len(), rows, literature };
     let text = table::markdown(&result);
     write_atomically(&a.out.join("table.md"), text.as_bytes())?;
     write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&result)?.as_bytes())?;
@@ -151,10 +158,26 @@ fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
     all.push(one_stage);
     let none = Quirks::default();
     let quirks = [
-        ("bug-recentring", "two stages, PnP, author's code: shift of the second crop not scaled", Quirks { unscaled_recentring: true, ..none }),
-        ("bug-eight-bits", "two stages, PnP, author's code: coordinates in 8 bits", Quirks { eight_bits: true, ..none }),
-        ("bug-centre-choice", "two stages, PnP, author's code: candidate chosen by its centre", Quirks { centre_choice: true, ..none }),
-        ("bug-plain-pnp", "two stages, author's code: EPnP, 5 px, 100 iterations", Quirks { plain_pnp: true, ..none }),
+        (
+            "bug-recentring",
+            "two stages, PnP, author's code: shift of the second crop not scaled",
+            Quirks { unscaled_recentring: true, ..none },
+        ),
+        (
+            "bug-eight-bits",
+            "two stages, PnP, author's code: coordinates in 8 bits",
+            Quirks { eight_bits: true, ..none },
+        ),
+        (
+            "bug-centre-choice",
+            "two stages, PnP, author's code: candidate chosen by its centre",
+            Quirks { centre_choice: true, ..none },
+        ),
+        (
+            "bug-plain-pnp",
+            "two stages, author's code: EPnP, 5 px, 100 iterations",
+            Quirks { plain_pnp: true, ..none },
+        ),
         ("bugs-all", "two stages, author's code: all four", Quirks::all()),
     ];
     for (key, title, quirks) in quirks {
@@ -167,7 +190,11 @@ fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
         all.push(Setting { refine: true, noise: Some(f64::from(percent) / 100.0), ..plain(key, &title) });
     }
     if a.detections.is_some() {
-        all.push(Setting { refine: true, detections: true, ..plain("detections", "default, boxes of the detections") });
+        all.push(Setting {
+            refine: true,
+            detections: true,
+            ..plain("detections", "default, boxes of the detections")
+        });
         all.push(Setting {
             detections: true,
             ..plain("detections-no-refinement", "two stages, PnP, boxes of the detections")
@@ -193,8 +220,7 @@ fn test_targets(
     }
     // The model's card says what it was trained on: scores on those frames would be worth nothing.
     let card = &pix2pose.model().card().data;
-    let words: BTreeSet<&str> = card.split(|c: char| !(c.is_ascii_digit() || c == '/')).collect();
-    if let Some(t) = targets.iter().find(|t| words.contains(format!("{}/{}", t.scene_id, t.im_id).as_str())) {
+    if let Some(t) = targets.iter().find(|t| pix2pose.was_trained_on(t.scene_id, t.im_id)) {
         bail!(
             "{}: the model was trained on frame {}/{}, which {} does not list; give the frames of its training (its card says: {card})",
             a.weights.display(),
@@ -223,8 +249,8 @@ fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
     let path = folder.join("inputs.json");
     let now = serde_json::to_value(inputs)?;
     if let Ok(text) = std::fs::read_to_string(&path) {
-        let before: serde_json::Value =
-            serde_json::from_str(&text).with_context(|| format!("{}: not JSON; remove the folder", path.display()))?;
+        let before: serde_json::Value = serde_json::from_str(&text)
+            .with_context(|| format!("{}: not JSON; remove the folder", path.display()))?;
         if let (Some(before), Some(now)) = (before.as_object(), now.as_object())
             && let Some((field, was)) = before.iter().find(|(field, was)| now.get(*field) != Some(*was))
         {
@@ -241,7 +267,9 @@ fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
 
 /// 64-bit FNV-1a: tells files apart, nothing more.
 fn fnv(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
+    bytes
+        .iter()
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
 impl Bench {

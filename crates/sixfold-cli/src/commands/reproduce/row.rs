@@ -80,8 +80,9 @@ pub(super) struct Times {
 pub(super) fn kept_or_made(folder: &Path, key: &str, make: impl FnOnce() -> Result<Row>) -> Result<Row> {
     let path = folder.join("rows").join(format!("{key}.json"));
     if let Ok(text) = std::fs::read_to_string(&path) {
-        return serde_json::from_str(&text)
-            .with_context(|| format!("{}: not a row of this version; remove it to have it made again", path.display()));
+        return serde_json::from_str(&text).with_context(|| {
+            format!("{}: not a row of this version; remove it to have it made again", path.display())
+        });
     }
     eprintln!("row {key}");
     let row = make()?;
@@ -117,12 +118,17 @@ impl Bench {
                 let mine = boxes.get(&(*scene_id, *im_id, o.obj_id)).unwrap_or(&none);
                 for (number, (region, score)) in mine.iter().enumerate() {
                     let region = match setting.noise {
-                        Some(share) => moved(region, share, [self.seed, (*scene_id).into(), (*im_id).into(), o.obj_id.into(), number as u64]),
+                        Some(share) => moved(
+                            region,
+                            share,
+                            [self.seed, (*scene_id).into(), (*im_id).into(), o.obj_id.into(), number as u64],
+                        ),
                         None => *region,
                     };
                     regions += 1;
                     let start = Instant::now();
-                    let posed = pix2pose.estimate(&image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
+                    let posed =
+                        pix2pose.estimate(&image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
                     times.push(start.elapsed().as_secs_f64());
                     match posed {
                         Ok(Some(p)) => estimates.push(Estimate::new(
@@ -134,7 +140,11 @@ impl Bench {
                         )),
                         Ok(None) => {}
                         Err(error) => {
-                            eprintln!("note: image {scene_id}/{im_id}, object {}: {}", o.obj_id, crate::describe(&error));
+                            eprintln!(
+                                "note: image {scene_id}/{im_id}, object {}: {}",
+                                o.obj_id,
+                                crate::describe(&error)
+                            );
                         }
                     }
                 }
@@ -174,7 +184,10 @@ impl Bench {
             .iter()
             .filter_map(|(id, o)| {
                 let (targets, add_s) = (o.targets, o.add_s_recall);
-                Some((id.parse().ok()?, ObjectScore { targets, ar_mssd: o.ar_mssd, ar_mspd: o.ar_mspd, add_s }))
+                Some((
+                    id.parse().ok()?,
+                    ObjectScore { targets, ar_mssd: o.ar_mssd, ar_mspd: o.ar_mspd, add_s },
+                ))
             })
             .filter(|(_, o): &(u32, ObjectScore)| o.targets > 0)
             .collect();
@@ -195,7 +208,8 @@ impl Bench {
                 ar_mssd: e.ar_mssd,
                 ar_mspd: e.ar_mspd,
                 add_s: e.add_s_recall.get("mean").copied().flatten(),
-                add_s_mean_of_objects: (!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64),
+                add_s_mean_of_objects: (!each.is_empty())
+                    .then(|| each.iter().sum::<f64>() / each.len() as f64),
                 objects,
             },
             regions,

@@ -27,7 +27,8 @@ pub(super) fn markdown(whole: &Whole) -> String {
     out += "|---|---|---|---|---|---|---|---|\n";
     for row in &whole.rows {
         let s = &row.scores;
-        let time = row.milliseconds.map_or_else(|| "-".into(), |t| format!("{:.0} / {:.0}", t.mean, t.median));
+        let time =
+            row.milliseconds.map_or_else(|| "-".into(), |t| format!("{:.0} / {:.0}", t.mean, t.median));
         let _ = writeln!(
             out,
             "| {} | {} | {} | {} | {} | {} | {} | {time} |",
@@ -57,14 +58,16 @@ pub(super) fn markdown(whole: &Whole) -> String {
         for row in &compared {
             match row.scores.objects.get(&id) {
                 Some(o) => {
-                    let _ = write!(out, " {} / {} / {} |", digits(o.ar_mssd), digits(o.ar_mspd), digits(o.add_s));
+                    let _ =
+                        write!(out, " {} / {} / {} |", digits(o.ar_mssd), digits(o.ar_mspd), digits(o.add_s));
                 }
                 None => out += " - |",
             }
         }
         out.push('\n');
     }
-    out += "\nNot measured here, on all 200 frames of LM-O's test split with the methods' own detections:\n\n";
+    out +=
+        "\nNot measured here, on all 200 frames of LM-O's test split with the methods' own detections:\n\n";
     for (what, value) in &whole.literature {
         let _ = writeln!(out, "- {what}: {value:.3}");
     }

@@ -11,7 +11,9 @@ use sixfold_pix2pose::estimate::EstimateOptions;
 
 use super::row::{self, Row, Setting};
 use super::{Bench, Regions};
-use crate::arguments::{Arguments, Command, ReproducePix2PoseArguments, TrainCommand, TrainPix2PoseArguments};
+use crate::arguments::{
+    Arguments, Command, ReproducePix2PoseArguments, TrainCommand, TrainPix2PoseArguments,
+};
 use crate::commands::pix2pose::Pix2Pose;
 use crate::commands::train::train_pix2pose;
 
@@ -24,23 +26,45 @@ struct Training {
 
 const TRAININGS: [Training; 2] = [
     Training { key: "trained-transformer-loss", title: "symmetric objects, transformer loss", more: &[] },
-    Training { key: "trained-plain-l1", title: "symmetric objects, plain L1", more: &["--no-transformer-loss"] },
+    Training {
+        key: "trained-plain-l1",
+        title: "symmetric objects, plain L1",
+        more: &["--no-transformer-loss"],
+    },
 ];
 
 /// Trains, or goes on with the trainings, and measures what they came to.
 pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<Row>> {
     let infos = bench.dataset.models_info(Models::Rendering)?.unwrap_or_default();
-    let ids: Vec<u32> =
-        bench.meshes.keys().copied().filter(|id| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty())).collect();
+    let ids: Vec<u32> = bench
+        .meshes
+        .keys()
+        .copied()
+        .filter(|id| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty()))
+        .collect();
     if ids.is_empty() {
-        eprintln!("note: no object of the model has a discrete symmetry: nothing to train for the comparison");
+        eprintln!(
+            "note: no object of the model has a discrete symmetry: nothing to train for the comparison"
+        );
         return Ok(vec![]);
     }
-    let mine = |regions: &Regions| regions.iter().filter(|(key, _)| ids.contains(&key.2)).map(|(k, v)| (*k, v.clone())).collect();
+    let mine = |regions: &Regions| {
+        regions.iter().filter(|(key, _)| ids.contains(&key.2)).map(|(k, v)| (*k, v.clone())).collect()
+    };
     let few = Bench {
         dataset: bench.dataset.clone(),
-        targets: bench.targets.iter().filter(|t| t.object.is_some_and(|o| ids.contains(&o.obj_id))).copied().collect(),
-        meshes: bench.meshes.iter().filter(|(id, _)| ids.contains(id)).map(|(id, mesh)| (*id, mesh.clone())).collect(),
+        targets: bench
+            .targets
+            .iter()
+            .filter(|t| t.object.is_some_and(|o| ids.contains(&o.obj_id)))
+            .copied()
+            .collect(),
+        meshes: bench
+            .meshes
+            .iter()
+            .filter(|(id, _)| ids.contains(id))
+            .map(|(id, mesh)| (*id, mesh.clone()))
+            .collect(),
         truth: mine(&bench.truth),
         detections: None,
         seed: bench.seed,
@@ -76,7 +100,8 @@ fn arguments(
     more: &[&str],
 ) -> Result<TrainPix2PoseArguments> {
     let text = |path: &Path| path.as_os_str().to_owned();
-    let mut words: Vec<std::ffi::OsString> = ["sixfold", "train", "pix2pose", "--dataset"].map(Into::into).to_vec();
+    let mut words: Vec<std::ffi::OsString> =
+        ["sixfold", "train", "pix2pose", "--dataset"].map(Into::into).to_vec();
     words.push(text(&a.dataset));
     words.extend(["--frames".into(), text(&a.frames), "--out".into(), text(folder)]);
     let options = [

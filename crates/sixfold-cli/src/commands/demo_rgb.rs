@@ -1,0 +1,174 @@
+//! The demo's second half: poses from colour alone in the boxes of the ground truth, beside those from depth.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Result, bail};
+use serde::Serialize;
+use sixfold_bop::{BopDataset, Target, write_rgb};
+
+use super::boxes::Boxes;
+use super::demo::{Known, add_s, found_upwards};
+use super::pix2pose::Pix2Pose;
+use crate::arguments::DemoArguments;
+use crate::overlay::{self, Drawn};
+use crate::progress::{Progress, check_interrupt};
+
+#[derive(Serialize)]
+pub(super) struct Row {
+    pub image: String,
+    pub object: u32,
+    pub add_s_mm: f64,
+    pub add_s_of_diameter: f64,
+    pub confidence: f64,
+    pub seconds: f64,
+}
+
+/// Poses from colour, or why there are none.
+#[derive(Serialize)]
+pub(super) struct Colour {
+    pub weights: Option<PathBuf>,
+    pub poses: Vec<Row>,
+    pub correct: usize,
+    /// Targets in colour images that were looked for.
+    pub targets: usize,
+    pub pictures: Vec<PathBuf>,
+    /// Why there are no poses.
+    pub reason: Option<String>,
+}
+
+/// Weights of the sample objects, relative to the repository.
+const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
+
+pub(super) fn run(
+    a: &DemoArguments,
+    dataset: &BopDataset,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<Colour> {
+    let none = |weights: Option<PathBuf>, reason: String| Colour {
+        weights,
+        poses: vec![],
+        correct: 0,
+        targets: 0,
+        pictures: vec![],
+        reason: Some(reason),
+    };
+    let Some(weights) = a.weights.clone().or_else(|| found_upwards(Path::new(WEIGHTS))) else {
+        return Ok(none(
+            None,
+            format!("no {WEIGHTS}; `sixfold train pix2pose` makes weights, --weights FILE takes them"),
+        ));
+    };
+    let result = Pix2Pose::load(&weights)
+        .and_then(|pix2pose| with_model(a, &pix2pose, &weights, dataset, targets, known));
+    match result {
+        Ok(colour) => Ok(colour),
+        // Those that were asked for have to be right.
+        Err(error) if a.weights.is_some() => Err(error),
+        Err(error) => Ok(none(Some(weights), crate::describe(&error))),
+    }
+}
+
+fn with_model(
+    a: &DemoArguments,
+    pix2pose: &Pix2Pose,
+    weights: &Path,
+    dataset: &BopDataset,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<Colour> {
+    for (id, k) in known {
+        if targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id)) {
+            pix2pose.check_mesh(*id, &k.object.mesh, &format!("model {id}"))?;
+        }
+    }
+    let mut colour = Colour {
+        weights: Some(weights.to_owned()),
+        poses: vec![],
+        correct: 0,
+        targets: 0,
+        pictures: vec![],
+        reason: None,
+    };
+    let mut progress = Progress::new("poses from colour", targets.len());
+    for scene_id in dataset.scene_ids() {
+        let scene = dataset.scene(scene_id)?;
+        for im_id in scene.image_ids() {
+            check_interrupt("run it again")?;
+            let Some(image) = scene.rgb(im_id)? else { continue };
+            if pix2pose.was_trained_on(scene_id, im_id) {
+                bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", weights.display());
+            }
+            let camera = scene.camera(im_id)?;
+            let mut drawn = vec![];
+            for t in targets.iter().filter(|t| (t.scene_id, t.im_id) == (scene_id, im_id)) {
+                let Some((o, k)) = t.object.and_then(|o| Some((o, known.get(&o.obj_id)?))) else { continue };
+                colour.targets += 1;
+                progress.step(format!("image {im_id}, object {}", o.obj_id));
+                let regions = Boxes::GroundTruth
+                    .of_target(&scene, t, &o, |id| known.get(&id).map(|k| &k.object.mesh))?;
+                let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
+                let (Some((region, _)), Some(truth)) = (regions.first(), truth) else { continue };
+                let start = Instant::now();
+                let Some(posed) =
+                    pix2pose.estimate(&image, &camera, o.obj_id, region, Some(&k.object.mesh))?
+                else {
+                    continue;
+                };
+                let error = add_s(k, posed.camera_from_object, truth);
+                colour.poses.push(Row {
+                    image: format!("{scene_id}/{im_id}"),
+                    object: o.obj_id,
+                    add_s_mm: 1000.0 * error,
+                    add_s_of_diameter: error / k.object.info.diameter,
+                    confidence: posed.score,
+                    seconds: start.elapsed().as_secs_f64(),
+                });
+                drawn.push(Drawn {
+                    mesh: &k.object.mesh,
+                    camera_from_object: posed.camera_from_object,
+                    color: overlay::color(o.obj_id as usize),
+                });
+            }
+            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}_colour.png"));
+            write_rgb(&picture, &overlay::draw(&image, &camera, &drawn))?;
+            colour.pictures.push(picture);
+        }
+    }
+    progress.finish();
+    colour.correct = colour.poses.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
+    if colour.targets == 0 {
+        colour.reason = Some("the samples have no colour images".into());
+    }
+    Ok(colour)
+}
+
+/// Errors beside those from depth, found by image and object.
+pub(super) fn print_table(colour: &Colour, of_depth: impl Fn(&str, u32) -> Option<f64>) {
+    if let Some(reason) = &colour.reason {
+        println!("\nPoses from colour alone (Pix2Pose): none: {reason}");
+        return;
+    }
+    println!(
+        "\nPoses from colour alone (Pix2Pose), in the boxes of the ground truth; last column: the errors from depth above"
+    );
+    println!(
+        "{:>10} {:>7} {:>12} {:>10} {:>11} {:>8} {:>11}",
+        "image", "object", "error (mm)", "of diam.", "confidence", "seconds", "from depth"
+    );
+    for r in &colour.poses {
+        let depth = of_depth(&r.image, r.object).map_or_else(|| "-".into(), |s| format!("{:.1}%", 100.0 * s));
+        println!(
+            "{:>10} {:>7} {:>12.1} {:>9.1}% {:>11.3} {:>8.2} {depth:>11}",
+            r.image,
+            r.object,
+            r.add_s_mm,
+            100.0 * r.add_s_of_diameter,
+            r.confidence,
+            r.seconds
+        );
+    }
+    println!("{} of {} poses from colour within 10 % of the diameter", colour.correct, colour.targets);
+}
