@@ -192,7 +192,8 @@ fn print_table(whole: &Whole, folder: Option<&Path>) {
         println!("{name:<24} not found");
     }
     if let Some(folder) = folder {
-        println!("poses.json, overlay.png and coordinates.png are in {}", folder.display());
+        let coordinates = if whole.coordinates.is_some() { ", coordinates.png" } else { "" };
+        println!("poses.json, overlay.png{coordinates} are in {}", folder.display());
     }
 }
 
