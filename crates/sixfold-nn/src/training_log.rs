@@ -173,7 +173,7 @@ fn read_lines(path: &Path) -> Result<Lines, TrainingLogError> {
 const PANEL_WIDTH: u32 = 560;
 const PANEL_HEIGHT: u32 = 340;
 const LEFT: f64 = 84.0;
-const RIGHT: f64 = 20.0;
+const RIGHT: f64 = 32.0;
 const TOP: f64 = 44.0;
 const BOTTOM: f64 = 56.0;
 /// More losses than this are not drawn.
@@ -222,11 +222,15 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
     let lowest = finite.iter().map(|p| p.1).fold(f64::INFINITY, f64::min);
     let highest = finite.iter().map(|p| p.1).fold(f64::NEG_INFINITY, f64::max);
     let logarithmic = lowest > 0.0 && highest > 20.0 * lowest;
+    // A schedule that ends near zero must not press the rest together.
+    let lowest = if logarithmic { lowest.max(1e-4 * highest) } else { lowest };
     let vertical = if logarithmic { ticks_logarithmic(lowest, highest) } else { ticks(lowest, highest) };
     let last_step = points.last().map_or(1.0, |p| p.0).max(1.0);
     let horizontal = ticks(0.0, last_step);
 
-    let last = finite.last().map_or("no number".to_owned(), |p| format!("{:.4}", p.1));
+    let last = finite.last().map_or("no number".to_owned(), |p| {
+        if p.1 != 0.0 && p.1.abs() < 1e-3 { format!("{:.2e}", p.1) } else { format!("{:.4}", p.1) }
+    });
     let room = (width / 12.0) as usize;
     let title: String = format!("{name}   {last}").chars().take(room).collect();
     canvas.text(left, corner.1 + 16.0, 2.0, &title, INK);
