@@ -387,6 +387,9 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Draw the meshes in random colours, as untextured CAD models
     #[arg(long)]
     pub no_mesh_colors: bool,
+    /// Learn the coordinates of the meshes' convex hulls, as if nothing better were known of the objects
+    #[arg(long)]
+    pub convex_hull: bool,
     /// Plain L1 for symmetric objects instead of the transformer loss
     #[arg(long)]
     pub no_transformer_loss: bool,

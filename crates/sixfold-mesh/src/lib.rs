@@ -12,6 +12,7 @@
 //! # Ok::<(), sixfold_mesh::MeshFileError>(())
 //! ```
 
+mod convex_hull;
 mod diameter;
 mod error;
 mod file;

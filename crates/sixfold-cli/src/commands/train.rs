@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use burn::tensor::Device;
 use serde::Serialize;
 use sixfold_augment::{Backgrounds, PhotographOptions};
@@ -70,9 +70,18 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         Some(root) => from_dataset(a, root)?,
         None => from_objects(a)?,
     };
-    let Material { objects, real, description } = material;
+    let Material { mut objects, real, mut description } = material;
     for object in &objects {
         warn_of_symmetry(object);
+    }
+    if a.convex_hull {
+        for object in &mut objects {
+            object.mesh = object
+                .mesh
+                .convex_hull()
+                .with_context(|| format!("object {}: its vertices have no convex hull", object.id))?;
+        }
+        description += "; convex hulls in place of the meshes";
     }
     let backgrounds = backgrounds(a, &real, &objects)?;
     let options = TrainingOptions {

@@ -140,6 +140,10 @@ fn a_training_goes_on_and_is_not_mixed_with_another() {
     assert!(std::fs::read(tiny.path().join(WEIGHTS)).unwrap() == model);
     let json = sixfold(tiny.path(), &format!("{} --export --json", train(3))).expect(0).json();
     assert_eq!((&json["steps"], &json["seconds"]), (&3.into(), &Value::Null));
+    // The card says what the network has not seen the mesh of.
+    sixfold(tiny.path(), &train(1).replace("--out trained", "--out hull --convex-hull")).expect(0);
+    let card = std::fs::read_to_string(tiny.path().join("hull/model.md")).unwrap();
+    assert!(card.contains("convex hulls"), "{card}");
     // Another seed is another network.
     let other = train(3).replace("--out trained", "--out other --seed 1");
     sixfold(tiny.path(), &other).expect(0);

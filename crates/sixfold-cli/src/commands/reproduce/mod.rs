@@ -104,7 +104,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
         check_interrupt("the rows done so far are kept; run the same command again to go on")?;
         let used =
             pix2pose.varied(EstimateOptions { seed: a.seed, ..setting.options.clone() }, setting.refine);
-        rows.push(row::kept_or_made(&a.out, setting.key, || bench.measure(&used, &setting, &a.out))?);
+        rows.push(row::kept_or_made(&a.out, &setting.key, || bench.measure(&used, &setting, &a.out))?);
     }
     if let Some(file) = &a.published {
         rows.push(row::kept_or_made(&a.out, "published", || {
@@ -141,8 +141,8 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
 
 /// The ways of using the model that are compared.
 fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
-    let plain = |key, title: &str| Setting {
-        key,
+    let plain = |key: &str, title: &str| Setting {
+        key: key.to_string(),
         title: title.to_string(),
         options: EstimateOptions::default(),
         refine: false,

@@ -20,7 +20,7 @@ use crate::progress::{Progress, check_interrupt};
 /// A way of using the model.
 pub(super) struct Setting {
     /// Name of its files.
-    pub key: &'static str,
+    pub key: String,
     /// What the table says.
     pub title: String,
     pub options: EstimateOptions,
@@ -164,7 +164,7 @@ impl Bench {
             (false, None) => "ground truth".to_string(),
             (false, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
         };
-        self.scored(setting.key, &setting.title, &name, &estimates, times, regions)
+        self.scored(&setting.key, &setting.title, &name, &estimates, times, regions)
     }
 
     /// A row of estimates.
