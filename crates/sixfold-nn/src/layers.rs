@@ -71,7 +71,10 @@ impl ConvConfig {
     /// If a length does not fit.
     pub fn with_values(&self, weight: Vec<f32>, bias: Vec<f32>, device: &Device) -> Conv {
         Conv {
-            weight: Param::from_tensor(Tensor::from_data(TensorData::new(weight, self.weight_shape()), device)),
+            weight: Param::from_tensor(Tensor::from_data(
+                TensorData::new(weight, self.weight_shape()),
+                device,
+            )),
             bias: Param::from_tensor(Tensor::from_data(TensorData::new(bias, [self.outputs]), device)),
             stride: self.stride,
             depthwise: self.depthwise,

@@ -191,7 +191,12 @@ impl Lite0Config {
                 let depthwise = source.conv(config, &name("_depthwise_conv"), &name("_bn1"))?;
                 let config = ConvConfig::new([inner, *outputs], 1, Activation::Linear);
                 let project = source.conv(config, &name("_project_conv"), &name("_bn2"))?;
-                blocks.push(Block { expand, depthwise, project, residual: stride == 1 && inputs == *outputs });
+                blocks.push(Block {
+                    expand,
+                    depthwise,
+                    project,
+                    residual: stride == 1 && inputs == *outputs,
+                });
             }
         }
         Ok(Lite0 { stem, blocks })

@@ -49,7 +49,9 @@ fn contiguous(tensor: FlexTensor) -> FlexTensor {
 }
 
 fn values(tensor: &FlexTensor) -> &[f32] {
-    tensor.as_slice::<f32>().unwrap_or_else(|| panic!("convolution needs f32 tensors, found {:?}", tensor.dtype()))
+    tensor
+        .as_slice::<f32>()
+        .unwrap_or_else(|| panic!("convolution needs f32 tensors, found {:?}", tensor.dtype()))
 }
 
 fn tensor(values: Vec<f32>, shape: impl Into<Shape>) -> FlexTensor {
@@ -194,13 +196,24 @@ impl<B: SixfoldOps, C: CheckpointStrategy> SixfoldOps for Autodiff<B, C> {
 /// # Panics
 /// If the shapes do not fit each other, as Burn's own convolution does.
 pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) -> Tensor<4> {
-    let ([_, inputs, ..], [outputs, per_group, kernel, second], [biases]) = (x.dims(), weight.dims(), bias.dims());
+    let ([_, inputs, ..], [outputs, per_group, kernel, second], [biases]) =
+        (x.dims(), weight.dims(), bias.dims());
     assert!(
-        biases == outputs && kernel == second && (spec.groups == 1 || (spec.groups == inputs && inputs == outputs))
+        biases == outputs
+            && kernel == second
+            && (spec.groups == 1 || (spec.groups == inputs && inputs == outputs))
             && per_group * spec.groups == inputs,
-        "convolution: input {:?}, weight {:?}, bias {biases}, groups {} do not fit", x.dims(), weight.dims(), spec.groups
+        "convolution: input {:?}, weight {:?}, bias {biases}, groups {} do not fit",
+        x.dims(),
+        weight.dims(),
+        spec.groups
     );
-    Tensor::from_dispatch(Dispatch::sixfold_conv(x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch(), spec))
+    Tensor::from_dispatch(Dispatch::sixfold_conv(
+        x.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+        spec,
+    ))
 }
 
 /// Doubles an image by repeating pixels: `batch x channels x height x width` to twice the rows and columns.

@@ -121,7 +121,8 @@ fn upsampling_repeats_pixels_and_sums_gradients() {
     let device = Device::flex().autodiff();
     let x = Tensor::<4>::from_data([[[[1.0, 2.0], [3.0, 4.0]]]], &device).require_grad();
     let y = upsample(x.clone());
-    let expected = [[[[1.0, 1.0, 2.0, 2.0], [1.0, 1.0, 2.0, 2.0], [3.0, 3.0, 4.0, 4.0], [3.0, 3.0, 4.0, 4.0]]]];
+    let expected =
+        [[[[1.0, 1.0, 2.0, 2.0], [1.0, 1.0, 2.0, 2.0], [3.0, 3.0, 4.0, 4.0], [3.0, 3.0, 4.0, 4.0]]]];
     y.clone().into_data().assert_eq(&TensorData::from(expected), false);
     let weights: Vec<f32> = (0..16).map(|i| i as f32).collect();
     let weights = Tensor::<4>::from_data(TensorData::new(weights, [1, 1, 4, 4]), &device);

@@ -31,6 +31,9 @@ fn main() {
         let t = Instant::now();
         let grads = GradientsParams::from_grads(grads, &net);
         net = optimiser.step(1e-3, net, grads);
-        println!("encoder {te:.1?} forward {tf:.1?} loss {tl:.1?} backward {tb:.1?} optimiser {:.1?}", t.elapsed());
+        println!(
+            "encoder {te:.1?} forward {tf:.1?} loss {tl:.1?} backward {tb:.1?} optimiser {:.1?}",
+            t.elapsed()
+        );
     }
 }

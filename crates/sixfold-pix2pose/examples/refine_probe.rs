@@ -21,7 +21,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scale: f64 = arguments.get(2).map_or(1.0, |s| s.parse().unwrap());
     let options = RefineOptions::default();
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut normal = move || rng.random_range(-1.0..1.0f64) + rng.random_range(-1.0..1.0) + rng.random_range(-1.0..1.0);
+    let mut normal =
+        move || rng.random_range(-1.0..1.0f64) + rng.random_range(-1.0..1.0) + rng.random_range(-1.0..1.0);
     let mut all: BTreeMap<u32, Vec<[f64; 4]>> = BTreeMap::new();
     let mut seconds = 0.0;
     for target in frames {
@@ -29,7 +30,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let frame = scene.image(target.im_id)?;
         let camera = scene.camera(target.im_id)?;
         let image = scene.rgb(target.im_id)?.unwrap();
-        let placed: Vec<_> = frame.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
+        let placed: Vec<_> =
+            frame.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
         let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
         for (g, v) in frame.ground_truth.iter().zip(visible) {
             if v.info.visib_fract < 0.3 {
@@ -37,23 +39,52 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             }
             let Some(b) = v.info.bbox_visib else { continue };
             let side = 1.5 * b.width.max(b.height);
-            let window = Rect { x: b.x + 0.5 * b.width - 0.5 * side, y: b.y + 0.5 * b.height - 0.5 * side, width: side, height: side };
+            let window = Rect {
+                x: b.x + 0.5 * b.width - 0.5 * side,
+                y: b.y + 0.5 * b.height - 0.5 * side,
+                width: side,
+                height: side,
+            };
             let n = 64;
             let visible: Vec<f32> = (0..n * n)
                 .map(|i| {
                     let x = window.x + ((i % n) as f64 + 0.5) / n as f64 * side - 0.5;
                     let y = window.y + ((i / n) as f64 + 0.5) / n as f64 * side - 0.5;
-                    f32::from(v.mask_visible.get(x.round().max(0.0) as usize, y.round().max(0.0) as usize).copied().unwrap_or(false))
+                    f32::from(
+                        v.mask_visible
+                            .get(x.round().max(0.0) as usize, y.round().max(0.0) as usize)
+                            .copied()
+                            .unwrap_or(false),
+                    )
                 })
                 .collect();
             let t = g.camera_from_object.translation();
             // Turn about the centre, shift across and along the view.
-            let twist = [0.003 * normal(), 0.003 * normal(), 0.02 * t.z * normal(), 0.05 * normal(), 0.05 * normal(), 0.05 * normal()].map(|v| v * scale);
+            let twist = [
+                0.003 * normal(),
+                0.003 * normal(),
+                0.02 * t.z * normal(),
+                0.05 * normal(),
+                0.05 * normal(),
+                0.05 * normal(),
+            ]
+            .map(|v| v * scale);
             let centre = Pose::from_translation(t);
             let initial = centre * Pose::exp(&twist.into()) * centre.inverse() * g.camera_from_object;
+            let view = View {
+                window,
+                input: image.clone(),
+                prediction: Prediction { side: n, coordinates: vec![], error: vec![], visible },
+            };
             let found = Found {
-                hypotheses: vec![Hypothesis { camera_from_object: initial, threshold: 0.2, inliers: 1, score: 1.0 }],
-                view: View { window, input: image.clone(), prediction: Prediction { side: n, coordinates: vec![], error: vec![], visible } },
+                hypotheses: vec![Hypothesis {
+                    camera_from_object: initial,
+                    threshold: 0.2,
+                    inliers: 1,
+                    score: 1.0,
+                }],
+                open_view: view.clone(),
+                view,
                 object_points: vec![],
                 image_points: vec![],
             };
@@ -63,10 +94,20 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             seconds += began.elapsed().as_secs_f64();
             let add = |pose: &Pose| {
                 let points: Vec<Vec3> = mesh.vertices().iter().step_by(10).copied().collect();
-                points.iter().map(|p| (pose.transform_point(p) - g.camera_from_object.transform_point(p)).norm()).sum::<f64>() / points.len() as f64 / infos.0[&g.obj_id].diameter
+                points
+                    .iter()
+                    .map(|p| (pose.transform_point(p) - g.camera_from_object.transform_point(p)).norm())
+                    .sum::<f64>()
+                    / points.len() as f64
+                    / infos.0[&g.obj_id].diameter
             };
             let dz = |pose: &Pose| 1000.0 * (pose.translation().z - t.z).abs();
-            all.entry(g.obj_id).or_default().push([add(&initial), add(&refined.camera_from_object), dz(&initial), dz(&refined.camera_from_object)]);
+            all.entry(g.obj_id).or_default().push([
+                add(&initial),
+                add(&refined.camera_from_object),
+                dz(&initial),
+                dz(&refined.camera_from_object),
+            ]);
         }
     }
     let median = |v: &[[f64; 4]], k: usize| {
@@ -77,7 +118,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let recall = |v: &[[f64; 4]], k: usize| v.iter().filter(|e| e[k] < 0.1).count() as f64 / v.len() as f64;
     let everything: Vec<[f64; 4]> = all.values().flatten().copied().collect();
     for (id, v) in all.iter().map(|(i, v)| (i.to_string(), v)).chain([("all".to_string(), &everything)]) {
-        println!("{id:>4}: n {:>3}  ADD/d {:.3} -> {:.3}   recall {:.2} -> {:.2}   dz mm {:.1} -> {:.1}", v.len(), median(v, 0), median(v, 1), recall(v, 0), recall(v, 1), median(v, 2), median(v, 3));
+        println!(
+            "{id:>4}: n {:>3}  ADD/d {:.3} -> {:.3}   recall {:.2} -> {:.2}   dz mm {:.1} -> {:.1}",
+            v.len(),
+            median(v, 0),
+            median(v, 1),
+            recall(v, 0),
+            recall(v, 1),
+            median(v, 2),
+            median(v, 3)
+        );
     }
     println!("{:.1} ms each", 1000.0 * seconds / everything.len() as f64);
     Ok(())

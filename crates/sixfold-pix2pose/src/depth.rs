@@ -6,8 +6,8 @@
 
 use crate::estimate::Found;
 use sixfold_geometry::{
-    Camera, DepthImage, DepthTarget, IcpError, IcpLevel, IcpOptions, NormalImage, NormalOptions, PointCloud, Pose, icp,
-    inpaint_depth, normals_from_depth,
+    Camera, DepthImage, DepthTarget, IcpError, IcpLevel, IcpOptions, NormalImage, NormalOptions, PointCloud,
+    Pose, icp, inpaint_depth, normals_from_depth,
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
@@ -51,7 +51,13 @@ impl DepthScene {
     ///
     /// # Errors
     /// [`IcpError`] where too little depth is measured on the object or its surface can slide.
-    pub fn align(&self, mesh: &Mesh, diameter: f64, start: &Pose, found: &Found) -> Result<AlignedToDepth, IcpError> {
+    pub fn align(
+        &self,
+        mesh: &Mesh,
+        diameter: f64,
+        start: &Pose,
+        found: &Found,
+    ) -> Result<AlignedToDepth, IcpError> {
         let mut frame = Frame::new(&self.camera);
         let mut pose = self.at_measured_distance(&mut frame, mesh, diameter, start, found)?;
         let target = DepthTarget { depth: &self.depth, normals: &self.normals, camera: &self.camera };
@@ -68,7 +74,8 @@ impl DepthScene {
                     }
                 }
             }
-            let source = PointCloud::from_depth(&seen, Some(&normals), &self.camera).transformed(&pose.inverse());
+            let source =
+                PointCloud::from_depth(&seen, Some(&normals), &self.camera).transformed(&pose.inverse());
             let stride = (source.len() / 1000).max(1);
             let options = IcpOptions {
                 levels: vec![IcpLevel { rejection_distance: share * diameter, iterations: 8, stride }],
@@ -104,7 +111,12 @@ impl DepthScene {
         }
         if differences.len() < LEAST_PIXELS {
             let (found, distance) = (differences.len(), diameter);
-            return Err(IcpError::TooFewCorrespondences { found, points: found, distance, needed: LEAST_PIXELS });
+            return Err(IcpError::TooFewCorrespondences {
+                found,
+                points: found,
+                distance,
+                needed: LEAST_PIXELS,
+            });
         }
         differences.sort_by(f64::total_cmp);
         let shift = differences[differences.len() / 2];
@@ -168,7 +180,12 @@ mod tests {
         let start = Pose::new(off, truth.translation() * (0.75 / 0.7));
         let side = 16;
         let found = Found {
-            hypotheses: vec![Hypothesis { camera_from_object: start, threshold: 0.3, inliers: 1, score: 1.0 }],
+            hypotheses: vec![Hypothesis {
+                camera_from_object: start,
+                threshold: 0.3,
+                inliers: 1,
+                score: 1.0,
+            }],
             view: View {
                 window: Rect { x: 0.0, y: -40.0, width: 320.0, height: 320.0 },
                 input: RgbImage::filled(1, 1, [0; 3]),

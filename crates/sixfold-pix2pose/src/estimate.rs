@@ -118,6 +118,8 @@ pub struct Found {
     pub hypotheses: Vec<Hypothesis>,
     /// What the network saw and said last, for the best hypothesis.
     pub view: View,
+    /// The same with the background left in: where the object's border is, a crop without background cannot tell.
+    pub open_view: View,
     /// Object and image points of the best hypothesis' correspondences, metres and pixels.
     pub object_points: Vec<Vec3>,
     /// In the order of `object_points`.
@@ -167,7 +169,8 @@ pub fn estimate(
     let thresholds = if options.thresholds.is_empty() { &object.thresholds } else { &options.thresholds };
     let context = Context { camera, object, options, visible };
     if !options.two_stages {
-        return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)]));
+        let open = view(&crop, &first);
+        return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)], open));
     }
     // The crop follows the object's pixels; it does not grow.
     let window = recentred(&window, &mask, first.side, options);
@@ -176,16 +179,23 @@ pub fn estimate(
     for &threshold in thresholds {
         let mask = object_mask(&first, threshold);
         if mask.iter().filter(|m| **m).count() >= LEAST_PIXELS {
+            let mask = grown(&mask, first.side);
             candidates.push((threshold, scaled.without_background(&crop.window, &mask, first.side)));
         }
     }
     if candidates.is_empty() {
         return Ok(None);
     }
+    // The last of the batch keeps its background; it is a candidate too.
+    candidates.push((thresholds.iter().copied().fold(0.0, f32::max), scaled));
     let batch: Vec<f32> = candidates.iter().flat_map(|(_, crop)| crop.pixels.iter().copied()).collect();
     let predictions = model.predict(index, &batch);
-    let views = candidates.into_iter().zip(predictions).map(|((t, crop), p)| (t, crop, p)).collect();
-    Ok(context.best(views))
+    let views: Vec<(f32, Crop, Prediction)> =
+        candidates.into_iter().zip(predictions).map(|((t, crop), p)| (t, crop, p)).collect();
+    let Some(open) = views.last().map(|(_, crop, prediction)| view(crop, prediction)) else {
+        return Ok(None);
+    };
+    Ok(context.best(views, open))
 }
 
 fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), EstimateError> {
@@ -211,6 +221,28 @@ fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), Estimat
 /// Where the first pass sees the object, less certain pixels left out.
 fn object_mask(prediction: &Prediction, threshold: f32) -> Vec<bool> {
     prediction.visible.iter().zip(&prediction.error).map(|(v, e)| *v > VISIBLE && *e < threshold).collect()
+}
+
+/// The mask with its direct neighbours: thresholds take the least certain pixels away, and those lie on the border.
+fn grown(mask: &[bool], side: usize) -> Vec<bool> {
+    (0..mask.len())
+        .map(|i| {
+            let (x, y) = (i % side, i / side);
+            mask[i]
+                || (x > 0 && mask[i - 1])
+                || (x + 1 < side && mask[i + 1])
+                || (y > 0 && mask[i - side])
+                || (y + 1 < side && mask[i + side])
+        })
+        .collect()
+}
+
+/// A crop and its prediction as the caller sees them.
+fn view(crop: &Crop, prediction: &Prediction) -> View {
+    let side = crop.window.side;
+    let corner = crop.window.centre - Vec2::repeat(0.5 * side);
+    let window = Rect { x: corner.x, y: corner.y, width: side, height: side };
+    View { window, input: crop.picture(), prediction: prediction.clone() }
 }
 
 /// The window about the object's pixels: their box and the crop factor, no larger than before.
@@ -251,7 +283,8 @@ impl Crop {
         let corner = |window: &Window| window.centre - Vec2::repeat(0.5 * window.side);
         let (here, there) = (corner(&self.window), corner(of));
         let inside = |x: usize, y: usize| {
-            let image = here + Vec2::new(x as f64 + 0.5, y as f64 + 0.5) * (self.window.side / self.side as f64);
+            let image =
+                here + Vec2::new(x as f64 + 0.5, y as f64 + 0.5) * (self.window.side / self.side as f64);
             let at = (image - there) * (side as f64 / of.side);
             // Bilinear between the mask's pixels, as far as half.
             let at = at - Vec2::repeat(0.5);
@@ -282,7 +315,8 @@ impl Crop {
     fn picture(&self) -> RgbImage {
         let area = self.side * self.side;
         RgbImage::from_fn(self.side, self.side, |x, y| {
-            [0, 1, 2].map(|c| (self.pixels[c * area + y * self.side + x] * 255.0).round().clamp(0.0, 255.0) as u8)
+            [0, 1, 2]
+                .map(|c| (self.pixels[c * area + y * self.side + x] * 255.0).round().clamp(0.0, 255.0) as u8)
         })
     }
 }
@@ -304,7 +338,7 @@ struct Candidate {
 }
 
 impl Context<'_> {
-    fn best(&self, views: Vec<(f32, Crop, Prediction)>) -> Option<Found> {
+    fn best(&self, views: Vec<(f32, Crop, Prediction)>, open_view: View) -> Option<Found> {
         let mut all: Vec<(Candidate, usize)> = Vec::new();
         for (index, (threshold, crop, prediction)) in views.iter().enumerate() {
             all.extend(self.pose(*threshold, crop, prediction).map(|c| (c, index)));
@@ -315,13 +349,11 @@ impl Context<'_> {
         } else {
             all.sort_by(|a, b| b.0.hypothesis.inliers.cmp(&a.0.hypothesis.inliers));
         }
-        let (first, view) = all.first().map(|(_, view)| *view).and_then(|v| Some((all.first()?, &views[v])))?;
-        let (_, crop, prediction) = view;
-        let corner = crop.window.centre - Vec2::repeat(0.5 * (crop.window.side - 1.0));
-        let window =
-            Rect { x: corner.x - 0.5, y: corner.y - 0.5, width: crop.window.side, height: crop.window.side };
+        let first = all.first()?;
+        let (_, crop, prediction) = &views[first.1];
         Some(Found {
-            view: View { window, input: crop.picture(), prediction: prediction.clone() },
+            view: view(crop, prediction),
+            open_view,
             object_points: first.0.object_points.clone(),
             image_points: first.0.image_points.clone(),
             hypotheses: all.into_iter().map(|(candidate, _)| candidate.hypothesis).collect(),
@@ -370,7 +402,12 @@ impl Context<'_> {
         let centre = self.camera.project(&report.camera_from_object.transform_point(&scale.centre))?;
         let score = (inliers as f64 / self.visible.max(object_points.len()) as f64).min(1.0);
         Some(Candidate {
-            hypothesis: Hypothesis { camera_from_object: report.camera_from_object, threshold, inliers, score },
+            hypothesis: Hypothesis {
+                camera_from_object: report.camera_from_object,
+                threshold,
+                inliers,
+                score,
+            },
             object_points,
             image_points,
             off_centre: (centre - centroid).norm(),

@@ -1,6 +1,7 @@
 //! Pix2Pose (Park, Patten, Vincze 2019; dissertation chapter 3): per-pixel object coordinates and their expected error
 //! from an RGB crop, and poses from them.
 
+pub mod adversarial;
 pub mod depth;
 pub mod estimate;
 pub mod loss;

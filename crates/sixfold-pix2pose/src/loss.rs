@@ -1,4 +1,4 @@
-//! Losses on the networks' raw outputs, with their gradients (equations 3.1 to 3.3).
+//! Losses on the networks' outputs, with their gradients (equations 3.1 to 3.3).
 //!
 //! They are computed in one pass over the pixels. A training step hands the gradient on to the network as the sum of
 //! output times gradient, whose derivative it is.
@@ -9,8 +9,8 @@ use rayon::prelude::*;
 /// What a network's channels mean, and how its pixels are weighed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OutputKind {
-    /// The dissertation's: three coordinates through tanh, the error through a sigmoid. Background pixels have the
-    /// target 0 and count; sums are divided by all pixels.
+    /// The dissertation's: three coordinates in -1..1 and the error in 0..1, after their activations. Background pixels
+    /// have the target 0 and count; sums are divided by all pixels.
     Paper,
     /// Three linear coordinates, the error and the visibility through sigmoids. Coordinates count on the object only;
     /// sums are divided by the sum of the weights.
@@ -59,7 +59,7 @@ pub struct Targets<'a> {
     pub visible: &'a [f32],
 }
 
-/// Means over the batch, and the gradient with respect to the raw output.
+/// Means over the batch, and the gradient with respect to the output.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LossValue {
     /// Weighted L1 distance of the coordinates.
@@ -76,7 +76,7 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// Loss and gradient of one object's images. `raw` is `batch x channels x pixels`; the gradient belongs to
+/// Loss and gradient of one object's images. `raw`, the network's output, is `batch x channels x pixels`; the gradient belongs to
 /// `scale *` the sum over the images (equation 3.2: of each image the least loss over the pool of symmetries).
 ///
 /// # Panics
@@ -139,10 +139,7 @@ impl Image<'_> {
     }
 
     fn prediction(&self, pixel: usize) -> [f32; 3] {
-        std::array::from_fn(|c| {
-            let value = self.raw[c * self.pixels + pixel];
-            if self.kind == OutputKind::Paper { value.tanh() } else { value }
-        })
+        std::array::from_fn(|c| self.raw[c * self.pixels + pixel])
     }
 
     fn target(&self, pixel: usize, symmetry: &SymmetryMap) -> [f32; 3] {
@@ -190,21 +187,21 @@ impl Image<'_> {
                 for c in 0..3 {
                     let difference = prediction[c] - target[c];
                     l1 += difference.abs() / 3.0;
-                    let slope = match self.kind {
-                        OutputKind::Paper => 1.0 - prediction[c] * prediction[c],
-                        OutputKind::Compact => 1.0,
-                    };
                     let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
-                    gradient[c * n + pixel] = scale * slope * sign / 3.0 * weight / total;
+                    gradient[c * n + pixel] = scale * sign / 3.0 * weight / total;
                 }
                 terms[0] += f64::from(weight * l1 / total);
-                let error = sigmoid(self.raw[3 * n + pixel]);
+                let output = self.raw[3 * n + pixel];
+                let (error, slope) = match self.kind {
+                    OutputKind::Paper => (output, 1.0),
+                    OutputKind::Compact => (sigmoid(output), sigmoid(output) * (1.0 - sigmoid(output))),
+                };
                 let difference = error - l1.min(1.0);
                 // The dissertation's error prediction (equation 3.3) counts every pixel once.
                 let weight = if self.kind == OutputKind::Paper { 1.0 } else { weight };
                 terms[1] += f64::from(weight * difference * difference / total);
-                let slope = error * (1.0 - error);
-                gradient[3 * n + pixel] = scale * self.options.error * 2.0 * difference * slope * weight / total;
+                gradient[3 * n + pixel] =
+                    scale * self.options.error * 2.0 * difference * slope * weight / total;
             }
             if self.kind == OutputKind::Compact {
                 let logit = self.raw[4 * n + pixel];
@@ -212,7 +209,8 @@ impl Image<'_> {
                 // Binary cross entropy of a logit without overflow.
                 let entropy = logit.max(0.0) - logit * visible + (-logit.abs()).exp().ln_1p();
                 terms[2] += f64::from(entropy / n as f32);
-                gradient[4 * n + pixel] = scale * self.options.visibility * (sigmoid(logit) - visible) / n as f32;
+                gradient[4 * n + pixel] =
+                    scale * self.options.visibility * (sigmoid(logit) - visible) / n as f32;
             }
         }
         terms
@@ -302,7 +300,8 @@ mod tests {
                 case.raw[c * 20 + pixel] = sign * case.coordinates[c * 20 + pixel];
             }
         }
-        let targets = Targets { coordinates: &case.coordinates, object: &case.object, visible: &case.visible };
+        let targets =
+            Targets { coordinates: &case.coordinates, object: &case.object, visible: &case.visible };
         let options = LossOptions::of(OutputKind::Compact);
         let value = |pool: &[SymmetryMap]| {
             loss(&case.raw, &targets, 20, pool, OutputKind::Compact, &options, 1.0).coordinates
@@ -325,7 +324,7 @@ mod tests {
         assert!((value.coordinates - 0.3).abs() < 1e-6);
         let paper = LossOptions::of(OutputKind::Paper);
         let value = loss(&raw[..8], &targets, 2, &[IDENTITY], OutputKind::Paper, &paper, 1.0);
-        let expected = (3.0 * f64::from(0.3f32.tanh()) + f64::from(0.6f32.tanh())) / 2.0;
+        let expected = (3.0 * 0.3 + 0.6) / 2.0;
         assert!((value.coordinates - expected).abs() < 1e-6);
     }
 }

@@ -2,15 +2,53 @@
 
 use crate::loss::OutputKind;
 use crate::networks::{Compact, CompactConfig};
+use crate::networks::{GeneratorOutput, PaperGenerator, PaperGeneratorConfig};
+use crate::networks::{ResNet50Generator, ResNet50GeneratorConfig};
 use crate::object::ObjectEntry;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_nn::weights::{ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown};
+use sixfold_nn::weights::{
+    ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown,
+};
 use std::path::{Path, PathBuf};
 
 /// Name of the compact network in weight files.
 pub const COMPACT: &str = "pix2pose-compact";
+/// Name of the dissertation's generator in weight files.
+pub const PAPER: &str = "pix2pose-paper";
+/// Name of the generator with a ResNet-50 encoder in weight files.
+pub const RESNET50: &str = "pix2pose-resnet50";
+
+/// A network of one of the three kinds. Those of the dissertation know one object.
+#[derive(Debug, Clone)]
+pub enum Network {
+    /// Shared encoder, one decoder an object.
+    Compact(Box<Compact>),
+    /// The dissertation's generator.
+    Paper(Box<PaperGenerator>),
+    /// The one with a ResNet-50 encoder.
+    ResNet50(Box<ResNet50Generator>),
+}
+
+impl Network {
+    /// Name in weight files.
+    pub fn architecture(&self) -> &'static str {
+        match self {
+            Network::Compact(_) => COMPACT,
+            Network::Paper(_) => PAPER,
+            Network::ResNet50(_) => RESNET50,
+        }
+    }
+
+    fn for_inference(self) -> Self {
+        match self {
+            Network::Compact(n) => Network::Compact(Box::new(n.valid())),
+            Network::Paper(n) => Network::Paper(Box::new(n.valid())),
+            Network::ResNet50(n) => Network::ResNet50(Box::new(n.valid())),
+        }
+    }
+}
 
 /// Why a model could not be read.
 #[derive(Debug, thiserror::Error)]
@@ -31,7 +69,9 @@ pub enum ModelError {
         found: String,
     },
     /// The model was not trained on this object.
-    #[error("the model knows the objects {known}, not object {id}; train it (`sixfold train pix2pose`) or give other weights")]
+    #[error(
+        "the model knows the objects {known}, not object {id}; train it (`sixfold train pix2pose`) or give other weights"
+    )]
     UnknownObject {
         /// The object that was asked for.
         id: u32,
@@ -58,7 +98,7 @@ impl Default for ImageSizes {
 /// A network and what it was trained on.
 #[derive(Debug, Clone)]
 pub struct Pix2PoseModel {
-    network: Compact,
+    network: Network,
     objects: Vec<ObjectEntry>,
     sizes: ImageSizes,
     card: ModelCard,
@@ -80,35 +120,68 @@ pub struct Prediction {
 
 impl Pix2PoseModel {
     /// A model of a trained network. `card` gets architecture, objects and sizes filled in.
-    pub fn new(network: Compact, objects: Vec<ObjectEntry>, sizes: ImageSizes, card: ModelCard) -> Self {
+    pub fn new(network: Network, objects: Vec<ObjectEntry>, sizes: ImageSizes, card: ModelCard) -> Self {
         let objects_json = objects.iter().map(|o| serde_json::to_value(o).unwrap_or_default()).collect();
         let mut extra = card.extra.clone();
         if !extra.is_object() {
             extra = serde_json::json!({});
         }
         extra["image_sizes"] = serde_json::to_value(sizes).unwrap_or_default();
-        let card = ModelCard { architecture: COMPACT.to_string(), objects: objects_json, extra, ..card };
-        Self { network: network.valid(), objects, sizes, card, device: Device::flex() }
+        let card = ModelCard {
+            architecture: network.architecture().to_string(),
+            objects: objects_json,
+            extra,
+            ..card
+        };
+        Self { network: network.for_inference(), objects, sizes, card, device: Device::flex() }
     }
 
     /// Reads a weight file.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let device = Device::flex();
         let card = read_card(path)?;
-        let wrong = |field, expected, found: String| ModelError::Card { file: path.to_path_buf(), field, expected, found };
+        let wrong = |field, expected, found: String| ModelError::Card {
+            file: path.to_path_buf(),
+            field,
+            expected,
+            found,
+        };
         let objects = card
             .objects
             .iter()
             .map(|value| {
-                serde_json::from_value(value.clone())
-                    .map_err(|error| wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string()))
+                serde_json::from_value(value.clone()).map_err(|error| {
+                    wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string())
+                })
             })
             .collect::<Result<Vec<ObjectEntry>, _>>()?;
         let sizes: ImageSizes = serde_json::from_value(card.extra["image_sizes"].clone())
             .map_err(|error| wrong("extra.image_sizes", "input and output in pixels", error.to_string()))?;
-        let network = CompactConfig { objects: objects.len() }.init_random(0, &device);
-        let (network, card) = load_weights(network, path, COMPACT)?;
-        Ok(Self { network: network.no_grad(), objects, sizes, card, device })
+        let (network, card) = match card.architecture.as_str() {
+            PAPER => {
+                let (network, card) =
+                    load_weights(PaperGeneratorConfig::default().init(&device), path, PAPER)?;
+                (Network::Paper(Box::new(network)), card)
+            }
+            RESNET50 => {
+                let network = ResNet50GeneratorConfig::default().init(&device);
+                let (network, card) = load_weights(network, path, RESNET50)?;
+                (Network::ResNet50(Box::new(network)), card)
+            }
+            _ => {
+                let network = CompactConfig { objects: objects.len() }.init_random(0, &device);
+                let (network, card) = load_weights(network, path, COMPACT)?;
+                (Network::Compact(Box::new(network)), card)
+            }
+        };
+        if !matches!(network, Network::Compact(_)) && objects.len() != 1 {
+            return Err(wrong(
+                "objects",
+                "one object, which is all this network knows",
+                objects.len().to_string(),
+            ));
+        }
+        Ok(Self { network, objects, sizes, card, device })
     }
 
     /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
@@ -123,7 +196,11 @@ impl Pix2PoseModel {
 
     /// Writes the weight file and, beside it, the card as text.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
-        save_weights(&self.network, &self.card, path)?;
+        match &self.network {
+            Network::Compact(network) => save_weights(network.as_ref(), &self.card, path)?,
+            Network::Paper(network) => save_weights(network.as_ref(), &self.card, path)?,
+            Network::ResNet50(network) => save_weights(network.as_ref(), &self.card, path)?,
+        }
         Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
     }
 
@@ -163,26 +240,75 @@ impl Pix2PoseModel {
         let side = self.sizes.input;
         let count = crops.len() / (3 * side * side);
         assert!(count > 0 && crops.len() == count * 3 * side * side);
-        let input = Tensor::<4>::from_data(TensorData::new(network_input(crops), [count, 3, side, side]), &self.device);
-        let output = self.network.forward(input, &[(object_index, count)]).remove(0);
-        let [.., rows, columns] = output.dims();
-        assert_eq!((rows, columns), (self.sizes.output, self.sizes.output));
-        let raw: Vec<f32> = output.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
-        let pixels = rows * columns;
-        raw.chunks_exact(OutputKind::Compact.channels() * pixels)
-            .map(|raw| {
-                let sigmoid = |v: &f32| 1.0 / (1.0 + (-v).exp());
-                Prediction {
-                    side: rows,
-                    coordinates: (0..pixels)
-                        .map(|p| [0, 1, 2].map(|c| raw[c * pixels + p].clamp(-1.2, 1.2)))
-                        .collect(),
-                    error: raw[3 * pixels..4 * pixels].iter().map(sigmoid).collect(),
-                    visible: raw[4 * pixels..5 * pixels].iter().map(sigmoid).collect(),
-                }
+        let input = |values: Vec<f32>| {
+            Tensor::<4>::from_data(TensorData::new(values, [count, 3, side, side]), &self.device)
+        };
+        let generated = match &self.network {
+            Network::Compact(network) => {
+                let output = network.forward(input(network_input(crops)), &[(object_index, count)]).remove(0);
+                return self.compact_predictions(output);
+            }
+            Network::Paper(network) => network.forward(input(paper_input(crops))),
+            Network::ResNet50(network) => network.forward(input(resnet_input(crops))),
+        };
+        self.paper_predictions(generated)
+    }
+
+    fn compact_predictions(&self, output: Tensor<4>) -> Vec<Prediction> {
+        let side = self.sizes.output;
+        let pixels = side * side;
+        let sigmoid = |v: &f32| 1.0 / (1.0 + (-v).exp());
+        numbers(output)
+            .chunks_exact(OutputKind::Compact.channels() * pixels)
+            .map(|raw| Prediction {
+                side,
+                coordinates: (0..pixels)
+                    .map(|p| [0, 1, 2].map(|c| raw[c * pixels + p].clamp(-1.2, 1.2)))
+                    .collect(),
+                error: raw[3 * pixels..4 * pixels].iter().map(sigmoid).collect(),
+                visible: raw[4 * pixels..5 * pixels].iter().map(sigmoid).collect(),
             })
             .collect()
     }
+
+    /// The dissertation's networks have no channel of visibility: a pixel is the object's where its coordinates are
+    /// longer than 0.3, and the surer the smaller its expected error.
+    fn paper_predictions(&self, output: GeneratorOutput) -> Vec<Prediction> {
+        let side = self.sizes.output;
+        let pixels = side * side;
+        let (coordinates, errors) = (numbers(output.coordinates), numbers(output.error));
+        coordinates
+            .chunks_exact(3 * pixels)
+            .zip(errors.chunks_exact(pixels))
+            .map(|(raw, error)| {
+                let coordinates: Vec<[f32; 3]> =
+                    (0..pixels).map(|p| [0, 1, 2].map(|c| raw[c * pixels + p])).collect();
+                let visible = coordinates
+                    .iter()
+                    .zip(error)
+                    .map(|(n, e)| if n.iter().map(|v| v * v).sum::<f32>() > 0.09 { 1.0 - e } else { 0.0 })
+                    .collect();
+                Prediction { side, coordinates, error: error.to_vec(), visible }
+            })
+            .collect()
+    }
+}
+
+fn numbers(output: Tensor<4>) -> Vec<f32> {
+    output.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
+}
+
+/// Values in 0..1 as the dissertation's generator takes them: `(255 v - 128) / 128`.
+pub fn paper_input(rgb: &[f32]) -> Vec<f32> {
+    rgb.iter().map(|v| (v * 255.0 - 128.0) / 128.0).collect()
+}
+
+/// Images of `3 x side x side` values in 0..1 as torchvision's ResNet-50 takes them.
+pub fn resnet_input(rgb: &[f32]) -> Vec<f32> {
+    const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+    const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
+    let plane = 128 * 128;
+    rgb.iter().enumerate().map(|(i, v)| (v - MEAN[i / plane % 3]) / DEVIATION[i / plane % 3]).collect()
 }
 
 /// Values in 0..1 as EfficientNet-Lite0 takes them: `(255 v - 127) / 128`.

@@ -96,7 +96,8 @@ pub fn symmetry_deviation(mesh: &Mesh, object_from_object: &Pose) -> f64 {
     let surface = mesh.sample_surface(5000, 0).points;
     let tree = KdTree::new(&surface);
     let probes = surface.iter().step_by(10);
-    let distances = probes.filter_map(|p| tree.nearest(&object_from_object.transform_point(p))).map(|n| n.distance);
+    let distances =
+        probes.filter_map(|p| tree.nearest(&object_from_object.transform_point(p))).map(|n| n.distance);
     let (sum, count) = distances.fold((0.0, 0usize), |(sum, n), d| (sum + d, n + 1));
     sum / count.max(1) as f64
 }
@@ -107,8 +108,9 @@ mod tests {
 
     #[test]
     fn a_quarter_turn_of_a_box_with_unequal_sides_is_applied_in_metres() {
-        let scale = BoundingBoxScale { centre: Vec3::new(0.01, -0.02, 0.0), half_size: Vec3::new(0.1, 0.2, 0.05) };
-        let turn = Pose::exp(&[0.0, 0.0, std::f64::consts::FRAC_PI_2, 0.0, 0.0, 0.0].into());
+        let scale =
+            BoundingBoxScale { centre: Vec3::new(0.01, -0.02, 0.0), half_size: Vec3::new(0.1, 0.2, 0.05) };
+        let turn = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::FRAC_PI_2].into());
         let point = Vec3::new(0.03, 0.05, -0.01);
         let map = SymmetryMap::new(&turn, &scale);
         let normalised = scale.normalise(&point);

@@ -13,7 +13,7 @@ use crate::estimate::{Found, Hypothesis};
 use crate::samples::second_stage::GREY;
 use crate::samples::window::Window;
 use sixfold_augment::Patch;
-use sixfold_geometry::{Camera, NormalEquations, Pose, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
@@ -28,6 +28,9 @@ pub struct RefineOptions {
     pub largest: usize,
     /// Weight of the correspondences as a whole, in independent measurements.
     pub correspondences: f64,
+    /// Weight of the correspondences' shape: what is left of them once a shift and a scale common to all are taken out.
+    /// They know the rotation, the outline knows the place.
+    pub shape: f64,
     /// Weight of a line, in independent measurements.
     pub line: f64,
     /// Weight of colour against the network in telling object from background.
@@ -40,9 +43,10 @@ impl Default for RefineOptions {
             reaches: vec![8.0, 5.0, 3.0],
             iterations: 5,
             largest: 200,
-            correspondences: 30.0,
+            correspondences: 5.0,
+            shape: 30.0,
             line: 0.3,
-            color: 0.5,
+            color: 2.0,
         }
     }
 }
@@ -61,20 +65,27 @@ pub struct Refined {
 }
 
 /// Aligns the best hypothesis of what [`crate::estimate::estimate`] found in the same image.
-pub fn refine(image: &RgbImage, camera: &Camera, mesh: &Mesh, found: &Found, options: &RefineOptions) -> Refined {
+pub fn refine(
+    image: &RgbImage,
+    camera: &Camera,
+    mesh: &Mesh,
+    found: &Found,
+    options: &RefineOptions,
+) -> Refined {
     let Some(Hypothesis { camera_from_object, .. }) = found.hypotheses.first() else {
         return Refined { camera_from_object: Pose::identity(), lines: 0, distance: 0.0, improved: false };
     };
-    let unchanged = Refined { camera_from_object: *camera_from_object, lines: 0, distance: 0.0, improved: false };
+    let unchanged =
+        Refined { camera_from_object: *camera_from_object, lines: 0, distance: 0.0, improved: false };
     if mesh.faces().is_empty() {
         return unchanged;
     }
-    let r = &found.view.window;
+    let r = &found.open_view.window;
     let window = Window { centre: Vec2::new(r.x + 0.5 * r.width, r.y + 0.5 * r.height), side: r.width };
     let side = (window.side.round() as usize).clamp(64, options.largest.max(64));
     let crop = window.camera(camera, side);
     let (patch, inside) = Patch::warp(image, &window.map(camera, side, 0.0), side, side, [GREY; 3]);
-    let prediction = &found.view.prediction;
+    let prediction = &found.open_view.prediction;
     let network: Vec<f32> = (0..side * side)
         .map(|i| {
             let (u, v) = ((i % side) as f64 + 0.5, (i / side) as f64 + 0.5);
@@ -91,7 +102,12 @@ pub fn refine(image: &RgbImage, camera: &Camera, mesh: &Mesh, found: &Found, opt
         side,
         crop,
         centre: (low + high) * 0.5,
-        correspondences: found.object_points.iter().copied().zip(found.image_points.iter().copied()).collect(),
+        correspondences: found
+            .object_points
+            .iter()
+            .copied()
+            .zip(found.image_points.iter().copied())
+            .collect(),
         options,
     };
     let mut pose = *camera_from_object;
@@ -142,7 +158,8 @@ fn odds(patch: &Patch, network: &[f32], color: f32) -> Vec<f32> {
     let bins = BINS * BINS * BINS;
     let mut counts = [vec![0.5f32; bins], vec![0.5f32; bins]];
     let bin = |i: usize| {
-        (0..3).fold(0, |bin, c| bin * BINS + ((patch.data[c * area + i] * BINS as f32) as usize).min(BINS - 1))
+        (0..3)
+            .fold(0, |bin, c| bin * BINS + ((patch.data[c * area + i] * BINS as f32) as usize).min(BINS - 1))
     };
     for (i, p) in network.iter().enumerate() {
         // What is uncertain says nothing.
@@ -235,7 +252,8 @@ impl Aligner<'_> {
                 }
                 let normal = -gradient / steep;
                 // The outline lies where the blurred silhouette is one half.
-                let start = Vec2::new(x as f64, y as f64) + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(-1.0, 1.5);
+                let start = Vec2::new(x as f64, y as f64)
+                    + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(-1.0, 1.5);
                 if let Some((offset, variance)) = self.border(&start, &normal, reach) {
                     let depth = 1.0 / f64::from(inverse_depth[i]);
                     lines.push(Line { point: self.crop.unproject(&start, depth), normal, offset, variance });
@@ -293,7 +311,8 @@ impl Aligner<'_> {
         let mut equations = NormalEquations::default();
         for line in &lines {
             let rows = motion(&self.crop, &line.point, &centre);
-            let jacobian: [f64; 6] = std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
+            let jacobian: [f64; 6] =
+                std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
             let weight = self.options.line * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
             equations.add(&jacobian, -line.offset, weight);
         }
@@ -307,7 +326,8 @@ impl Aligner<'_> {
         }
         let moved = lines.iter().filter_map(|line| {
             let after = about * Pose::exp(&step) * about.inverse();
-            let (a, b) = (self.crop.project(&line.point)?, self.crop.project(&after.transform_point(&line.point))?);
+            let (a, b) =
+                (self.crop.project(&line.point)?, self.crop.project(&after.transform_point(&line.point))?);
             Some((a - b).norm())
         });
         let moved = moved.fold(0.0, f64::max);
@@ -328,12 +348,40 @@ impl Aligner<'_> {
         let mut sizes: Vec<f64> = errors.iter().map(|(_, e)| e.norm()).collect();
         let middle = sizes.len() / 2;
         let noise = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.3);
-        let share = self.options.correspondences / errors.len() as f64;
-        for (point, error) in errors {
-            let weight = tukey(error.norm() / noise) * share / (noise * noise);
-            let jacobian = motion(self.camera, &point, centre);
-            for (row, e) in jacobian.iter().zip([error.x, error.y]) {
-                equations.add(row, e, weight);
+        let full = self.options.correspondences / errors.len() as f64 / (noise * noise);
+        let shape = self.options.shape / errors.len() as f64 / (noise * noise);
+        // Rows of every pair: x and y, each with its Jacobian, error, weight and its part in the common shift and scale.
+        let mut rows: Vec<([f64; 6], f64, f64, [f64; 3])> = Vec::with_capacity(2 * errors.len());
+        let middle =
+            errors.iter().filter_map(|(p, _)| self.camera.project(p)).sum::<Vec2>() / errors.len() as f64;
+        for (point, error) in &errors {
+            let weight = tukey(error.norm() / noise);
+            let Some(pixel) = self.camera.project(point) else { continue };
+            let arm = pixel - middle;
+            let [first, second] = motion(self.camera, point, centre);
+            rows.push((first, error.x, weight, [1.0, 0.0, arm.x]));
+            rows.push((second, error.y, weight, [0.0, 1.0, arm.y]));
+        }
+        // Least squares of Jacobians and errors on shift and scale, to be taken out of them.
+        let mut gram = Mat3::zeros();
+        let mut sums = [Vec3::zeros(); 7];
+        for (jacobian, error, weight, common) in &rows {
+            let common = Vec3::from(*common);
+            gram += common * common.transpose() * *weight;
+            for (sum, value) in sums.iter_mut().zip(jacobian.iter().chain([error])) {
+                *sum += common * (weight * value);
+            }
+        }
+        let inverse = gram.try_inverse();
+        for (jacobian, error, weight, common) in &rows {
+            equations.add(jacobian, *error, weight * full);
+            if let Some(inverse) = &inverse {
+                let common = inverse * Vec3::from(*common);
+                let rest: [f64; 7] = std::array::from_fn(|k| {
+                    jacobian.get(k).copied().unwrap_or(*error) - common.dot(&sums[k])
+                });
+                let [a, b, c, d, e, f, residual] = rest;
+                equations.add(&[a, b, c, d, e, f], residual, weight * shape);
             }
         }
     }

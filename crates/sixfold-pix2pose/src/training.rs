@@ -1,17 +1,19 @@
 //! The training loop of the compact network: samples made on the fly, checkpoints, interruption and resume.
 
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
-use crate::model::network_input;
+use crate::model::{Network, network_input};
 use crate::networks::Compact;
 use crate::object::SymmetryMap;
 use crate::samples::SampleSource;
 use burn::module::Module;
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
+use burn::optim::{AdamWConfig, GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use sixfold_nn::schedule::{LearningRate, LearningRateError};
-use sixfold_nn::training_log::{TrainingLog, TrainingLogError, TrainingRecord, draw_curves, read_training_log};
+use sixfold_nn::training_log::{
+    TrainingLog, TrainingLogError, TrainingRecord, draw_curves, read_training_log,
+};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -89,7 +91,9 @@ pub enum TrainingError {
     #[error(transparent)]
     Log(#[from] TrainingLogError),
     /// The folder holds a training with other options.
-    #[error("{folder}: holds a training with other options ({difference}); go on with the same ones, or start anew in another folder")]
+    #[error(
+        "{folder}: holds a training with other options ({difference}); go on with the same ones, or start anew in another folder"
+    )]
     OtherTraining {
         /// The folder.
         folder: String,
@@ -97,7 +101,9 @@ pub enum TrainingError {
         difference: String,
     },
     /// The loss is no number any more.
-    #[error("step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})")]
+    #[error(
+        "step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})"
+    )]
     NotFinite {
         /// The step.
         step: u64,
@@ -110,7 +116,7 @@ pub enum TrainingError {
 #[derive(Debug)]
 pub enum TrainingOutcome {
     /// All steps are done.
-    Finished(Box<Compact>),
+    Finished(Network),
     /// It was asked to stop; a checkpoint of this step was written.
     Interrupted {
         /// Steps done.
@@ -147,7 +153,13 @@ struct State {
 }
 
 impl State {
-    fn write(&self, step: u64, seconds: f64, options: &TrainingOptions, folder: &Path) -> Result<(), TrainingError> {
+    fn write(
+        &self,
+        step: u64,
+        seconds: f64,
+        options: &TrainingOptions,
+        folder: &Path,
+    ) -> Result<(), TrainingError> {
         CheckpointWriter::new(step)
             .module("network", &self.network)?
             .optimiser("encoder", &self.encoder)?
@@ -170,14 +182,19 @@ impl State {
     ) -> BTreeMap<String, f64> {
         let count = options.per_object;
         let images = pools.len() * count;
-        let groups: Vec<(usize, usize)> = (0..pools.len()).map(|object| (object, count)).collect();
-        let input = Tensor::<4>::from_data(TensorData::new(batch.rgb, [images, 3, side, side]), device);
-        let outputs = self.network.forward(input, &groups);
         let kind = OutputKind::Compact;
         let loss_options = LossOptions::of(kind);
         let mut sums = [0.0; 3];
-        let mut surrogate: Option<Tensor<1>> = None;
-        for (object, output) in outputs.into_iter().enumerate() {
+        // One object after another: their images together would not fit the processor's caches, and memory is what this
+        // network waits for.
+        let mut encoder_gradients = GradientsAccumulator::new();
+        let mut decoder_gradients = GradientsAccumulator::new();
+        let mut rgb = batch.rgb.as_slice();
+        for (object, pool) in pools.iter().enumerate() {
+            let (images_of_object, rest) = rgb.split_at(count * 3 * side * side);
+            rgb = rest;
+            let input = TensorData::new(images_of_object.to_vec(), [count, 3, side, side]);
+            let output = self.network.forward(Tensor::from_data(input, device), &[(object, count)]).remove(0);
             let dims = output.dims();
             let pixels = dims[2] * dims[3];
             let range = |width: usize| object * count * width * pixels..(object + 1) * count * width * pixels;
@@ -188,26 +205,25 @@ impl State {
             };
             let raw = output.clone().inner().into_data();
             let raw = raw.as_slice::<f32>().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
-            let pool = if options.transformer_loss { &pools[object][..] } else { &pools[object][..1] };
+            let pool = if options.transformer_loss { &pool[..] } else { &pool[..1] };
             let value = loss(raw, &targets, pixels, pool, kind, &loss_options, 1.0 / images as f32);
             for (sum, term) in sums.iter_mut().zip([value.coordinates, value.error, value.visibility]) {
                 *sum += term / pools.len() as f64;
             }
             let gradient = Tensor::<4>::from_data(TensorData::new(value.gradient, dims), device);
-            let part = (output * gradient).sum();
-            surrogate = Some(match surrogate {
-                Some(sum) => sum + part,
-                None => part,
-            });
+            let mut gradients = (output * gradient).sum().backward();
+            let of_encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
+            let of_decoders = GradientsParams::from_module(&mut gradients, &self.network.decoders);
+            encoder_gradients.accumulate(&self.network.encoder, of_encoder);
+            decoder_gradients.accumulate(&self.network.decoders, of_decoders);
         }
-        if let Some(surrogate) = surrogate {
-            let mut gradients = surrogate.backward();
-            let encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
-            let decoders = GradientsParams::from_module(&mut gradients, &self.network.decoders);
-            self.network.encoder =
-                self.encoder.step(rate * options.encoder_share, self.network.encoder.clone(), encoder);
-            self.network.decoders = self.decoders.step(rate, self.network.decoders.clone(), decoders);
-        }
+        self.network.encoder = self.encoder.step(
+            rate * options.encoder_share,
+            self.network.encoder.clone(),
+            encoder_gradients.grads(),
+        );
+        self.network.decoders =
+            self.decoders.step(rate, self.network.decoders.clone(), decoder_gradients.grads());
         [("coordinates", sums[0]), ("error", sums[1]), ("visibility", sums[2])]
             .map(|(name, value)| (name.to_string(), value))
             .into()
@@ -266,7 +282,9 @@ pub fn train(
                 let (first, quit) = (step + producer as u64, &quit);
                 scope.spawn(move || {
                     for number in (first..options.steps).step_by(producers) {
-                        if quit.load(Ordering::Relaxed) || send.send(make_batch(source, options, number)).is_err() {
+                        if quit.load(Ordering::Relaxed)
+                            || send.send(make_batch(source, options, number)).is_err()
+                        {
                             return;
                         }
                     }
@@ -323,7 +341,7 @@ pub fn train(
                     return Ok(TrainingOutcome::Interrupted { step });
                 }
             }
-            Ok(TrainingOutcome::Finished(Box::new(state.network.valid())))
+            Ok(TrainingOutcome::Finished(Network::Compact(Box::new(state.network.valid()))))
         })();
         quit.store(true, Ordering::Relaxed);
         drop(batches);
@@ -348,15 +366,25 @@ fn check(
 ) -> Result<LearningRate, TrainingError> {
     let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
     if pools.len() != source.objects() || pools.iter().any(Vec::is_empty) {
-        return wrong("pools", "one list with the identity for every object", format!("{} lists", pools.len()));
+        return wrong(
+            "pools",
+            "one list with the identity for every object",
+            format!("{} lists", pools.len()),
+        );
     }
     let (side, target) = (source.options().size, source.options().target());
     if side % 16 != 0 || target * 2 != side {
-        return wrong("size", "a multiple of 16 with targets of half the side", format!("{side} and {target}"));
+        return wrong(
+            "size",
+            "a multiple of 16 with targets of half the side",
+            format!("{side} and {target}"),
+        );
     }
-    for (field, value) in
-        [("per_object", options.per_object as u64), ("log_every", options.log_every), ("checkpoint_every", options.checkpoint_every)]
-    {
+    for (field, value) in [
+        ("per_object", options.per_object as u64),
+        ("log_every", options.log_every),
+        ("checkpoint_every", options.checkpoint_every),
+    ] {
         if value == 0 {
             return wrong(field, "at least 1", "0".to_string());
         }
@@ -382,10 +410,10 @@ fn difference(found: &TrainingOptions, asked: &TrainingOptions) -> Option<String
         sample_threads: 0,
         ..options.clone()
     };
-    let (found, asked) = (serde_json::to_value(neutral(found)).ok()?, serde_json::to_value(neutral(asked)).ok()?);
+    let (found, asked) =
+        (serde_json::to_value(neutral(found)).ok()?, serde_json::to_value(neutral(asked)).ok()?);
     let (found, asked) = (found.as_object()?, asked.as_object()?);
-    found
-        .iter()
-        .find(|(name, value)| asked.get(*name) != Some(*value))
-        .map(|(name, value)| format!("{name} was {value}, is {}", asked.get(name).cloned().unwrap_or_default()))
+    found.iter().find(|(name, value)| asked.get(*name) != Some(*value)).map(|(name, value)| {
+        format!("{name} was {value}, is {}", asked.get(name).cloned().unwrap_or_default())
+    })
 }

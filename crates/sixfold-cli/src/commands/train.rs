@@ -13,7 +13,7 @@ use sixfold_mesh::ModelInfo;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_pix2pose::model::{ImageSizes, Pix2PoseModel};
+use sixfold_pix2pose::model::{ImageSizes, Network, Pix2PoseModel};
 use sixfold_pix2pose::networks::CompactConfig;
 use sixfold_pix2pose::object::{ObjectEntry, SymmetryMap, lmo_threshold};
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject, read_real_crops};
@@ -131,7 +131,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
             bail!("{}: holds no checkpoint; train first", folder.display());
         };
         card.steps = step;
-        Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
+        Pix2PoseModel::new(Network::Compact(Box::new(network)), entries, sizes, card).save(&path)?;
         let (seconds, losses) = (None, std::collections::BTreeMap::new());
         let model = path.display().to_string();
         return Ok(Summary { model, objects: ids, photographs, steps: step, seconds, losses });
@@ -150,24 +150,15 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     let source = SampleSource::new(objects, real, backgrounds, sample_options)?;
     let mut progress = Progress::new("steps", options.steps as usize);
     let mut last = TrainingRecord::default();
-    let outcome = train(
-        &source,
-        &pools,
-        network,
-        &device,
-        &folder,
-        &options,
-        interrupted(),
-        |record| {
-            progress.set(record.step as usize);
-            progress.message(format!(
-                "L1 {:.4}, {:.0} images/s",
-                record.losses.get("coordinates").copied().unwrap_or(f64::NAN),
-                record.samples_per_second
-            ));
-            last = record.clone();
-        },
-    )?;
+    let outcome = train(&source, &pools, network, &device, &folder, &options, interrupted(), |record| {
+        progress.set(record.step as usize);
+        progress.message(format!(
+            "L1 {:.4}, {:.0} images/s",
+            record.losses.get("coordinates").copied().unwrap_or(f64::NAN),
+            record.samples_per_second
+        ));
+        last = record.clone();
+    })?;
     progress.finish();
     let network = match outcome {
         TrainingOutcome::Finished(network) => network,
@@ -176,7 +167,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         }
     };
     card.steps = options.steps;
-    Pix2PoseModel::new(*network, entries, sizes, card).save(&path)?;
+    Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
     Ok(Summary {
         model: path.display().to_string(),
         objects: ids,
@@ -261,7 +252,11 @@ fn from_objects(a: &TrainPix2PoseArguments) -> Result<Material> {
 
 /// Photographs of the user's folder if there is one, else procedural textures; and always the training frames themselves
 /// away from their objects.
-fn backgrounds(a: &TrainPix2PoseArguments, real: &[RealCrop], objects: &[TrainingObject]) -> Result<Backgrounds> {
+fn backgrounds(
+    a: &TrainPix2PoseArguments,
+    real: &[RealCrop],
+    objects: &[TrainingObject],
+) -> Result<Backgrounds> {
     let (mut backgrounds, share) = match &a.backgrounds {
         Some(folder) => (Backgrounds::from_folder(folder, &PhotographOptions::default())?, 0.1),
         None => (Backgrounds::procedural(), 0.6),
@@ -281,7 +276,8 @@ fn backgrounds(a: &TrainPix2PoseArguments, real: &[RealCrop], objects: &[Trainin
         if x.is_empty() {
             continue;
         }
-        let rect = Rect { x: least(&x), y: least(&y), width: most(&x) - least(&x), height: most(&y) - least(&y) };
+        let rect =
+            Rect { x: least(&x), y: least(&y), width: most(&x) - least(&x), height: most(&y) - least(&y) };
         match frames.iter_mut().find(|(image, _)| Arc::ptr_eq(image, crop.image())) {
             Some((_, rects)) => rects.push(rect),
             None => frames.push((crop.image(), vec![rect])),

@@ -41,7 +41,8 @@ impl Plan {
         let out = shape.output_size(spec);
         let patch = shape.inputs * shape.kernel * shape.kernel;
         let pointwise = shape.kernel == 1 && spec.stride == 1 && spec.padding == [0, 0];
-        let longest = if pointwise { BAND / (shape.inputs + shape.outputs) } else { BAND / patch };
+        // Products of fewer than 128 columns are slow, whatever the cache.
+        let longest = if pointwise { BAND / (shape.inputs + shape.outputs) } else { (BAND / patch).max(128) };
         Self { out, patch, rows: (longest / out[1]).clamp(1, out[0]), pointwise }
     }
 
@@ -68,7 +69,14 @@ fn inside(kx: usize, width: usize, out: usize, spec: &ConvSpec) -> (usize, usize
 }
 
 /// Lays the patches of output rows `first..first + rows` of one image out as columns: `patch x (rows * out columns)`.
-fn columns(x: &[f32], shape: &ConvShape, spec: &ConvSpec, plan: &Plan, (first, rows): (usize, usize), out: &mut [f32]) {
+fn columns(
+    x: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+    plan: &Plan,
+    (first, rows): (usize, usize),
+    out: &mut [f32],
+) {
     let [height, width] = shape.size;
     let n = rows * plan.out[1];
     let k = shape.kernel;
@@ -90,7 +98,9 @@ fn columns(x: &[f32], shape: &ConvShape, spec: &ConvSpec, plan: &Plan, (first, r
                     if spec.stride == 1 {
                         target[from..to].copy_from_slice(&source[start..start + to - from]);
                     } else {
-                        for (value, s) in target[from..to].iter_mut().zip(source[start..].iter().step_by(spec.stride)) {
+                        for (value, s) in
+                            target[from..to].iter_mut().zip(source[start..].iter().step_by(spec.stride))
+                        {
                             *value = *s;
                         }
                     }
@@ -142,14 +152,21 @@ fn add_columns(
     }
 }
 
-pub(super) fn dense_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+pub(super) fn dense_forward(
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+) -> Vec<f32> {
     let plan = Plan::new(shape, spec);
     let pixels = plan.pixels();
     let mut y = unwritten(shape.batch * shape.outputs * pixels);
     let shared = Shared::new(&mut y);
     let image = shape.inputs * shape.pixels();
     // Several images keep both cores busy; a single one is cut into bands (at least four where it can be).
-    let plan = if shape.batch == 1 { Plan { rows: plan.rows.min(plan.out[0].div_ceil(4)), ..plan } } else { plan };
+    let plan =
+        if shape.batch == 1 { Plan { rows: plan.rows.min(plan.out[0].div_ceil(4)), ..plan } } else { plan };
     (0..shape.batch * plan.bands()).into_par_iter().for_each(|task| {
         let (b, band) = (task / plan.bands(), plan.band(task % plan.bands()));
         let (start, n) = (band.0 * plan.out[1], band.1 * plan.out[1]);
@@ -242,7 +259,9 @@ pub(super) fn dense_backward(
                             // SAFETY: every image belongs to one group, every band to one turn of its loop.
                             #[allow(unsafe_code)]
                             if plan.pointwise {
-                                unsafe { multiply(size, (shared, b * image + start, pixels), false, left, right) };
+                                unsafe {
+                                    multiply(size, (shared, b * image + start, pixels), false, left, right)
+                                };
                             } else {
                                 let dpatches = sized(dpatches, plan.patch * n);
                                 unsafe { multiply(size, (Shared::new(dpatches), 0, n), false, left, right) };

@@ -136,23 +136,33 @@ fn taps(padded: &Padded, kernel: usize, rows: usize) -> Vec<usize> {
     starts
 }
 
-pub(super) fn depthwise_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+pub(super) fn depthwise_forward(
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+) -> Vec<f32> {
     let [rows, columns] = shape.output_size(spec);
     let padded = Padded::new(shape, spec);
     let area = shape.kernel * shape.kernel;
     let starts = taps(&padded, shape.kernel, rows);
     let mut y = unwritten(shape.batch * shape.outputs * rows * columns);
-    y.par_chunks_mut(rows * columns).zip(x.par_chunks(shape.pixels())).enumerate().with_min_len(8).for_each_init(
-        || vec![0.0; padded.len()],
-        |buffer, (plane, (out, image))| {
-            let channel = plane % shape.outputs;
-            padded.fill(buffer, image, shape.size[1], spec);
-            for (out, starts) in out.chunks_exact_mut(columns).zip(starts.chunks_exact(area)) {
-                row(out, buffer, starts, &weight[channel * area..][..area], bias[channel]);
-            }
-            activate(out, spec.activation);
-        },
-    );
+    y.par_chunks_mut(rows * columns)
+        .zip(x.par_chunks(shape.pixels()))
+        .enumerate()
+        .with_min_len(8)
+        .for_each_init(
+            || vec![0.0; padded.len()],
+            |buffer, (plane, (out, image))| {
+                let channel = plane % shape.outputs;
+                padded.fill(buffer, image, shape.size[1], spec);
+                for (out, starts) in out.chunks_exact_mut(columns).zip(starts.chunks_exact(area)) {
+                    row(out, buffer, starts, &weight[channel * area..][..area], bias[channel]);
+                }
+                activate(out, spec.activation);
+            },
+        );
     y
 }
 
@@ -172,7 +182,8 @@ pub(super) fn depthwise_backward(
     let mut dx = unwritten(if want_x { x.len() } else { 0 });
     // With a stride of one the input gradient is a convolution of the gradient with the kernel turned round.
     let turned = spec.stride == 1 && spec.padding.iter().all(|p| *p < shape.kernel);
-    let turned_spec = ConvSpec { padding: spec.padding.map(|p| (shape.kernel - 1).saturating_sub(p)), ..*spec };
+    let turned_spec =
+        ConvSpec { padding: spec.padding.map(|p| (shape.kernel - 1).saturating_sub(p)), ..*spec };
     let turned_shape = ConvShape { size: [rows, columns], ..*shape };
     let turned_padded = Padded::new(&turned_shape, &turned_spec);
     let turned_starts = if turned { taps(&turned_padded, shape.kernel, shape.size[0]) } else { Vec::new() };
@@ -184,7 +195,13 @@ pub(super) fn depthwise_backward(
         .into_par_iter()
         .with_min_len(4)
         .map_init(
-            || (vec![0.0; padded.len()], vec![0.0; padded.len().max(turned_padded.len())], vec![0.0; rows * wide]),
+            || {
+                (
+                    vec![0.0; padded.len()],
+                    vec![0.0; padded.len().max(turned_padded.len())],
+                    vec![0.0; rows * wide],
+                )
+            },
             |(buffer, dbuffer, gradient), channel| {
                 let weight = &weight[channel * area..][..area];
                 let turned_weight: Vec<f32> = weight.iter().rev().copied().collect();
@@ -211,10 +228,12 @@ pub(super) fn depthwise_backward(
                         let dx = unsafe { shared.slice(plane * pixels, pixels) };
                         if turned {
                             for (y, g) in gradient.chunks_exact(wide).enumerate() {
-                                let start = turned_padded.start(y + turned_spec.padding[0], 0) + turned_spec.padding[0];
+                                let start = turned_padded.start(y + turned_spec.padding[0], 0)
+                                    + turned_spec.padding[0];
                                 dbuffer[start..start + columns].copy_from_slice(&g[..columns]);
                             }
-                            let lines = dx.chunks_exact_mut(shape.size[1]).zip(turned_starts.chunks_exact(area));
+                            let lines =
+                                dx.chunks_exact_mut(shape.size[1]).zip(turned_starts.chunks_exact(area));
                             lines.for_each(|(dx, starts)| row(dx, dbuffer, starts, &turned_weight, 0.0));
                         } else {
                             dbuffer.fill(0.0);

@@ -34,7 +34,8 @@ pub struct ConvShape {
 impl ConvShape {
     /// Rows and columns of the output.
     pub fn output_size(&self, spec: &ConvSpec) -> [usize; 2] {
-        let side = |i: usize| (self.size[i] + spec.padding[0] + spec.padding[1] - self.kernel) / spec.stride + 1;
+        let side =
+            |i: usize| (self.size[i] + spec.padding[0] + spec.padding[1] - self.kernel) / spec.stride + 1;
         [side(0), side(1)]
     }
 

@@ -82,7 +82,7 @@ vectorised! {
         match activation {
             Activation::Linear => {}
             Activation::Relu => values.iter_mut().for_each(|v| *v = v.max(0.0)),
-            Activation::Relu6 => values.iter_mut().for_each(|v| *v = v.max(0.0).min(6.0)),
+            Activation::Relu6 => values.iter_mut().for_each(|v| *v = v.clamp(0.0, 6.0)),
         }
     }
 }
@@ -180,7 +180,9 @@ pub(super) unsafe fn multiply(
     left: View<'_>,
     right: View<'_>,
 ) {
-    let last = |rows: usize, columns: usize, strides: [usize; 2]| (rows - 1) * strides[0] + (columns - 1) * strides[1];
+    let last = |rows: usize, columns: usize, strides: [usize; 2]| {
+        (rows - 1) * strides[0] + (columns - 1) * strides[1]
+    };
     assert!(m > 0 && n > 0 && k > 0);
     assert!(start + last(m, n, [out_stride, 1]) < out.1);
     assert!(last(m, k, left.strides) < left.data.len());

@@ -79,8 +79,12 @@ impl Decoder {
         let narrow = conv([96, 64], 1);
         let quarter = conv([64 + SKIPS[1] + 32, 64], 3);
         let refine = conv([64, 64], 3);
-        let detail = ConvConfig { stride: 2, padding: Padding::Zeros(0), ..ConvConfig::new([SKIPS[0], 32], 2, Activation::Relu) }
-            .init(2.0, rng, device);
+        let detail = ConvConfig {
+            stride: 2,
+            padding: Padding::Zeros(0),
+            ..ConvConfig::new([SKIPS[0], 32], 2, Activation::Relu)
+        }
+        .init(2.0, rng, device);
         let head = ConvConfig::new([64, 4 * CHANNELS], 1, Activation::Linear).init(0.1, rng, device);
         Self { code, context, eighth, narrow, detail, quarter, refine, head }
     }
@@ -103,7 +107,12 @@ impl Decoder {
 fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
     let [batch, channels, height, width] = x.dims();
     let c = channels / 4;
-    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([batch, c, 2 * height, 2 * width])
+    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
+        batch,
+        c,
+        2 * height,
+        2 * width,
+    ])
 }
 
 impl Compact {
@@ -114,8 +123,7 @@ impl Compact {
         let mut start = 0;
         let mut outputs = Vec::with_capacity(objects.len());
         for (object, count) in objects {
-            let part: Vec<Tensor<4>> =
-                maps.iter().map(|map| map.clone().narrow(0, start, *count)).collect();
+            let part: Vec<Tensor<4>> = maps.iter().map(|map| map.clone().narrow(0, start, *count)).collect();
             outputs.push(self.decoders[*object].forward(&part));
             start += count;
         }

@@ -1,0 +1,352 @@
+//! Training of the dissertation's generators: reconstruction, error prediction and a discriminator (equations 3.1 to
+//! 3.5), for one object.
+//!
+//! Each iteration teaches the discriminator on rendered and on generated coordinate images, then the generator on
+//! `lambda_1 * reconstruction + lambda_2 * error + adversarial`.
+
+use crate::loss::{LossOptions, OutputKind, Targets, loss};
+use crate::model::{Network, paper_input, resnet_input};
+use crate::networks::ResNet50Generator;
+use crate::networks::{Discriminator, DiscriminatorConfig};
+use crate::networks::{GeneratorOutput, PaperGenerator};
+use crate::object::SymmetryMap;
+use crate::samples::{Sample, SampleSource};
+use crate::training::{TrainingError, TrainingOutcome};
+use burn::module::Module;
+use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
+use burn::tensor::{Device, Tensor, TensorData};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use sixfold_nn::checkpoint::{Checkpoint, CheckpointWriter};
+use sixfold_nn::schedule::LearningRate;
+use sixfold_nn::training_log::{TrainingLog, TrainingRecord, draw_curves, read_training_log};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// How to train. The defaults are the dissertation's (section 3.4.1).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AdversarialOptions {
+    /// Iterations (dissertation: 25,000).
+    pub steps: u64,
+    /// Images in a batch (dissertation: 50).
+    pub batch: usize,
+    /// Learning rate of generator and discriminator, divided by ten every `decay_every` iterations.
+    pub learning_rate: f64,
+    /// Iterations between divisions of the rate (dissertation: 12,000).
+    pub decay_every: u64,
+    /// Weight of the reconstruction, lambda_1.
+    pub reconstruction: f32,
+    /// Weight of the error prediction, lambda_2.
+    pub error: f32,
+    /// Teach a discriminator; without, the generator learns from its targets alone.
+    pub adversarial: bool,
+    /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
+    pub transformer_loss: bool,
+    /// Seed of samples and labels.
+    pub seed: u64,
+    /// Iterations between checkpoints.
+    pub checkpoint_every: u64,
+    /// Iterations between records of the log.
+    pub log_every: u64,
+}
+
+impl Default for AdversarialOptions {
+    fn default() -> Self {
+        Self {
+            steps: 25_000,
+            batch: 50,
+            learning_rate: 1e-4,
+            decay_every: 12_000,
+            reconstruction: 100.0,
+            error: 50.0,
+            adversarial: true,
+            transformer_loss: true,
+            seed: 0,
+            checkpoint_every: 100,
+            log_every: 10,
+        }
+    }
+}
+
+/// A generator that can be trained: it makes coordinates and error of `batch x 3 x 128 x 128` images.
+pub trait Generator: Module {
+    /// Coordinates and expected error.
+    fn generate(&self, x: Tensor<4>) -> GeneratorOutput;
+    /// Pixel values in 0..1 as the network takes them.
+    fn input(rgb: &[f32]) -> Vec<f32>;
+    /// The network for a model file.
+    fn network(self) -> Network;
+}
+
+impl Generator for PaperGenerator {
+    fn generate(&self, x: Tensor<4>) -> GeneratorOutput {
+        self.forward(x)
+    }
+    fn input(rgb: &[f32]) -> Vec<f32> {
+        paper_input(rgb)
+    }
+    fn network(self) -> Network {
+        Network::Paper(Box::new(self))
+    }
+}
+
+impl Generator for ResNet50Generator {
+    fn generate(&self, x: Tensor<4>) -> GeneratorOutput {
+        self.forward(x)
+    }
+    fn input(rgb: &[f32]) -> Vec<f32> {
+        resnet_input(rgb)
+    }
+    fn network(self) -> Network {
+        Network::ResNet50(Box::new(self))
+    }
+}
+
+/// What is trained, and what trains it.
+struct State<G> {
+    generator: G,
+    discriminator: Discriminator,
+    generator_optimiser: ModuleOptimizer,
+    discriminator_optimiser: ModuleOptimizer,
+}
+
+impl<G: Generator> State<G> {
+    fn write(
+        &self,
+        step: u64,
+        seconds: f64,
+        options: &AdversarialOptions,
+        folder: &Path,
+    ) -> Result<(), TrainingError> {
+        CheckpointWriter::new(step)
+            .module("generator", &self.generator)?
+            .module("discriminator", &self.discriminator)?
+            .optimiser("generator", &self.generator_optimiser)?
+            .optimiser("discriminator", &self.discriminator_optimiser)?
+            .state("adversarial options", options)?
+            .state("seconds", &seconds)?
+            .write(folder)?;
+        Ok(())
+    }
+
+    /// One iteration on a batch.
+    fn step(
+        &mut self,
+        samples: &[Sample],
+        pool: &[SymmetryMap],
+        side: usize,
+        options: &AdversarialOptions,
+        (step, rate): (u64, f64),
+        device: &Device,
+    ) -> BTreeMap<String, f64> {
+        let count = samples.len();
+        let gather =
+            |part: fn(&Sample) -> &[f32]| samples.iter().flat_map(part).copied().collect::<Vec<f32>>();
+        let images = Tensor::<4>::from_data(
+            TensorData::new(G::input(&gather(|s| &s.rgb)), [count, 3, side, side]),
+            device,
+        );
+        let coordinates = gather(|s| &s.coordinates);
+        let output = self.generator.generate(images);
+        let mut losses = BTreeMap::new();
+        if options.adversarial {
+            let real =
+                Tensor::<4>::from_data(TensorData::new(coordinates.clone(), [count, 3, side, side]), device);
+            let teaching = self.teach(real, output.coordinates.clone().detach(), options, step, rate, device);
+            losses.insert("discriminator".to_string(), teaching);
+        }
+        let joined = Tensor::cat(vec![output.coordinates.clone(), output.error], 1);
+        let values = joined.clone().inner().into_data();
+        let values = values.as_slice::<f32>().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
+        let targets = Targets {
+            coordinates: &coordinates,
+            object: &gather(|s| &s.object),
+            visible: &gather(|s| &s.visible),
+        };
+        let weights = LossOptions {
+            error: options.error / options.reconstruction,
+            ..LossOptions::of(OutputKind::Paper)
+        };
+        let scale = options.reconstruction / count as f32;
+        let value = loss(values, &targets, side * side, pool, OutputKind::Paper, &weights, scale);
+        losses.insert("coordinates".to_string(), value.coordinates);
+        losses.insert("error".to_string(), value.error);
+        let gradient = Tensor::<4>::from_data(TensorData::new(value.gradient, joined.dims()), device);
+        let mut total = (joined * gradient).sum();
+        if options.adversarial {
+            let fooled = entropy(self.discriminator.forward(output.coordinates), 1.0);
+            let known = fooled.clone().inner().into_scalar::<f32>();
+            losses.insert("adversarial".to_string(), f64::from(known));
+            total = total + fooled;
+        }
+        let gradients = GradientsParams::from_grads(total.backward(), &self.generator);
+        self.generator = self.generator_optimiser.step(rate, self.generator.clone(), gradients);
+        losses
+    }
+
+    /// One step of the discriminator on generated, then on rendered coordinates; its mean loss.
+    fn teach(
+        &mut self,
+        real: Tensor<4>,
+        generated: Tensor<4>,
+        options: &AdversarialOptions,
+        step: u64,
+        rate: f64,
+        device: &Device,
+    ) -> f64 {
+        // Soft labels, now and then turned round for a whole batch, as in the author's code.
+        let mut random = ChaCha8Rng::seed_from_u64(options.seed);
+        random.set_stream(step + 1);
+        let mut sum = 0.0;
+        for (images, true_label) in [(generated, false), (real, true)] {
+            let label = if true_label != (random.random::<f32>() < 0.2) {
+                random.random_range(0.9..1.0)
+            } else {
+                random.random_range(0.0..0.1)
+            };
+            let images = Tensor::from_data(images.into_data(), device);
+            let loss = entropy(self.discriminator.forward(images), label);
+            sum += 0.5 * f64::from(loss.clone().inner().into_scalar::<f32>());
+            let gradients = GradientsParams::from_grads(loss.backward(), &self.discriminator);
+            self.discriminator =
+                self.discriminator_optimiser.step(rate, self.discriminator.clone(), gradients);
+        }
+        sum
+    }
+}
+
+/// Mean binary cross entropy of logits against one label.
+fn entropy(logits: Tensor<2>, label: f32) -> Tensor<1> {
+    let positive = logits.clone().clamp_min(0.0);
+    let rest = logits.clone().abs().neg().exp().log1p();
+    (positive - logits.mul_scalar(label) + rest).mean()
+}
+
+/// Trains a generator for the one object of `source`; as [`crate::training::train`] otherwise.
+///
+/// # Errors
+/// [`TrainingError`]; the last checkpoints stay.
+#[allow(clippy::too_many_arguments)]
+pub fn train_adversarial<G: Generator>(
+    source: &SampleSource,
+    pool: &[SymmetryMap],
+    generator: G,
+    device: &Device,
+    folder: &Path,
+    options: &AdversarialOptions,
+    stop: &AtomicBool,
+    mut progress: impl FnMut(&TrainingRecord),
+) -> Result<TrainingOutcome, TrainingError> {
+    let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
+    let side = source.options().size;
+    if source.objects() != 1 || pool.is_empty() {
+        return wrong("objects", "one: this network learns a single object", source.objects().to_string());
+    }
+    if side != 128 || source.options().target() != 128 {
+        return wrong(
+            "size",
+            "128 pixels for images and targets",
+            format!("{side} and {}", source.options().target()),
+        );
+    }
+    for (field, value) in [
+        ("batch", options.batch as u64),
+        ("log_every", options.log_every),
+        ("checkpoint_every", options.checkpoint_every),
+        ("decay_every", options.decay_every),
+    ] {
+        if value == 0 {
+            return wrong(field, "at least 1", "0".to_string());
+        }
+    }
+    let schedule = LearningRate::StepDecay {
+        rate: options.learning_rate,
+        factor: 0.1,
+        at: (1..).map(|n| n * options.decay_every).take_while(|at| *at < options.steps).collect(),
+    };
+    schedule.check()?;
+    let optimiser = || AdamConfig::new().init();
+    let mut state = State {
+        generator,
+        discriminator: DiscriminatorConfig { seed: options.seed }.init(device),
+        generator_optimiser: optimiser(),
+        discriminator_optimiser: optimiser(),
+    };
+    let (mut step, mut before) = (0, 0.0);
+    if let Some(checkpoint) = Checkpoint::latest(folder)? {
+        let found: AdversarialOptions = checkpoint.state("adversarial options")?;
+        let neutral =
+            |o: &AdversarialOptions| AdversarialOptions { checkpoint_every: 1, log_every: 1, ..o.clone() };
+        if neutral(&found) != neutral(options) {
+            return Err(TrainingError::OtherTraining {
+                folder: folder.display().to_string(),
+                difference: format!("found {found:?}, asked for {options:?}"),
+            });
+        }
+        state.generator = checkpoint.module("generator", state.generator)?;
+        state.discriminator = checkpoint.module("discriminator", state.discriminator)?;
+        state.generator_optimiser = checkpoint.optimiser("generator", state.generator_optimiser)?;
+        state.discriminator_optimiser =
+            checkpoint.optimiser("discriminator", state.discriminator_optimiser)?;
+        before = checkpoint.state("seconds")?;
+        step = checkpoint.step();
+    }
+    let log_path = folder.join("log.jsonl");
+    if step == 0 {
+        state.write(0, 0.0, options, folder)?;
+    }
+    let mut log = TrainingLog::open(&log_path, step)?;
+    let began = Instant::now();
+    let (mut since, mut counted) = (Instant::now(), 0u32);
+    let mut sums: BTreeMap<String, f64> = BTreeMap::new();
+    while step < options.steps {
+        let first = step * options.batch as u64;
+        let samples: Vec<Sample> = (0..options.batch as u64)
+            .into_par_iter()
+            .map(|image| source.sample(0, options.seed, first + image))
+            .collect();
+        let rate = schedule.at(step);
+        let pool = if options.transformer_loss { pool } else { &pool[..1] };
+        let losses = state.step(&samples, pool, side, options, (step, rate), device);
+        if losses.values().any(|v| !v.is_finite()) {
+            return Err(TrainingError::NotFinite { step, rate });
+        }
+        step += 1;
+        counted += 1;
+        for (name, value) in losses {
+            *sums.entry(name).or_default() += value;
+        }
+        let last = step == options.steps;
+        if step % options.log_every == 0 || last {
+            let record = TrainingRecord {
+                step,
+                seconds: before + began.elapsed().as_secs_f64(),
+                learning_rate: rate,
+                samples_per_second: f64::from(counted) * options.batch as f64 / since.elapsed().as_secs_f64(),
+                losses: std::mem::take(&mut sums)
+                    .into_iter()
+                    .map(|(name, sum)| (name, sum / f64::from(counted)))
+                    .collect(),
+            };
+            (since, counted) = (Instant::now(), 0);
+            log.append(&record)?;
+            progress(&record);
+        }
+        let stopped = stop.load(Ordering::Relaxed);
+        if step % options.checkpoint_every == 0 || last || stopped {
+            state.write(step, before + began.elapsed().as_secs_f64(), options, folder)?;
+            let records = read_training_log(&log_path)?;
+            if !records.is_empty() {
+                draw_curves(&records, &folder.join("curves.png"))?;
+            }
+        }
+        if stopped && !last {
+            return Ok(TrainingOutcome::Interrupted { step });
+        }
+    }
+    Ok(TrainingOutcome::Finished(state.generator.valid().network()))
+}
