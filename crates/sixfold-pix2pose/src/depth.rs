@@ -179,6 +179,16 @@ mod tests {
         let off = UnitQuaternion::from_euler_angles(0.03, -0.03, 0.02) * rotation;
         let start = Pose::new(off, truth.translation() * (0.75 / 0.7));
         let side = 16;
+        let view = View {
+            window: Rect { x: 0.0, y: -40.0, width: 320.0, height: 320.0 },
+            input: RgbImage::filled(1, 1, [0; 3]),
+            prediction: Prediction {
+                side,
+                coordinates: vec![[0.0; 3]; side * side],
+                error: vec![0.0; side * side],
+                visible: vec![1.0; side * side],
+            },
+        };
         let found = Found {
             hypotheses: vec![Hypothesis {
                 camera_from_object: start,
@@ -186,16 +196,8 @@ mod tests {
                 inliers: 1,
                 score: 1.0,
             }],
-            view: View {
-                window: Rect { x: 0.0, y: -40.0, width: 320.0, height: 320.0 },
-                input: RgbImage::filled(1, 1, [0; 3]),
-                prediction: Prediction {
-                    side,
-                    coordinates: vec![[0.0; 3]; side * side],
-                    error: vec![0.0; side * side],
-                    visible: vec![1.0; side * side],
-                },
-            },
+            open_view: view.clone(),
+            view,
             object_points: vec![],
             image_points: vec![],
         };

@@ -347,7 +347,7 @@ impl Context<'_> {
             let cost = |c: &Candidate| c.off_centre.powi(2) / c.hypothesis.inliers.max(1) as f64;
             all.sort_by(|a, b| cost(&a.0).total_cmp(&cost(&b.0)));
         } else {
-            all.sort_by(|a, b| b.0.hypothesis.inliers.cmp(&a.0.hypothesis.inliers));
+            all.sort_by_key(|(candidate, _)| std::cmp::Reverse(candidate.hypothesis.inliers));
         }
         let first = all.first()?;
         let (_, crop, prediction) = &views[first.1];

@@ -237,6 +237,7 @@ impl State {
 ///
 /// # Errors
 /// [`TrainingError`]; the last checkpoints stay.
+#[allow(clippy::too_many_arguments)]
 pub fn train(
     source: &SampleSource,
     pools: &[Vec<SymmetryMap>],

@@ -93,7 +93,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         seed: a.seed,
         ..TrainingOptions::default()
     };
-    if a.size % 32 != 0 || !(32..=512).contains(&a.size) {
+    if !a.size.is_multiple_of(32) || !(32..=512).contains(&a.size) {
         bail!("--size: found {}, expected a multiple of 32 from 32 to 512", a.size);
     }
     if !(0.0..=180.0).contains(&a.rotation) {

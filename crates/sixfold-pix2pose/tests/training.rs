@@ -1,0 +1,91 @@
+//! A training that is interrupted and goes on ends with the same numbers as one that is not.
+
+use burn::module::Module;
+use burn::tensor::Device;
+use sixfold_augment::Backgrounds;
+use sixfold_geometry::Vec3;
+use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_nn::weights::{ModelCard, save_weights};
+use sixfold_pix2pose::model::Network;
+use sixfold_pix2pose::networks::CompactConfig;
+use sixfold_pix2pose::object::SymmetryMap;
+use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
+use sixfold_pix2pose::training::{TrainingError, TrainingOptions, TrainingOutcome, train};
+use sixfold_render::BoundingBoxScale;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+fn source() -> (SampleSource, Vec<Vec<SymmetryMap>>) {
+    let vertices = vec![
+        Vec3::new(-0.05, -0.04, 0.0),
+        Vec3::new(0.05, -0.03, 0.0),
+        Vec3::new(0.0, 0.06, 0.0),
+        Vec3::new(0.01, 0.0, 0.08),
+    ];
+    let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]).unwrap();
+    let (low, high) = mesh.bounding_box();
+    let scale = BoundingBoxScale::of_corners(&low, &high);
+    let info = ModelInfo::of_mesh(&mesh);
+    let pools = vec![SymmetryMap::pool(&info, &scale)];
+    let objects = vec![TrainingObject { id: 1, mesh, info, scale }];
+    let options = SampleOptions {
+        size: 64,
+        target_size: Some(32),
+        random_color_chance: 1.0,
+        ..SampleOptions::default()
+    };
+    (SampleSource::new(objects, vec![], Backgrounds::procedural(), options).unwrap(), pools)
+}
+
+/// Trains in `folder`, stopping after step `stop_at`; the weight file's bytes when it finished.
+fn run(
+    folder: &Path,
+    options: &TrainingOptions,
+    stop_at: Option<u64>,
+) -> Result<Option<Vec<u8>>, TrainingError> {
+    let (source, pools) = source();
+    let device = Device::flex().autodiff();
+    let network = CompactConfig { objects: 1 }.init_random(3, &device);
+    let stop = AtomicBool::new(false);
+    let training = folder.join("training");
+    let outcome = train(&source, &pools, network, &device, &training, options, &stop, |record| {
+        if stop_at == Some(record.step) {
+            stop.store(true, Ordering::Relaxed);
+        }
+    })?;
+    Ok(match outcome {
+        TrainingOutcome::Finished(Network::Compact(network)) => {
+            let file = folder.join("model.safetensors");
+            save_weights(&network.valid(), &ModelCard::new("test", "test"), &file).unwrap();
+            Some(std::fs::read(file).unwrap())
+        }
+        TrainingOutcome::Finished(_) => panic!("another network came out"),
+        TrainingOutcome::Interrupted { step } => {
+            assert_eq!(Some(step), stop_at);
+            None
+        }
+    })
+}
+
+#[test]
+fn interrupted_and_resumed_it_ends_with_the_same_bytes() {
+    let options = TrainingOptions {
+        steps: 4,
+        per_object: 2,
+        warm_up: 1,
+        log_every: 1,
+        checkpoint_every: 3,
+        ..TrainingOptions::default()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let straight = run(&folder.path().join("a"), &options, None).unwrap().unwrap();
+    assert!(run(&folder.path().join("b"), &options, Some(2)).unwrap().is_none());
+    let resumed = run(&folder.path().join("b"), &options, None).unwrap().unwrap();
+    assert_eq!(straight, resumed);
+    let shorter = TrainingOptions { steps: 2, ..options.clone() };
+    assert_ne!(straight, run(&folder.path().join("c"), &shorter, None).unwrap().unwrap());
+
+    let other = TrainingOptions { learning_rate: 0.1, ..options };
+    let error = run(&folder.path().join("b"), &other, None).unwrap_err().to_string();
+    assert!(error.contains("learning_rate was 0.002, is 0.1"), "{error}");
+}
