@@ -328,6 +328,27 @@ pub(crate) enum TrainCommand {
     Pix2pose(Box<TrainPix2PoseArguments>),
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum NetworkKind {
+    /// ImageNet encoder shared by all objects, a small decoder for each; trains on two cores
+    Compact,
+    /// The dissertation's generator with its discriminator, one object; asks for a GPU or patience
+    Paper,
+    /// The same with a ResNet-50 encoder, as in the entry to BOP 2020
+    Resnet50,
+}
+
+impl NetworkKind {
+    /// As it is typed.
+    pub fn name(self) -> &'static str {
+        match self {
+            NetworkKind::Compact => "compact",
+            NetworkKind::Paper => "paper",
+            NetworkKind::Resnet50 => "resnet50",
+        }
+    }
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct TrainPix2PoseArguments {
     /// BOP dataset folder with models and posed photographs
@@ -357,15 +378,24 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Training steps; each takes so many images of every object
-    #[arg(long, value_name = "N", default_value = "8000")]
-    pub steps: u64,
-    /// Images of every object in a step
-    #[arg(long, value_name = "N", default_value = "4")]
-    pub per_object: usize,
-    /// Highest learning rate
-    #[arg(long, value_name = "RATE", default_value = "0.002")]
-    pub learning_rate: f64,
+    /// Which network learns
+    #[arg(long, value_enum, default_value = "compact")]
+    pub network: NetworkKind,
+    /// Training steps; each takes so many images of every object (default: 8000; the dissertation's networks: 25000)
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
+    /// Images of every object in a step (default: 4; the dissertation's networks: 50)
+    #[arg(long, value_name = "N")]
+    pub per_object: Option<usize>,
+    /// Highest learning rate (default: 0.002; the dissertation's networks: 0.0001)
+    #[arg(long, value_name = "RATE")]
+    pub learning_rate: Option<f64>,
+    /// Train a network of the dissertation without its discriminator
+    #[arg(long)]
+    pub no_adversarial: bool,
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network resnet50 (default: random)
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
     /// Stages of the ImageNet encoder that stay as they are, of five
     #[arg(long, value_name = "N", default_value = "2")]
     pub frozen_stages: usize,

@@ -13,15 +13,16 @@ use sixfold_mesh::ModelInfo;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
+use sixfold_pix2pose::adversarial::{AdversarialOptions, train_adversarial};
 use sixfold_pix2pose::model::{ImageSizes, Network, Pix2PoseModel};
-use sixfold_pix2pose::networks::CompactConfig;
+use sixfold_pix2pose::networks::{CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
 use sixfold_pix2pose::object::{ObjectEntry, SymmetryMap, lmo_threshold};
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject, read_real_crops};
 use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 use sixfold_render::BoundingBoxScale;
 
 use crate::Outcome;
-use crate::arguments::{TrainArguments, TrainCommand, TrainPix2PoseArguments};
+use crate::arguments::{NetworkKind, TrainArguments, TrainCommand, TrainPix2PoseArguments};
 use crate::objects;
 use crate::output::report;
 use crate::progress::{Progress, interrupted};
@@ -84,10 +85,11 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         description += "; convex hulls in place of the meshes";
     }
     let backgrounds = backgrounds(a, &real, &objects)?;
+    let compact = a.network == NetworkKind::Compact;
     let options = TrainingOptions {
-        steps: a.steps,
-        per_object: a.per_object,
-        learning_rate: a.learning_rate,
+        steps: a.steps.unwrap_or(8000),
+        per_object: a.per_object.unwrap_or(4),
+        learning_rate: a.learning_rate.unwrap_or(0.002),
         frozen_stages: a.frozen_stages,
         transformer_loss: !a.no_transformer_loss,
         seed: a.seed,
@@ -99,7 +101,15 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     if !(0.0..=180.0).contains(&a.rotation) {
         bail!("--rotation: found {}, expected degrees from 0 to 180", a.rotation);
     }
-    let sizes = ImageSizes { input: a.size, output: a.size / 2 };
+    if !compact && (objects.len() != 1 || a.size != 128 || a.init.is_some() || a.export) {
+        bail!(
+            "--network {}: it learns one object (found {}; choose it with --ids) from images of 128 pixels, and --init \
+             and --export are for the compact network",
+            a.network.name(),
+            objects.len()
+        );
+    }
+    let sizes = ImageSizes { input: a.size, output: if compact { a.size / 2 } else { a.size } };
     let photographs = real.len();
     let entries: Vec<ObjectEntry> = objects
         .iter()
@@ -125,6 +135,20 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     card.seed = options.seed;
     card.command = command_line();
     card.extra = serde_json::json!({ "training": options });
+    let dissertation = AdversarialOptions {
+        steps: a.steps.unwrap_or(25_000),
+        batch: a.per_object.unwrap_or(50),
+        learning_rate: a.learning_rate.unwrap_or(1e-4),
+        adversarial: !a.no_adversarial,
+        transformer_loss: !a.no_transformer_loss,
+        seed: a.seed,
+        ..AdversarialOptions::default()
+    };
+    if !compact {
+        card.title = format!("Pix2Pose, the dissertation's schedule, {} network", a.network.name());
+        card.extra = serde_json::json!({ "training": dissertation });
+    }
+    let steps = if compact { options.steps } else { dissertation.steps };
     let path = a.out.join("model.safetensors");
     if a.export {
         let Some((network, step)) = last_checkpoint(&folder, network)? else {
@@ -148,9 +172,9 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     };
     eprintln!("making {} objects and {photographs} photographed instances ready", objects.len());
     let source = SampleSource::new(objects, real, backgrounds, sample_options)?;
-    let mut progress = Progress::new("steps", options.steps as usize);
+    let mut progress = Progress::new("steps", steps as usize);
     let mut last = TrainingRecord::default();
-    let outcome = train(&source, &pools, network, &device, &folder, &options, interrupted(), |record| {
+    let shown = |record: &TrainingRecord| {
         progress.set(record.step as usize);
         progress.message(format!(
             "L1 {:.4}, {:.0} images/s",
@@ -158,7 +182,23 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
             record.samples_per_second
         ));
         last = record.clone();
-    })?;
+    };
+    let stop = interrupted();
+    let outcome = match a.network {
+        NetworkKind::Compact => train(&source, &pools, network, &device, &folder, &options, stop, shown)?,
+        NetworkKind::Paper => {
+            let generator = PaperGeneratorConfig { seed: a.seed }.init(&device);
+            train_adversarial(&source, &pools[0], generator, &device, &folder, &dissertation, stop, shown)?
+        }
+        NetworkKind::Resnet50 => {
+            let config = ResNet50GeneratorConfig { seed: a.seed };
+            let generator = match &a.encoder {
+                Some(file) => config.from_pytorch(file, &device)?,
+                None => config.init(&device),
+            };
+            train_adversarial(&source, &pools[0], generator, &device, &folder, &dissertation, stop, shown)?
+        }
+    };
     progress.finish();
     let network = match outcome {
         TrainingOutcome::Finished(network) => network,
@@ -166,13 +206,13 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
             bail!("interrupted after step {step}, which is kept; run the same command again to go on")
         }
     };
-    card.steps = options.steps;
+    card.steps = steps;
     Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
     Ok(Summary {
         model: path.display().to_string(),
         objects: ids,
         photographs,
-        steps: options.steps,
+        steps,
         seconds: Some(last.seconds),
         losses: last.losses,
     })
