@@ -8,6 +8,7 @@ use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
 use crate::samples::second_stage::GREY;
 use crate::samples::window::Window;
+use rayon::prelude::*;
 use sixfold_augment::Patch;
 use sixfold_geometry::{Camera, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac};
 
@@ -339,10 +340,11 @@ struct Candidate {
 
 impl Context<'_> {
     fn best(&self, views: Vec<(f32, Crop, Prediction)>, open_view: View) -> Option<Found> {
-        let mut all: Vec<(Candidate, usize)> = Vec::new();
-        for (index, (threshold, crop, prediction)) in views.iter().enumerate() {
-            all.extend(self.pose(*threshold, crop, prediction).map(|c| (c, index)));
-        }
+        // In the order of the views, however many threads there are.
+        let candidates: Vec<Option<Candidate>> =
+            views.par_iter().map(|(threshold, crop, prediction)| self.pose(*threshold, crop, prediction)).collect();
+        let mut all: Vec<(Candidate, usize)> =
+            candidates.into_iter().enumerate().filter_map(|(index, c)| Some((c?, index))).collect();
         if self.options.quirks.centre_choice {
             let cost = |c: &Candidate| c.off_centre.powi(2) / c.hypothesis.inliers.max(1) as f64;
             all.sort_by(|a, b| cost(&a.0).total_cmp(&cost(&b.0)));

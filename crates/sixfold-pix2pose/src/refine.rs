@@ -14,7 +14,7 @@ use crate::samples::second_stage::GREY;
 use crate::samples::window::Window;
 use sixfold_augment::Patch;
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
 /// How poses are aligned.
@@ -62,6 +62,15 @@ pub struct Refined {
     pub distance: f64,
     /// Whether the pose was changed.
     pub improved: bool,
+}
+
+/// Faces of a mesh that is drawn for its outline alone.
+const OUTLINE_FACES: usize = 4000;
+
+/// The mesh with no more faces than its outline needs, for [`refine`]: scans have tens of thousands, and drawing them takes
+/// longer than all the rest.
+pub fn outline_mesh(mesh: &Mesh) -> Mesh {
+    if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }
 }
 
 /// Aligns the best hypothesis of what [`crate::estimate::estimate`] found in the same image.

@@ -1,6 +1,8 @@
 //! Pix2Pose as the commands use it: model, options, refinement and alignment with depth in one.
 
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::{Arc, Mutex};
 
 use anyhow::{Result, anyhow, bail};
 use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
@@ -9,7 +11,7 @@ use sixfold_pix2pose::depth::{AlignedToDepth, DepthScene};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, View, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::object::ObjectEntry;
-use sixfold_pix2pose::refine::{RefineOptions, refine};
+use sixfold_pix2pose::refine::{RefineOptions, outline_mesh, refine};
 
 use crate::arguments::EstimateArguments;
 
@@ -19,6 +21,8 @@ pub(crate) struct Pix2Pose {
     model: Pix2PoseModel,
     options: EstimateOptions,
     refine: Option<RefineOptions>,
+    /// The objects' meshes as the alignment draws them, made when first needed.
+    outlines: Arc<Mutex<BTreeMap<u32, Arc<Mesh>>>>,
 }
 
 /// A pose with its score and what it came from.
@@ -48,12 +52,13 @@ impl Pix2Pose {
     /// The model of a weight file with the default options.
     pub fn load(weights: &Path) -> Result<Pix2Pose> {
         let (options, refine) = (EstimateOptions::default(), Some(RefineOptions::default()));
-        Ok(Pix2Pose { model: Pix2PoseModel::load(weights)?, options, refine })
+        Ok(Pix2Pose { model: Pix2PoseModel::load(weights)?, options, refine, outlines: Arc::default() })
     }
 
     /// The same model used in another way.
     pub fn varied(&self, options: EstimateOptions, refines: bool) -> Pix2Pose {
-        Pix2Pose { model: self.model.clone(), options, refine: refines.then(RefineOptions::default) }
+        let refine = refines.then(RefineOptions::default);
+        Pix2Pose { model: self.model.clone(), options, refine, outlines: self.outlines.clone() }
     }
 
     pub fn model(&self) -> &Pix2PoseModel {
@@ -105,6 +110,11 @@ impl Pix2Pose {
         Ok(())
     }
 
+    fn outline(&self, object_id: u32, mesh: &Mesh) -> Arc<Mesh> {
+        let mut outlines = self.outlines.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        outlines.entry(object_id).or_insert_with(|| Arc::new(outline_mesh(mesh))).clone()
+    }
+
     /// The best pose of an object in a box of a pinhole image, `None` if it is not seen there. Without a mesh the outline
     /// is not aligned.
     pub fn estimate(
@@ -121,7 +131,7 @@ impl Pix2Pose {
         let Some(best) = found.hypotheses.first() else { return Ok(None) };
         let (score, mut camera_from_object, mut refined) = (best.score, best.camera_from_object, false);
         if let (Some(options), Some(mesh)) = (&self.refine, mesh) {
-            let aligned = refine(image, camera, mesh, &found, options);
+            let aligned = refine(image, camera, &self.outline(object_id, mesh), &found, options);
             (camera_from_object, refined) = (aligned.camera_from_object, aligned.improved);
         }
         Ok(Some(Pix2PosePose { camera_from_object, score, refined, found }))
