@@ -423,6 +423,9 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Plain L1 for symmetric objects instead of the transformer loss
     #[arg(long)]
     pub no_transformer_loss: bool,
+    /// Plain L1 with one side of a symmetric object standing for all, instead of the transformer loss
+    #[arg(long)]
+    pub view_limits: bool,
     /// Outlier thresholds of the dissertation's LM-O experiment instead of the three of its BOP entry
     #[arg(long)]
     pub lmo_thresholds: bool,

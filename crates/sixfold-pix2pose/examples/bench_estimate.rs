@@ -51,7 +51,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 continue;
             };
             let (mesh, small) = &meshes[&truth.obj_id];
-            let mut clock = |part: usize, began: Instant| times[part].push(1e3 * began.elapsed().as_secs_f64());
+            let mut clock =
+                |part: usize, began: Instant| times[part].push(1e3 * began.elapsed().as_secs_f64());
             let began = Instant::now();
             let one = EstimateOptions { two_stages: false, ..EstimateOptions::default() };
             estimate(&model, &image, &camera, truth.obj_id, &region, &one)?;

@@ -84,6 +84,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                     score: 1.0,
                 }],
                 open_view: view.clone(),
+                first_view: view.clone(),
                 view,
                 object_points: vec![],
                 image_points: vec![],

@@ -197,6 +197,7 @@ mod tests {
                 score: 1.0,
             }],
             open_view: view.clone(),
+            first_view: view.clone(),
             view,
             object_points: vec![],
             image_points: vec![],

@@ -121,6 +121,8 @@ pub struct Found {
     pub view: View,
     /// The same with the background left in: where the object's border is, a crop without background cannot tell.
     pub open_view: View,
+    /// The first pass: the box as it was given.
+    pub first_view: View,
     /// Object and image points of the best hypothesis' correspondences, metres and pixels.
     pub object_points: Vec<Vec3>,
     /// In the order of `object_points`.
@@ -171,8 +173,9 @@ pub fn estimate(
     let context = Context { camera, object, options, visible };
     if !options.two_stages {
         let open = view(&crop, &first);
-        return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)], open));
+        return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)], open.clone(), open));
     }
+    let first_view = view(&crop, &first);
     // The crop follows the object's pixels; it does not grow.
     let window = recentred(&window, &mask, first.side, options);
     let scaled = Crop::cut(image, camera, window, model.sizes().input);
@@ -196,7 +199,7 @@ pub fn estimate(
     let Some(open) = views.last().map(|(_, crop, prediction)| view(crop, prediction)) else {
         return Ok(None);
     };
-    Ok(context.best(views, open))
+    Ok(context.best(views, first_view, open))
 }
 
 fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), EstimateError> {
@@ -339,10 +342,12 @@ struct Candidate {
 }
 
 impl Context<'_> {
-    fn best(&self, views: Vec<(f32, Crop, Prediction)>, open_view: View) -> Option<Found> {
+    fn best(&self, views: Vec<(f32, Crop, Prediction)>, first_view: View, open_view: View) -> Option<Found> {
         // In the order of the views, however many threads there are.
-        let candidates: Vec<Option<Candidate>> =
-            views.par_iter().map(|(threshold, crop, prediction)| self.pose(*threshold, crop, prediction)).collect();
+        let candidates: Vec<Option<Candidate>> = views
+            .par_iter()
+            .map(|(threshold, crop, prediction)| self.pose(*threshold, crop, prediction))
+            .collect();
         let mut all: Vec<(Candidate, usize)> =
             candidates.into_iter().enumerate().filter_map(|(index, c)| Some((c?, index))).collect();
         if self.options.quirks.centre_choice {
@@ -356,6 +361,7 @@ impl Context<'_> {
         Some(Found {
             view: view(crop, prediction),
             open_view,
+            first_view,
             object_points: first.0.object_points.clone(),
             image_points: first.0.image_points.clone(),
             hypotheses: all.into_iter().map(|(candidate, _)| candidate.hypothesis).collect(),

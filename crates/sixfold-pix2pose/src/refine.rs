@@ -9,7 +9,7 @@
 //!
 //! It goes beyond the dissertation, whose poses from colour end with PnP, and needs no colours of the mesh.
 
-use crate::estimate::{Found, Hypothesis};
+use crate::estimate::{Found, Hypothesis, View};
 use crate::samples::second_stage::GREY;
 use crate::samples::window::Window;
 use sixfold_augment::Patch;
@@ -33,6 +33,8 @@ pub struct RefineOptions {
     pub shape: f64,
     /// Weight of a line, in independent measurements.
     pub line: f64,
+    /// Share of the first pass in where the object is seen; the rest is the second's. They err apart.
+    pub first_pass: f32,
     /// Weight of colour against the network in telling object from background.
     pub color: f32,
 }
@@ -46,6 +48,7 @@ impl Default for RefineOptions {
             correspondences: 5.0,
             shape: 30.0,
             line: 0.3,
+            first_pass: 0.5,
             color: 2.0,
         }
     }
@@ -94,12 +97,24 @@ pub fn refine(
     let side = (window.side.round() as usize).clamp(64, options.largest.max(64));
     let crop = window.camera(camera, side);
     let (patch, inside) = Patch::warp(image, &window.map(camera, side, 0.0), side, side, [GREY; 3]);
-    let prediction = &found.open_view.prediction;
     let network: Vec<f32> = (0..side * side)
         .map(|i| {
-            let (u, v) = ((i % side) as f64 + 0.5, (i / side) as f64 + 0.5);
-            let p = bilinear(&prediction.visible, prediction.side, u / side as f64, v / side as f64);
-            if inside.data[i] > 0.5 { p } else { 0.5 }
+            if inside.data[i] <= 0.5 {
+                return 0.5;
+            }
+            let at = |n: usize| (n as f64 + 0.5) / side as f64;
+            let (u, v) = (at(i % side), at(i / side));
+            let second = seen(&found.open_view, u, v);
+            let f = &found.first_view.window;
+            let (u, v) = ((r.x + u * r.width - f.x) / f.width, (r.y + v * r.height - f.y) / f.height);
+            if (0.0..=1.0).contains(&u) && (0.0..=1.0).contains(&v) {
+                let logit = |p: f32| (p.clamp(0.01, 0.99) / (1.0 - p.clamp(0.01, 0.99))).ln();
+                let first = logit(seen(&found.first_view, u, v));
+                let both = options.first_pass * first + (1.0 - options.first_pass) * logit(second);
+                1.0 / (1.0 + (-both).exp())
+            } else {
+                second
+            }
         })
         .collect();
     let (low, high) = mesh.bounding_box();
@@ -142,9 +157,10 @@ pub fn refine(
 /// Fewer lines do not hold a pose.
 const LEAST_LINES: usize = 12;
 
-/// Value of a square map at a position in 0..1 of its sides.
-fn bilinear(map: &[f32], side: usize, u: f64, v: f64) -> f32 {
-    sample(map, side, u * side as f64 - 0.5, v * side as f64 - 0.5)
+/// How probably the object is visible at a position in 0..1 of a view's sides.
+fn seen(view: &View, u: f64, v: f64) -> f32 {
+    let side = view.prediction.side;
+    sample(&view.prediction.visible, side, u * side as f64 - 0.5, v * side as f64 - 0.5)
 }
 
 /// Value of a square map at pixel `(x, y)`.
@@ -420,7 +436,6 @@ fn tukey(r: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::View;
     use crate::model::Prediction;
     use sixfold_geometry::Rect;
     use sixfold_geometry::nalgebra::UnitQuaternion;
@@ -492,6 +507,7 @@ mod tests {
                 score: 1.0,
             }],
             open_view: view.clone(),
+            first_view: view.clone(),
             view,
             object_points: vec![],
             image_points: vec![],

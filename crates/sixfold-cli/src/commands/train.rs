@@ -91,7 +91,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         per_object: a.per_object.unwrap_or(4),
         learning_rate: a.learning_rate.unwrap_or(0.002),
         frozen_stages: a.frozen_stages,
-        transformer_loss: !a.no_transformer_loss,
+        transformer_loss: !a.no_transformer_loss && !a.view_limits,
         seed: a.seed,
         ..TrainingOptions::default()
     };
@@ -140,7 +140,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         batch: a.per_object.unwrap_or(50),
         learning_rate: a.learning_rate.unwrap_or(1e-4),
         adversarial: !a.no_adversarial,
-        transformer_loss: !a.no_transformer_loss,
+        transformer_loss: !a.no_transformer_loss && !a.view_limits,
         seed: a.seed,
         ..AdversarialOptions::default()
     };
@@ -167,6 +167,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         near_real_share: a.near_photographs,
         rotation: a.rotation.to_radians(),
         random_color_chance: if a.no_mesh_colors { 1.0 } else { 0.0 },
+        view_limits: a.view_limits,
         seed: a.seed,
         ..SampleOptions::default()
     };

@@ -64,6 +64,9 @@ pub struct SampleOptions {
     pub camera: Option<Camera>,
     /// Chance that a rendered object has random colours instead of its mesh's (always, when the mesh has none).
     pub random_color_chance: f32,
+    /// Targets of an object with discrete symmetries are those of one side that stands for all (for comparison with the
+    /// transformer loss).
+    pub view_limits: bool,
     /// Meshes with more faces are simplified to about so many before they are drawn.
     pub faces: usize,
     /// Seed of the pictures that are made once (renders used as occluders).
@@ -103,6 +106,7 @@ impl Default for SampleOptions {
             distance: None,
             camera: None,
             random_color_chance: 0.0,
+            view_limits: false,
             faces: 6000,
             seed: 0,
         }

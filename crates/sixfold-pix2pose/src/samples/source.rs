@@ -214,7 +214,7 @@ impl SampleSource {
             &object.mesh,
             &object.scale,
             &window.camera(camera, options.target()),
-            &canonical(&pose, &object.info),
+            &canonical(&pose, &object.info, options.view_limits),
         );
         let composition = if random.random::<f32>() < options.keep_background_chance {
             scenery.keep(patch, &inside, visible, random)
@@ -241,7 +241,7 @@ impl SampleSource {
             &object.mesh,
             &object.scale,
             &window.camera(&object.camera, options.target()),
-            &canonical(&pose, &object.info),
+            &canonical(&pose, &object.info, options.view_limits),
         );
         let camera = window.camera(&object.camera, options.size);
         let random_colors = !object.colored || random.random::<f32>() < options.random_color_chance;

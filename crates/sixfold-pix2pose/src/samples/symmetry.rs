@@ -4,13 +4,27 @@
 //! The author sets the Euler angle about the axis to zero, which still depends on the view; turning towards the camera
 //! does not, and has no jump except where the camera looks along the axis.
 
+//!
+//! For comparison, discrete symmetries can be treated in the same way ("view limits" in the dissertation's table 3.1):
+//! the pose whose camera looks at one side of the object stands for all. Targets then jump where two sides meet.
+
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo};
 
-/// The pose whose targets are trained.
-pub(super) fn canonical(pose: &Pose, info: &ModelInfo) -> Pose {
-    info.symmetries_continuous.iter().fold(*pose, |pose, symmetry| facing_camera(&pose, symmetry))
+/// The pose whose targets are trained; with `limits`, one of those that the discrete symmetries make equal.
+pub(super) fn canonical(pose: &Pose, info: &ModelInfo, limits: bool) -> Pose {
+    let pose = if limits { within_limits(pose, info) } else { *pose };
+    info.symmetries_continuous.iter().fold(pose, |pose, symmetry| facing_camera(&pose, symmetry))
+}
+
+/// Of the poses that look alike the one whose camera lies furthest in a fixed direction of the object.
+fn within_limits(pose: &Pose, info: &ModelInfo) -> Pose {
+    // Along no axis of symmetry that a person would choose.
+    let side = Vec3::new(0.67, 0.74, 0.05);
+    let reach = |pose: &Pose| pose.inverse().translation().dot(&side);
+    let equal = info.symmetries_discrete.iter().map(|symmetry| *pose * *symmetry);
+    equal.fold(*pose, |best, other| if reach(&other) > reach(&best) { other } else { best })
 }
 
 fn facing_camera(pose: &Pose, symmetry: &ContinuousSymmetry) -> Pose {
@@ -46,13 +60,33 @@ mod tests {
             symmetries_continuous: vec![symmetry],
         };
         let pose = Pose::exp(&[0.1, 0.2, 0.8, 0.4, 1.0, -0.6].into());
-        let expected = canonical(&pose, &info);
+        let expected = canonical(&pose, &info, false);
         for turn in info.symmetry_poses(0.3) {
-            let found = canonical(&(pose * turn), &info);
+            let found = canonical(&(pose * turn), &info, false);
             assert!((found.inverse() * expected).log().amax() < 1e-9);
             // And it is one of those that look alike: points on the axis stay.
             let on_axis = symmetry.offset + symmetry.axis * 0.3;
             assert!((found.transform_point(&on_axis) - pose.transform_point(&on_axis)).norm() < 1e-9);
         }
+    }
+
+    #[test]
+    fn view_limits_choose_one_of_the_poses_that_look_alike() {
+        let quarter = |n: f64| Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, n * std::f64::consts::FRAC_PI_2].into());
+        let info = ModelInfo {
+            diameter: 0.1,
+            min: Vec3::repeat(-0.05),
+            size: Vec3::repeat(0.1),
+            symmetries_discrete: vec![quarter(1.0), quarter(2.0), quarter(3.0)],
+            symmetries_continuous: vec![],
+        };
+        let pose = Pose::exp(&[0.1, 0.2, 0.8, 0.4, 1.0, -0.6].into());
+        let chosen = canonical(&pose, &info, true);
+        for symmetry in &info.symmetries_discrete {
+            assert!((canonical(&(pose * *symmetry), &info, true).inverse() * chosen).log().amax() < 1e-9);
+        }
+        let alike = std::iter::once(Pose::identity()).chain(info.symmetries_discrete.iter().copied());
+        assert!(alike.into_iter().any(|s| ((pose * s).inverse() * chosen).log().amax() < 1e-9));
+        assert!((canonical(&pose, &info, false).inverse() * pose).log().amax() < 1e-9);
     }
 }

@@ -4,6 +4,7 @@
 //! the model; its poses (`rows/KEY.csv`, BOP's format) and scores (`rows/KEY.json`) stay in the output folder and are not
 //! computed again.
 
+mod fourfold;
 mod row;
 mod table;
 mod trainings;
@@ -72,6 +73,27 @@ struct Bench {
 
 /// Boxes and their scores by scene, image and object.
 type Regions = BTreeMap<(u32, u32, u32), Vec<(Rect, f64)>>;
+
+/// The boxes of all targets.
+fn regions(
+    dataset: &BopDataset,
+    targets: &[Target],
+    meshes: &BTreeMap<u32, Mesh>,
+    boxes: &Boxes,
+) -> Result<Regions> {
+    let mut all = Regions::new();
+    let mut scenes = BTreeMap::new();
+    for t in targets {
+        let Some(o) = t.object else { continue };
+        if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(t.scene_id) {
+            place.insert(dataset.scene(t.scene_id)?);
+        }
+        let Some(scene) = scenes.get(&t.scene_id) else { continue };
+        let found = boxes.of_target(scene, t, &o, |id| meshes.get(&id))?;
+        all.insert((t.scene_id, t.im_id, o.obj_id), found);
+    }
+    Ok(all)
+}
 
 /// Every so manieth frame with `--quick`.
 const QUICK: usize = 8;
@@ -273,6 +295,18 @@ fn fnv(bytes: &[u8]) -> u64 {
 }
 
 impl Bench {
+    /// All targets of a dataset, in their ground-truth boxes.
+    fn of_dataset(root: &Path, seed: u64) -> Result<Bench> {
+        let dataset = BopDataset::open(root, "test")?;
+        let targets = dataset.object_targets(&dataset.targets(None)?)?;
+        let mut meshes = BTreeMap::new();
+        for id in targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect::<BTreeSet<_>>() {
+            meshes.insert(id, dataset.model(id, Models::Rendering)?);
+        }
+        let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
+        Ok(Bench { dataset, targets, meshes, truth, detections: None, seed })
+    }
+
     fn new(
         a: &ReproducePix2PoseArguments,
         dataset: BopDataset,
@@ -285,21 +319,7 @@ impl Bench {
             pix2pose.check_mesh(id, &mesh, &format!("{}: model {id}", a.dataset.display()))?;
             meshes.insert(id, mesh);
         }
-        let regions = |boxes: &Boxes| -> Result<Regions> {
-            let mut all = Regions::new();
-            let mut scenes = BTreeMap::new();
-            for t in &targets {
-                let Some(o) = t.object else { continue };
-                if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(t.scene_id) {
-                    place.insert(dataset.scene(t.scene_id)?);
-                }
-                let Some(scene) = scenes.get(&t.scene_id) else { continue };
-                let found = boxes.of_target(scene, t, &o, |id| meshes.get(&id))?;
-                all.insert((t.scene_id, t.im_id, o.obj_id), found);
-            }
-            Ok(all)
-        };
-        let truth = regions(&Boxes::GroundTruth)?;
+        let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
         let detections = match &a.detections {
             None => None,
             Some(file) => {
@@ -307,7 +327,7 @@ impl Bench {
                 for s in skipped {
                     eprintln!("skipped {s}");
                 }
-                Some(regions(&boxes)?)
+                Some(regions(&dataset, &targets, &meshes, &boxes)?)
             }
         };
         Ok(Bench { dataset, targets, meshes, truth, detections, seed: a.seed })

@@ -1,7 +1,7 @@
-//! Networks trained for a comparison: symmetric objects with and without the transformer loss, and two others with their
-//! convex hulls in place of the meshes, from photographs alone.
+//! Networks trained for a comparison: symmetric objects with the transformer loss, with L1 and view limits, and with
+//! plain L1 (table 3.1), and two others with their convex hulls in place of the meshes, from photographs alone.
 //!
-//! Not here yet: L1 with limited views, training against a discriminator.
+//! Not here yet: training against a discriminator.
 
 use std::path::Path;
 
@@ -11,42 +11,50 @@ use sixfold_bop::{Models, Target};
 use sixfold_pix2pose::estimate::EstimateOptions;
 
 use super::row::{self, Row, Setting};
-use super::{Bench, Regions};
+use super::{Bench, Regions, fourfold};
 use crate::arguments::{
     Arguments, Command, ReproducePix2PoseArguments, TrainCommand, TrainPix2PoseArguments,
 };
 use crate::commands::pix2pose::Pix2Pose;
 use crate::commands::train::train_pix2pose;
 
+/// What a training of the comparison learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Of {
+    /// The dataset's objects with discrete symmetries.
+    Symmetric,
+    /// The first two without.
+    Others,
+    /// A made-up object with four equal sides, from renders.
+    Fourfold,
+}
+
 /// One training of the comparison.
 struct Training {
     key: &'static str,
     title: &'static str,
-    /// Of the objects with discrete symmetries; otherwise of the first two others.
-    symmetric: bool,
+    of: Of,
     more: &'static [&'static str],
 }
 
-const TRAININGS: [Training; 4] = [
-    Training { key: "trained-transformer-loss", title: "transformer loss", symmetric: true, more: &[] },
-    Training {
-        key: "trained-plain-l1",
-        title: "plain L1",
-        symmetric: true,
-        more: &["--no-transformer-loss"],
-    },
-    Training {
-        key: "trained-mesh",
-        title: "meshes, photographs only",
-        symmetric: false,
-        more: &["--render-share", "0"],
-    },
-    Training {
-        key: "trained-convex-hull",
-        title: "convex hulls, photographs only",
-        symmetric: false,
-        more: &["--render-share", "0", "--convex-hull"],
-    },
+const fn training(key: &'static str, title: &'static str, of: Of, more: &'static [&'static str]) -> Training {
+    Training { key, title, of, more }
+}
+
+const TRAININGS: [Training; 8] = [
+    training("trained-transformer-loss", "transformer loss", Of::Symmetric, &[]),
+    training("trained-view-limits", "L1 with view limits", Of::Symmetric, &["--view-limits"]),
+    training("trained-plain-l1", "L1", Of::Symmetric, &["--no-transformer-loss"]),
+    training("fourfold-transformer-loss", "transformer loss", Of::Fourfold, &[]),
+    training("fourfold-view-limits", "L1 with view limits", Of::Fourfold, &["--view-limits"]),
+    training("fourfold-plain-l1", "L1", Of::Fourfold, &["--no-transformer-loss"]),
+    training("trained-mesh", "meshes, photographs only", Of::Others, &["--render-share", "0"]),
+    training(
+        "trained-convex-hull",
+        "convex hulls, photographs only",
+        Of::Others,
+        &["--render-share", "0", "--convex-hull"],
+    ),
 ];
 
 /// Trains, or goes on with the trainings, and measures what they came to.
@@ -55,9 +63,15 @@ pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<
     let symmetric = |id: &u32| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty());
     let (turning, others): (Vec<u32>, Vec<u32>) = bench.meshes.keys().copied().partition(symmetric);
     let others: Vec<u32> = others.into_iter().take(2).collect();
+    let fourfold_folder = a.out.join("fourfold");
+    let mut fourfold_bench = None;
     let mut rows = vec![];
     for training in TRAININGS {
-        let ids = if training.symmetric { &turning } else { &others };
+        let ids = match training.of {
+            Of::Symmetric => turning.clone(),
+            Of::Others => others.clone(),
+            Of::Fourfold => vec![fourfold::OBJECT],
+        };
         let key = format!("{}-{}", training.key, a.steps);
         if ids.is_empty() {
             eprintln!("note: {key}: the model has no such object, nothing to train for the comparison");
@@ -65,24 +79,34 @@ pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<
         }
         let names: Vec<String> = ids.iter().map(u32::to_string).collect();
         let folder = a.out.join("trainings").join(&key);
+        let made = training.of == Of::Fourfold;
+        if made && fourfold_bench.is_none() {
+            fourfold::write(&fourfold_folder, a.seed)?;
+            fourfold_bench = Some(Bench::of_dataset(&fourfold_folder, a.seed)?);
+        }
         rows.push(row::kept_or_made(&a.out, &key, || {
-            let model = train_pix2pose(&arguments(a, &names, &folder, training.more)?)?.model;
+            let dataset = if made { &fourfold_folder } else { &a.dataset };
+            let words = arguments(a, dataset, made, &names, &folder, training.more)?;
+            let model = train_pix2pose(&words)?.model;
             let options = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
             let trained = Pix2Pose::load(Path::new(&model))?.varied(options.clone(), false);
+            let what = if made {
+                "object with four equal sides".into()
+            } else {
+                format!("objects {}", names.join(" and "))
+            };
             let setting = Setting {
                 key: key.clone(),
-                title: format!(
-                    "objects {}, {} steps, two stages, PnP: {}",
-                    names.join(" and "),
-                    a.steps,
-                    training.title
-                ),
+                title: format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title),
                 options,
                 refine: false,
                 noise: None,
                 detections: false,
             };
-            bench.of_objects(ids).measure(&trained, &setting, &a.out)
+            match &fourfold_bench {
+                Some(bench) if made => bench.measure(&trained, &setting, &a.out),
+                _ => bench.of_objects(&ids).measure(&trained, &setting, &a.out),
+            }
         })?);
     }
     Ok(rows)
@@ -114,6 +138,8 @@ impl Bench {
 /// The training's arguments with the defaults of the command line.
 fn arguments(
     a: &ReproducePix2PoseArguments,
+    dataset: &Path,
+    renders_only: bool,
     ids: &[String],
     folder: &Path,
     more: &[&str],
@@ -121,8 +147,13 @@ fn arguments(
     let text = |path: &Path| path.as_os_str().to_owned();
     let mut words: Vec<std::ffi::OsString> =
         ["sixfold", "train", "pix2pose", "--dataset"].map(Into::into).to_vec();
-    words.push(text(&a.dataset));
-    words.extend(["--frames".into(), text(&a.frames), "--out".into(), text(folder)]);
+    words.push(text(dataset));
+    if renders_only {
+        words.push("--renders-only".into());
+    } else {
+        words.extend(["--frames".into(), text(&a.frames)]);
+    }
+    words.extend(["--out".into(), text(folder)]);
     let options = [
         ("--split", a.split.clone()),
         ("--ids", ids.join(",")),
