@@ -67,21 +67,22 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for share in [0.0, 0.3, 0.7] {
         variants.push((format!("first pass {share}"), with(&|o| o.first_pass = share)));
     }
+    for robust in [0.0, 0.7, 1.5] {
+        variants.push((format!("robust {robust}"), with(&|o| o.robust = robust)));
+    }
     for color in [0.0, 1.0, 3.0] {
         variants.push((format!("colour {color}"), with(&|o| o.color = color)));
     }
-    for line in [0.1, 0.6] {
+    for line in [0.15, 0.6] {
         variants.push((format!("line {line}"), with(&|o| o.line = line)));
     }
     for weight in [0.0, 2.0, 15.0] {
         variants.push((format!("correspondences {weight}"), with(&|o| o.correspondences = weight)));
     }
-    for weight in [10.0, 90.0] {
+    for weight in [5.0, 10.0, 90.0] {
         variants.push((format!("shape {weight}"), with(&|o| o.shape = weight)));
     }
-    for reaches in [vec![12.0, 8.0, 5.0, 3.0], vec![8.0, 5.0], vec![5.0, 3.0]] {
-        variants.push((format!("reaches {reaches:?}"), with(&|o| o.reaches = reaches.clone())));
-    }
+    variants.push(("more steps".into(), with(&|o| o.iterations = 10)));
     let error = |case: &Case, pose: &Pose| {
         let points = &meshes[&case.object].2;
         let info = &infos.0[&case.object];
@@ -93,11 +94,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let print = |name: &str, errors: &[(f64, f64)]| {
         let recall = errors.iter().filter(|e| e.0 < 0.1).count() as f64 / errors.len() as f64;
         let mean: f64 = errors.iter().map(|e| 1.0 - (e.0 / 0.2).min(1.0)).sum::<f64>() / errors.len() as f64;
+        let mut signed: Vec<f64> = errors.iter().map(|e| e.1).collect();
+        signed.sort_by(f64::total_cmp);
         let mut depths: Vec<f64> = errors.iter().map(|e| e.1.abs()).collect();
         depths.sort_by(f64::total_cmp);
         println!(
-            "{name:<28} recall {recall:.3}  area to 0.2 d {mean:.3}  |dz| median {:.1} mm",
-            depths[depths.len() / 2]
+            "{name:<28} recall {recall:.3}  area to 0.2 d {mean:.3}  |dz| median {:.1} mm, dz {:.1} mm",
+            depths[depths.len() / 2],
+            signed[signed.len() / 2]
         );
     };
     let measured = |case: &Case, pose: &Pose| {

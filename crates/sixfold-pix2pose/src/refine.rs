@@ -33,6 +33,9 @@ pub struct RefineOptions {
     pub shape: f64,
     /// Weight of a line, in independent measurements.
     pub line: f64,
+    /// Lines count less the further their border is from the outline, in units of this many deviations of all lines
+    /// (Tukey's biweight); 0 for all lines alike.
+    pub robust: f64,
     /// Share of the first pass in where the object is seen; the rest is the second's. They err apart.
     pub first_pass: f32,
     /// Weight of colour against the network in telling object from background.
@@ -48,6 +51,7 @@ impl Default for RefineOptions {
             correspondences: 5.0,
             shape: 30.0,
             line: 0.3,
+            robust: 1.0,
             first_pass: 0.5,
             color: 2.0,
         }
@@ -334,11 +338,18 @@ impl Aligner<'_> {
         }
         let centre = pose.transform_point(&self.centre);
         let mut equations = NormalEquations::default();
+        let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
+        let middle = offsets.len() / 2;
+        let deviation = 1.4826 * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let robust = self.options.robust * deviation.max(0.5);
         for line in &lines {
             let rows = motion(&self.crop, &line.point, &centre);
             let jacobian: [f64; 6] =
                 std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
-            let weight = self.options.line * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
+            let mut weight = self.options.line * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
+            if robust > 0.0 {
+                weight *= tukey(line.offset / robust);
+            }
             equations.add(&jacobian, -line.offset, weight);
         }
         self.add_correspondences(&mut equations, pose, &centre);
