@@ -5,21 +5,23 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyIterator;
 use sixfold_geometry::{
-    AlignmentError, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, NormalOptions, PnpError,
-    PnpOptions, PnpReport, PnpSolver, PointCloud, Pose, RefineOptions,
+    AlignmentError, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, NormalOptions,
+    PnpError, PnpOptions, PnpReport, PnpSolver, PointCloud, Pose, RefineOptions,
 };
 
 use crate::NoSolutionError;
 use crate::arrays::{self, bad, positive, seed, whole};
 use crate::camera::PyCamera;
-use crate::guard::{OnInterrupt, free, interruptible};
+use crate::guard::{free, interruptible};
 
 fn pnp_error(error: PnpError) -> PyErr {
     let argument = match &error {
         PnpError::NoModel => return NoSolutionError::new_err(error.to_string()),
         PnpError::Lengths { .. } => "object_points, image_points",
         PnpError::TooFew { .. } => "object_points",
-        PnpError::NotFinite { what, .. } | PnpError::Degenerate { what } if what.contains("image") => "image_points",
+        PnpError::NotFinite { what, .. } | PnpError::Degenerate { what } if what.contains("image") => {
+            "image_points"
+        }
         PnpError::NotFinite { .. } | PnpError::Degenerate { .. } => "object_points",
         PnpError::Undistortable { .. } => "image_points",
         PnpError::Camera(_) => "camera",
@@ -127,9 +129,7 @@ pub(crate) fn pnp_ransac(
     };
     let camera = camera.0;
     let found = if max_iterations > MANY_ITERATIONS || object.len() > 200_000 {
-        interruptible(py, OnInterrupt::Leave, move |_| {
-            sixfold_geometry::pnp_ransac(&object, &image, &camera, &options)
-        })?
+        interruptible(py, move |_| sixfold_geometry::pnp_ransac(&object, &image, &camera, &options))?
     } else {
         free(py, || sixfold_geometry::pnp_ransac(&object, &image, &camera, &options))?
     };
@@ -148,7 +148,7 @@ pub(crate) fn pnp_ransac(
 /// The pose (4, 4) that EPnP (Lepetit et al. 2009) finds for at least four correspondences without outliers:
 /// object_points (N, 3) metres, image_points (N, 2) pixels of the raw image.
 ///
-/// Raises ValueError as [pnp_ransac].
+/// Raises ValueError as pnp_ransac.
 #[pyfunction]
 pub(crate) fn epnp<'py>(
     py: Python<'py>,
@@ -165,7 +165,7 @@ pub(crate) fn epnp<'py>(
 /// Refines `initial` (4, 4) over all correspondences, outliers included, by truncated least squares (Blake and Zisserman
 /// 1987): reprojection errors beyond threshold_px have no influence. Returns the pose (4, 4) and the number of inliers.
 ///
-/// Raises ValueError as [pnp_ransac]; NoSolutionError when fewer than three correspondences are within the threshold.
+/// Raises ValueError as pnp_ransac; NoSolutionError when fewer than three correspondences are within the threshold.
 #[pyfunction]
 #[pyo3(signature = (object_points, image_points, camera, initial, threshold_px=3.0, max_iterations=50))]
 pub(crate) fn refine_pose<'py>(
@@ -191,7 +191,9 @@ fn alignment_error(error: AlignmentError) -> PyErr {
     let argument = match &error {
         AlignmentError::Value { what, .. } if what.contains("weight") => "weights",
         AlignmentError::Value { what, .. } if what.contains("target") => "target",
-        AlignmentError::Lengths { .. } => "source, target, weights",
+        AlignmentError::Lengths { source_points, target_points, .. } if source_points == target_points => {
+            "weights"
+        }
         _ => "source, target",
     };
     PyValueError::new_err(format!("{argument}: {error}"))
@@ -230,14 +232,15 @@ pub(crate) fn kabsch<'py>(
     weights: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let (source, target, weights) = pairs(source, target, weights)?;
-    let pose = free(py, || sixfold_geometry::kabsch(&source, &target, weights.as_deref()))?.map_err(alignment_error)?;
+    let pose = free(py, || sixfold_geometry::kabsch(&source, &target, weights.as_deref()))?
+        .map_err(alignment_error)?;
     arrays::from_pose(py, &pose)
 }
 
 /// The similarity that minimises the weighted squared distances (Umeyama 1991, equations 40 to 42): target_from_source
 /// (4, 4) without the scale, and the scale, so that target = R (scale * source) + t.
 ///
-/// Raises ValueError as [kabsch].
+/// Raises ValueError as kabsch.
 ///
 /// >>> import numpy as np
 /// >>> points = np.random.default_rng(0).normal(size=(10, 3))
@@ -253,7 +256,8 @@ pub(crate) fn umeyama<'py>(
     weights: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, f64)> {
     let (source, target, weights) = pairs(source, target, weights)?;
-    let found = free(py, || sixfold_geometry::umeyama(&source, &target, weights.as_deref()))?.map_err(alignment_error)?;
+    let found = free(py, || sixfold_geometry::umeyama(&source, &target, weights.as_deref()))?
+        .map_err(alignment_error)?;
     Ok((arrays::from_pose(py, &found.target_from_source)?, found.scale))
 }
 
@@ -300,7 +304,9 @@ impl IcpResult {
 
 fn icp_error(error: IcpError) -> PyErr {
     match &error {
-        IcpError::TooFewCorrespondences { .. } | IcpError::Degenerate => NoSolutionError::new_err(error.to_string()),
+        IcpError::TooFewCorrespondences { .. } | IcpError::Degenerate => {
+            NoSolutionError::new_err(error.to_string())
+        }
         IcpError::NoNormals { .. } => PyValueError::new_err(format!("target_normals: {error}")),
         _ => PyValueError::new_err(error.to_string()),
     }
@@ -318,7 +324,11 @@ fn icp_result(py: Python<'_>, report: Result<IcpReport, IcpError>) -> PyResult<I
 }
 
 /// The levels of a schedule: a rejection distance, or `[(metres, iterations, stride), ...]`.
-fn icp_options(rejection_distance: f64, levels: Option<&Bound<'_, PyAny>>, max_angle: f64) -> PyResult<IcpOptions> {
+fn icp_options(
+    rejection_distance: f64,
+    levels: Option<&Bound<'_, PyAny>>,
+    max_angle: f64,
+) -> PyResult<IcpOptions> {
     let rejection_distance = positive("rejection_distance", rejection_distance)?;
     let mut options = IcpOptions::coarse_to_fine(rejection_distance);
     if let Some(levels) = levels {
@@ -353,9 +363,16 @@ fn cloud(
         Some((argument, object)) => {
             let normals = arrays::points3(argument, object)?;
             if normals.len() != list.len() {
-                return Err(bad(argument, format!("{} normals, one a point", list.len()), normals.len().to_string()));
+                return Err(bad(
+                    argument,
+                    format!("{} normals, one a point", list.len()),
+                    normals.len().to_string(),
+                ));
             }
-            normals.iter().map(|n| n.try_normalize(1e-12).unwrap_or_else(sixfold_geometry::Vec3::zeros)).collect()
+            normals
+                .iter()
+                .map(|n| n.try_normalize(1e-12).unwrap_or_else(sixfold_geometry::Vec3::zeros))
+                .collect()
         }
     };
     Ok(PointCloud { points: list, normals })
@@ -398,17 +415,17 @@ pub(crate) fn icp(
     let target = cloud(("target", target), Some(("target_normals", target_normals)))?;
     let initial = initial.map_or(Ok(Pose::identity()), |i| arrays::pose("initial", i))?;
     let options = icp_options(rejection_distance, levels, max_angle)?;
-    let report = interruptible(py, OnInterrupt::Leave, move |_| {
+    let report = interruptible(py, move |_| {
         let target = IndexedCloud::new(target)?;
         sixfold_geometry::icp(&source, &target, &initial, &options)
     })?;
     icp_result(py, report)
 }
 
-/// As [icp] with a depth image (H, W) in metres as the target: a point's partner is what its pixel shows (Blais and Levine
+/// As icp with a depth image (H, W) in metres as the target: a point's partner is what its pixel shows (Blais and Levine
 /// 1995). The source is in the object's frame, the result is camera_from_object.
 ///
-/// Raises ValueError when depth and camera differ in size; NoSolutionError as [icp].
+/// Raises ValueError when depth and camera differ in size; NoSolutionError as icp.
 #[pyfunction]
 #[pyo3(signature = (source, depth, camera, initial, *, rejection_distance=0.02, source_normals=None, levels=None, max_angle=1.0471975511965976))]
 #[allow(clippy::too_many_arguments)]
@@ -428,7 +445,7 @@ pub(crate) fn icp_to_depth(
     let camera = camera.of_image("depth", depth.size())?;
     let initial = arrays::pose("initial", initial)?;
     let options = icp_options(rejection_distance, levels, max_angle)?;
-    let report = interruptible(py, OnInterrupt::Leave, move |_| {
+    let report = interruptible(py, move |_| {
         let normals = sixfold_geometry::normals_from_depth(&depth, &camera, &NormalOptions::default());
         let target = DepthTarget { depth: &depth, normals: &normals, camera: &camera };
         sixfold_geometry::icp(&source, &target, &initial, &options)

@@ -3,14 +3,18 @@
 //!
 //! Every refusal is a `ValueError` with the argument's name, what was expected and what was found.
 
-use numpy::{Element, PyArray1, PyArray2, PyArray3, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyUntypedArray};
 use numpy::PyUntypedArrayMethods;
+use numpy::{
+    Element, PyArray1, PyArray2, PyArray3, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyUntypedArray,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sixfold_bop::Placement;
 use sixfold_geometry::nalgebra::{Matrix4, Vector2, Vector3};
-use sixfold_geometry::{DepthImage, Image, Mask, Mat3, NormalImage, PointImage, Pose, Rect, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{
+    DepthImage, Image, Mask, Mat3, NormalImage, PointImage, Pose, Rect, RgbImage, Vec2, Vec3,
+};
 
 /// A `ValueError` in the form that all arguments use.
 pub(crate) fn bad(argument: &str, expected: impl AsRef<str>, found: impl AsRef<str>) -> PyErr {
@@ -56,8 +60,11 @@ struct Type {
 }
 
 const REAL: Type = Type { kinds: b"fiu", dtype: "float64", words: "real numbers (float64)" };
-const METRES: Type =
-    Type { kinds: b"f", dtype: "float32", words: "float32 or float64 in metres (a depth image in integer units has to be scaled first)" };
+const METRES: Type = Type {
+    kinds: b"f",
+    dtype: "float32",
+    words: "float32 or float64 in metres (a depth image in integer units has to be scaled first)",
+};
 const COLOR: Type = Type { kinds: b"u", dtype: "uint8", words: "uint8 from 0 to 255" };
 const MASK: Type = Type { kinds: b"b", dtype: "bool", words: "bool" };
 const WHOLE: Type = Type { kinds: b"iu", dtype: "int64", words: "whole numbers (int64)" };
@@ -100,8 +107,10 @@ fn read<T: Element + Copy>(
     let kind = array.dtype().kind();
     // An empty list is an array of float64; there is nothing in it that could be of a wrong kind.
     let empty = found.contains(&0) && fits;
-    if !fits || !(of.kinds.contains(&kind) || empty) || (of.dtype == "uint8" && array.dtype().itemsize() != 1) {
-        let found = format!("shape {:?} of {}", found, array.dtype().str()?).replace('[', "(").replace(']', ")");
+    if !fits || !(of.kinds.contains(&kind) || empty) || (of.dtype == "uint8" && array.dtype().itemsize() != 1)
+    {
+        let found =
+            format!("shape {:?} of {}", found, array.dtype().str()?).replace('[', "(").replace(']', ")");
         return Err(bad(argument, expected(), found));
     }
     let options = PyDict::new(py);
@@ -109,7 +118,8 @@ fn read<T: Element + Copy>(
     options.set_item("order", "C")?;
     let array = numpy.call_method("asarray", (array,), Some(&options))?;
     let array = array.cast::<PyArrayDyn<T>>().map_err(|_| bad(argument, expected(), "another type"))?;
-    let readable = array.try_readonly().map_err(|error| bad(argument, "a readable array", error.to_string()))?;
+    let readable =
+        array.try_readonly().map_err(|error| bad(argument, "a readable array", error.to_string()))?;
     let values = readable.as_slice().map_err(|error| bad(argument, expected(), error.to_string()))?.to_vec();
     Ok(Numbers { shape: found, values })
 }
@@ -203,7 +213,8 @@ fn image<T>(argument: &str, shape: &[usize], values: Vec<T>) -> PyResult<Image<T
     if shape[0] == 0 || shape[1] == 0 {
         return Err(bad(argument, "at least one pixel", format!("{} rows, {} columns", shape[0], shape[1])));
     }
-    Image::from_vec(shape[1], shape[0], values).map_err(|error| PyValueError::new_err(format!("{argument}: {error}")))
+    Image::from_vec(shape[1], shape[0], values)
+        .map_err(|error| PyValueError::new_err(format!("{argument}: {error}")))
 }
 
 /// `(H, W)` depth in metres; anything not finite and positive is missing.
@@ -265,7 +276,11 @@ pub(crate) fn boxes(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Vec<R
     Ok(numbers.values.as_chunks::<4>().0.iter().map(rect).collect())
 }
 
-fn rows<'py, T: Element>(py: Python<'py>, values: Vec<T>, columns: usize) -> PyResult<Bound<'py, PyArray2<T>>> {
+fn rows<'py, T: Element>(
+    py: Python<'py>,
+    values: Vec<T>,
+    columns: usize,
+) -> PyResult<Bound<'py, PyArray2<T>>> {
     let count = values.len() / columns;
     PyArray1::from_vec(py, values).reshape([count, columns])
 }
@@ -302,7 +317,10 @@ pub(crate) fn from_pose<'py>(py: Python<'py>, pose: &Pose) -> PyResult<Bound<'py
 }
 
 /// `(4, 4)`, the rotation as it is.
-pub(crate) fn from_placement<'py>(py: Python<'py>, placement: &Placement) -> PyResult<Bound<'py, PyArray2<f64>>> {
+pub(crate) fn from_placement<'py>(
+    py: Python<'py>,
+    placement: &Placement,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let (r, t) = (&placement.rotation, &placement.translation);
     let mut values = vec![0.0; 16];
     for row in 0..3 {
@@ -332,7 +350,10 @@ pub(crate) fn from_poses<'py>(py: Python<'py>, poses: &[Pose]) -> PyResult<Bound
 }
 
 /// `(H, W)`, without a copy.
-pub(crate) fn from_image<'py, T: Element>(py: Python<'py>, image: Image<T>) -> PyResult<Bound<'py, PyArray2<T>>> {
+pub(crate) fn from_image<'py, T: Element>(
+    py: Python<'py>,
+    image: Image<T>,
+) -> PyResult<Bound<'py, PyArray2<T>>> {
     let (width, height) = image.size();
     PyArray1::from_vec(py, image.into_vec()).reshape([height, width])
 }
@@ -347,6 +368,9 @@ pub(crate) fn from_image_of<'py, T: Element, const K: usize>(
 }
 
 /// `(H, W, 3)` points, without a copy.
-pub(crate) fn from_point_image<'py>(py: Python<'py>, image: PointImage) -> PyResult<Bound<'py, PyArray3<f32>>> {
+pub(crate) fn from_point_image<'py>(
+    py: Python<'py>,
+    image: PointImage,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
     from_image_of(py, image)
 }

@@ -17,7 +17,10 @@ use crate::guard::{dataset_error, free, results_error};
 use crate::mesh::PyMesh;
 
 /// What serialises, as dicts, lists and numbers.
-pub(crate) fn json_to_python<'py>(py: Python<'py>, value: &impl serde::Serialize) -> PyResult<Bound<'py, PyAny>> {
+pub(crate) fn json_to_python<'py>(
+    py: Python<'py>,
+    value: &impl serde::Serialize,
+) -> PyResult<Bound<'py, PyAny>> {
     let text = serde_json::to_string(value).map_err(|error| PyValueError::new_err(error.to_string()))?;
     py.import("json")?.call_method1("loads", (text,))
 }
@@ -282,8 +285,9 @@ impl PyDataset {
         let out = PyList::empty(py);
         for (index, truth) in image.ground_truth.iter().enumerate() {
             let info = image.info.as_ref().map(|i| &i[index]);
-            let corners =
-                |r: Option<sixfold_geometry::Rect>| r.map(|r| PyArray1::from_vec(py, vec![r.x, r.y, r.width, r.height]));
+            let corners = |r: Option<sixfold_geometry::Rect>| {
+                r.map(|r| PyArray1::from_vec(py, vec![r.x, r.y, r.width, r.height]))
+            };
             let entry = PyDict::new(py);
             entry.set_item("obj_id", truth.obj_id)?;
             entry.set_item("camera_from_object", arrays::from_placement(py, &truth.placement())?)?;
@@ -301,7 +305,10 @@ impl PyDataset {
     fn targets(&self, path: Option<PathBuf>) -> PyResult<Vec<(u32, u32, u32, usize)>> {
         let targets = self.0.targets(path.as_deref()).map_err(dataset_error)?;
         let targets = self.0.object_targets(&targets).map_err(dataset_error)?;
-        Ok(targets.iter().filter_map(|t| t.object.map(|o| (t.scene_id, t.im_id, o.obj_id, o.inst_count))).collect())
+        Ok(targets
+            .iter()
+            .filter_map(|t| t.object.map(|o| (t.scene_id, t.im_id, o.obj_id, o.inst_count)))
+            .collect())
     }
 
     /// The model of an object as a Mesh in metres with the symmetries of models_info.json; evaluation=True takes that of
@@ -424,15 +431,17 @@ pub(crate) fn decode_mask<'py>(
     py: Python<'py>,
     rle: &Bound<'py, PyDict>,
 ) -> PyResult<Bound<'py, PyArray2<bool>>> {
-    let wrong = || bad("rle", "a dict with size [H, W] and counts (text or a list of runs)", "something else");
+    let wrong =
+        || bad("rle", "a dict with size [H, W] and counts (text or a list of runs)", "something else");
     let size = rle.get_item("size")?.ok_or_else(wrong)?;
     let (height, width) = size.extract::<[u64; 2]>().map(|[h, w]| (h, w)).map_err(|_| wrong())?;
     let counts = rle.get_item("counts")?.ok_or_else(wrong)?;
     let rle = if let Ok(text) = counts.extract::<String>() {
         sixfold_bop::Rle::from_compressed(width, height, &text)
-    } else if let Ok(bytes) = counts.extract::<Vec<u8>>().and_then(|b| {
-        if counts.is_instance_of::<pyo3::types::PyBytes>() { Ok(b) } else { Err(wrong()) }
-    }) {
+    } else if let Ok(bytes) = counts
+        .extract::<Vec<u8>>()
+        .and_then(|b| if counts.is_instance_of::<pyo3::types::PyBytes>() { Ok(b) } else { Err(wrong()) })
+    {
         let text = String::from_utf8(bytes).map_err(|_| wrong())?;
         sixfold_bop::Rle::from_compressed(width, height, &text)
     } else {

@@ -16,8 +16,8 @@ use crate::guard::free;
 /// Raises ValueError for a focal length that is not above zero, an empty image, or numbers that are not finite.
 ///
 /// >>> camera = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-/// >>> camera.matrix[0, 0]
-/// 572.4
+/// >>> camera.matrix[0].tolist()
+/// [572.4, 0.0, 325.3]
 #[pyclass(name = "Camera", module = "sixfold", frozen, eq, from_py_object)]
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) struct PyCamera(pub(crate) Camera);
@@ -126,7 +126,11 @@ impl PyCamera {
     ///
     /// >>> Camera(500, 500, 320, 240, 640, 480).project([[0.1, 0.0, 1.0]])
     /// array([[370., 240.]])
-    fn project<'py>(&self, py: Python<'py>, points: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn project<'py>(
+        &self,
+        py: Python<'py>,
+        points: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let points = arrays::points3("points", points)?;
         arrays::from_points2(py, points.iter().map(|p| self.0.project(p)))
     }
@@ -143,7 +147,11 @@ impl PyCamera {
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let (pixels, depth) = (arrays::points2("pixels", pixels)?, arrays::numbers("depth", depth)?);
         if pixels.len() != depth.len() {
-            return Err(bad("depth", format!("{} numbers, one a pixel", pixels.len()), depth.len().to_string()));
+            return Err(bad(
+                "depth",
+                format!("{} numbers, one a pixel", pixels.len()),
+                depth.len().to_string(),
+            ));
         }
         let points: Vec<_> = pixels.iter().zip(&depth).map(|(p, z)| self.0.unproject(p, *z)).collect();
         arrays::from_points3(py, &points)
@@ -182,7 +190,11 @@ impl PyCamera {
         let boxes = arrays::boxes("box", r#box)?;
         let [rect] = boxes[..] else { return Err(bad("box", "one box", format!("{}", boxes.len()))) };
         if !(rect.width >= 1.0 && rect.height >= 1.0 && rect.width <= 1048576.0 && rect.height <= 1048576.0) {
-            return Err(bad("box", "a side of 1 to 1048576 pixels", format!("{} x {}", rect.width, rect.height)));
+            return Err(bad(
+                "box",
+                "a side of 1 to 1048576 pixels",
+                format!("{} x {}", rect.width, rect.height),
+            ));
         }
         Ok(PyCamera(self.0.crop(&rect)))
     }
@@ -200,7 +212,10 @@ impl PyCamera {
             Some(d) => format!(", distortion={d:?}"),
             None => String::new(),
         };
-        format!("Camera(fx={}, fy={}, cx={}, cy={}, width={}, height={}{lens})", c.fx, c.fy, c.cx, c.cy, c.width, c.height)
+        format!(
+            "Camera(fx={}, fy={}, cx={}, cy={}, width={}, height={}{lens})",
+            c.fx, c.fy, c.cx, c.cy, c.width, c.height
+        )
     }
 
     fn __getnewargs__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
@@ -255,19 +270,25 @@ pub(crate) fn undistort_depth<'py>(
 /// >>> pose_exp([0.1, 0, 1, 0, 0, 0])[:3, 3]
 /// array([0.1, 0. , 1. ])
 #[pyfunction]
-pub(crate) fn pose_exp<'py>(py: Python<'py>, twist: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+pub(crate) fn pose_exp<'py>(
+    py: Python<'py>,
+    twist: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let v = arrays::numbers("twist", twist)?;
     let v: [f64; 6] =
         v.try_into().map_err(|v: Vec<f64>| bad("twist", "6 numbers (v, w)", format!("{}", v.len())))?;
     arrays::from_pose(py, &sixfold_geometry::Pose::exp(&v.into()))
 }
 
-/// A pose (4, 4) to the six numbers (v, w) of [pose_exp]; for rotation angles below pi.
+/// A pose (4, 4) to the six numbers (v, w) of pose_exp; for rotation angles below pi.
 ///
-/// >>> pose_log(pose_exp([0.1, 0, 1, 0, 0, 0.5])).round(9)
+/// >>> pose_log(pose_exp([0.1, 0, 1, 0, 0, 0.5])).round(9) + 0
 /// array([0.1, 0. , 1. , 0. , 0. , 0.5])
 #[pyfunction]
-pub(crate) fn pose_log<'py>(py: Python<'py>, pose: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray1<f64>>> {
+pub(crate) fn pose_log<'py>(
+    py: Python<'py>,
+    pose: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let twist = arrays::pose("pose", pose)?.log();
     Ok(PyArray1::from_vec(py, twist.iter().copied().collect()))
 }

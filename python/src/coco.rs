@@ -9,18 +9,23 @@ use sixfold_bop::{CocoGroundTruth, Detection, IouType, ReadDetections, evaluate_
 
 use crate::arrays::{bad, id};
 use crate::bop::{decode_mask, encode_mask, json_to_python};
-use crate::guard::{OnInterrupt, dataset_error, free, interruptible, os_error};
+use crate::guard::{dataset_error, free, interruptible, os_error};
 
 /// A file, or what such a file holds, as text.
 fn document(argument: &'static str, source: &Bound<'_, PyAny>) -> PyResult<(Vec<u8>, PathBuf)> {
     if let Ok(path) = source.extract::<PathBuf>() {
-        let bytes = std::fs::read(&path)
-            .map_err(|error| os_error(error.kind(), format!("{}: cannot be read: {error}", path.display())))?;
+        let bytes = std::fs::read(&path).map_err(|error| {
+            os_error(error.kind(), format!("{}: cannot be read: {error}", path.display()))
+        })?;
         return Ok((bytes, path));
     }
     let text = source.py().import("json")?.call_method1("dumps", (source,));
     let text = text.map_err(|error| {
-        bad(argument, "a JSON file or what one holds (dicts, lists, numbers)", error.value(source.py()).to_string())
+        bad(
+            argument,
+            "a JSON file or what one holds (dicts, lists, numbers)",
+            error.value(source.py()).to_string(),
+        )
     })?;
     Ok((text.extract::<String>()?.into_bytes(), PathBuf::from(argument)))
 }
@@ -66,16 +71,16 @@ fn evaluate<'py>(
     match ground_truth.cast::<PyDict>() {
         Ok(dict) if !dict.contains("images")? && !dict.contains("annotations")? => {
             for (scene_id, source) in dict {
-                let scene_id: i64 = scene_id
-                    .extract()
-                    .map_err(|_| bad("ground_truth", "scene ids as keys, or images and annotations", "other keys"))?;
+                let scene_id: i64 = scene_id.extract().map_err(|_| {
+                    bad("ground_truth", "scene ids as keys, or images and annotations", "other keys")
+                })?;
                 add(id("ground_truth", scene_id)?, &source)?;
             }
         }
         _ => add(0, ground_truth)?,
     }
     let detections = detections_of("detections", detections)?;
-    let scores = interruptible(py, OnInterrupt::Leave, move |_| evaluate_coco(&truth, &detections, iou_type))?;
+    let scores = interruptible(py, move |_| evaluate_coco(&truth, &detections, iou_type))?;
     json_to_python(py, &scores)
 }
 
@@ -97,7 +102,11 @@ fn read_detections<'py>(
     let options = ReadDetections { lenient, image_size };
     let read = free(py, || sixfold_bop::read_detections(&path, &options))?.map_err(dataset_error)?;
     if let Some(first) = read.adjusted.first() {
-        let text = format!("{} detections were changed or left out, the first: {}", read.adjusted.len(), first.message);
+        let text = format!(
+            "{} detections were changed or left out, the first: {}",
+            read.adjusted.len(),
+            first.message
+        );
         py.import("warnings")?.call_method1("warn", (text,))?;
     }
     let list: Vec<serde_json::Value> = read.detections.iter().map(as_json).collect();
@@ -118,7 +127,7 @@ fn as_json(d: &Detection) -> serde_json::Value {
     })
 }
 
-/// Writes detections, a list of dicts as [read_detections] gives, in BOP's form; all or nothing.
+/// Writes detections, a list of dicts as read_detections gives, in BOP's form; all or nothing.
 ///
 /// Raises OSError when the file cannot be written, ValueError with entry and field for a broken one.
 #[pyfunction]

@@ -37,33 +37,19 @@ struct Stopped;
 pub(crate) struct Stop(Arc<AtomicBool>);
 
 impl Stop {
-    /// Leaves the work when Ctrl-C was pressed. Unwinds without a message; [`interruptible`] catches it.
+    /// Leaves the work when Ctrl-C was pressed: unwinds without a message, and [`interruptible`] catches it.
     pub(crate) fn check(&self) {
         if self.0.load(Ordering::Relaxed) {
             resume_unwind(Box::new(Stopped));
         }
     }
-
-    /// The flag itself, for work that looks at one.
-    pub(crate) fn flag(&self) -> &AtomicBool {
-        &self.0
-    }
-}
-
-/// What happens to the work when Ctrl-C is pressed.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum OnInterrupt {
-    /// The call returns at once; what is under way ends by itself in the background and its result is dropped.
-    Leave,
-    /// The call waits until the work has put away what it has.
-    Wait,
 }
 
 /// Runs long work on a thread of its own without the interpreter lock and raises what a signal handler raises
-/// (`KeyboardInterrupt`) while it runs.
+/// (`KeyboardInterrupt`) while it runs. The call then returns at once: work that looks at [`Stop`] ends soon, other work
+/// when it is done, and nobody sees its result.
 pub(crate) fn interruptible<T: Send + 'static>(
     py: Python<'_>,
-    on_interrupt: OnInterrupt,
     work: impl FnOnce(&Stop) -> T + Send + 'static,
 ) -> PyResult<T> {
     let stop = Stop(Arc::new(AtomicBool::new(false)));
@@ -76,26 +62,22 @@ pub(crate) fn interruptible<T: Send + 'static>(
             let _ = send.send(catch_unwind(AssertUnwindSafe(|| work(&flag))));
         })
         .map_err(|error| PyOSError::new_err(format!("no thread could be started: {error}")))?;
-    let mut interrupt: Option<PyErr> = None;
     loop {
         let answer;
         (answer, receive) = py.detach(move || (receive.recv_timeout(LISTEN), receive));
-        match (answer, interrupt.take()) {
-            (Err(RecvTimeoutError::Timeout), None) => {
+        match answer {
+            Ok(Ok(value)) => return Ok(value),
+            Ok(Err(payload)) => return Err(internal(payload.as_ref())),
+            Err(RecvTimeoutError::Timeout) => {
                 if let Err(error) = py.check_signals() {
                     stop.0.store(true, Ordering::Relaxed);
-                    if on_interrupt == OnInterrupt::Leave {
-                        return Err(error);
-                    }
-                    interrupt = Some(error);
+                    return Err(error);
                 }
             }
-            (Err(RecvTimeoutError::Timeout), waiting) => interrupt = waiting,
-            (_, Some(error)) => return Err(error),
-            (Ok(Ok(value)), None) => return Ok(value),
-            (Ok(Err(payload)), None) => return Err(internal(payload.as_ref())),
-            (Err(RecvTimeoutError::Disconnected), None) => {
-                return Err(PyRuntimeError::new_err("internal error in sixfold: the work ended without an answer"));
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(PyRuntimeError::new_err(
+                    "internal error in sixfold: the work ended without an answer",
+                ));
             }
         }
     }

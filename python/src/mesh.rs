@@ -12,7 +12,7 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, UnitError};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
-use crate::guard::{OnInterrupt, free, interruptible, mesh_file_error};
+use crate::guard::{free, interruptible, mesh_file_error};
 
 /// A triangle mesh in its object's frame, in metres; without faces a list of points. It cannot be changed.
 ///
@@ -63,26 +63,16 @@ impl PyMesh {
         PyMesh::symmetric(mesh, self.discrete.clone(), self.continuous.clone())
     }
 
-    pub(crate) fn info(&self) -> ModelInfo {
-        let (low, high) = self.mesh.bounding_box();
-        ModelInfo {
-            diameter: self.known_diameter(),
-            min: low,
-            size: high - low,
-            symmetries_discrete: self.discrete.clone(),
-            symmetries_continuous: self.continuous.clone(),
-        }
-    }
-
     pub(crate) fn known_diameter(&self) -> f64 {
         *self.diameter.get_or_init(|| self.mesh.diameter())
     }
 
     pub(crate) fn symmetry_poses(&self, max_step: f64) -> Vec<Pose> {
-        self.info_without_size().symmetry_poses(max_step)
+        self.turns().symmetry_poses(max_step)
     }
 
-    fn info_without_size(&self) -> ModelInfo {
+    /// The symmetries as the library takes them; size and diameter do not matter to them.
+    fn turns(&self) -> ModelInfo {
         ModelInfo {
             diameter: 1.0,
             min: Vec3::zeros(),
@@ -186,7 +176,13 @@ impl PyMesh {
     /// 0.10209...
     #[classmethod]
     #[pyo3(signature = (path, unit, *, check_size=true))]
-    fn load(_class: &Bound<'_, PyType>, py: Python<'_>, path: PathBuf, unit: &str, check_size: bool) -> PyResult<Self> {
+    fn load(
+        _class: &Bound<'_, PyType>,
+        py: Python<'_>,
+        path: PathBuf,
+        unit: &str,
+        check_size: bool,
+    ) -> PyResult<Self> {
         let unit = self::unit(unit)?;
         let read = if check_size { sixfold_mesh::read_mesh } else { sixfold_mesh::read_mesh_unchecked };
         let mesh = free(py, || read(&path, unit))?.map_err(mesh_file_error)?;
@@ -255,7 +251,10 @@ impl PyMesh {
 
     /// The axes about which the object may turn freely: a list of (direction (3,), point (3,) in metres).
     #[getter]
-    fn symmetry_axes<'py>(&self, py: Python<'py>) -> Vec<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)> {
+    fn symmetry_axes<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> Vec<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)> {
         let axes = self.continuous.iter();
         axes.map(|s| (arrays::from_vector3(py, &s.axis), arrays::from_vector3(py, &s.offset))).collect()
     }
@@ -334,7 +333,7 @@ impl PyMesh {
     /// >>> coarse = mesh.simplify(2000)  # doctest: +SKIP
     fn simplify(&self, py: Python<'_>, faces: i64) -> PyResult<PyMesh> {
         let (mesh, faces) = (self.mesh.clone(), whole("faces", faces, 1)?);
-        Ok(self.like(interruptible(py, OnInterrupt::Leave, move |_| sixfold_mesh::simplify(&mesh, faces))?))
+        Ok(self.like(interruptible(py, move |_| sixfold_mesh::simplify(&mesh, faces))?))
     }
 
     /// The smallest convex body around the vertices (Barber et al. 1996). Raises ValueError when they lie in a plane.
@@ -370,11 +369,19 @@ impl PyMesh {
     }
 
     fn __repr__(&self) -> String {
-        let symmetric = if self.discrete.is_empty() && self.continuous.is_empty() { "" } else { ", symmetric" };
-        format!("<Mesh: {} vertices, {} faces{symmetric}>", self.mesh.vertices().len(), self.mesh.faces().len())
+        let symmetric =
+            if self.discrete.is_empty() && self.continuous.is_empty() { "" } else { ", symmetric" };
+        format!(
+            "<Mesh: {} vertices, {} faces{symmetric}>",
+            self.mesh.vertices().len(),
+            self.mesh.faces().len()
+        )
     }
 
-    fn __reduce__<'py>(slf: &Bound<'py, Self>, py: Python<'py>) -> PyResult<(Py<PyAny>, (Bound<'py, PyDict>,))> {
+    fn __reduce__<'py>(
+        slf: &Bound<'py, Self>,
+        py: Python<'py>,
+    ) -> PyResult<(Py<PyAny>, (Bound<'py, PyDict>,))> {
         let this = slf.get();
         let parts = PyDict::new(py);
         parts.set_item("vertices", this.vertices(py)?)?;
@@ -383,7 +390,8 @@ impl PyMesh {
         parts.set_item("colors", this.colors(py)?)?;
         parts.set_item("texcoords", this.texcoords(py)?)?;
         parts.set_item("texture", this.texture(py)?)?;
-        let discrete = if this.discrete.is_empty() { None } else { Some(arrays::from_poses(py, &this.discrete)?) };
+        let discrete =
+            if this.discrete.is_empty() { None } else { Some(arrays::from_poses(py, &this.discrete)?) };
         parts.set_item("symmetries", discrete)?;
         parts.set_item("symmetry_axes", this.symmetry_axes(py))?;
         let restore = py.import("sixfold._sixfold")?.getattr("_mesh_of")?;

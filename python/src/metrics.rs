@@ -7,7 +7,8 @@ use numpy::PyArray1;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use sixfold_bop::{
-    EvalOptions, Estimate, ModelPoints, Models, VsdOptions, evaluate, evaluate_detection, write_recall_curves,
+    Estimate, EvalOptions, ModelPoints, Models, VsdError, VsdOptions, evaluate, evaluate_detection,
+    write_recall_curves,
 };
 use sixfold_geometry::Pose;
 use sixfold_mesh::ModelInfo;
@@ -15,7 +16,7 @@ use sixfold_mesh::ModelInfo;
 use crate::arrays::{self, bad};
 use crate::bop::{PyDataset, PyEstimate, json_to_python};
 use crate::camera::PyCamera;
-use crate::guard::{OnInterrupt, dataset_error, eval_error, free, interruptible, results_error};
+use crate::guard::{dataset_error, eval_error, free, interruptible, results_error};
 use crate::mesh::PyMesh;
 
 #[derive(FromPyObject)]
@@ -72,7 +73,7 @@ fn add(
     free(py, || sixfold_bop::add(&points, e, g))
 }
 
-/// As [add] with the nearest point in place of the corresponding one: ADD-S or ADI, for symmetric objects
+/// As add with the nearest point in place of the corresponding one: ADD-S or ADI, for symmetric objects
 /// (Hinterstoisser et al. 2012), metres.
 ///
 /// >>> import numpy as np
@@ -113,7 +114,7 @@ fn mssd(
 }
 
 /// Maximum symmetry-aware projection distance (Hodan et al. 2020, section 2.2), pixels of a pinhole camera; infinite when a
-/// vertex lies behind the camera. symmetries as for [mssd].
+/// vertex lies behind the camera. symmetries as for mssd.
 ///
 /// >>> import numpy as np
 /// >>> from sixfold import Camera
@@ -184,6 +185,16 @@ fn translation_error(
     Ok(sixfold_bop::translation_error(&e, &g, &self::symmetries(symmetries)?))
 }
 
+fn vsd_error(error: VsdError) -> PyErr {
+    let argument = match &error {
+        VsdError::Diameter { .. } => "diameter",
+        VsdError::Size { image: "estimate", .. } => "depth_estimate",
+        VsdError::Size { image: "ground-truth", .. } => "depth_ground_truth",
+        _ => "depth",
+    };
+    PyValueError::new_err(format!("{argument}: {error}"))
+}
+
 fn vsd_options(taus: Option<&Bound<'_, PyAny>>, delta: f64) -> PyResult<VsdOptions> {
     let mut options = VsdOptions { delta, ..VsdOptions::default() };
     if let Some(taus) = taus {
@@ -231,10 +242,10 @@ fn vsd<'py>(
         let draw = |pose: &Pose| sixfold_render::render_depth(&mesh.mesh, pose, &camera);
         sixfold_bop::vsd(&draw(&e), &draw(&g), &test, &camera, diameter, &options)
     })?;
-    Ok(PyArray1::from_vec(py, errors.map_err(|error| PyValueError::new_err(error.to_string()))?))
+    Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
 
-/// As [vsd] from depth images (H, W) in metres that were drawn elsewhere: of the model at the estimate, at the ground
+/// As vsd from depth images (H, W) in metres that were drawn elsewhere: of the model at the estimate, at the ground
 /// truth, and the sensor's.
 #[pyfunction]
 #[pyo3(signature = (depth_estimate, depth_ground_truth, depth, camera, diameter, *, taus=None, delta=0.015))]
@@ -254,7 +265,7 @@ fn vsd_of_depth<'py>(
     let t = arrays::depth("depth", depth)?;
     let options = vsd_options(taus, delta)?;
     let errors = free(py, || sixfold_bop::vsd(&e, &g, &t, &camera.0, diameter, &options))?;
-    Ok(PyArray1::from_vec(py, errors.map_err(|error| PyValueError::new_err(error.to_string()))?))
+    Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
 
 /// Average precision with COCO's 101 recall steps, as the BOP Challenge 2024 computes it: right (N,) bool says of each
@@ -369,10 +380,9 @@ fn bop19<'py>(
         EvalOptions { compute_vsd: vsd, visib_gt_min, models: models_of(models)?, ..EvalOptions::default() };
     options.check().map_err(eval_error)?;
     let targets = dataset.targets(targets.as_deref()).map_err(dataset_error)?;
-    let scores = interruptible(py, OnInterrupt::Leave, move |stop| {
-        evaluate(&dataset, &estimates, &targets, &options, &|_| stop.check())
-    })?
-    .map_err(eval_error)?;
+    let scores =
+        interruptible(py, move |stop| evaluate(&dataset, &estimates, &targets, &options, &|_| stop.check()))?
+            .map_err(eval_error)?;
     if let Some(path) = curves {
         free(py, || write_recall_curves(&path, &scores))?.map_err(dataset_error)?;
     }
@@ -380,7 +390,7 @@ fn bop19<'py>(
 }
 
 /// Scores estimates as 6D detections (BOP Challenge 2024): a dict with ap, ap_mssd, ap_mspd, ap_mssd_mm (thresholds 2 to
-/// 20 mm), objects, reasons. Arguments as for [bop19].
+/// 20 mm), objects, reasons. Arguments as for bop19.
 #[pyfunction]
 #[pyo3(signature = (dataset, results, *, split="test", targets=None, visib_gt_min=None, models="eval"))]
 fn bop24<'py>(
@@ -397,10 +407,8 @@ fn bop24<'py>(
     let options = EvalOptions { visib_gt_min, models: models_of(models)?, ..EvalOptions::default() };
     options.check().map_err(eval_error)?;
     let targets = dataset.targets(targets.as_deref()).map_err(dataset_error)?;
-    let scores = interruptible(py, OnInterrupt::Leave, move |_| {
-        evaluate_detection(&dataset, &estimates, &targets, &options)
-    })?
-    .map_err(eval_error)?;
+    let scores = interruptible(py, move |_| evaluate_detection(&dataset, &estimates, &targets, &options))?
+        .map_err(eval_error)?;
     json_to_python(py, &scores)
 }
 

@@ -18,7 +18,7 @@ use sixfold_pix2pose::refine::{RefineOptions, refine};
 
 use crate::arrays::{self, about, bad, positive, seed};
 use crate::camera::PyCamera;
-use crate::guard::{OnInterrupt, interruptible, os_error};
+use crate::guard::{interruptible, os_error};
 use crate::mesh::PyMesh;
 
 /// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
@@ -140,11 +140,14 @@ type Meshes = BTreeMap<u32, Arc<Mesh>>;
 fn meshes_of(model: &Pix2PoseModel, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
     let mut out = BTreeMap::new();
     for (id, mesh) in meshes.unwrap_or_default() {
-        let (_, entry) = model.object(id).map_err(|error| PyValueError::new_err(format!("meshes: {error}")))?;
+        let (_, entry) =
+            model.object(id).map_err(|error| PyValueError::new_err(format!("meshes: {error}")))?;
         let mesh = mesh.get().mesh.clone();
         let scale = entry.scale();
         let (low, high) = mesh.bounding_box();
-        let off = (low - (scale.centre - scale.half_size)).amax().max((high - (scale.centre + scale.half_size)).amax());
+        let off = (low - (scale.centre - scale.half_size))
+            .amax()
+            .max((high - (scale.centre + scale.half_size)).amax());
         if off > SAME_BOX * entry.diameter {
             let size = 1000.0 * (high - low);
             let own = 2000.0 * scale.half_size;
@@ -185,8 +188,7 @@ impl Pix2Pose {
         camera: Option<PyCamera>,
         meshes: Option<BTreeMap<u32, Py<PyMesh>>>,
     ) -> PyResult<Self> {
-        let model =
-            interruptible(py, OnInterrupt::Leave, move |_| Pix2PoseModel::load(&path))?.map_err(model_error)?;
+        let model = interruptible(py, move |_| Pix2PoseModel::load(&path))?.map_err(model_error)?;
         let meshes = meshes_of(&model, meshes)?;
         Ok(Pix2Pose { model: Arc::new(model), camera, meshes })
     }
@@ -276,7 +278,7 @@ impl Pix2Pose {
             ..EstimateOptions::default()
         };
         let model = self.model.clone();
-        let found = interruptible(py, OnInterrupt::Leave, move |stop| {
+        let found = interruptible(py, move |stop| {
             let scene = depth.as_ref().map(|d| DepthScene::new(d, &camera));
             let mut out: Vec<Option<Posed>> = Vec::with_capacity(boxes.len());
             for (region, object_id) in boxes.iter().zip(ids) {
@@ -298,7 +300,8 @@ impl Pix2Pose {
                 };
                 if let Some(mesh) = meshes.get(&object_id) {
                     if refine {
-                        let aligned = self::refine(&image, &camera, mesh, &posed.found, &RefineOptions::default());
+                        let aligned =
+                            self::refine(&image, &camera, mesh, &posed.found, &RefineOptions::default());
                         posed.camera_from_object = aligned.camera_from_object;
                         posed.refined = aligned.improved;
                     }

@@ -39,7 +39,8 @@ pub(crate) struct Rendering {
 #[pymethods]
 impl Rendering {
     fn __iter__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyIterator>> {
-        let parts = (&self.depth, &self.mask, &self.normals, &self.coordinates, &self.rgb).into_pyobject(py)?;
+        let parts =
+            (&self.depth, &self.mask, &self.normals, &self.coordinates, &self.rgb).into_pyobject(py)?;
         parts.try_iter()
     }
 
@@ -257,7 +258,7 @@ pub(crate) fn render(
     })
 }
 
-/// Draws several objects, [(mesh, camera_from_object (4, 4)), ...], into one image; see [render] for the other arguments.
+/// Draws several objects, [(mesh, camera_from_object (4, 4)), ...], into one image; see render for the other arguments.
 ///
 /// Raises ValueError for no object, a pose that is none, or a background of another size.
 ///
@@ -301,7 +302,10 @@ pub(crate) fn render_scene(
 }
 
 /// `[(mesh, camera_from_object), ...]`, at least one.
-pub(crate) fn posed_objects(argument: &'static str, objects: &Bound<'_, PyAny>) -> PyResult<Vec<(Arc<Mesh>, Pose)>> {
+pub(crate) fn posed_objects(
+    argument: &'static str,
+    objects: &Bound<'_, PyAny>,
+) -> PyResult<Vec<(Arc<Mesh>, Pose)>> {
     let wrong = |found: &Bound<'_, PyAny>| {
         bad(argument, "a list of pairs (Mesh, camera_from_object)", found.get_type().to_string())
     };
@@ -321,7 +325,7 @@ pub(crate) fn posed_objects(argument: &'static str, objects: &Bound<'_, PyAny>) 
     Ok(out)
 }
 
-/// The depth (H, W) float32 in metres of a mesh at camera_from_object (4, 4), 0 where it is not seen: what [render] gives
+/// The depth (H, W) float32 in metres of a mesh at camera_from_object (4, 4), 0 where it is not seen: what render gives
 /// first, without the rest.
 ///
 /// >>> import numpy as np
@@ -371,7 +375,10 @@ pub(crate) fn simulate_depth<'py>(
 /// The table under posed objects, [(mesh, camera_from_object (4, 4)), ...]: a Plane in the camera frame, normal up, or
 /// None. The camera is taken to be held upright and above the table.
 #[pyfunction]
-pub(crate) fn support_plane(py: Python<'_>, objects: &Bound<'_, PyAny>) -> PyResult<Option<crate::scene::PyPlane>> {
+pub(crate) fn support_plane(
+    py: Python<'_>,
+    objects: &Bound<'_, PyAny>,
+) -> PyResult<Option<crate::scene::PyPlane>> {
     let objects = posed_objects("objects", objects)?;
     let plane = free(py, || {
         let objects: Vec<SceneObject<'_>> =

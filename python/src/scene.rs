@@ -8,11 +8,11 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sixfold_geometry::{NormalOptions, Plane, PlaneOptions, PointCloud, Vec3};
-use sixfold_match::{EstimateOptions, ModelOptions, ObjectModel, Scene, SceneOptions};
+use sixfold_match::{EstimateOptions, ModelOptions, ObjectModel, Scene, SceneError, SceneOptions};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::camera::PyCamera;
-use crate::guard::{OnInterrupt, free, interruptible};
+use crate::guard::{free, interruptible};
 use crate::mesh::PyMesh;
 
 /// Step of discretised symmetry axes in a description, as a share of the diameter: as the command line does.
@@ -143,7 +143,11 @@ impl PyPlane {
     }
 
     /// Signed distances (N,) of points (N, 3), positive on the side the normal points to; metres.
-    fn distance<'py>(&self, py: Python<'py>, points: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    fn distance<'py>(
+        &self,
+        py: Python<'py>,
+        points: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let points = arrays::points3("points", points)?;
         Ok(PyArray1::from_vec(py, points.iter().map(|p| self.0.distance(p)).collect()))
     }
@@ -176,7 +180,11 @@ pub(crate) fn dominant_plane(
     let points = arrays::points3("points", points)?;
     let normals = normals.map(|n| arrays::points3("normals", n)).transpose()?.unwrap_or_default();
     if !normals.is_empty() && normals.len() != points.len() {
-        return Err(bad("normals", format!("{} normals, one a point", points.len()), normals.len().to_string()));
+        return Err(bad(
+            "normals",
+            format!("{} normals, one a point", points.len()),
+            normals.len().to_string(),
+        ));
     }
     let options = PlaneOptions {
         threshold: positive("threshold", threshold)?,
@@ -185,9 +193,7 @@ pub(crate) fn dominant_plane(
         ..PlaneOptions::default()
     };
     let (cloud, seed) = (PointCloud { points, normals }, self::seed(seed)?);
-    let plane = interruptible(py, OnInterrupt::Leave, move |_| {
-        sixfold_geometry::dominant_plane(&cloud, &options, seed)
-    })?;
+    let plane = interruptible(py, move |_| sixfold_geometry::dominant_plane(&cloud, &options, seed))?;
     Ok(plane.map(PyPlane))
 }
 
@@ -226,7 +232,7 @@ fn describe(
 ) -> PyResult<PpfModel> {
     options.check().map_err(|error| PyValueError::new_err(error.to_string()))?;
     let (surface, symmetries) = (mesh.mesh.clone(), mesh.symmetry_poses(SYMMETRY_STEP));
-    let (model, note) = interruptible(py, OnInterrupt::Leave, move |_| match cache {
+    let (model, note) = interruptible(py, move |_| match cache {
         Some(path) => ObjectModel::cached(&path, &surface, &symmetries, &options),
         None => ObjectModel::new(&surface, &symmetries, &options).map(|model| (model, None)),
     })?
@@ -272,13 +278,13 @@ impl PpfModel {
     }
 }
 
-/// A depth image prepared for [estimate_ppf]: in-painting, normals, table plane, thinned points. Prepare once, search any
+/// A depth image prepared for estimate_ppf: in-painting, normals, table plane, thinned points. Prepare once, search any
 /// number of objects.
 ///
 /// depth (H, W) metres; mask (H, W) bool says where objects may be; remove_plane leaves the dominant plane out;
 /// max_depth in metres.
 ///
-/// Raises ValueError for images of different sizes or a depth in the wrong unit. Ctrl-C is heard.
+/// Raises ValueError for images of different sizes, a depth in the wrong unit or without any value. Ctrl-C is heard.
 ///
 /// >>> scene = PpfScene(depth, camera)  # doctest: +SKIP
 #[pyclass(name = "PpfScene", module = "sixfold", frozen)]
@@ -302,10 +308,12 @@ impl PpfScene {
         let mask = mask.map(|m| arrays::mask("mask", m)).transpose()?;
         let (max_depth, seed) = (positive("max_depth", max_depth)?, self::seed(seed)?);
         let options = SceneOptions { remove_plane, max_depth, seed, ..SceneOptions::default() };
-        let scene = interruptible(py, OnInterrupt::Leave, move |_| {
-            Scene::new(&depth, &camera, mask.as_ref(), &options)
+        let scene = interruptible(py, move |_| Scene::new(&depth, &camera, mask.as_ref(), &options))?;
+        let scene = scene.map_err(|error| match &error {
+            SceneError::MaskSize { .. } => about("mask")(error),
+            _ => about("depth")(error),
         })?;
-        Ok(PpfScene(Arc::new(scene.map_err(about("depth"))?)))
+        Ok(PpfScene(Arc::new(scene)))
     }
 
     /// The table plane, normal to the camera, or None.
@@ -359,7 +367,7 @@ enum ModelOrMesh<'py> {
 /// which is described first. instances: most poses returned; refined and verified: hypotheses that get a short ICP and
 /// the full check. The same input gives the same result at any number of threads. Ctrl-C is heard.
 ///
-/// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit.
+/// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit or without any value.
 ///
 /// >>> found = estimate_ppf(depth, mesh, camera)  # doctest: +SKIP
 /// >>> found[0].camera_from_object  # doctest: +SKIP
@@ -378,7 +386,8 @@ pub(crate) fn estimate_ppf(
     verified: Option<i64>,
     seed: i64,
 ) -> PyResult<Vec<PpfEstimate>> {
-    let mut options = EstimateOptions { max_instances: whole("instances", instances, 1)?, ..EstimateOptions::default() };
+    let mut options =
+        EstimateOptions { max_instances: whole("instances", instances, 1)?, ..EstimateOptions::default() };
     if !(0.0..=1.0).contains(&min_score) {
         return Err(bad("min_score", "a number from 0 to 1", min_score.to_string()));
     }
@@ -402,16 +411,18 @@ pub(crate) fn estimate_ppf(
         Ok(ModelOrMesh::Mesh(mesh)) => describe(py, mesh.get(), ModelOptions::default(), None)?.model,
         Err(_) => return Err(bad("model", "a PpfModel or a Mesh", model.get_type().to_string())),
     };
-    let found =
-        interruptible(py, OnInterrupt::Leave, move |_| sixfold_match::estimate(&scene, &model, &options))?;
+    let found = interruptible(py, move |_| sixfold_match::estimate(&scene, &model, &options))?;
     found
         .into_iter()
         .map(|e| {
             let verification = PyDict::new(py);
             let s = e.score;
-            for (name, value) in
-                [("rendered", s.rendered), ("inliers", s.inliers), ("occluded", s.occluded), ("outliers", s.outliers)]
-            {
+            for (name, value) in [
+                ("rendered", s.rendered),
+                ("inliers", s.inliers),
+                ("occluded", s.occluded),
+                ("outliers", s.outliers),
+            ] {
                 verification.set_item(name, value)?;
             }
             for (name, value) in [

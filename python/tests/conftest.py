@@ -27,7 +27,9 @@ def bumpy():
 
 @pytest.fixture
 def pose():
-    return sixfold.pose_exp([0.02, -0.03, 0.7, 0.6, -0.4, 0.3])
+    camera_from_object = sixfold.pose_exp([0, 0, 0, 0.6, -0.4, 0.3])
+    camera_from_object[:3, 3] = (0.02, -0.03, 0.7)
+    return camera_from_object
 
 
 @pytest.fixture(scope="session")

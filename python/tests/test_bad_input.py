@@ -155,6 +155,8 @@ def test_depth(call, wrong):
         ("weights", lambda: sixfold.kabsch(POINTS, POINTS, -np.ones(30))),
         ("weights", lambda: sixfold.kabsch(POINTS, POINTS, with_nan(np.ones(30)))),
         ("weights", lambda: sixfold.kabsch(POINTS, POINTS, np.ones(29))),
+        ("depth_estimate", lambda: metrics.vsd_of_depth(DEPTH[:9], DEPTH, DEPTH, CAMERA, 0.1)),
+        ("depth", lambda: metrics.vsd_of_depth(DEPTH, DEPTH, DEPTH[:9], CAMERA, 0.1)),
         ("target_normals", lambda: sixfold.icp(POINTS, POINTS, NORMALS[:5])),
         ("source_normals", lambda: sixfold.icp(POINTS, POINTS, NORMALS, source_normals=NORMALS[:5])),
         ("source", lambda: sixfold.icp(POINTS[:0], POINTS, NORMALS)),
@@ -279,7 +281,8 @@ def test_missing_depth_may_be_nan_zero_or_negative():
     zeros = np.where(np.isfinite(holes) & (holes > 0), holes, 0)
     assert (sixfold.normals_from_depth(holes, CAMERA) == sixfold.normals_from_depth(zeros, CAMERA)).all()
     assert len(sixfold.point_cloud(np.zeros((480, 640), np.float32), CAMERA)[0]) == 0
-    assert sixfold.estimate_ppf(np.zeros((480, 640), np.float32), BOX, CAMERA) == []
+    with pytest.raises(ValueError, match="^depth: .*no valid pixel"):
+        sixfold.estimate_ppf(np.zeros((480, 640), np.float32), BOX, CAMERA)
 
 
 def test_files_that_are_missing_or_broken(tmp_path):

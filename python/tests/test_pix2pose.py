@@ -50,8 +50,7 @@ def test_same_seed_same_result_and_views_of_arrays(network, frame):
     assert np.allclose(first.camera_from_object, third.camera_from_object, atol=1e-12)
 
 
-def test_nothing_in_the_box_is_none(network, frame):
-    assert network(np.zeros_like(frame[2]), [[10, 10, 40, 40]], [8]) == [None]
+def test_no_box_no_pose(network, frame):
     assert network(frame[2], np.zeros((0, 4)), []) == []
 
 
