@@ -240,6 +240,15 @@ pub(crate) struct EvalArguments {
     /// COCO detections to score by box AP (and mask AP where they have masks)
     #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
     pub detections: Option<PathBuf>,
+    /// With --detections: leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE", requires = "detections")]
+    pub except: Option<PathBuf>,
+    /// With --detections: score from which on detections count for recall and false detections, 0 to 1
+    #[arg(long, value_name = "SCORE", default_value = "0.4")]
+    pub min_score: f64,
+    /// With --detections: write the ground truth that they were scored with as a COCO file
+    #[arg(long, value_name = "FILE.json", requires = "detections")]
+    pub write_truth: Option<PathBuf>,
     /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)
     #[arg(long)]
     pub detection_ap: bool,

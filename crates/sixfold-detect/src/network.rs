@@ -135,13 +135,14 @@ impl DetectorConfig {
         let shared = tower(self.shared, &mut layer);
         let score_tower = tower(self.own, &mut layer);
         let box_tower = tower(self.own, &mut layer);
-        let mut scores = conv(w, self.classes, 1, Activation::Linear, 0.1);
+        // Small, as the encoder's numbers are large: scores begin at their prior everywhere.
+        let mut scores = conv(w, self.classes, 1, Activation::Linear, 0.003);
         scores.bias = burn::module::Param::from_tensor(Tensor::full(
             [self.classes],
             -((1.0 - PRIOR) / PRIOR).ln(),
             device,
         ));
-        let mut boxes = conv(w, self.regression_channels(), 1, Activation::Linear, 0.1);
+        let mut boxes = conv(w, self.regression_channels(), 1, Activation::Linear, 0.003);
         // Sides begin three strides away: e is 2.7.
         let bias: Vec<f32> = (0..self.regression_channels()).map(|i| f32::from(i < 4)).collect();
         boxes.bias = burn::module::Param::from_tensor(Tensor::from_data(
@@ -153,7 +154,7 @@ impl DetectorConfig {
             coarse: conv(w, half, 1, Activation::Linear, 1.0),
             fine: conv(channels[0], half, 1, Activation::Linear, 1.0),
             mix: conv(half, half, 3, Activation::Relu, 2.0),
-            out: conv(half, self.prototypes, 1, Activation::Relu, 2.0),
+            out: conv(half, self.prototypes, 1, Activation::Relu, 0.1),
         };
         let extra = (of_encoder..self.levels)
             .map(|_| {

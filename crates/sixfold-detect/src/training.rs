@@ -33,7 +33,7 @@ pub struct TrainingOptions {
     pub warm_up: u64,
     /// Decoupled weight decay.
     pub weight_decay: f32,
-    /// Gradients longer than this are shortened to it (Euclidean length over each of encoder and heads).
+    /// A tensor's gradient that is longer than this (Euclidean) is shortened to it.
     pub longest_gradient: f32,
     /// Stages of the encoder that stay as they are.
     pub frozen_stages: usize,
@@ -96,16 +96,16 @@ fn numbers(tensor: &Tensor<4>) -> Vec<f32> {
     data.try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
 
+/// What one image says: losses, gradients of encoder and of the rest.
+struct Lesson {
+    terms: [f64; 3],
+    encoder: GradientsParams,
+    heads: GradientsParams,
+}
+
 impl State<'_> {
-    /// Adds an image's gradients to the sums; its losses.
-    fn learn(
-        &self,
-        image: &TrainingImage,
-        positives: usize,
-        masks: usize,
-        of_encoder: &mut GradientsAccumulator<crate::network::Encoder>,
-        of_heads: &mut GradientsAccumulator<Detector>,
-    ) -> [f64; 3] {
+    /// One image through the network and back.
+    fn learn(&self, image: &TrainingImage, positives: usize, masks: usize) -> Lesson {
         let side = self.side;
         let input = TensorData::new(image.input.clone(), [1, 3, side, side]);
         let DetectorOutput { scores, boxes, prototypes } =
@@ -120,20 +120,18 @@ impl State<'_> {
             mask_width: side / MASK_STRIDE,
         };
         let value = loss(&raw, &image.targets, self.config, &LossWeights::default(), positives, masks);
+        let terms = [value.scores, value.boxes, value.masks];
         let gradients = value.of_scores.into_iter().chain(value.of_boxes).chain([value.of_prototypes]);
-        let products =
-            scores.into_iter().chain(boxes).chain([prototypes]).zip(gradients).map(|(out, gradient)| {
-                let dims = out.dims();
-                (out * Tensor::from_data(TensorData::new(gradient, dims), self.device)).sum()
-            });
-        if let Some(sum) = products.reduce(|a, b| a + b) {
-            let mut gradients = sum.backward();
-            let encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
-            of_encoder.accumulate(&self.network.encoder, encoder);
-            let heads = GradientsParams::from_module(&mut gradients, &self.network);
-            of_heads.accumulate(&self.network, heads);
-        }
-        [value.scores, value.boxes, value.masks]
+        let outputs = scores.into_iter().chain(boxes).chain([prototypes]);
+        let products = outputs.zip(gradients).map(|(out, gradient)| {
+            let dims = out.dims();
+            (out * Tensor::from_data(TensorData::new(gradient, dims), self.device)).sum()
+        });
+        let Some(sum) = products.reduce(|a, b| a + b) else { unreachable!("a detector has levels") };
+        let mut gradients = sum.backward();
+        let encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
+        let heads = GradientsParams::from_module(&mut gradients, &self.network);
+        Lesson { terms, encoder, heads }
     }
 }
 
@@ -144,14 +142,34 @@ impl Trainee for State<'_> {
         let count = |of: fn(&Targets) -> usize| batch.iter().map(|i| of(&i.targets)).sum::<usize>();
         let positives = count(|t| t.positives.len());
         let masks = count(|t| t.mask_positives.len());
+        // An image a thread: together in one tensor they would not fit the processor's caches, and much between the
+        // convolutions runs on one thread. Threads of their own, not of rayon's pool, whose kernels must not wait for a
+        // whole image.
+        let threads = rayon::current_num_threads().clamp(1, batch.len().max(1));
+        let state = &*self;
+        let lessons: Vec<Vec<Lesson>> = std::thread::scope(|scope| {
+            let workers: Vec<_> = (0..threads)
+                .map(|first| {
+                    let images = batch.iter().skip(first).step_by(threads);
+                    scope.spawn(move || images.map(|i| state.learn(i, positives, masks)).collect())
+                })
+                .collect();
+            let join = |worker: std::thread::ScopedJoinHandle<'_, _>| match worker.join() {
+                Ok(lessons) => lessons,
+                Err(panic) => std::panic::resume_unwind(panic),
+            };
+            workers.into_iter().map(join).collect()
+        });
+        // Summed in the order of the images, whichever thread had them.
         let mut of_encoder = GradientsAccumulator::new();
         let mut of_heads = GradientsAccumulator::new();
         let mut sums = [0.0; 3];
-        // One image after the other: together they would not fit the processor's caches, and memory is what this
-        // network waits for.
-        for image in &batch {
-            let terms = self.learn(image, positives, masks, &mut of_encoder, &mut of_heads);
-            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+        let mut lessons: Vec<_> = lessons.into_iter().map(Vec::into_iter).collect();
+        for image in 0..batch.len() {
+            let Some(lesson) = lessons[image % threads].next() else { continue };
+            sums.iter_mut().zip(lesson.terms).for_each(|(sum, term)| *sum += term);
+            of_encoder.accumulate(&self.network.encoder, lesson.encoder);
+            of_heads.accumulate(&self.network, lesson.heads);
         }
         let encoder = self.network.encoder.clone();
         self.network.encoder =
