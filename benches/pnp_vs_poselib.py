@@ -162,4 +162,5 @@ def main():
             )
 
 
-main()
+if __name__ == "__main__":
+    main()

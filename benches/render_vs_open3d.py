@@ -55,4 +55,5 @@ def main():
     print(f"pixels covered by one only: {np.sum((ours > 0) != (theirs > 0))} (at edges), elsewhere {np.sum(((ours > 0) != (theirs > 0)) & inner)}")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -5,6 +5,7 @@
 
 mod coco;
 mod coco_score;
+mod coco_truth;
 mod dataset;
 mod dataset_error;
 mod errors;
@@ -27,6 +28,7 @@ pub use coco::{
     parse_detections, read_detections, write_detections,
 };
 pub use coco_score::{CocoScores, IouType, evaluate_coco};
+pub use coco_truth::{FoundAtHalf, VisibleTruth, found_at_half};
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{

@@ -33,6 +33,11 @@ pub(crate) enum Command {
         sixfold estimate --dataset lmo --split test --out results.csv\n  \
         sixfold estimate --method pix2pose --weights model.safetensors --dataset lmo --boxes gt --out results.csv")]
     Estimate(Box<EstimateArguments>),
+    /// Detect objects in colour images: boxes and masks, for `sixfold estimate` or any COCO tool
+    #[command(after_help = "Examples:\n  \
+        sixfold detect --weights detector.safetensors --rgb c.png --out out\n  \
+        sixfold detect --weights detector.safetensors --dataset lmo --out detections.json")]
+    Detect(Box<DetectArguments>),
     /// Score a result file against the ground truth of a BOP dataset
     #[command(
         after_help = "Example:\n  sixfold eval --dataset lmo --results results.csv --curves curves.png"
@@ -181,9 +186,13 @@ pub(crate) struct EstimateArguments {
     /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
     #[arg(long, value_name = "FILE", requires = "dataset")]
     pub targets: Option<PathBuf>,
-    /// Where the objects are: gt for the ground truth's boxes, or a file of COCO detections (default: anywhere)
-    #[arg(long, value_name = "gt|FILE", requires = "dataset")]
+    /// Where the objects are: gt for the ground truth's boxes, detect for those of --detector, or a file of COCO
+    /// detections (default: detect with --detector, else anywhere)
+    #[arg(long, value_name = "gt|detect|FILE", requires = "dataset")]
     pub boxes: Option<String>,
+    /// Trained detector that says where the objects are: a file that `sixfold train detector` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub detector: Option<PathBuf>,
     /// Result: a CSV file in the BOP format for a dataset, a folder for one image
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
@@ -231,6 +240,15 @@ pub(crate) struct EvalArguments {
     /// COCO detections to score by box AP (and mask AP where they have masks)
     #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
     pub detections: Option<PathBuf>,
+    /// With --detections: leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE", requires = "detections")]
+    pub except: Option<PathBuf>,
+    /// With --detections: score from which on detections count for recall and false detections, 0 to 1
+    #[arg(long, value_name = "SCORE", default_value = "0.4")]
+    pub min_score: f64,
+    /// With --detections: write the ground truth that they were scored with as a COCO file
+    #[arg(long, value_name = "FILE.json", requires = "detections")]
+    pub write_truth: Option<PathBuf>,
     /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)
     #[arg(long)]
     pub detection_ap: bool,
@@ -326,6 +344,139 @@ pub(crate) enum TrainCommand {
         sixfold train pix2pose --object mug.ply --unit mm --out out/mug\n\n\
         Interrupted, it goes on when the same command is given again.")]
     Pix2pose(Box<TrainPix2PoseArguments>),
+    /// Boxes and masks of objects in colour images: `sixfold detect`, `sixfold estimate --detector`
+    #[command(after_help = "Examples:\n  \
+        sixfold train detector --dataset lmo --frames frames.json --backgrounds photographs --out out/detector\n  \
+        sixfold train detector --object mug.ply --unit mm --out out/mug-detector\n\n\
+        Interrupted, it goes on when the same command is given again.")]
+    Detector(Box<TrainDetectorArguments>),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum DetectorKind {
+    /// EfficientNet-Lite0 with a pyramid of three levels; trains on two cores
+    Compact,
+    /// ResNet-50 with RetinaNet's pyramid and heads, as in the dissertation; asks for a GPU or patience
+    Retinanet,
+}
+
+impl DetectorKind {
+    /// As it is typed.
+    pub fn name(self) -> &'static str {
+        match self {
+            DetectorKind::Compact => "compact",
+            DetectorKind::Retinanet => "retinanet",
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainDetectorArguments {
+    #[command(flatten)]
+    pub material: MaterialArguments,
+    /// Folder for checkpoints, learning curves and the finished model
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Which network learns
+    #[arg(long, value_enum, default_value = "compact")]
+    pub network: DetectorKind,
+    /// Training steps
+    #[arg(long, value_name = "N", default_value = "8000")]
+    pub steps: u64,
+    /// Images in a step
+    #[arg(long, value_name = "N", default_value = "4")]
+    pub batch: usize,
+    /// Highest learning rate
+    #[arg(long, value_name = "RATE", default_value = "0.002")]
+    pub learning_rate: f64,
+    /// The pretrained encoder's share of the learning rate, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value = "0.3")]
+    pub encoder_share: f64,
+    /// Stages of the ImageNet encoder that stay as they are, of five
+    #[arg(long, value_name = "N", default_value = "2")]
+    pub frozen_stages: usize,
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random)
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
+    /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
+    #[arg(long, value_name = "PIXELS", default_value = "320")]
+    pub size: usize,
+    /// Share of training images that are parts of photographs, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value = "0.45")]
+    pub photograph_share: f32,
+    /// Share of renders among pasted objects that have photographs, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value = "0.4")]
+    pub render_share: f32,
+    /// Largest turn in the image plane, degrees
+    #[arg(long, value_name = "DEGREES", default_value = "15")]
+    pub rotation: f32,
+    /// Draw the meshes in random colours, as untextured CAD models
+    #[arg(long)]
+    pub no_mesh_colors: bool,
+    /// Larger images will be reduced to so many pixels along their longer side before detection
+    #[arg(long, value_name = "PIXELS", default_value = "640")]
+    pub longest_side: usize,
+    /// Score below which detections will be left out unless something else is asked for, 0 to 1
+    #[arg(long, value_name = "SCORE", default_value = "0.4")]
+    pub threshold: f32,
+    /// Go on from the weights of another training of the same objects instead of ImageNet's
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Seed of weights and samples
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DetectArguments {
+    /// Trained detector: a file that `sixfold train detector` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: PathBuf,
+    /// Colour image: PNG or JPEG of any size, grey or colour
+    #[arg(long, value_name = "FILE", required_unless_present = "dataset", conflicts_with = "dataset")]
+    pub rgb: Option<PathBuf>,
+    /// BOP dataset folder: detect in the images of its targets
+    #[arg(long, value_name = "DIR", requires = "out")]
+    pub dataset: Option<PathBuf>,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file that says which images (default: its test_targets_bop19.json, or all images)
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub targets: Option<PathBuf>,
+    /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub except: Option<PathBuf>,
+    /// Result: a JSON file of COCO detections for a dataset, a folder for one image
+    #[arg(long, value_name = "PATH")]
+    pub out: Option<PathBuf>,
+    /// Folder for overlay pictures of a dataset's images
+    #[arg(long, value_name = "DIR", requires = "dataset")]
+    pub overlays: Option<PathBuf>,
+    /// Only these of the detector's objects (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub ids: Vec<u32>,
+    /// Leave out detections with a lower score, 0 to 1 (default: the model's; 0.02 with --dataset, as average precision
+    /// wants it)
+    #[arg(long, value_name = "SCORE")]
+    pub threshold: Option<f32>,
+    /// Of two boxes of an object that overlap more than this (intersection over union), leave the worse one out
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub overlap: f32,
+    /// Most detections of each object in an image, the best ones
+    #[arg(long, value_name = "N", default_value = "100")]
+    pub per_object: usize,
+    /// Most detections in an image, the best ones
+    #[arg(long, value_name = "N", default_value = "100")]
+    pub most: usize,
+    /// Boxes only
+    #[arg(long)]
+    pub no_masks: bool,
+    #[command(flatten)]
+    pub json: JsonArguments,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -349,8 +500,9 @@ impl NetworkKind {
     }
 }
 
+/// What a training learns from.
 #[derive(Debug, Args)]
-pub(crate) struct TrainPix2PoseArguments {
+pub(crate) struct MaterialArguments {
     /// BOP dataset folder with models and posed photographs
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
@@ -375,6 +527,15 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Folder of photographs for backgrounds (default: made-up textures)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainPix2PoseArguments {
+    #[command(flatten)]
+    pub material: MaterialArguments,
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -432,9 +593,6 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Train no further: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
-    /// Folder of stored objects
-    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
-    pub store: PathBuf,
     /// Seed of weights and samples
     #[arg(long, default_value = "0")]
     pub seed: u64,

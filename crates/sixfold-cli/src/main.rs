@@ -39,6 +39,7 @@ fn main() -> ExitCode {
         Command::Estimate(a) if a.dataset.is_some() => commands::estimate_dataset::run(a),
         Command::Estimate(a) if a.method == Method::Pix2pose => commands::estimate_rgb::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
+        Command::Detect(a) => commands::detect::run(a),
         Command::Eval(a) => commands::eval::run(a),
         Command::Render(a) => commands::render::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),

@@ -2,6 +2,7 @@
 
 use sixfold_geometry::{Camera, DepthImage, Image, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
+use sixfold_plot::text_dots;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
 /// Colours that differ on screens and for most eyes (Okabe and Ito 2008).
@@ -105,6 +106,33 @@ fn line(image: &mut RgbImage, a: [f64; 2], b: [f64; 2], color: [u8; 3]) {
                 image[(px as usize, py as usize)] = color;
             }
         }
+    }
+}
+
+/// A box of two pixels' width: left, top, right, bottom.
+pub(crate) fn rectangle(image: &mut RgbImage, [left, top, right, bottom]: [f64; 4], color: [u8; 3]) {
+    let corners = [[left, top], [right, top], [right, bottom], [left, bottom]];
+    for i in 0..4 {
+        line(image, corners[i], corners[(i + 1) % 4], color);
+    }
+}
+
+/// A small text on a coloured ground whose lower left corner is at a point, kept within the image.
+pub(crate) fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3]) {
+    let (width, height) = (6 * text.chars().count() + 1, 10);
+    let (columns, rows) = image.size();
+    let left = (x.max(0.0) as usize).min(columns.saturating_sub(width));
+    let top = ((y.max(0.0) as usize).saturating_sub(height)).min(rows.saturating_sub(height));
+    let mut set = |x: usize, y: usize, color: [u8; 3]| {
+        if x < columns && y < rows {
+            image[(x, y)] = color;
+        }
+    };
+    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+        set(left + x, top + y, color);
+    }
+    for (x, y) in text_dots(text) {
+        set(left + 1 + x, top + 1 + y, [0; 3]);
     }
 }
 

@@ -15,5 +15,6 @@ mod files;
 pub mod pretrained;
 pub mod resnet;
 pub mod schedule;
+pub mod training;
 pub mod training_log;
 pub mod weights;

@@ -144,6 +144,18 @@ pub fn text_width(text: &str, size: f64) -> f64 {
     size * (6.0 * text.chars().count() as f64 - 1.0).max(0.0)
 }
 
+/// The dots of a text, column and row from its top left corner; six columns a character, eight rows.
+pub fn text_dots(text: &str) -> Vec<(usize, usize)> {
+    let mut dots = vec![];
+    for (i, c) in text.chars().enumerate() {
+        let Some(columns) = (c as usize).checked_sub(32).and_then(|c| FONT.get(c)) else { continue };
+        for (column, bits) in columns.iter().enumerate() {
+            dots.extend((0..8).filter(|row| bits >> row & 1 == 1).map(|row| (6 * i + column, row)));
+        }
+    }
+    dots
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,8 +1,9 @@
-//! Where in an image a target is looked for: ground truth's boxes, a file of detections, or anywhere.
+//! Where in an image a target is looked for: ground truth's boxes, a file of detections, a detector's, or anywhere.
 
+use std::cell::RefCell;
 use std::path::Path;
 
-use anyhow::Result;
+use anyhow::{Context, Result, anyhow};
 use sixfold_bop::{
     Adjustment, BopDataset, Detection, ReadDetections, Scene, Target, TargetObject, ground_truth_visibility,
     read_detections,
@@ -10,14 +11,32 @@ use sixfold_bop::{
 use sixfold_geometry::Rect;
 use sixfold_mesh::Mesh;
 
+use super::detect::Detector;
+
 /// Where targets are looked for.
 pub(crate) enum Boxes {
     Anywhere,
     GroundTruth,
     Detections(Vec<Detection>),
+    /// A detector, and what it found in the image that was looked at last.
+    Detector(Box<Detector>, RefCell<LastImage>),
 }
 
+type LastImage = Option<((u32, u32), Vec<Detection>)>;
+
+/// Detections this sure are passed on: a pose's own confidence sorts them further.
+const SURE_ENOUGH: f32 = 0.1;
+
 impl Boxes {
+    /// A detector of the objects `ids`.
+    pub fn of_detector(weights: &Path, ids: impl IntoIterator<Item = u32>) -> Result<Boxes> {
+        let detector = Detector::load(weights)?.with_threshold(SURE_ENOUGH);
+        for id in ids {
+            detector.model().check_object(id).with_context(|| weights.display().to_string())?;
+        }
+        Ok(Boxes::Detector(Box::new(detector), RefCell::new(None)))
+    }
+
     /// The detections of a file, and what was left out of them.
     pub fn read(dataset: &BopDataset, file: &Path) -> Result<(Boxes, Vec<String>)> {
         let options = ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() };
@@ -47,19 +66,28 @@ impl Boxes {
                 .into_iter()
                 .map(|region| (region, 1.0))
                 .collect(),
-            Boxes::Detections(all) => {
-                let mut mine: Vec<&Detection> = all
-                    .iter()
-                    .filter(|d| {
-                        (d.scene_id, d.image_id, d.category_id)
-                            == (target.scene_id, target.im_id, object.obj_id)
-                    })
-                    .collect();
-                mine.sort_by(|x, y| y.score.total_cmp(&x.score));
-                mine.iter().take(object.inst_count).filter_map(|d| Some((d.bbox?, d.score))).collect()
+            Boxes::Detections(all) => best(all, target, object),
+            Boxes::Detector(detector, last) => {
+                let image = (target.scene_id, target.im_id);
+                let mut last = last.borrow_mut();
+                if last.as_ref().is_none_or(|(of, _)| *of != image) {
+                    let rgb = scene.rgb(target.im_id)?;
+                    let rgb = rgb.ok_or_else(|| anyhow!("has no colour image, which the detector needs"))?;
+                    *last = Some((image, detector.detections(&rgb, target.scene_id, target.im_id)?));
+                }
+                last.as_ref().map_or_else(Vec::new, |(_, all)| best(all, target, object))
             }
         })
     }
+}
+
+/// The target's boxes among detections, best first.
+fn best(all: &[Detection], target: &Target, object: &TargetObject) -> Vec<(Rect, f64)> {
+    let wanted = (target.scene_id, target.im_id, object.obj_id);
+    let mut mine: Vec<&Detection> =
+        all.iter().filter(|d| (d.scene_id, d.image_id, d.category_id) == wanted).collect();
+    mine.sort_by(|x, y| y.score.total_cmp(&x.score));
+    mine.iter().take(object.inst_count).filter_map(|d| Some((d.bbox?, d.score))).collect()
 }
 
 /// The visible boxes of an object's instances: from `scene_gt_info.json`, or rendered.

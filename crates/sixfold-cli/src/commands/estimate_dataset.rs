@@ -36,6 +36,8 @@ struct RunRecord {
     split: String,
     targets: Option<String>,
     boxes: Option<String>,
+    #[serde(default)]
+    detector: Option<String>,
     min_score: Option<f64>,
     keep_plane: bool,
     seed: u64,
@@ -76,13 +78,15 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let dataset = BopDataset::open(root, &a.split)?;
     let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
     let mut skipped: Vec<String> = vec![];
-    let boxes = match a.boxes.as_deref() {
-        None => Boxes::Anywhere,
-        Some("gt") => Boxes::GroundTruth,
-        Some("detect") => {
-            bail!("--boxes detect: no detector is part of this version; give gt or a file of COCO detections")
+    let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+    let boxes = match (a.boxes.as_deref(), &a.detector) {
+        (Some("gt"), _) => Boxes::GroundTruth,
+        (None | Some("detect"), Some(weights)) => Boxes::of_detector(weights, ids)?,
+        (Some("detect"), None) => {
+            bail!("--boxes detect needs --detector FILE.safetensors, which `sixfold train detector` writes")
         }
-        Some(file) => {
+        (None, None) => Boxes::Anywhere,
+        (Some(file), _) => {
             let (boxes, left_out) = Boxes::read(&dataset, Path::new(file))?;
             skipped.extend(left_out);
             boxes
@@ -90,7 +94,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     };
     let pix2pose = match a.method {
         Method::Pix2pose if matches!(boxes, Boxes::Anywhere) => {
-            bail!("--method pix2pose needs boxes: give --boxes gt or a file of COCO detections")
+            bail!(
+                "--method pix2pose needs boxes: give --detector FILE.safetensors, --boxes gt or a file of COCO detections"
+            )
         }
         Method::Pix2pose => Some(Pix2Pose::new(a)?),
         Method::Ppf if a.weights.is_some() || a.icp => {
@@ -113,6 +119,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
         boxes: a.boxes.clone(),
+        detector: a.detector.as_ref().map(|w| w.display().to_string()),
         min_score: a.min_score,
         keep_plane: a.keep_plane,
         seed: a.seed,

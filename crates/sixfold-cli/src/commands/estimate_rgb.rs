@@ -6,11 +6,13 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
-use sixfold_geometry::{Camera, Mask, Pose, Rect, Vec2, Vec3, undistort_depth, undistort_rgb};
+use sixfold_detect::model::DetectorModel;
+use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2, Vec3, undistort_depth, undistort_rgb};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::object::ObjectEntry;
 
+use super::detect;
 use super::estimate::{depth_scale, given_box};
 use super::pix2pose::{Pix2Pose, view_picture};
 use crate::Outcome;
@@ -93,9 +95,12 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let (width, height) = raw.size();
     let file = camera_file::read(camera_path)?;
     let lens = file.for_image(width, height, camera_path)?;
-    let region = region(a, &lens)?;
     // Lens distortion ends here: everything behind works on pinhole images.
     let image = undistort_rgb(&raw, &lens).with_context(|| rgb_file.display().to_string())?;
+    let region = match (&a.detector, &a.region, &a.mask) {
+        (Some(weights), None, None) => detected(weights, &image, entry.id)?,
+        _ => Some(region(a, &lens)?),
+    };
     let depth = match (&a.depth, a.icp) {
         (Some(path), true) => {
             let raw = read_depth(path, depth_scale(a, &file, camera_path)? / 1000.0)?;
@@ -112,9 +117,11 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let name = object.as_ref().map_or_else(|| format!("object {}", entry.id), |o| o.name.clone());
     let mesh = object.as_ref().map(|o| &o.mesh);
     let start = Instant::now();
-    let posed = pix2pose
-        .estimate(&image, &camera, entry.id, &region, mesh)?
-        .filter(|p| p.score >= a.min_score.unwrap_or(0.0));
+    let posed = match &region {
+        Some(region) => pix2pose.estimate(&image, &camera, entry.id, region, mesh)?,
+        None => None,
+    };
+    let posed = posed.filter(|p| p.score >= a.min_score.unwrap_or(0.0));
     let mut pose: Option<Pose> = posed.as_ref().map(|p| p.camera_from_object);
     let mut aligned = None;
     if let (Some(depth), Some(posed), Some(mesh)) = (&depth, &posed, mesh) {
@@ -197,6 +204,14 @@ fn print_table(whole: &Whole, folder: Option<&Path>) {
     }
 }
 
+/// Where a detector sees the object best, if at all.
+fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Rect>> {
+    let model = DetectorModel::load(weights)?;
+    model.check_object(id).with_context(|| weights.display().to_string())?;
+    let found = model.detect(image, &model.options())?;
+    Ok(detect::best(&found, &model, id).map(|d| d.bbox))
+}
+
 /// Where the object is: `--box`, or the box of `--mask`; in the pinhole image.
 fn region(a: &EstimateArguments, lens: &Camera) -> Result<Rect> {
     let region = match (given_box(a, lens)?, &a.mask) {
@@ -210,7 +225,10 @@ fn region(a: &EstimateArguments, lens: &Camera) -> Result<Rect> {
         }
         (Some(_), Some(_)) => bail!("--box and --mask: give one of them, --method pix2pose needs one box"),
         (None, None) => {
-            bail!("--method pix2pose needs to know where the object is: give --box X,Y,W,H or --mask FILE")
+            bail!(
+                "--method pix2pose needs to know where the object is: give --detector FILE.safetensors, --box X,Y,W,H or \
+                 --mask FILE"
+            )
         }
     };
     Ok(undistorted(&region, lens))

@@ -1,11 +1,13 @@
 //! `sixfold eval`: scores on the screen, curves as a picture, JSON for scripts.
 
+use std::collections::BTreeSet;
+
 use anyhow::{Context, Result, anyhow};
 use serde::Serialize;
 use sixfold_bop::{
     Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType,
-    ReadDetections, evaluate, evaluate_coco, evaluate_detection, read_detections, read_results,
-    read_results_lenient, write_recall_curves,
+    ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half,
+    read_detections, read_results, read_results_lenient, write_recall_curves,
 };
 
 use crate::Outcome;
@@ -138,18 +140,24 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
         eprintln!("{} {}", if clipped { "note:" } else { "skipped" }, changed.message);
         incomplete |= !clipped;
     }
-    let mut truth = CocoGroundTruth::default();
-    for scene_id in dataset.scene_ids() {
-        let file = dataset.scene(scene_id)?.dir().join("scene_gt_coco.json");
-        let text = std::fs::read(&file).with_context(|| {
-            format!("{}: the ground truth of detection (BOP's scene_gt_coco.json) is needed", file.display())
-        })?;
-        truth.add_scene(scene_id, &text, &file)?;
+    let truth = coco_truth(a, dataset)?;
+    if let Some(file) = &a.write_truth {
+        truth.truth.write(file)?;
     }
-    let boxes = evaluate_coco(&truth, &read.detections, IouType::Box);
-    let with_masks = read.detections.iter().any(|d| d.segmentation.is_some());
-    let masks = with_masks.then(|| evaluate_coco(&truth, &read.detections, IouType::Mask));
-    let value = serde_json::json!({ "box": boxes, "mask": masks });
+    let boxes = evaluate_coco(&truth.truth, &read.detections, IouType::Box);
+    let with_masks = read.detections.iter().any(|d| d.segmentation.is_some())
+        && truth.truth.annotations.iter().any(|a| a.segmentation.is_some());
+    let masks = with_masks.then(|| evaluate_coco(&truth.truth, &read.detections, IouType::Mask));
+    let known = truth.visible.len() == truth.truth.annotations.len();
+    let least_visible: &[f64] = if known { &[0.1, 0.4] } else { &[] };
+    let found: Vec<_> =
+        least_visible.iter().map(|v| found_at_half(&truth, &read.detections, a.min_score, *v)).collect();
+    let value = serde_json::json!({
+        "images": truth.truth.images.len(),
+        "box": boxes,
+        "mask": masks,
+        "found_at_half": found,
+    });
     report(&a.json, &value, || println!("{}", serde_json::to_string_pretty(&value).unwrap_or_default()))?;
     Ok(if incomplete {
         Outcome::Incomplete
@@ -158,4 +166,40 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     } else {
         Outcome::Found
     })
+}
+
+/// The ground truth of the dataset's images, or of those of the targets but `--except`: as its `scene_gt_coco.json` says,
+/// or from poses where a scene has none.
+fn coco_truth(a: &EvalArguments, dataset: &BopDataset) -> Result<VisibleTruth> {
+    let mut images: BTreeSet<(u32, u32)> = BTreeSet::new();
+    match &a.targets {
+        Some(file) => images.extend(dataset.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id))),
+        None => {
+            for scene_id in dataset.scene_ids() {
+                images
+                    .extend(dataset.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
+            }
+        }
+    }
+    if let Some(file) = &a.except {
+        for t in dataset.targets(Some(file))? {
+            images.remove(&(t.scene_id, t.im_id));
+        }
+    }
+    let mut files = vec![];
+    for scene_id in dataset.scene_ids() {
+        files.push((scene_id, dataset.scene(scene_id)?.dir().join("scene_gt_coco.json")));
+    }
+    if !files.iter().all(|(_, file)| file.is_file()) {
+        let images: Vec<(u32, u32)> = images.into_iter().collect();
+        return Ok(VisibleTruth::of_poses(dataset, &images)?);
+    }
+    let mut truth = CocoGroundTruth::default();
+    for (scene_id, file) in files {
+        let text = std::fs::read(&file).with_context(|| file.display().to_string())?;
+        truth.add_scene(scene_id, &text, &file)?;
+    }
+    truth.images.retain(|image| images.contains(image));
+    truth.annotations.retain(|a| images.contains(&(a.scene_id, a.image_id)));
+    Ok(VisibleTruth { truth, visible: vec![] })
 }

@@ -8,7 +8,8 @@ use sixfold_geometry::{Camera, Mat3, Pose, Vec2, Vec3};
 use super::options::SampleOptions;
 
 /// What poses are drawn from.
-pub(super) struct PoseRange<'a> {
+pub struct PoseRange<'a> {
+    /// The camera.
     pub camera: &'a Camera,
     /// Centre of the object's box in its own frame, metres.
     pub centre: Vec3,
@@ -19,6 +20,7 @@ pub(super) struct PoseRange<'a> {
 }
 
 impl PoseRange<'_> {
+    /// A pose: near one of the photographs or from anywhere, as the options say.
     pub fn draw(&self, options: &SampleOptions, random: &mut Random) -> Pose {
         let near = !self.real.is_empty() && random.random::<f32>() < options.near_real_share;
         let facing = if near {

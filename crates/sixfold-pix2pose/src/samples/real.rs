@@ -143,7 +143,7 @@ impl RealCrop {
     }
 
     /// How much of each crop pixel shows the object.
-    pub(super) fn visible(&self, map: &AffineMap, size: usize) -> Coverage {
+    pub fn visible(&self, map: &AffineMap, size: usize) -> Coverage {
         Coverage::from_fn(size, size, |x, y| {
             let [u, v] = map.apply(x as f32, y as f32);
             self.visible.sample(u, v)
@@ -151,7 +151,7 @@ impl RealCrop {
     }
 
     /// The visible part as a picture of its own.
-    pub(super) fn cutout(&self) -> Option<Cutout> {
+    pub fn cutout(&self) -> Option<Cutout> {
         let m = &self.visible;
         let image = RgbImage::from_fn(m.width, m.height, |x, y| self.image[(m.x + x, m.y + y)]);
         let mask = Mask::from_fn(m.width, m.height, |x, y| m.data[y * m.width + x] > 0);

@@ -51,7 +51,7 @@ pub(super) fn colors(
 }
 
 /// As [`colors`], in planes.
-pub(super) fn color_patch(
+pub fn color_patch(
     mesh: &Mesh,
     camera: &Camera,
     camera_from_object: &Pose,
@@ -94,7 +94,7 @@ pub(super) fn random_material(random: &mut Random) -> Material {
 }
 
 /// The mesh in random colours that change slowly over its surface, for shapes without colours.
-pub(super) fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
+pub fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
     let (low, high) = mesh.bounding_box();
     let size = (high - low).norm().max(1e-9);
     let base: [f32; 3] = std::array::from_fn(|_| uniform(random, [0.1, 0.9]));

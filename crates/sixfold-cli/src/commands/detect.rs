@@ -1,0 +1,285 @@
+//! `sixfold detect`: boxes and masks of a detector's objects, in one image or in all of a dataset.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow, bail};
+use serde::Serialize;
+use sixfold_bop::{BopDataset, Detection, Rle, read_rgb, write_detections, write_rgb};
+use sixfold_detect::detect::{DetectOptions, Detected};
+use sixfold_detect::model::DetectorModel;
+use sixfold_geometry::RgbImage;
+
+use crate::Outcome;
+use crate::arguments::DetectArguments;
+use crate::output::{report, write_atomically};
+use crate::overlay;
+use crate::progress::{Progress, check_interrupt};
+
+/// A detector with what is asked of it.
+pub(crate) struct Detector {
+    model: DetectorModel,
+    options: DetectOptions,
+}
+
+impl Detector {
+    /// The detector of a weight file with its default threshold.
+    pub fn load(weights: &Path) -> Result<Detector> {
+        let model = DetectorModel::load(weights)?;
+        let options = model.options();
+        Ok(Detector { model, options })
+    }
+
+    pub fn model(&self) -> &DetectorModel {
+        &self.model
+    }
+
+    /// Detections below `threshold` are left out.
+    pub fn with_threshold(self, threshold: f32) -> Detector {
+        Detector { options: DetectOptions { threshold, ..self.options }, ..self }
+    }
+
+    /// Detections of an image as COCO has them.
+    pub fn detections(&self, image: &RgbImage, scene_id: u32, image_id: u32) -> Result<Vec<Detection>> {
+        let start = Instant::now();
+        let found = self.model.detect(image, &self.options)?;
+        let time = start.elapsed().as_secs_f64();
+        found
+            .iter()
+            .map(|d| {
+                Ok(Detection {
+                    scene_id,
+                    image_id,
+                    category_id: self.model.id_of(d.class),
+                    score: f64::from(d.score),
+                    bbox: Some(d.bbox),
+                    segmentation: d.mask.as_ref().map(Rle::encode).transpose()?,
+                    time: Some(time),
+                })
+            })
+            .collect()
+    }
+}
+
+#[derive(Serialize)]
+struct Found {
+    object_id: u32,
+    score: f64,
+    /// x, y, width, height in pixels.
+    bbox: [f64; 4],
+    mask_pixels: Option<u64>,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    detections: Vec<Found>,
+    seconds: f64,
+    file: Option<PathBuf>,
+    overlay: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Summary {
+    images: usize,
+    detections: usize,
+    skipped: Vec<String>,
+    seconds_per_image: Option<f64>,
+    file: PathBuf,
+}
+
+pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
+    let model = DetectorModel::load(&a.weights)?;
+    for id in &a.ids {
+        model.check_object(*id).with_context(|| "--ids".to_string())?;
+    }
+    let default = match a.dataset {
+        Some(_) => DetectOptions::for_scores().threshold,
+        None => model.usage().threshold,
+    };
+    let options = DetectOptions {
+        threshold: a.threshold.unwrap_or(default),
+        overlap: a.overlap,
+        per_class: a.per_object,
+        most: a.most,
+        masks: !a.no_masks,
+    };
+    options.check().map_err(|message| anyhow!(message))?;
+    let detector = Detector { model, options };
+    match (&a.dataset, &a.rgb) {
+        (Some(root), _) => in_dataset(a, &detector, root),
+        (None, Some(file)) => in_image(a, &detector, file),
+        (None, None) => bail!("give --rgb FILE or --dataset DIR"),
+    }
+}
+
+/// Whether an object was asked for.
+fn wanted(a: &DetectArguments, id: u32) -> bool {
+    a.ids.is_empty() || a.ids.contains(&id)
+}
+
+fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Outcome> {
+    let image = read_rgb(file)?;
+    let start = Instant::now();
+    let mut found = detector.detections(&image, 0, 0).with_context(|| file.display().to_string())?;
+    let seconds = start.elapsed().as_secs_f64();
+    found.retain(|d| wanted(a, d.category_id));
+    let (mut overlay, mut json) = (None, None);
+    if let Some(folder) = &a.out {
+        let path = folder.join("overlay.png");
+        write_rgb(&path, &picture(&image, &found))?;
+        overlay = Some(path);
+        let path = folder.join("detections.json");
+        write_detections(&path, &found)?;
+        json = Some(path);
+    }
+    let detections = found
+        .iter()
+        .filter_map(|d| {
+            let b = d.bbox?;
+            Some(Found {
+                object_id: d.category_id,
+                score: d.score,
+                bbox: [b.x, b.y, b.width, b.height],
+                mask_pixels: d.segmentation.as_ref().map(Rle::area),
+            })
+        })
+        .collect();
+    let whole = Whole { detections, seconds, file: json, overlay };
+    if let Some(folder) = &a.out {
+        write_atomically(&folder.join("result.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    }
+    report(&a.json, &whole, || {
+        println!("{:>8} {:>8} {:>32} {:>10}", "object", "score", "box: x, y, width, height", "mask");
+        for d in &whole.detections {
+            let numbers: Vec<String> = d.bbox.iter().map(|v| format!("{v:.1}")).collect();
+            let mask = d.mask_pixels.map_or("-".to_string(), |m| format!("{m} px"));
+            println!("{:>8} {:>8.3} {:>32} {mask:>10}", d.object_id, d.score, numbers.join(", "));
+        }
+        if whole.detections.is_empty() {
+            println!("nothing found");
+        }
+        println!("{:.0} ms", 1000.0 * whole.seconds);
+        if let Some(folder) = &a.out {
+            println!("detections.json and overlay.png are in {}", folder.display());
+        }
+    })?;
+    Ok(if whole.detections.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<Outcome> {
+    let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
+    if out.extension().is_none_or(|e| e != "json") {
+        bail!("--out: found {}, expected a file that ends in .json", out.display());
+    }
+    let dataset = BopDataset::open(root, &a.split)?;
+    let images = images(a, &dataset)?;
+    let mut progress = Progress::new("images", images.len());
+    let (mut all, mut skipped, mut seconds) = (vec![], vec![], vec![]);
+    let mut scene = None;
+    for (scene_id, im_id) in &images {
+        check_interrupt("nothing was written")?;
+        if scene.as_ref().is_none_or(|(id, _)| id != scene_id) {
+            scene = Some((*scene_id, dataset.scene(*scene_id)?));
+        }
+        let Some((_, scene)) = &scene else { continue };
+        let found = scene.rgb(*im_id).map_err(anyhow::Error::from).and_then(|image| {
+            let image = image.ok_or_else(|| anyhow!("there is no colour image"))?;
+            let start = Instant::now();
+            let mut found = detector.detections(&image, *scene_id, *im_id)?;
+            let time = start.elapsed().as_secs_f64();
+            found.retain(|d| wanted(a, d.category_id));
+            if let Some(folder) = &a.overlays {
+                let sure = detector.model.usage().threshold;
+                let shown: Vec<Detection> =
+                    found.iter().filter(|d| d.score >= f64::from(sure)).cloned().collect();
+                write_rgb(&folder.join(format!("{scene_id:06}_{im_id:06}.png")), &picture(&image, &shown))?;
+            }
+            Ok((found, time))
+        });
+        match found {
+            Ok((found, time)) => {
+                all.extend(found);
+                seconds.push(time);
+            }
+            Err(error) => skipped.push(format!("image {scene_id}/{im_id}: {}", crate::describe(&error))),
+        }
+        progress.step(format!("{scene_id}/{im_id}"));
+    }
+    progress.finish();
+    for s in &skipped {
+        eprintln!("skipped {s}");
+    }
+    write_detections(out, &all)?;
+    let summary = Summary {
+        images: images.len(),
+        detections: all.len(),
+        skipped,
+        seconds_per_image: (!seconds.is_empty()).then(|| seconds.iter().sum::<f64>() / seconds.len() as f64),
+        file: out.to_owned(),
+    };
+    report(&a.json, &summary, || {
+        println!("{} detections in {} images: {}", summary.detections, summary.images, out.display());
+        if let Some(seconds) = summary.seconds_per_image {
+            println!("{:.0} ms per image", 1000.0 * seconds);
+        }
+    })?;
+    Ok(if !summary.skipped.is_empty() {
+        Outcome::Incomplete
+    } else if summary.detections == 0 {
+        Outcome::NothingFound
+    } else {
+        Outcome::Found
+    })
+}
+
+/// The images of the targets, or all of a dataset without targets, but those of `--except`.
+fn images(a: &DetectArguments, dataset: &BopDataset) -> Result<Vec<(u32, u32)>> {
+    let mut images: BTreeSet<(u32, u32)> = BTreeSet::new();
+    if a.targets.is_some() || dataset.root().join("test_targets_bop19.json").is_file() {
+        let targets = dataset.targets(a.targets.as_deref())?;
+        images.extend(targets.iter().map(|t| (t.scene_id, t.im_id)));
+    } else {
+        for scene_id in dataset.scene_ids() {
+            images.extend(dataset.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
+        }
+    }
+    if let Some(file) = &a.except {
+        for t in dataset.targets(Some(file))? {
+            images.remove(&(t.scene_id, t.im_id));
+        }
+    }
+    Ok(images.into_iter().collect())
+}
+
+/// Boxes and tinted masks over the image, the best on top.
+fn picture(image: &RgbImage, found: &[Detection]) -> RgbImage {
+    let mut out = image.clone();
+    for d in found.iter().rev() {
+        let color = overlay::color(d.category_id as usize);
+        if let Some(mask) = d.segmentation.as_ref().map(Rle::decode) {
+            for (pixel, inside) in out.as_mut_slice().iter_mut().zip(mask.as_slice()) {
+                if *inside {
+                    for (channel, tint) in pixel.iter_mut().zip(color) {
+                        *channel = ((u16::from(*channel) + u16::from(tint)) / 2) as u8;
+                    }
+                }
+            }
+        }
+        if let Some(b) = d.bbox {
+            overlay::rectangle(&mut out, [b.x, b.y, b.x + b.width, b.y + b.height], color);
+        }
+    }
+    for d in found.iter().rev() {
+        if let Some(b) = d.bbox {
+            let text = format!("{} {:.2}", d.category_id, d.score);
+            overlay::label(&mut out, [b.x, b.y], &text, overlay::color(d.category_id as usize));
+        }
+    }
+    out
+}
+
+/// The best detection of an object in an image that the detector is sure enough of.
+pub(super) fn best(found: &[Detected], model: &DetectorModel, id: u32) -> Option<Detected> {
+    found.iter().find(|d| model.id_of(d.class) == id).cloned()
+}

@@ -1,0 +1,36 @@
+//! Training images a second of the compact detector, samples included, on renders of a made-up object.
+//!
+//!     cargo run --release -p sixfold-detect --example bench_training -- [STEPS]
+
+use std::error::Error;
+use std::sync::atomic::AtomicBool;
+
+use burn::tensor::Device;
+use sixfold_augment::Backgrounds;
+use sixfold_detect::network::{DetectorConfig, Encoder};
+use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_detect::training::{TrainingOptions, TrainingPace, train};
+use sixfold_geometry::Vec3;
+use sixfold_mesh::Mesh;
+use sixfold_nn::lite0::imagenet_encoder;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let steps = std::env::args().nth(1).map_or(Ok(60), |text| text.parse())?;
+    let vertices =
+        [[-0.05, -0.04, 0.0], [0.05, -0.03, 0.0], [0.0, 0.06, 0.0], [0.01, 0.0, 0.08]].map(Vec3::from).to_vec();
+    let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])?;
+    let objects = vec![SceneObject { id: 1, mesh, diameter: 0.12 }];
+    let options = SceneOptions { random_color_chance: 1.0, ..SceneOptions::default() };
+    let source = SceneSource::new(objects, &[], &[], Backgrounds::procedural(), options)?;
+    let device = Device::flex().autodiff();
+    let config = DetectorConfig::compact(1);
+    let network = config.init_with(Encoder::Lite0(imagenet_encoder(&device)?), 1, &device);
+    let options = TrainingOptions { steps, ..TrainingOptions::default() };
+    let pace = TrainingPace { log_every: 20, ..TrainingPace::default() };
+    let folder = std::env::temp_dir().join(format!("sixfold-bench-training-{}", std::process::id()));
+    let stop = AtomicBool::new(false);
+    train(&source, network, &config, &device, &folder, &options, &pace, &stop, |record| {
+        println!("step {}: {:.1} images/s, {:?}", record.step, record.samples_per_second, record.losses);
+    })?;
+    Ok(std::fs::remove_dir_all(folder)?)
+}

@@ -1,0 +1,353 @@
+//! From an image to boxes: resizing and padding, decoding, non-maximum suppression, masks.
+
+use crate::loss::{distance, middle, sigmoid};
+use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
+use sixfold_augment::{AffineMap, Patch};
+use sixfold_geometry::{Mask, Rect, RgbImage};
+
+/// Which detections are given.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DetectOptions {
+    /// Detections with a lower score are left out.
+    pub threshold: f32,
+    /// Of two boxes of a class that overlap more (intersection over union) the worse one is left out.
+    pub overlap: f32,
+    /// Most detections of a class, the best ones.
+    pub per_class: usize,
+    /// Most detections of an image, the best ones.
+    pub most: usize,
+    /// Make masks too.
+    pub masks: bool,
+}
+
+impl Default for DetectOptions {
+    /// For people and for poses: what the detector is sure of.
+    fn default() -> Self {
+        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, most: 100, masks: true }
+    }
+}
+
+impl DetectOptions {
+    /// For average precision, which wants unsure detections too.
+    pub fn for_scores() -> Self {
+        DetectOptions { threshold: 0.02, ..DetectOptions::default() }
+    }
+
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// The field, what it is and what it must be, in words.
+    pub fn check(&self) -> Result<(), String> {
+        for (field, value) in [("threshold", self.threshold), ("overlap", self.overlap)] {
+            if !(0.0..=1.0).contains(&value) {
+                return Err(format!("detection option {field}: found {value}, expected 0 to 1"));
+            }
+        }
+        if self.per_class == 0 || self.most == 0 {
+            let (a, b) = (self.per_class, self.most);
+            return Err(format!(
+                "detection options per_class and most: found {a} and {b}, expected at least 1"
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// A detected object.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Detected {
+    /// Place of its class in the network.
+    pub class: usize,
+    /// Expected overlap of the box with the truth where there is one: the confidence, 0..1.
+    pub score: f32,
+    /// Box of the visible part in the image's pixels: first pixel, last minus first, as BOP's `bbox_visib`.
+    pub bbox: Rect,
+    /// Visible part, of the image's size, if asked for.
+    pub mask: Option<Mask>,
+}
+
+/// An image at the network's scale.
+#[derive(Debug, Clone)]
+pub struct NetworkImage {
+    /// 3 x height x width, as the encoder wants it.
+    pub values: Vec<f32>,
+    /// Columns, multiple of the alignment.
+    pub width: usize,
+    /// Rows, multiple of the alignment.
+    pub height: usize,
+    /// Columns and rows that show the image; the rest is grey.
+    pub filled: [usize; 2],
+    /// Image pixels per network pixel along a side.
+    pub step: f32,
+}
+
+impl NetworkImage {
+    /// An image reduced to at most `longest_side` pixels along its longer side (never enlarged), with grey to the right
+    /// and below. `None` for an image without pixels.
+    pub fn new(image: &RgbImage, config: &DetectorConfig, longest_side: usize) -> Option<NetworkImage> {
+        let (w, h) = image.size();
+        if w == 0 || h == 0 {
+            return None;
+        }
+        let step = (w.max(h) as f32 / longest_side.max(1) as f32).max(1.0);
+        let filled = [w, h].map(|side| ((side as f32 / step).round() as usize).max(1));
+        let alignment = config.alignment();
+        let [width, height] = filled.map(|side| side.next_multiple_of(alignment));
+        let mut values = vec![0.5; 3 * width * height];
+        if step == 1.0 {
+            for (y, row) in (0..h).map(|y| (y, image.row(y))) {
+                for (x, rgb) in row.iter().enumerate() {
+                    for c in 0..3 {
+                        values[(c * height + y) * width + x] = f32::from(rgb[c]) * (1.0 / 255.0);
+                    }
+                }
+            }
+        } else {
+            let offset = 0.5 * (step - 1.0);
+            let map = AffineMap { x: [step, 0.0, offset], y: [0.0, step, offset] };
+            let (patch, _) = Patch::warp(image, &map, filled[0], filled[1], [0.5; 3]);
+            for c in 0..3 {
+                for y in 0..filled[1] {
+                    values[(c * height + y) * width..][..filled[0]]
+                        .copy_from_slice(&patch.data[(c * filled[1] + y) * filled[0]..][..filled[0]]);
+                }
+            }
+        }
+        config.input(&mut values, width * height);
+        Some(NetworkImage { values, width, height, filled, step })
+    }
+}
+
+/// Network output of one image as numbers.
+#[derive(Debug, Clone)]
+pub struct Numbers {
+    /// Logits of every level.
+    pub scores: Vec<Vec<f32>>,
+    /// Sides, coefficients, bias of every level.
+    pub boxes: Vec<Vec<f32>>,
+    /// Prototypes.
+    pub prototypes: Vec<f32>,
+}
+
+/// A box before suppression, in network pixels.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    class: usize,
+    score: f32,
+    /// Left, top, right, bottom.
+    corners: [f32; 4],
+    level: usize,
+    location: usize,
+}
+
+fn overlap(a: &[f32; 4], b: &[f32; 4]) -> f32 {
+    let w = a[2].min(b[2]) - a[0].max(b[0]);
+    let h = a[3].min(b[3]) - a[1].max(b[1]);
+    if w <= 0.0 || h <= 0.0 {
+        return 0.0;
+    }
+    let area = |r: &[f32; 4]| (r[2] - r[0]) * (r[3] - r[1]);
+    w * h / (area(a) + area(b) - w * h)
+}
+
+/// Non-maximum suppression of each class by itself: goes from the best to the worst and leaves out what overlaps a kept
+/// box of its class by more than `most_overlap`; at most `per_class` of a class and `most` in all are kept. Equal scores
+/// keep their order.
+fn suppress(
+    mut candidates: Vec<Candidate>,
+    most_overlap: f32,
+    per_class: usize,
+    most: usize,
+) -> Vec<Candidate> {
+    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let mut kept: Vec<Candidate> = vec![];
+    for c in candidates {
+        if kept.len() == most {
+            break;
+        }
+        let mut same = kept.iter().filter(|k| k.class == c.class);
+        if same.clone().count() < per_class && !same.any(|k| overlap(&k.corners, &c.corners) > most_overlap) {
+            kept.push(c);
+        }
+    }
+    kept
+}
+
+/// Detections in an image of `size` (columns, rows), best first.
+pub fn decode(
+    raw: &Numbers,
+    image: &NetworkImage,
+    size: (usize, usize),
+    config: &DetectorConfig,
+    options: &DetectOptions,
+) -> Vec<Detected> {
+    /// Most candidates that suppression looks at.
+    const MOST_CANDIDATES: usize = 2000;
+    let threshold = options.threshold.clamp(1e-4, 1.0 - 1e-6);
+    let least_logit = (threshold / (1.0 - threshold)).ln();
+    let limits = image.filled.map(|side| side as f32 - 0.5);
+    let mut candidates = vec![];
+    for level in 0..config.levels {
+        let stride = config.stride(level);
+        let width = image.width / stride;
+        let locations = width * (image.height / stride);
+        for (index, logit) in raw.scores[level].iter().enumerate() {
+            if *logit < least_logit {
+                continue;
+            }
+            let (class, location) = (index / locations, index % locations);
+            let [x, y] = middle(location, width, stride as f32);
+            let far: [f32; 4] =
+                std::array::from_fn(|i| distance(raw.boxes[level][i * locations + location], stride as f32));
+            let corners = [
+                (x - far[0]).clamp(-0.5, limits[0]),
+                (y - far[1]).clamp(-0.5, limits[1]),
+                (x + far[2]).clamp(-0.5, limits[0]),
+                (y + far[3]).clamp(-0.5, limits[1]),
+            ];
+            if corners[2] - corners[0] >= 1.0 && corners[3] - corners[1] >= 1.0 {
+                candidates.push(Candidate { class, score: sigmoid(*logit), corners, level, location });
+            }
+        }
+    }
+    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+    candidates.truncate(MOST_CANDIDATES);
+    let to_image = |v: f32, last: usize| {
+        f64::from(((v + 0.5) * image.step - 0.5).clamp(0.0, last.saturating_sub(1) as f32))
+    };
+    suppress(candidates, options.overlap, options.per_class, options.most)
+        .into_iter()
+        .map(|c| {
+            let [left, top, right, bottom] = c.corners;
+            let (x, y) = (to_image(left, size.0), to_image(top, size.1));
+            let bbox =
+                Rect { x, y, width: to_image(right, size.0) - x, height: to_image(bottom, size.1) - y };
+            let mask = options.masks.then(|| mask_of(raw, image, size, config, &c));
+            Detected { class: c.class, score: c.score, bbox, mask }
+        })
+        .collect()
+}
+
+/// A candidate's mask in the image: the sum of prototypes within its box, one block of prototype pixels wider.
+fn mask_of(
+    raw: &Numbers,
+    image: &NetworkImage,
+    size: (usize, usize),
+    config: &DetectorConfig,
+    c: &Candidate,
+) -> Mask {
+    let stride = FINEST_STRIDE << c.level;
+    let locations = (image.width / stride) * (image.height / stride);
+    let numbers: Vec<f32> =
+        (0..=config.prototypes).map(|k| raw.boxes[c.level][(4 + k) * locations + c.location]).collect();
+    let (width, height) = (image.width / MASK_STRIDE, image.height / MASK_STRIDE);
+    let span = |low: f32, high: f32, limit: usize| {
+        let first = (low.max(0.0) as usize / MASK_STRIDE).saturating_sub(1).min(limit - 1);
+        (first, (high.max(0.0) as usize / MASK_STRIDE + 2).clamp(first + 1, limit))
+    };
+    let (x0, x1) = span(c.corners[0], c.corners[2], width);
+    let (y0, y1) = span(c.corners[1], c.corners[3], height);
+    let (columns, rows) = (x1 - x0, y1 - y0);
+    let mut logits = vec![numbers[config.prototypes]; columns * rows];
+    for k in 0..config.prototypes {
+        for row in 0..rows {
+            let source = &raw.prototypes[(k * height + y0 + row) * width + x0..][..columns];
+            let target = &mut logits[row * columns..][..columns];
+            target.iter_mut().zip(source).for_each(|(t, s)| *t += numbers[k] * s);
+        }
+    }
+    let at = |x: usize, y: usize| logits[y.min(rows - 1) * columns + x.min(columns - 1)];
+    let mut mask = Mask::filled(size.0, size.1, false);
+    let span = |low: f32, high: f32, limit: usize| {
+        let at = |v: f32| ((v + 0.5) * image.step).clamp(0.0, limit as f32);
+        at(low - 0.5).floor() as usize..at(high + 0.5).ceil() as usize
+    };
+    let per_mask = MASK_STRIDE as f32;
+    for y in span(c.corners[1], c.corners[3], size.1) {
+        // Where the pixel lies between the middles of the prototypes' pixels.
+        let v = (((y as f32 + 0.5) / image.step) / per_mask - 0.5 - y0 as f32).max(0.0);
+        for x in span(c.corners[0], c.corners[2], size.0) {
+            let u = (((x as f32 + 0.5) / image.step) / per_mask - 0.5 - x0 as f32).max(0.0);
+            let (i, j) = (u as usize, v as usize);
+            let (fx, fy) = (u - i as f32, v - j as f32);
+            let top = at(i, j) * (1.0 - fx) + at(i + 1, j) * fx;
+            let bottom = at(i, j + 1) * (1.0 - fx) + at(i + 1, j + 1) * fx;
+            mask[(x, y)] = top * (1.0 - fy) + bottom * fy > 0.0;
+        }
+    }
+    mask
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn candidate(class: usize, score: f32, corners: [f32; 4]) -> Candidate {
+        Candidate { class, score, corners, level: 0, location: 0 }
+    }
+
+    #[test]
+    fn of_overlapping_boxes_of_a_class_the_best_stays() {
+        let all = vec![
+            candidate(0, 0.5, [0.0, 0.0, 10.0, 10.0]),
+            candidate(0, 0.9, [1.0, 0.0, 11.0, 10.0]),
+            candidate(1, 0.4, [0.0, 0.0, 10.0, 10.0]),
+            candidate(0, 0.6, [20.0, 0.0, 30.0, 10.0]),
+        ];
+        let scores = |kept: Vec<Candidate>| kept.iter().map(|c| c.score).collect::<Vec<_>>();
+        assert_eq!(scores(suppress(all.clone(), 0.5, 9, 9)), [0.9, 0.6, 0.4]);
+        assert_eq!(scores(suppress(all.clone(), 0.5, 1, 9)), [0.9, 0.4]);
+        assert_eq!(scores(suppress(all.clone(), 0.5, 9, 1)), [0.9]);
+        assert_eq!(scores(suppress(all, 0.9, 9, 9)), [0.9, 0.6, 0.5, 0.4]);
+    }
+
+    #[test]
+    fn a_location_becomes_a_box_and_a_mask_in_the_image() {
+        let config = DetectorConfig { prototypes: 1, ..DetectorConfig::compact(2) };
+        // An image of twice the network's size: 160x128 to 80x64, padded to 96x64.
+        let image = RgbImage::filled(160, 128, [127; 3]);
+        let input = NetworkImage::new(&image, &config, 80).unwrap();
+        assert_eq!((input.width, input.height, input.filled, input.step), (96, 64, [80, 64], 2.0));
+        assert!(input.values.iter().all(|v| v.abs() < 0.01));
+        let sizes = [12 * 8, 6 * 4, 3 * 2];
+        let mut raw = Numbers {
+            scores: sizes.iter().map(|n| vec![-9.0; 2 * n]).collect(),
+            boxes: sizes.iter().map(|n| vec![0.0; 6 * n]).collect(),
+            prototypes: vec![0.0; 24 * 16],
+        };
+        // Location (4, 3) of level 0, middle (35.5, 27.5): class 1, 8 pixels up, 16 to the other sides.
+        let location = 3 * 12 + 4;
+        raw.scores[0][96 + location] = 2.0;
+        for i in [0, 2, 3] {
+            raw.boxes[0][i * 96 + location] = 2.0f32.ln();
+        }
+        raw.boxes[0][4 * 96 + location] = 1.0;
+        raw.boxes[0][5 * 96 + location] = -0.5;
+        // The prototype is on in its left half, up to network pixel 35.
+        for row in raw.prototypes.chunks_exact_mut(24) {
+            row[..9].fill(1.0);
+        }
+        let found = decode(&raw, &input, image.size(), &config, &DetectOptions::default());
+        assert_eq!(found.len(), 1);
+        let d = &found[0];
+        assert_eq!(d.class, 1);
+        assert!((d.score - sigmoid(2.0)).abs() < 1e-6);
+        let expected = [39.5, 39.5, 64.0, 48.0];
+        let found = [d.bbox.x, d.bbox.y, d.bbox.width, d.bbox.height];
+        assert!(found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-3), "{found:?}");
+        let mask = d.mask.as_ref().unwrap();
+        let columns: Vec<usize> = (0..160).filter(|x| mask[(*x, 60)]).collect();
+        assert_eq!((columns[0], columns[columns.len() - 1]), (39, 71));
+        assert!((0..128).all(|y| !mask[(50, y)] || (39..=88).contains(&y)));
+    }
+
+    #[test]
+    fn images_of_any_size() {
+        let config = DetectorConfig::compact(1);
+        for (w, h) in [(1, 1), (33, 700), (2000, 10), (640, 480)] {
+            let image = NetworkImage::new(&RgbImage::filled(w, h, [9; 3]), &config, 640).unwrap();
+            assert!(image.width % 32 == 0 && image.height % 32 == 0 && image.width.max(image.height) <= 640);
+        }
+        assert!(NetworkImage::new(&RgbImage::filled(0, 0, [9; 3]), &config, 640).is_none());
+    }
+}

@@ -1,0 +1,11 @@
+//! 2D detection of known objects in colour images: boxes, confidences and masks.
+//!
+//! The short way: [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
+
+pub mod detect;
+pub mod loss;
+pub mod model;
+pub mod network;
+pub mod samples;
+pub mod targets;
+pub mod training;

@@ -1,0 +1,269 @@
+//! A trained detector: the network with the objects it knows, as one file.
+
+use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode};
+use crate::network::{Detector, DetectorConfig, EncoderKind};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::RgbImage;
+use sixfold_nn::weights::{
+    ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown,
+};
+use std::path::{Path, PathBuf};
+
+/// Name of the compact detector in weight files.
+pub const COMPACT: &str = "detect-compact";
+/// Name of the detector on ResNet-50 in weight files.
+pub const RETINANET: &str = "detect-retinanet";
+
+/// What a detector knows of a class.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClassEntry {
+    /// The object's id in its dataset.
+    pub id: u32,
+}
+
+/// How a detector is used unless something else is asked for; part of its file.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DetectorUse {
+    /// Larger images are reduced to this along their longer side, pixels.
+    pub longest_side: usize,
+    /// Detections with a lower score are left out.
+    pub threshold: f32,
+}
+
+impl Default for DetectorUse {
+    fn default() -> Self {
+        DetectorUse { longest_side: 640, threshold: DetectOptions::default().threshold }
+    }
+}
+
+/// Why a detector could not be read or used.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The weight file.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The card does not describe a detector.
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is not a detector of this version", file.display())]
+    Card {
+        /// The file.
+        file: PathBuf,
+        /// Field of the card.
+        field: &'static str,
+        /// What it should hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+    /// The detector was not trained on this object.
+    #[error(
+        "the detector knows the objects {known}, not object {id}; train it (`sixfold train detector`), give other weights or a file of detections"
+    )]
+    UnknownObject {
+        /// The object that was asked for.
+        id: u32,
+        /// Those it knows.
+        known: String,
+    },
+    /// An option is out of range.
+    #[error("{0}")]
+    Option(String),
+    /// There is nothing to look at.
+    #[error("the image is empty (0x0 pixels); give one with at least one pixel")]
+    EmptyImage,
+}
+
+/// A network and what it was trained on.
+#[derive(Debug, Clone)]
+pub struct DetectorModel {
+    network: Detector,
+    config: DetectorConfig,
+    classes: Vec<ClassEntry>,
+    usage: DetectorUse,
+    card: ModelCard,
+    device: Device,
+}
+
+fn architecture(config: &DetectorConfig) -> &'static str {
+    match config.encoder {
+        EncoderKind::Lite0 => COMPACT,
+        EncoderKind::ResNet50 => RETINANET,
+    }
+}
+
+impl DetectorModel {
+    /// A model of a trained network. `card` gets architecture, classes and sizes filled in.
+    ///
+    /// # Panics
+    /// If there is not one entry a class.
+    pub fn new(
+        network: Detector,
+        config: DetectorConfig,
+        classes: Vec<ClassEntry>,
+        usage: DetectorUse,
+        card: ModelCard,
+    ) -> Self {
+        assert_eq!(config.classes, classes.len());
+        let mut extra = card.extra.clone();
+        if !extra.is_object() {
+            extra = serde_json::json!({});
+        }
+        extra["network"] = serde_json::to_value(&config).unwrap_or_default();
+        extra["use"] = serde_json::to_value(usage).unwrap_or_default();
+        let objects = classes.iter().map(|c| serde_json::to_value(c).unwrap_or_default()).collect();
+        let card = ModelCard { architecture: architecture(&config).to_string(), objects, extra, ..card };
+        let network = network.valid();
+        DetectorModel { network, config, classes, usage, card, device: Device::flex() }
+    }
+
+    /// Reads a weight file.
+    ///
+    /// # Errors
+    /// [`ModelError`] for a file that cannot be read or is no detector.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let device = Device::flex();
+        let (network, config, classes, usage, card) = read(path, &device)?;
+        Ok(DetectorModel { network: network.valid(), config, classes, usage, card, device })
+    }
+
+    /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
+    ///
+    /// # Errors
+    /// As [`DetectorModel::load`]; [`ModelError::Card`] also for a detector of other objects or in another order.
+    pub fn network_for_training(
+        path: &Path,
+        ids: &[u32],
+        device: &Device,
+    ) -> Result<(Detector, DetectorConfig), ModelError> {
+        let (network, config, classes, ..) = read(path, device)?;
+        let found: Vec<u32> = classes.iter().map(|c| c.id).collect();
+        if found != ids {
+            return Err(ModelError::Card {
+                file: path.to_path_buf(),
+                field: "objects",
+                expected: "the objects that are to be trained, in this order",
+                found: format!("{found:?} instead of {ids:?}"),
+            });
+        }
+        Ok((network, config))
+    }
+
+    /// Writes the weight file and, beside it, the card as text.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`].
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        save_weights(&self.network, &self.card, path)?;
+        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+    }
+
+    /// The classes, in the network's order.
+    pub fn classes(&self) -> &[ClassEntry] {
+        &self.classes
+    }
+
+    /// The object's id of a class of this network.
+    pub fn id_of(&self, class: usize) -> u32 {
+        self.classes.get(class).map_or(0, |c| c.id)
+    }
+
+    /// An error unless the detector knows the object.
+    ///
+    /// # Errors
+    /// [`ModelError::UnknownObject`].
+    pub fn check_object(&self, id: u32) -> Result<(), ModelError> {
+        if self.classes.iter().any(|c| c.id == id) {
+            return Ok(());
+        }
+        let known = self.classes.iter().map(|c| c.id.to_string()).collect::<Vec<_>>().join(", ");
+        Err(ModelError::UnknownObject { id, known })
+    }
+
+    /// How it is used unless something else is asked for.
+    pub fn usage(&self) -> DetectorUse {
+        self.usage
+    }
+
+    /// Sizes of the network.
+    pub fn config(&self) -> &DetectorConfig {
+        &self.config
+    }
+
+    /// The card.
+    pub fn card(&self) -> &ModelCard {
+        &self.card
+    }
+
+    /// The default options with the model's own threshold.
+    pub fn options(&self) -> DetectOptions {
+        DetectOptions { threshold: self.usage.threshold, ..DetectOptions::default() }
+    }
+
+    /// Detects the model's objects in an image of any size, best first.
+    ///
+    /// # Errors
+    /// [`ModelError::Option`] and [`ModelError::EmptyImage`].
+    pub fn detect(&self, image: &RgbImage, options: &DetectOptions) -> Result<Vec<Detected>, ModelError> {
+        options.check().map_err(ModelError::Option)?;
+        let input =
+            NetworkImage::new(image, &self.config, self.usage.longest_side).ok_or(ModelError::EmptyImage)?;
+        let raw = self.run(&input);
+        Ok(decode(&raw, &input, image.size(), &self.config, options))
+    }
+
+    /// The network's output for an image.
+    pub fn run(&self, input: &NetworkImage) -> Numbers {
+        let data = TensorData::new(input.values.clone(), [1, 3, input.height, input.width]);
+        let out = self.network.forward(Tensor::from_data(data, &self.device));
+        let numbers = |t: Tensor<4>| -> Vec<f32> {
+            t.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
+        };
+        Numbers {
+            scores: out.scores.into_iter().map(numbers).collect(),
+            boxes: out.boxes.into_iter().map(numbers).collect(),
+            prototypes: numbers(out.prototypes),
+        }
+    }
+}
+
+type Content = (Detector, DetectorConfig, Vec<ClassEntry>, DetectorUse, ModelCard);
+
+fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
+    let card = read_card(path)?;
+    let wrong = |field, expected, found: String| ModelError::Card {
+        file: path.to_path_buf(),
+        field,
+        expected,
+        found,
+    };
+    if card.architecture != COMPACT && card.architecture != RETINANET {
+        return Err(wrong("architecture", "detect-compact or detect-retinanet", card.architecture));
+    }
+    let classes = card
+        .objects
+        .iter()
+        .map(|value| {
+            serde_json::from_value(value.clone()).map_err(|e| wrong("objects", "an id", e.to_string()))
+        })
+        .collect::<Result<Vec<ClassEntry>, _>>()?;
+    let config: DetectorConfig = serde_json::from_value(card.extra["network"].clone())
+        .map_err(|e| wrong("extra.network", "the network's sizes", e.to_string()))?;
+    let usage: DetectorUse = serde_json::from_value(card.extra["use"].clone())
+        .map_err(|e| wrong("extra.use", "longest_side and threshold", e.to_string()))?;
+    let sane = config.classes == classes.len()
+        && (1..=10_000).contains(&config.classes)
+        && (2..=4096).contains(&config.width)
+        && (2..=6).contains(&config.levels)
+        && config.shared + config.own <= 64
+        && (1..=1024).contains(&config.prototypes)
+        && (32..=16_384).contains(&usage.longest_side)
+        && (0.0..=1.0).contains(&usage.threshold)
+        && architecture(&config) == card.architecture;
+    if !sane {
+        let found = format!("{config:?}, {usage:?} for {} objects", classes.len());
+        return Err(wrong("extra", "sizes that fit each other", found));
+    }
+    let (network, card) = load_weights(config.init(0, device), path, architecture(&config))?;
+    Ok((network, config, classes, usage, card))
+}

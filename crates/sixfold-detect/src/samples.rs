@@ -1,0 +1,618 @@
+//! Training images: the few photographs with all that is annotated in them, objects cut out of them or rendered and
+//! pasted on other backgrounds (dissertation, section 3.4.1: "Cropped patches of objects in real images are pasted to
+//! random background images"), and images without any object.
+//!
+//! A photograph shows objects wherever it shows them: it is never a mere background, its annotations stay. Each sample is
+//! a function of seed and number alone.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+use sixfold_augment::{
+    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream,
+    uniform,
+};
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3, sphere_directions};
+use sixfold_mesh::{Mesh, simplify};
+use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch, randomly_colored};
+
+use crate::targets::{Annotation, IGNORED, Instance};
+
+/// Objects with fewer visible pixels in a training image are not learnt.
+const LEAST_PIXELS: usize = 64;
+/// Meshes with more faces are simplified.
+const FACES: usize = 5000;
+/// The camera of renders where there are no photographs.
+const DEFAULT_CAMERA: Camera =
+    Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+
+/// Shares and ranges. The defaults are for few real images of objects on a table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SceneOptions {
+    /// Side of the training images, pixels; a multiple of 32.
+    pub size: usize,
+    /// Share of images that are parts of photographs, 0..1.
+    pub photograph_share: f32,
+    /// Share of images without any object, 0..1.
+    pub empty_share: f32,
+    /// Factors on the size that objects have in the photographs.
+    pub scale: [f32; 2],
+    /// Largest turn in the image plane to either side, radians.
+    pub rotation: f32,
+    /// Most objects pasted on a background.
+    pub most_pasted: u32,
+    /// Most objects pasted on a part of a photograph.
+    pub most_added: u32,
+    /// Share of renders among pasted objects that have photographs, 0..1.
+    pub render_share: f32,
+    /// Most distractors: shapes, and outlines of objects filled with something else.
+    pub most_distractors: u32,
+    /// Objects of which a smaller part is visible than this share are not learnt.
+    pub least_visible: f32,
+    /// Chance that a rendered object has random colours.
+    pub random_color_chance: f32,
+    /// Share of rendered poses near one of a photograph, 0..1.
+    pub near_real_share: f32,
+}
+
+impl Default for SceneOptions {
+    fn default() -> Self {
+        SceneOptions {
+            size: 320,
+            photograph_share: 0.45,
+            empty_share: 0.1,
+            scale: [0.65, 1.5],
+            rotation: 15f32.to_radians(),
+            most_pasted: 7,
+            most_added: 3,
+            render_share: 0.4,
+            most_distractors: 3,
+            least_visible: 0.15,
+            random_color_chance: 0.0,
+            near_real_share: 0.6,
+        }
+    }
+}
+
+/// Why no training images can be made.
+#[derive(Debug, thiserror::Error)]
+pub enum SceneError {
+    /// An option is out of its range.
+    #[error("sample option {field}: found {found}, expected {expected}")]
+    Option {
+        /// Its name.
+        field: &'static str,
+        /// What it is.
+        found: String,
+        /// What it must be.
+        expected: &'static str,
+    },
+    /// There is nothing to learn.
+    #[error("no object to learn was given; give at least one mesh")]
+    NoObjects,
+    /// So many classes have no place in the labels of one image.
+    #[error(
+        "object {id}: no photograph shows it and its mesh has neither colours nor texture; give photographs or a coloured mesh, or set random_color_chance above 0"
+    )]
+    NoPictures {
+        /// The object.
+        id: u32,
+    },
+    /// Colours or backgrounds.
+    #[error(transparent)]
+    Augment(#[from] AugmentError),
+}
+
+/// An object to be learnt.
+#[derive(Debug, Clone)]
+pub struct SceneObject {
+    /// Its id in the dataset.
+    pub id: u32,
+    /// Its surface in metres.
+    pub mesh: Mesh,
+    /// Its diameter in metres.
+    pub diameter: f64,
+}
+
+/// An object made ready.
+struct Prepared {
+    mesh: Mesh,
+    colored: bool,
+    extremes: Vec<Vec3>,
+    centre: Vec3,
+    poses: Vec<Pose>,
+    distance: [f64; 2],
+    /// Visible parts in photographs, with the length of the longer side there.
+    cutouts: Vec<(Cutout, f32)>,
+}
+
+/// A photograph with the objects visible in it.
+struct Photograph {
+    image: Arc<RgbImage>,
+    /// For every pixel 0 or the object's number in the photograph, from 1.
+    labels: Vec<u8>,
+    /// Class, visible pixels and middle of each object.
+    instances: Vec<(usize, f32, [f32; 2])>,
+}
+
+/// One training image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneSample {
+    /// 3 x side x side, in 0..1.
+    pub rgb: Vec<f32>,
+    /// What is in it.
+    pub annotation: Annotation,
+}
+
+/// Draws training images; shared between threads by reference.
+pub struct SceneSource {
+    objects: Vec<Prepared>,
+    photographs: Vec<Photograph>,
+    backgrounds: Backgrounds,
+    camera: Camera,
+    options: SceneOptions,
+    poses: SampleOptions,
+}
+
+/// An image in the making.
+struct Canvas {
+    image: Patch,
+    labels: Vec<u8>,
+    /// Class and pixels if nothing hid it; number 1 is the first.
+    instances: Vec<(usize, f32)>,
+    side: usize,
+}
+
+impl Canvas {
+    /// Draws a small picture whose top left pixel comes to lie at `corner`; returns how many pixels it covers in all,
+    /// also outside the canvas. `label` 0 hides what is there.
+    fn paste(&mut self, patch: &Patch, cover: &Coverage, corner: [i64; 2], feather: f32, label: u8) -> f32 {
+        let mut soft = cover.clone();
+        soft.blur(feather);
+        let side = self.side as i64;
+        let pixels = patch.width * patch.height;
+        let planes = self.side * self.side;
+        let mut covered = 0.0;
+        for y in 0..patch.height {
+            let to_y = corner[1] + y as i64;
+            for x in 0..patch.width {
+                let from = y * patch.width + x;
+                let alpha = cover.data[from];
+                if alpha <= 0.0 {
+                    continue;
+                }
+                covered += alpha;
+                let to_x = corner[0] + x as i64;
+                if to_x < 0 || to_y < 0 || to_x >= side || to_y >= side {
+                    continue;
+                }
+                let to = to_y as usize * self.side + to_x as usize;
+                // Soft towards the inside: outside the picture has no colours.
+                let alpha_soft = alpha * (1.6 * soft.data[from]).min(1.0);
+                for c in 0..3 {
+                    let value = &mut self.image.data[c * planes + to];
+                    *value += (patch.data[c * pixels + from] - *value) * alpha_soft;
+                }
+                if alpha > 0.5 {
+                    self.labels[to] = label;
+                }
+            }
+        }
+        covered
+    }
+}
+
+impl SceneSource {
+    /// Makes objects and photographs ready, which takes seconds. `real` holds every visible object of the photographs
+    /// that is to be learnt, `cut` those of them that are complete enough to be pasted elsewhere.
+    ///
+    /// # Errors
+    /// [`SceneError`].
+    pub fn new(
+        objects: Vec<SceneObject>,
+        real: &[RealCrop],
+        cut: &[RealCrop],
+        backgrounds: Backgrounds,
+        options: SceneOptions,
+    ) -> Result<Self, SceneError> {
+        options.check()?;
+        if objects.is_empty() {
+            return Err(SceneError::NoObjects);
+        }
+        let camera = real.first().map_or(DEFAULT_CAMERA, |c| *c.camera()).without_distortion();
+        let class_of: BTreeMap<u32, usize> = objects.iter().enumerate().map(|(i, o)| (o.id, i)).collect();
+        let photographs = photographs(real, &class_of);
+        let prepared = objects
+            .into_iter()
+            .map(|object| Prepared::new(object, real, cut, &options))
+            .collect::<Result<Vec<_>, _>>()?;
+        let poses = SampleOptions {
+            near_real_share: options.near_real_share,
+            rotation: options.rotation,
+            view_turn: options.rotation,
+            ..SampleOptions::default()
+        };
+        Ok(SceneSource { objects: prepared, photographs, backgrounds, camera, options, poses })
+    }
+
+    /// The options.
+    pub fn options(&self) -> &SceneOptions {
+        &self.options
+    }
+
+    /// How many photographs there are.
+    pub fn photographs(&self) -> usize {
+        self.photographs.len()
+    }
+
+    /// A training image: the same for the same arguments, on any thread.
+    pub fn sample(&self, seed: u64, number: u64) -> SceneSample {
+        let mut random = stream(seed ^ 0x5ce9_e000, number);
+        let random = &mut random;
+        let options = &self.options;
+        let kind = random.random::<f32>();
+        let mut canvas = if kind < options.photograph_share && !self.photographs.is_empty() {
+            let mut canvas = self.photograph(random);
+            for _ in 0..random.random_range(0..=options.most_added) {
+                self.paste_object(&mut canvas, random);
+            }
+            if random.random::<f32>() < 0.5 {
+                self.distract(&mut canvas, random);
+            }
+            canvas
+        } else {
+            let empty = kind > 1.0 - options.empty_share;
+            let mut canvas = self.background(random);
+            for _ in 0..random.random_range(0..=options.most_distractors) {
+                self.distract(&mut canvas, random);
+            }
+            if !empty {
+                for _ in 0..random.random_range(1..=options.most_pasted.max(1)) {
+                    self.paste_object(&mut canvas, random);
+                    if random.random::<f32>() < 0.15 {
+                        self.distract(&mut canvas, random);
+                    }
+                }
+            }
+            canvas
+        };
+        self.poses.color.apply(&mut canvas.image, random);
+        let annotation = self.annotation(&mut canvas);
+        SceneSample { rgb: canvas.image.data, annotation }
+    }
+
+    fn background(&self, random: &mut Random) -> Canvas {
+        let side = self.options.size;
+        let image = self.backgrounds.patch(side, side, random);
+        Canvas { image, labels: vec![0; side * side], instances: vec![], side }
+    }
+
+    /// A factor on sizes, even on the logarithm.
+    fn scale(&self, random: &mut Random) -> f32 {
+        uniform(random, self.options.scale.map(f32::ln)).exp()
+    }
+
+    /// A part of a photograph about one of its objects, or anywhere.
+    fn photograph(&self, random: &mut Random) -> Canvas {
+        let side = self.options.size;
+        let photograph = &self.photographs[random.random_range(0..self.photographs.len())];
+        let (width, height) = photograph.image.size();
+        let scale = self.scale(random);
+        let step = 1.0 / scale;
+        let turn = uniform(random, [-self.options.rotation, self.options.rotation]);
+        let reach = 0.4 * side as f32 * step;
+        let anywhere = photograph.instances.is_empty() || random.random::<f32>() < 0.2;
+        let centre = if anywhere {
+            [random.random::<f32>() * width as f32, random.random::<f32>() * height as f32]
+        } else {
+            let (_, _, middle) = photograph.instances[random.random_range(0..photograph.instances.len())];
+            middle.map(|m| m + uniform(random, [-reach, reach]))
+        };
+        // The image is better filled than not.
+        let half = 0.35 * side as f32 * step;
+        let clamped = |at: f32, limit: usize| {
+            let (low, high) = (half, limit as f32 - half);
+            if low < high { at.clamp(low, high) } else { 0.5 * limit as f32 }
+        };
+        let centre = [clamped(centre[0], width), clamped(centre[1], height)];
+        let (s, c) = turn.sin_cos();
+        let (sx, sy) = (c * step, s * step);
+        let middle = 0.5 * (side as f32 - 1.0);
+        let map = AffineMap {
+            x: [sx, -sy, centre[0] - (sx - sy) * middle],
+            y: [sy, sx, centre[1] - (sy + sx) * middle],
+        };
+        let (patch, inside) = Patch::warp(&photograph.image, &map, side, side, [0.5; 3]);
+        let mut canvas = if inside.data.iter().any(|v| *v < 0.5) && random.random::<bool>() {
+            let mut canvas = self.background(random);
+            canvas.image.blend(&patch, &inside);
+            canvas
+        } else {
+            Canvas { image: patch, labels: vec![0; side * side], instances: vec![], side }
+        };
+        for y in 0..side {
+            for x in 0..side {
+                let [u, v] = map.apply(x as f32, y as f32).map(|v| (v + 0.5).floor());
+                if u >= 0.0 && v >= 0.0 && u < width as f32 && v < height as f32 {
+                    canvas.labels[y * side + x] = photograph.labels[v as usize * width + u as usize];
+                }
+            }
+        }
+        canvas.instances =
+            photograph.instances.iter().map(|(class, pixels, _)| (*class, pixels * scale * scale)).collect();
+        canvas
+    }
+
+    /// Pastes an object, cut out or rendered, at a random place.
+    fn paste_object(&self, canvas: &mut Canvas, random: &mut Random) {
+        if canvas.instances.len() >= usize::from(IGNORED) - 1 {
+            return;
+        }
+        let class = random.random_range(0..self.objects.len());
+        let object = &self.objects[class];
+        let can_render = object.colored || self.options.random_color_chance > 0.0;
+        let render =
+            object.cutouts.is_empty() || (can_render && random.random::<f32>() < self.options.render_share);
+        let drawn = if render { self.render(object, random) } else { self.cut(object, random) };
+        let Some((mut patch, cover)) = drawn else { return };
+        let gain = uniform(random, [0.75, 1.25]);
+        patch.data.iter_mut().for_each(|v| *v = (*v * gain).min(1.0));
+        let corner = self.corner(&patch, random);
+        let feather = uniform(random, [0.4, 1.2]);
+        let label = (canvas.instances.len() + 1) as u8;
+        let pixels = canvas.paste(&patch, &cover, corner, feather, label);
+        canvas.instances.push((class, pixels));
+    }
+
+    /// Where a picture's corner comes to lie: its middle is in the image.
+    fn corner(&self, patch: &Patch, random: &mut Random) -> [i64; 2] {
+        let side = self.options.size as f32;
+        [patch.width, patch.height].map(|length| {
+            let middle = uniform(random, [0.02, 0.98]) * side;
+            (middle - 0.5 * length as f32).round() as i64
+        })
+    }
+
+    fn cut(&self, object: &Prepared, random: &mut Random) -> Option<(Patch, Coverage)> {
+        let (cutout, longest) = object.cutouts.get(random.random_range(0..object.cutouts.len().max(1)))?;
+        let longest = (longest * self.scale(random)).min(1.5 * self.options.size as f32);
+        let turn = uniform(random, [-self.options.rotation, self.options.rotation]);
+        Some(draw(cutout, longest, turn))
+    }
+
+    fn render(&self, object: &Prepared, random: &mut Random) -> Option<(Patch, Coverage)> {
+        let range = PoseRange {
+            camera: &self.camera,
+            centre: object.centre,
+            distance: object.distance,
+            real: &object.poses,
+        };
+        let pose = range.draw(&self.poses, random);
+        let scale = f64::from(self.scale(random));
+        let pixels: Option<Vec<Vec2>> =
+            object.extremes.iter().map(|v| self.camera.project(&pose.transform_point(v))).collect();
+        let (low, high) = pixels?
+            .iter()
+            .fold((Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY)), |(low, high), p| {
+                (low.inf(p), high.sup(p))
+            });
+        let side = (high - low).max() * scale + 4.0;
+        if !(8.0..=1.5 * self.options.size as f64).contains(&side) {
+            return None;
+        }
+        let size = side.ceil() as usize;
+        let corner = (low + high) * 0.5 * scale - Vec2::repeat(0.5 * size as f64);
+        let camera = Camera {
+            fx: self.camera.fx * scale,
+            fy: self.camera.fy * scale,
+            cx: self.camera.cx * scale - corner.x,
+            cy: self.camera.cy * scale - corner.y,
+            width: size,
+            height: size,
+            distortion: None,
+        };
+        let random_colors = !object.colored || random.random::<f32>() < self.options.random_color_chance;
+        let (mut patch, cover) = if random_colors {
+            color_patch(&randomly_colored(&object.mesh, random), &camera, &pose, random)
+        } else {
+            color_patch(&object.mesh, &camera, &pose, random)
+        };
+        self.poses.render_color.apply(&mut patch, random);
+        Some((patch, cover))
+    }
+
+    /// Something that is no object to be found: a shape, or the outline of an object filled with something else.
+    fn distract(&self, canvas: &mut Canvas, random: &mut Random) {
+        let side = self.options.size;
+        let longest = uniform(random, [0.06, 0.5]) * side as f32;
+        let outline = random.random::<f32>() < 0.5;
+        let object = &self.objects[random.random_range(0..self.objects.len())];
+        let cover = match object.cutouts.get(random.random_range(0..object.cutouts.len().max(1))) {
+            Some((cutout, _)) if outline => {
+                let turn = uniform(random, [-std::f32::consts::PI, std::f32::consts::PI]);
+                draw(cutout, longest, turn).1
+            }
+            _ => {
+                let window = (1.5 * longest).ceil().max(8.0) as usize;
+                let middle = 0.5 * window as f32;
+                Shape::random(random).draw(window, window, [middle, middle], 0.35 * longest)
+            }
+        };
+        let patch = match random.random_range(0..10u32) {
+            0..=1 => Patch::filled(cover.width, cover.height, std::array::from_fn(|_| random.random())),
+            2..=4 => procedural_texture(cover.width, cover.height, random),
+            _ => self.backgrounds.patch(cover.width, cover.height, random),
+        };
+        let corner = self.corner(&patch, random);
+        let feather = uniform(random, [0.4, 1.2]);
+        canvas.paste(&patch, &cover, corner, feather, 0);
+    }
+
+    /// What is visible in the end.
+    fn annotation(&self, canvas: &mut Canvas) -> Annotation {
+        let side = canvas.side;
+        let mut seen = vec![(0usize, [usize::MAX, usize::MAX, 0, 0]); canvas.instances.len()];
+        for (row, y) in canvas.labels.chunks_exact(side).zip(0..) {
+            for (label, x) in row.iter().zip(0..) {
+                if let Some(place) = usize::from(*label).checked_sub(1).and_then(|i| seen.get_mut(i)) {
+                    let [x0, y0, x1, y1] = place.1;
+                    *place = (place.0 + 1, [x0.min(x), y0.min(y), x1.max(x), y1.max(y)]);
+                }
+            }
+        }
+        let mut numbers = vec![0u8; 256];
+        let mut instances = vec![];
+        for (index, ((class, whole), (pixels, corners))) in canvas.instances.iter().zip(&seen).enumerate() {
+            let learnt = *pixels >= LEAST_PIXELS && *pixels as f32 >= self.options.least_visible * whole;
+            numbers[index + 1] = if learnt {
+                let corners = corners.map(|v| v as f32);
+                instances.push(Instance { class: *class, corners });
+                instances.len() as u8
+            } else {
+                IGNORED
+            };
+        }
+        let labels = canvas.labels.iter().map(|l| numbers[usize::from(*l)]).collect();
+        Annotation { size: [side, side], labels, instances }
+    }
+}
+
+/// A cut-out as a small picture about itself.
+fn draw(cutout: &Cutout, longest: f32, turn: f32) -> (Patch, Coverage) {
+    let (width, height) = cutout.size();
+    let scale = longest / width.max(height) as f32;
+    let (w, h) = (width as f32 * scale, height as f32 * scale);
+    let (s, c) = turn.sin_cos();
+    let wide = (w * c.abs() + h * s.abs()).ceil().max(4.0) as usize + 2;
+    let tall = (w * s.abs() + h * c.abs()).ceil().max(4.0) as usize + 2;
+    cutout.draw(wide, tall, [0.5 * (wide as f32 - 1.0), 0.5 * (tall as f32 - 1.0)], longest, turn)
+}
+
+/// The photographs with their labels.
+fn photographs(real: &[RealCrop], class_of: &BTreeMap<u32, usize>) -> Vec<Photograph> {
+    let mut photographs: Vec<Photograph> = vec![];
+    for crop in real {
+        let Some(class) = class_of.get(&crop.object_id()) else { continue };
+        let (width, height) = crop.image().size();
+        let index =
+            photographs.iter().position(|p| Arc::ptr_eq(&p.image, crop.image())).unwrap_or_else(|| {
+                let image = crop.image().clone();
+                photographs.push(Photograph { image, labels: vec![0; width * height], instances: vec![] });
+                photographs.len() - 1
+            });
+        let photograph = &mut photographs[index];
+        if photograph.instances.len() >= usize::from(IGNORED) - 1 {
+            continue;
+        }
+        let number = (photograph.instances.len() + 1) as u8;
+        let side = width.max(height);
+        let seen = crop.visible(&AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, side);
+        let (mut pixels, mut sum) = (0.0f32, [0.0f32; 2]);
+        for y in 0..height {
+            for x in 0..width {
+                if seen.data[y * side + x] > 0.5 {
+                    photograph.labels[y * width + x] = number;
+                    pixels += 1.0;
+                    sum = [sum[0] + x as f32, sum[1] + y as f32];
+                }
+            }
+        }
+        photograph.instances.push((*class, pixels, sum.map(|s| s / pixels.max(1.0))));
+    }
+    photographs
+}
+
+impl Prepared {
+    fn new(
+        object: SceneObject,
+        real: &[RealCrop],
+        cut: &[RealCrop],
+        options: &SceneOptions,
+    ) -> Result<Self, SceneError> {
+        let SceneObject { id, mesh, diameter } = object;
+        let colored = (mesh.texture().is_some() && mesh.texcoords().is_some()) || mesh.colors().is_some();
+        let colored = colored && !mesh.faces().is_empty();
+        let mine = || real.iter().filter(|c| c.object_id() == id);
+        let cutouts: Vec<(Cutout, f32)> = cut
+            .iter()
+            .filter(|c| c.object_id() == id)
+            .filter_map(RealCrop::cutout)
+            .map(|c| {
+                let longest = c.size().0.max(c.size().1) as f32;
+                (c, longest)
+            })
+            .collect();
+        if cutouts.is_empty() && !(colored || options.random_color_chance > 0.0 && !mesh.faces().is_empty()) {
+            return Err(SceneError::NoPictures { id });
+        }
+        let poses: Vec<Pose> = mine().map(|c| *c.camera_from_object()).collect();
+        // Without photographs of its own: those of the others, else 4 to 12 diameters.
+        let far = |crops: &mut dyn Iterator<Item = &RealCrop>| {
+            let (low, high) = crops
+                .map(|c| c.camera_from_object().translation().norm())
+                .fold((f64::INFINITY, 0.0f64), |(low, high), d| (low.min(d), high.max(d)));
+            (low <= high).then_some([0.9 * low, 1.1 * high])
+        };
+        let distance = far(&mut mine())
+            .or_else(|| far(&mut real.iter()))
+            .unwrap_or([4.0 * diameter, 12.0 * diameter])
+            .map(|d| d.max(diameter));
+        let (low, high) = mesh.bounding_box();
+        let extremes = extremes(&mesh);
+        let textured = mesh.texture().is_some() && mesh.texcoords().is_some();
+        let mesh = if mesh.faces().len() > FACES && !textured { simplify(&mesh, FACES) } else { mesh };
+        // Normals looked up per sample would be computed anew every time.
+        let normals = mesh.vertex_normals();
+        let mesh = mesh.clone().with_normals(normals).unwrap_or(mesh);
+        Ok(Prepared { mesh, colored, extremes, centre: (low + high) * 0.5, poses, distance, cutouts })
+    }
+}
+
+/// Vertices that are outermost in some direction.
+fn extremes(mesh: &Mesh) -> Vec<Vec3> {
+    let vertices = mesh.vertices();
+    let mut chosen: Vec<usize> = sphere_directions(200)
+        .iter()
+        .filter_map(|d| {
+            (0..vertices.len()).max_by(|&a, &b| d.dot(&vertices[a]).total_cmp(&d.dot(&vertices[b])))
+        })
+        .collect();
+    chosen.sort_unstable();
+    chosen.dedup();
+    chosen.into_iter().map(|i| vertices[i]).collect()
+}
+
+impl SceneOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`SceneError::Option`].
+    pub fn check(&self) -> Result<(), SceneError> {
+        let wrong = |field, expected, found: String| Err(SceneError::Option { field, expected, found });
+        if !self.size.is_multiple_of(32) || !(64..=1024).contains(&self.size) {
+            return wrong("size", "a multiple of 32 from 64 to 1024 pixels", self.size.to_string());
+        }
+        for (field, share) in [
+            ("photograph_share", self.photograph_share),
+            ("empty_share", self.empty_share),
+            ("render_share", self.render_share),
+            ("least_visible", self.least_visible),
+            ("random_color_chance", self.random_color_chance),
+            ("near_real_share", self.near_real_share),
+        ] {
+            if !(0.0..=1.0).contains(&share) {
+                return wrong(field, "0 to 1", share.to_string());
+            }
+        }
+        let [low, high] = self.scale;
+        if !(low >= 0.05 && low <= high && high <= 20.0) {
+            return wrong("scale", "two factors in order between 0.05 and 20", format!("{low}, {high}"));
+        }
+        if !(0.0..=std::f32::consts::PI).contains(&self.rotation) {
+            return wrong("rotation", "radians from 0 to pi", self.rotation.to_string());
+        }
+        Ok(())
+    }
+}

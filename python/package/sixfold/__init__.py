@@ -1,0 +1,102 @@
+"""Sixfold: known objects in images, where they are and how they are turned.
+
+numpy arrays in, poses out. Lengths are in metres, angles in radians. A pose is a (4, 4) float64 matrix
+``camera_from_object`` that takes points of the object's frame to the camera's: OpenCV's, x right, y down, z forward.
+The centre of the top left pixel is (0, 0). Only what says ``mm`` in its name is in millimetres (``sixfold.bop``).
+
+Bad input is a ``ValueError`` that names the argument, what was expected and what was found. ``NoSolutionError``, a
+``ValueError`` too, says that the input is fine and nothing fits it. Files that cannot be read are an ``OSError``.
+The same input and seed give the same result.
+"""
+
+from . import _sixfold, bop, coco, metrics
+from ._sixfold import (
+    AmbientLight,
+    Camera,
+    DirectionalLight,
+    IcpResult,
+    Mesh,
+    NoSolutionError,
+    Pix2Pose,
+    Pix2PosePose,
+    Plane,
+    PnpResult,
+    PointLight,
+    PpfEstimate,
+    PpfModel,
+    PpfScene,
+    Rendering,
+    SceneRendering,
+    dominant_plane,
+    epnp,
+    estimate_ppf,
+    fit_plane,
+    icp,
+    icp_to_depth,
+    inpaint_depth,
+    kabsch,
+    normals_from_depth,
+    pnp_ransac,
+    point_cloud,
+    pose_exp,
+    pose_log,
+    refine_pose,
+    render,
+    render_depth,
+    render_scene,
+    simulate_depth,
+    sphere_directions,
+    support_plane,
+    umeyama,
+    undistort_depth,
+    undistort_rgb,
+    voxel_downsample,
+)
+
+__version__ = _sixfold.__version__
+
+__all__ = [
+    "AmbientLight",
+    "Camera",
+    "DirectionalLight",
+    "IcpResult",
+    "Mesh",
+    "NoSolutionError",
+    "Pix2Pose",
+    "Pix2PosePose",
+    "Plane",
+    "PnpResult",
+    "PointLight",
+    "PpfEstimate",
+    "PpfModel",
+    "PpfScene",
+    "Rendering",
+    "SceneRendering",
+    "bop",
+    "coco",
+    "dominant_plane",
+    "epnp",
+    "estimate_ppf",
+    "fit_plane",
+    "icp",
+    "icp_to_depth",
+    "inpaint_depth",
+    "kabsch",
+    "metrics",
+    "normals_from_depth",
+    "pnp_ransac",
+    "point_cloud",
+    "pose_exp",
+    "pose_log",
+    "refine_pose",
+    "render",
+    "render_depth",
+    "render_scene",
+    "simulate_depth",
+    "sphere_directions",
+    "support_plane",
+    "umeyama",
+    "undistort_depth",
+    "undistort_rgb",
+    "voxel_downsample",
+]

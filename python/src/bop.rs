@@ -1,0 +1,469 @@
+//! `sixfold.bop`: datasets, result files and single images of the BOP format. Files hold millimetres; everything here is
+//! in metres unless its name says `mm`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2, PyArray3};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+use sixfold_bop::{BopDataset, Estimate, MaskKind, Models, Placement, Scene};
+use sixfold_geometry::Pose;
+
+use crate::arrays::{self, about, bad, id, positive, whole};
+use crate::camera::PyCamera;
+use crate::guard::{dataset_error, free, results_error};
+use crate::mesh::PyMesh;
+
+/// What serialises, as dicts, lists and numbers.
+pub(crate) fn json_to_python<'py>(
+    py: Python<'py>,
+    value: &impl serde::Serialize,
+) -> PyResult<Bound<'py, PyAny>> {
+    let text = serde_json::to_string(value).map_err(|error| PyValueError::new_err(error.to_string()))?;
+    py.import("json")?.call_method1("loads", (text,))
+}
+
+/// An estimated pose of an object in an image: a row of a result file.
+///
+/// camera_from_object (4, 4), metres; score: higher is surer; time: seconds for the whole image, None where not measured.
+///
+/// Raises ValueError for ids below zero, a score that is not finite, a pose that is none.
+///
+/// >>> import numpy as np
+/// >>> from sixfold import bop
+/// >>> bop.Estimate(2, 3, 8, 0.9, np.eye(4)).obj_id
+/// 8
+#[pyclass(name = "Estimate", module = "sixfold.bop", frozen, from_py_object)]
+#[derive(Clone)]
+pub(crate) struct PyEstimate(pub(crate) Estimate);
+
+#[pymethods]
+impl PyEstimate {
+    #[new]
+    #[pyo3(signature = (scene_id, im_id, obj_id, score, camera_from_object, time=None))]
+    fn new(
+        scene_id: i64,
+        im_id: i64,
+        obj_id: i64,
+        score: f64,
+        camera_from_object: &Bound<'_, PyAny>,
+        time: Option<f64>,
+    ) -> PyResult<Self> {
+        if !score.is_finite() {
+            return Err(bad("score", "a finite number", score.to_string()));
+        }
+        if let Some(t) = time
+            && !(t.is_finite() && t >= 0.0)
+        {
+            return Err(bad("time", "seconds from 0, or None", t.to_string()));
+        }
+        let pose = arrays::pose("camera_from_object", camera_from_object)?;
+        let placement = arrays::placement("camera_from_object", camera_from_object)?;
+        let mut estimate =
+            Estimate::new(id("scene_id", scene_id)?, id("im_id", im_id)?, id("obj_id", obj_id)?, score, pose);
+        estimate.time = time;
+        estimate.rotation_as_written = Some(placement.rotation);
+        Ok(PyEstimate(estimate))
+    }
+
+    /// The scene.
+    #[getter]
+    fn scene_id(&self) -> u32 {
+        self.0.scene_id
+    }
+
+    /// The image.
+    #[getter]
+    fn im_id(&self) -> u32 {
+        self.0.im_id
+    }
+
+    /// The object.
+    #[getter]
+    fn obj_id(&self) -> u32 {
+        self.0.obj_id
+    }
+
+    /// Confidence, higher is surer.
+    #[getter]
+    fn score(&self) -> f64 {
+        self.0.score
+    }
+
+    /// Seconds for the whole image, or None.
+    #[getter]
+    fn time(&self) -> Option<f64> {
+        self.0.time
+    }
+
+    /// The pose, (4, 4) float64, metres; its rotation is the one nearest to what was written.
+    #[getter]
+    fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::from_pose(py, &self.0.camera_from_object)
+    }
+
+    /// The pose with the rotation as it was written, (4, 4): what the scores are computed with.
+    #[getter]
+    fn camera_from_object_as_written<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::from_placement(py, &self.0.placement())
+    }
+
+    fn __repr__(&self) -> String {
+        let e = &self.0;
+        format!("<Estimate: scene {}, image {}, object {}, score {}>", e.scene_id, e.im_id, e.obj_id, e.score)
+    }
+}
+
+/// Reads a result file of the BOP Challenge (scene_id,im_id,obj_id,score,R,t,time; t in millimetres): a list of Estimate.
+/// lenient=True leaves broken rows out and warns.
+///
+/// Raises OSError when the file cannot be read, ValueError with line and column for a broken row.
+///
+/// >>> estimates = read_results("results.csv")  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (path, *, lenient=false))]
+fn read_results(py: Python<'_>, path: PathBuf, lenient: bool) -> PyResult<Vec<PyEstimate>> {
+    let estimates = if lenient {
+        let (good, rows) = free(py, || sixfold_bop::read_results_lenient(&path))?.map_err(results_error)?;
+        if let Some(first) = rows.first() {
+            let text = format!("{}: {} rows left out, the first: {first}", path.display(), rows.len());
+            py.import("warnings")?.call_method1("warn", (text,))?;
+        }
+        good
+    } else {
+        free(py, || sixfold_bop::read_results(&path))?.map_err(results_error)?
+    };
+    Ok(estimates.into_iter().map(PyEstimate).collect())
+}
+
+/// Writes a result file of the BOP Challenge, all or nothing. Raises OSError when it cannot be written.
+///
+/// >>> write_results("results.csv", estimates)  # doctest: +SKIP
+#[pyfunction]
+fn write_results(py: Python<'_>, path: PathBuf, estimates: Vec<PyEstimate>) -> PyResult<()> {
+    let rows: Vec<Estimate> = estimates.into_iter().map(|e| e.0).collect();
+    free(py, || sixfold_bop::write_results(&path, &rows))?.map_err(results_error)
+}
+
+/// A pose (4, 4) in metres from a rotation (3, 3) and a translation (3,) in millimetres, as BOP files have them.
+///
+/// >>> import numpy as np
+/// >>> pose_from_mm(np.eye(3), [0, 0, 1000])[2, 3]
+/// np.float64(1.0)
+#[pyfunction]
+fn pose_from_mm<'py>(
+    py: Python<'py>,
+    rotation: &Bound<'py, PyAny>,
+    translation_mm: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let rotation = arrays::matrix3("rotation", rotation)?;
+    let translation = arrays::vector3("translation_mm", translation_mm)? / 1000.0;
+    Pose::from_parts(&rotation, translation).map_err(about("rotation"))?;
+    arrays::from_placement(py, &Placement { rotation, translation })
+}
+
+/// Rotation (3, 3) and translation (3,) in millimetres, as BOP files have them, of a pose (4, 4) in metres.
+///
+/// >>> import numpy as np
+/// >>> pose_to_mm(np.diag([1.0, 1, 1, 1]))[1]
+/// array([0., 0., 0.])
+#[pyfunction]
+#[allow(clippy::type_complexity)]
+fn pose_to_mm<'py>(
+    py: Python<'py>,
+    pose: &Bound<'py, PyAny>,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<f64>>)> {
+    let placement = arrays::placement("pose", pose)?;
+    let millimetres = placement.translation * 1000.0;
+    Ok((arrays::from_matrix3(py, &placement.rotation)?, arrays::from_vector3(py, &millimetres)))
+}
+
+/// A BOP dataset on disk: `path/split` with scene folders, `path/models` and the text files around them. `path` may be a
+/// scene folder itself.
+///
+/// Raises FileNotFoundError when folder, split or scenes are missing, ValueError when a file is broken.
+///
+/// >>> from sixfold import bop
+/// >>> dataset = bop.Dataset("data/demo")  # doctest: +SKIP
+/// >>> dataset.rgb(2, 3).shape  # doctest: +SKIP
+/// (480, 640, 3)
+#[pyclass(name = "Dataset", module = "sixfold.bop", frozen)]
+pub(crate) struct PyDataset(pub(crate) Arc<BopDataset>);
+
+impl PyDataset {
+    fn scene(&self, scene_id: i64) -> PyResult<Scene> {
+        self.0.scene(id("scene_id", scene_id)?).map_err(dataset_error)
+    }
+}
+
+#[pymethods]
+impl PyDataset {
+    #[new]
+    #[pyo3(signature = (path, split="test"))]
+    fn new(py: Python<'_>, path: PathBuf, split: &str) -> PyResult<Self> {
+        let dataset = free(py, || BopDataset::open(&path, split))?.map_err(dataset_error)?;
+        Ok(PyDataset(Arc::new(dataset)))
+    }
+
+    /// The dataset's folder.
+    #[getter]
+    fn path(&self) -> PathBuf {
+        self.0.root().to_owned()
+    }
+
+    /// The scenes of the split, ascending.
+    #[getter]
+    fn scene_ids(&self) -> Vec<u32> {
+        self.0.scene_ids()
+    }
+
+    /// The images of a scene, ascending.
+    fn image_ids(&self, scene_id: i64) -> PyResult<Vec<u32>> {
+        Ok(self.scene(scene_id)?.image_ids())
+    }
+
+    /// The objects that models_info.json names, ascending.
+    #[getter]
+    fn object_ids(&self) -> PyResult<Vec<u32>> {
+        let infos = self.0.models_info(Models::Rendering).map_err(dataset_error)?;
+        Ok(infos.map_or_else(Vec::new, |i| i.0.keys().copied().collect()))
+    }
+
+    /// The camera of an image.
+    fn camera(&self, scene_id: i64, im_id: i64) -> PyResult<PyCamera> {
+        Ok(PyCamera(self.scene(scene_id)?.camera(id("im_id", im_id)?).map_err(dataset_error)?))
+    }
+
+    /// The colour image, (H, W, 3) uint8, or None where there is none.
+    fn rgb<'py>(
+        &self,
+        py: Python<'py>,
+        scene_id: i64,
+        im_id: i64,
+    ) -> PyResult<Option<Bound<'py, PyArray3<u8>>>> {
+        let (scene, im_id) = (self.scene(scene_id)?, id("im_id", im_id)?);
+        let image = free(py, || scene.rgb(im_id))?.map_err(dataset_error)?;
+        image.map(|i| arrays::from_image_of(py, i)).transpose()
+    }
+
+    /// The depth image, (H, W) float32 metres, 0 where nothing was measured; None where there is none.
+    fn depth<'py>(
+        &self,
+        py: Python<'py>,
+        scene_id: i64,
+        im_id: i64,
+    ) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
+        let (scene, im_id) = (self.scene(scene_id)?, id("im_id", im_id)?);
+        let image = free(py, || scene.depth(im_id))?.map_err(dataset_error)?;
+        image.map(|i| arrays::from_image(py, i)).transpose()
+    }
+
+    /// The mask (H, W) bool of ground-truth pose number `index`: what is visible, or with visible=False the whole
+    /// silhouette; None where there is none.
+    #[pyo3(signature = (scene_id, im_id, index, *, visible=true))]
+    fn mask<'py>(
+        &self,
+        py: Python<'py>,
+        scene_id: i64,
+        im_id: i64,
+        index: i64,
+        visible: bool,
+    ) -> PyResult<Option<Bound<'py, PyArray2<bool>>>> {
+        let (scene, im_id, index) = (self.scene(scene_id)?, id("im_id", im_id)?, whole("index", index, 0)?);
+        let kind = if visible { MaskKind::Visible } else { MaskKind::Full };
+        let image = free(py, || scene.mask(im_id, index, kind))?.map_err(dataset_error)?;
+        image.map(|i| arrays::from_image(py, i)).transpose()
+    }
+
+    /// The ground truth of an image: a list of dicts with obj_id, camera_from_object (4, 4) in metres, visible (fraction or
+    /// None), box and box_visible (x, y, width, height in pixels, or None).
+    fn ground_truth<'py>(&self, py: Python<'py>, scene_id: i64, im_id: i64) -> PyResult<Bound<'py, PyList>> {
+        let scene = self.scene(scene_id)?;
+        let image = scene.image(id("im_id", im_id)?).map_err(dataset_error)?;
+        let out = PyList::empty(py);
+        for (index, truth) in image.ground_truth.iter().enumerate() {
+            let info = image.info.as_ref().map(|i| &i[index]);
+            let corners = |r: Option<sixfold_geometry::Rect>| {
+                r.map(|r| PyArray1::from_vec(py, vec![r.x, r.y, r.width, r.height]))
+            };
+            let entry = PyDict::new(py);
+            entry.set_item("obj_id", truth.obj_id)?;
+            entry.set_item("camera_from_object", arrays::from_placement(py, &truth.placement())?)?;
+            entry.set_item("visible", info.map(|i| i.visib_fract))?;
+            entry.set_item("box", corners(info.and_then(|i| i.bbox_obj)))?;
+            entry.set_item("box_visible", corners(info.and_then(|i| i.bbox_visib)))?;
+            out.append(entry)?;
+        }
+        Ok(out)
+    }
+
+    /// What has to be found: (scene_id, im_id, obj_id, count) from a targets file, test_targets_bop19.json, or every pose
+    /// at least 10 % visible.
+    #[pyo3(signature = (path=None))]
+    fn targets(&self, path: Option<PathBuf>) -> PyResult<Vec<(u32, u32, u32, usize)>> {
+        let targets = self.0.targets(path.as_deref()).map_err(dataset_error)?;
+        let targets = self.0.object_targets(&targets).map_err(dataset_error)?;
+        Ok(targets
+            .iter()
+            .filter_map(|t| t.object.map(|o| (t.scene_id, t.im_id, o.obj_id, o.inst_count)))
+            .collect())
+    }
+
+    /// The model of an object as a Mesh in metres with the symmetries of models_info.json; evaluation=True takes that of
+    /// models_eval where there is one.
+    #[pyo3(signature = (obj_id, *, evaluation=false))]
+    fn model(&self, py: Python<'_>, obj_id: i64, evaluation: bool) -> PyResult<PyMesh> {
+        let (obj_id, dataset) = (id("obj_id", obj_id)?, &self.0);
+        let models = if evaluation { Models::Evaluation } else { Models::Rendering };
+        let mesh = free(py, || dataset.model(obj_id, models))?.map_err(dataset_error)?;
+        let infos = dataset.models_info(models).map_err(dataset_error)?;
+        Ok(PyMesh::with_info(mesh, infos.as_ref().and_then(|i| i.0.get(&obj_id))))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Dataset {}: {} scenes>", self.0.root().display(), self.0.scene_ids().len())
+    }
+}
+
+/// Reads a colour image (grey ones as colour): (H, W, 3) uint8. Raises OSError or ValueError.
+#[pyfunction]
+fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> {
+    let image = free(py, || sixfold_bop::read_rgb(&path))?.map_err(dataset_error)?;
+    arrays::from_image_of(py, image)
+}
+
+/// Reads a 16 bit depth image: (H, W) float32 metres. mm_per_unit is BOP's depth_scale, the millimetres of one step.
+#[pyfunction]
+fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound<'_, PyArray2<f32>>> {
+    let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
+    let image = free(py, || sixfold_bop::read_depth(&path, metres))?.map_err(dataset_error)?;
+    arrays::from_image(py, image)
+}
+
+/// Reads a mask: (H, W) bool, True where the file is above zero.
+#[pyfunction]
+fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>>> {
+    let image = free(py, || sixfold_bop::read_mask(&path))?.map_err(dataset_error)?;
+    arrays::from_image(py, image)
+}
+
+/// Writes a colour image (H, W, 3) uint8 as PNG.
+#[pyfunction]
+fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<()> {
+    let image = arrays::rgb("rgb", rgb)?;
+    free(py, || sixfold_bop::write_rgb(&path, &image))?.map_err(dataset_error)
+}
+
+/// Writes a depth image (H, W) in metres as 16 bit PNG in steps of mm_per_unit millimetres (BOP's depth_scale).
+#[pyfunction]
+fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_unit: f64) -> PyResult<()> {
+    let image = arrays::depth("depth", depth)?;
+    let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
+    free(py, || sixfold_bop::write_depth(&path, &image, metres))?.map_err(dataset_error)
+}
+
+/// Writes a mask (H, W) bool as PNG.
+#[pyfunction]
+fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResult<()> {
+    let image = arrays::mask("mask", mask)?;
+    free(py, || sixfold_bop::write_mask(&path, &image))?.map_err(dataset_error)
+}
+
+/// Masks and visibility of posed objects, [(mesh, camera_from_object (4, 4)), ...], as BOP's ground-truth info: a list of
+/// dicts with mask and mask_visible (H, W) bool and visible (fraction). depth (H, W) metres is the sensor's image, where
+/// there is one; delta the tolerance of the visibility test in metres.
+#[pyfunction]
+#[pyo3(signature = (objects, camera, depth=None, *, delta=0.015))]
+fn ground_truth_visibility<'py>(
+    py: Python<'py>,
+    objects: &Bound<'py, PyAny>,
+    camera: PyCamera,
+    depth: Option<&Bound<'py, PyAny>>,
+    delta: f64,
+) -> PyResult<Bound<'py, PyList>> {
+    let objects = crate::render::posed_objects("objects", objects)?;
+    let depth = depth.map(|d| arrays::depth("depth", d)).transpose()?;
+    let camera = match &depth {
+        Some(image) => camera.of_image("depth", image.size())?,
+        None => camera.pinhole()?,
+    };
+    let delta = positive("delta", delta)?;
+    let seen = free(py, || {
+        let posed: Vec<_> = objects.iter().map(|(mesh, pose)| (mesh.as_ref(), *pose)).collect();
+        sixfold_bop::ground_truth_visibility(&posed, &camera, depth.as_ref(), delta)
+    })?;
+    let out = PyList::empty(py);
+    for object in seen {
+        let entry = PyDict::new(py);
+        entry.set_item("mask", arrays::from_image(py, object.mask)?)?;
+        entry.set_item("mask_visible", arrays::from_image(py, object.mask_visible)?)?;
+        entry.set_item("visible", object.info.visib_fract)?;
+        out.append(entry)?;
+    }
+    Ok(out)
+}
+
+/// A mask (H, W) bool as COCO's compressed run lengths: a dict with size [H, W] and counts.
+///
+/// >>> import numpy as np
+/// >>> encode_mask(np.array([[False, True]]))
+/// {'size': [1, 2], 'counts': '11'}
+#[pyfunction]
+pub(crate) fn encode_mask<'py>(py: Python<'py>, mask: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
+    let mask = arrays::mask("mask", mask)?;
+    let rle = sixfold_bop::Rle::encode(&mask).map_err(about("mask"))?;
+    let out = PyDict::new(py);
+    out.set_item("size", [rle.height(), rle.width()])?;
+    out.set_item("counts", rle.to_compressed())?;
+    Ok(out)
+}
+
+/// The mask (H, W) bool of COCO's run lengths: a dict with size [H, W] and counts, text (compressed) or a list.
+///
+/// Raises ValueError when the counts are damaged or do not add up to the size.
+///
+/// >>> decode_mask({"size": [1, 2], "counts": [1, 1]})
+/// array([[False,  True]])
+#[pyfunction]
+pub(crate) fn decode_mask<'py>(
+    py: Python<'py>,
+    rle: &Bound<'py, PyDict>,
+) -> PyResult<Bound<'py, PyArray2<bool>>> {
+    let wrong =
+        || bad("rle", "a dict with size [H, W] and counts (text or a list of runs)", "something else");
+    let size = rle.get_item("size")?.ok_or_else(wrong)?;
+    let (height, width) = size.extract::<[u64; 2]>().map(|[h, w]| (h, w)).map_err(|_| wrong())?;
+    let counts = rle.get_item("counts")?.ok_or_else(wrong)?;
+    let rle = if let Ok(text) = counts.extract::<String>() {
+        sixfold_bop::Rle::from_compressed(width, height, &text)
+    } else if let Ok(bytes) = counts
+        .extract::<Vec<u8>>()
+        .and_then(|b| if counts.is_instance_of::<pyo3::types::PyBytes>() { Ok(b) } else { Err(wrong()) })
+    {
+        let text = String::from_utf8(bytes).map_err(|_| wrong())?;
+        sixfold_bop::Rle::from_compressed(width, height, &text)
+    } else {
+        sixfold_bop::Rle::new(width, height, counts.extract::<Vec<u32>>().map_err(|_| wrong())?)
+    };
+    arrays::from_image(py, rle.map_err(about("rle"))?.decode())
+}
+
+/// Adds what is in `sixfold.bop`.
+pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<PyEstimate>()?;
+    module.add_class::<PyDataset>()?;
+    module.add_function(wrap_pyfunction!(read_results, module)?)?;
+    module.add_function(wrap_pyfunction!(write_results, module)?)?;
+    module.add_function(wrap_pyfunction!(pose_from_mm, module)?)?;
+    module.add_function(wrap_pyfunction!(pose_to_mm, module)?)?;
+    module.add_function(wrap_pyfunction!(read_rgb, module)?)?;
+    module.add_function(wrap_pyfunction!(read_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(read_mask, module)?)?;
+    module.add_function(wrap_pyfunction!(write_rgb, module)?)?;
+    module.add_function(wrap_pyfunction!(write_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(write_mask, module)?)?;
+    module.add_function(wrap_pyfunction!(ground_truth_visibility, module)?)?;
+    Ok(())
+}

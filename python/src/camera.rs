@@ -1,0 +1,294 @@
+//! `Camera`: pinhole intrinsics with an optional lens distortion, and the images that belong to it.
+
+use numpy::{PyArray1, PyArray2, PyArray3};
+use pyo3::prelude::*;
+use pyo3::types::PyTuple;
+use sixfold_geometry::{BrownConrady, Camera, Vec2};
+
+use crate::arrays::{self, about, bad, whole};
+use crate::guard::free;
+
+/// A pinhole camera: focal lengths and principal point in pixels, image size in pixels. The centre of the top left
+/// pixel is (0, 0); x runs right, y down, z forward (OpenCV's frame).
+///
+/// `distortion` are Brown's coefficients in OpenCV's order: (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
+///
+/// Raises ValueError for a focal length that is not above zero, an empty image, or numbers that are not finite.
+///
+/// >>> camera = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+/// >>> camera.matrix[0].tolist()
+/// [572.4, 0.0, 325.3]
+#[pyclass(name = "Camera", module = "sixfold", frozen, eq, from_py_object)]
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) struct PyCamera(pub(crate) Camera);
+
+impl PyCamera {
+    /// The camera, or an error where only images without distortion are taken.
+    pub(crate) fn pinhole(&self) -> PyResult<Camera> {
+        if self.0.distortion.is_some() {
+            return Err(bad(
+                "camera",
+                "one without distortion",
+                "lens distortion; undistort the image (undistort_rgb, undistort_depth) and give camera.without_distortion()",
+            ));
+        }
+        Ok(self.0)
+    }
+
+    /// The camera for an image of this size.
+    pub(crate) fn of_image(&self, argument: &'static str, size: (usize, usize)) -> PyResult<Camera> {
+        let camera = self.pinhole()?;
+        camera.check_image(size.0, size.1).map_err(about(argument))?;
+        Ok(camera)
+    }
+}
+
+#[pymethods]
+impl PyCamera {
+    #[new]
+    #[pyo3(signature = (fx, fy, cx, cy, width, height, distortion=None))]
+    fn new(
+        fx: f64,
+        fy: f64,
+        cx: f64,
+        cy: f64,
+        width: i64,
+        height: i64,
+        distortion: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let distortion = match distortion {
+            None => None,
+            Some(object) => {
+                let c = arrays::numbers("distortion", object)?;
+                if c.len() != 4 && c.len() != 5 {
+                    let expected = "4 or 5 coefficients (k1, k2, p1, p2[, k3])";
+                    return Err(bad("distortion", expected, format!("{} of them", c.len())));
+                }
+                let k3 = c.get(4).copied().unwrap_or(0.0);
+                Some(BrownConrady { k1: c[0], k2: c[1], p1: c[2], p2: c[3], k3 })
+            }
+        };
+        let (width, height) = (whole("width", width, 1)?, whole("height", height, 1)?);
+        let camera = Camera { fx, fy, cx, cy, width, height, distortion };
+        camera.check().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
+        Ok(PyCamera(camera))
+    }
+
+    /// Focal length in x, pixels.
+    #[getter]
+    fn fx(&self) -> f64 {
+        self.0.fx
+    }
+
+    /// Focal length in y, pixels.
+    #[getter]
+    fn fy(&self) -> f64 {
+        self.0.fy
+    }
+
+    /// Principal point x, pixels.
+    #[getter]
+    fn cx(&self) -> f64 {
+        self.0.cx
+    }
+
+    /// Principal point y, pixels.
+    #[getter]
+    fn cy(&self) -> f64 {
+        self.0.cy
+    }
+
+    /// Image width in pixels.
+    #[getter]
+    fn width(&self) -> usize {
+        self.0.width
+    }
+
+    /// Image height in pixels.
+    #[getter]
+    fn height(&self) -> usize {
+        self.0.height
+    }
+
+    /// (k1, k2, p1, p2, k3), or None for a pinhole camera.
+    #[getter]
+    fn distortion(&self) -> Option<(f64, f64, f64, f64, f64)> {
+        self.0.distortion.map(|d| (d.k1, d.k2, d.p1, d.p2, d.k3))
+    }
+
+    /// The intrinsic matrix K, (3, 3) float64.
+    #[getter]
+    fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::from_matrix3(py, &self.0.matrix())
+    }
+
+    /// Projects points (N, 3) in the camera frame, metres, to pinhole pixels (N, 2); NaN at or behind the camera.
+    ///
+    /// >>> Camera(500, 500, 320, 240, 640, 480).project([[0.1, 0.0, 1.0]])
+    /// array([[370., 240.]])
+    fn project<'py>(
+        &self,
+        py: Python<'py>,
+        points: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let points = arrays::points3("points", points)?;
+        arrays::from_points2(py, points.iter().map(|p| self.0.project(p)))
+    }
+
+    /// The points (N, 3) in the camera frame, metres, seen at pinhole pixels (N, 2) at depths (N,) in metres.
+    ///
+    /// >>> Camera(500, 500, 320, 240, 640, 480).unproject([[370, 240]], [1.0])
+    /// array([[0.1, 0. , 1. ]])
+    fn unproject<'py>(
+        &self,
+        py: Python<'py>,
+        pixels: &Bound<'py, PyAny>,
+        depth: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let (pixels, depth) = (arrays::points2("pixels", pixels)?, arrays::numbers("depth", depth)?);
+        if pixels.len() != depth.len() {
+            return Err(bad(
+                "depth",
+                format!("{} numbers, one a pixel", pixels.len()),
+                depth.len().to_string(),
+            ));
+        }
+        let points: Vec<_> = pixels.iter().zip(&depth).map(|(p, z)| self.0.unproject(p, *z)).collect();
+        arrays::from_points3(py, &points)
+    }
+
+    /// Where the raw, distorted image shows what a pinhole would show at pixels (N, 2).
+    fn distort_points<'py>(
+        &self,
+        py: Python<'py>,
+        pixels: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let pixels = arrays::points2("pixels", pixels)?;
+        arrays::from_points2(py, pixels.iter().map(|p| Some(self.0.distort_point(p))))
+    }
+
+    /// The pinhole pixels for pixels (N, 2) of the raw image; NaN where the distortion cannot be undone.
+    fn undistort_points<'py>(
+        &self,
+        py: Python<'py>,
+        pixels: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let pixels = arrays::points2("pixels", pixels)?;
+        arrays::from_points2(py, pixels.iter().map(|p: &Vec2| self.0.undistort_point(p)))
+    }
+
+    /// The same camera without its distortion: what an undistorted image was taken with.
+    fn without_distortion(&self) -> PyCamera {
+        PyCamera(self.0.without_distortion())
+    }
+
+    /// The camera of a crop, box = (x, y, width, height) in pixels.
+    ///
+    /// >>> Camera(500, 500, 320, 240, 640, 480).crop((100, 50, 200, 200)).cx
+    /// 220.0
+    fn crop(&self, r#box: &Bound<'_, PyAny>) -> PyResult<PyCamera> {
+        let boxes = arrays::boxes("box", r#box)?;
+        let [rect] = boxes[..] else { return Err(bad("box", "one box", format!("{}", boxes.len()))) };
+        if !(rect.width >= 1.0 && rect.height >= 1.0 && rect.width <= 1048576.0 && rect.height <= 1048576.0) {
+            return Err(bad(
+                "box",
+                "a side of 1 to 1048576 pixels",
+                format!("{} x {}", rect.width, rect.height),
+            ));
+        }
+        Ok(PyCamera(self.0.crop(&rect)))
+    }
+
+    /// The camera of the image resized to width x height pixels.
+    fn resize(&self, width: i64, height: i64) -> PyResult<PyCamera> {
+        let camera = self.0.resize(whole("width", width, 1)?, whole("height", height, 1)?);
+        camera.check().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
+        Ok(PyCamera(camera))
+    }
+
+    fn __repr__(&self) -> String {
+        let c = &self.0;
+        let lens = match self.distortion() {
+            Some(d) => format!(", distortion={d:?}"),
+            None => String::new(),
+        };
+        format!(
+            "Camera(fx={}, fy={}, cx={}, cy={}, width={}, height={}{lens})",
+            c.fx, c.fy, c.cx, c.cy, c.width, c.height
+        )
+    }
+
+    fn __getnewargs__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let c = &self.0;
+        (c.fx, c.fy, c.cx, c.cy, c.width, c.height, self.distortion()).into_pyobject(py)
+    }
+}
+
+/// The colour image (H, W, 3) uint8 that a pinhole camera with the same intrinsics would have taken: bilinear, black
+/// where the raw image shows nothing.
+///
+/// Raises ValueError when the image is not of the camera's size.
+///
+/// >>> import numpy as np
+/// >>> camera = Camera(500, 500, 320, 240, 640, 480, distortion=(0.1, 0, 0, 0))
+/// >>> undistort_rgb(np.zeros((480, 640, 3), np.uint8), camera).shape
+/// (480, 640, 3)
+#[pyfunction]
+pub(crate) fn undistort_rgb<'py>(
+    py: Python<'py>,
+    rgb: &Bound<'py, PyAny>,
+    camera: PyCamera,
+) -> PyResult<Bound<'py, PyArray3<u8>>> {
+    let image = arrays::rgb("rgb", rgb)?;
+    let out = free(py, || sixfold_geometry::undistort_rgb(&image, &camera.0))?.map_err(about("rgb"))?;
+    arrays::from_image_of(py, out)
+}
+
+/// The depth image (H, W) float32 in metres that a pinhole camera with the same intrinsics would have measured: the
+/// nearest raw pixel, 0 where there is none.
+///
+/// Raises ValueError when the image is not of the camera's size.
+///
+/// >>> import numpy as np
+/// >>> camera = Camera(500, 500, 320, 240, 640, 480, distortion=(0.1, 0, 0, 0))
+/// >>> undistort_depth(np.ones((480, 640), np.float32), camera).max()
+/// np.float32(1.0)
+#[pyfunction]
+pub(crate) fn undistort_depth<'py>(
+    py: Python<'py>,
+    depth: &Bound<'py, PyAny>,
+    camera: PyCamera,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let image = arrays::depth("depth", depth)?;
+    let out = free(py, || sixfold_geometry::undistort_depth(&image, &camera.0))?.map_err(about("depth"))?;
+    arrays::from_image(py, out)
+}
+
+/// Six numbers (v, w) to a pose (4, 4): the exponential map of SE(3), v in metres, w a rotation vector in radians
+/// (Barfoot 2017, section 7.1).
+///
+/// >>> pose_exp([0.1, 0, 1, 0, 0, 0])[:3, 3]
+/// array([0.1, 0. , 1. ])
+#[pyfunction]
+pub(crate) fn pose_exp<'py>(
+    py: Python<'py>,
+    twist: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let v = arrays::numbers("twist", twist)?;
+    let v: [f64; 6] =
+        v.try_into().map_err(|v: Vec<f64>| bad("twist", "6 numbers (v, w)", format!("{}", v.len())))?;
+    arrays::from_pose(py, &sixfold_geometry::Pose::exp(&v.into()))
+}
+
+/// A pose (4, 4) to the six numbers (v, w) of pose_exp; for rotation angles below pi.
+///
+/// >>> pose_log(pose_exp([0.1, 0, 1, 0, 0, 0.5])).round(9) + 0
+/// array([0.1, 0. , 1. , 0. , 0. , 0.5])
+#[pyfunction]
+pub(crate) fn pose_log<'py>(
+    py: Python<'py>,
+    pose: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let twist = arrays::pose("pose", pose)?.log();
+    Ok(PyArray1::from_vec(py, twist.iter().copied().collect()))
+}

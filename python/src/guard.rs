@@ -1,0 +1,136 @@
+//! Work outside the interpreter lock: panics become `RuntimeError`, Ctrl-C is heard, file errors become `OSError`.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
+use pyo3::prelude::*;
+use sixfold_bop::{DatasetError, EvalError, ResultsError};
+use sixfold_mesh::MeshFileError;
+
+/// How often Ctrl-C is looked for.
+const LISTEN: Duration = Duration::from_millis(20);
+
+fn internal(payload: &(dyn Any + Send)) -> PyErr {
+    let text = payload
+        .downcast_ref::<&str>()
+        .map(|s| (*s).to_owned())
+        .or_else(|| payload.downcast_ref::<String>().cloned())
+        .unwrap_or_else(|| "unknown".to_owned());
+    PyRuntimeError::new_err(format!("internal error in sixfold, please report it with the input: {text}"))
+}
+
+/// Runs short work without the interpreter lock.
+pub(crate) fn free<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> PyResult<T> {
+    py.detach(|| catch_unwind(AssertUnwindSafe(work))).map_err(|payload| internal(payload.as_ref()))
+}
+
+/// What ends work that was asked to stop where it only has a callback.
+struct Stopped;
+
+/// Asked to stop: work calls [`Stop::check`] where it can be left.
+#[derive(Clone)]
+pub(crate) struct Stop(Arc<AtomicBool>);
+
+impl Stop {
+    /// Leaves the work when Ctrl-C was pressed: unwinds without a message, and [`interruptible`] catches it.
+    pub(crate) fn check(&self) {
+        if self.0.load(Ordering::Relaxed) {
+            resume_unwind(Box::new(Stopped));
+        }
+    }
+}
+
+/// Runs long work on a thread of its own without the interpreter lock and raises what a signal handler raises
+/// (`KeyboardInterrupt`) while it runs. The call then returns at once: work that looks at [`Stop`] ends soon, other work
+/// when it is done, and nobody sees its result.
+pub(crate) fn interruptible<T: Send + 'static>(
+    py: Python<'_>,
+    work: impl FnOnce(&Stop) -> T + Send + 'static,
+) -> PyResult<T> {
+    let stop = Stop(Arc::new(AtomicBool::new(false)));
+    let (send, mut receive) = channel();
+    let flag = stop.clone();
+    std::thread::Builder::new()
+        .name("sixfold".to_owned())
+        .spawn(move || {
+            // The receiver is gone when the call was left; then nobody wants the result.
+            let _ = send.send(catch_unwind(AssertUnwindSafe(|| work(&flag))));
+        })
+        .map_err(|error| PyOSError::new_err(format!("no thread could be started: {error}")))?;
+    loop {
+        let answer;
+        (answer, receive) = py.detach(move || (receive.recv_timeout(LISTEN), receive));
+        match answer {
+            Ok(Ok(value)) => return Ok(value),
+            Ok(Err(payload)) => return Err(internal(payload.as_ref())),
+            Err(RecvTimeoutError::Timeout) => {
+                if let Err(error) = py.check_signals() {
+                    stop.0.store(true, Ordering::Relaxed);
+                    return Err(error);
+                }
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(PyRuntimeError::new_err(
+                    "internal error in sixfold: the work ended without an answer",
+                ));
+            }
+        }
+    }
+}
+
+/// `OSError` (or the fitting child of it) with a message that names the file.
+pub(crate) fn os_error(kind: std::io::ErrorKind, message: String) -> PyErr {
+    match kind {
+        std::io::ErrorKind::NotFound => PyFileNotFoundError::new_err(message),
+        std::io::ErrorKind::PermissionDenied => PyPermissionError::new_err(message),
+        _ => PyOSError::new_err(message),
+    }
+}
+
+/// A mesh file that cannot be read or written.
+pub(crate) fn mesh_file_error(error: MeshFileError) -> PyErr {
+    match &error {
+        MeshFileError::Io { source, .. } => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// A dataset that cannot be read or written.
+pub(crate) fn dataset_error(error: DatasetError) -> PyErr {
+    match error {
+        DatasetError::Read { ref source, .. } | DatasetError::Write { ref source, .. } => {
+            os_error(source.kind(), error.to_string())
+        }
+        DatasetError::Missing { .. } | DatasetError::NoModel { .. } => {
+            PyFileNotFoundError::new_err(error.to_string())
+        }
+        DatasetError::Model(error) => match error.downcast::<MeshFileError>() {
+            Ok(error) => mesh_file_error(*error),
+            Err(error) => PyValueError::new_err(error.to_string()),
+        },
+        other => PyValueError::new_err(other.to_string()),
+    }
+}
+
+/// A result file that cannot be read or written.
+pub(crate) fn results_error(error: ResultsError) -> PyErr {
+    match &error {
+        ResultsError::Read { source, .. } | ResultsError::Write { source, .. } => {
+            os_error(source.kind(), error.to_string())
+        }
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// An evaluation that cannot be done.
+pub(crate) fn eval_error(error: EvalError) -> PyErr {
+    match error {
+        EvalError::Dataset(error) => dataset_error(error),
+        other => PyValueError::new_err(other.to_string()),
+    }
+}

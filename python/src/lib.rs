@@ -1,0 +1,88 @@
+//! The Python package `sixfold`: numpy arrays in, poses out. Every file of this crate turns one part of the library into
+//! Python's terms; nothing is computed here.
+//!
+//! Three rules hold for every function: what comes in is checked and refused with a `ValueError` that names the argument;
+//! the interpreter lock is released while the library works; no panic reaches Python (`guard.rs`).
+
+// PyO3 hands over arguments by value, and a Python call has as many as it needs.
+#![allow(clippy::needless_pass_by_value)]
+
+mod align;
+mod arrays;
+mod bop;
+mod camera;
+mod coco;
+mod guard;
+mod mesh;
+mod metrics;
+mod pix2pose;
+mod render;
+mod scene;
+
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+pyo3::create_exception!(
+    sixfold,
+    NoSolutionError,
+    PyValueError,
+    "The input is well formed, but nothing fits it: no pose agrees with enough correspondences, too few points find a partner."
+);
+
+/// The compiled part of the package `sixfold`.
+#[pymodule]
+fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    let py = module.py();
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("NoSolutionError", py.get_type::<NoSolutionError>())?;
+    module.add_class::<camera::PyCamera>()?;
+    module.add_class::<mesh::PyMesh>()?;
+    module.add_class::<render::Rendering>()?;
+    module.add_class::<render::SceneRendering>()?;
+    module.add_class::<render::AmbientLight>()?;
+    module.add_class::<render::DirectionalLight>()?;
+    module.add_class::<render::PointLight>()?;
+    module.add_class::<align::PnpResult>()?;
+    module.add_class::<align::IcpResult>()?;
+    module.add_class::<scene::PyPlane>()?;
+    module.add_class::<scene::PpfModel>()?;
+    module.add_class::<scene::PpfScene>()?;
+    module.add_class::<scene::PpfEstimate>()?;
+    module.add_class::<pix2pose::Pix2Pose>()?;
+    module.add_class::<pix2pose::Pix2PosePose>()?;
+    module.add_function(wrap_pyfunction!(mesh::_mesh_of, module)?)?;
+    module.add_function(wrap_pyfunction!(camera::undistort_rgb, module)?)?;
+    module.add_function(wrap_pyfunction!(camera::undistort_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(camera::pose_exp, module)?)?;
+    module.add_function(wrap_pyfunction!(camera::pose_log, module)?)?;
+    module.add_function(wrap_pyfunction!(render::render, module)?)?;
+    module.add_function(wrap_pyfunction!(render::render_scene, module)?)?;
+    module.add_function(wrap_pyfunction!(render::render_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(render::simulate_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(render::support_plane, module)?)?;
+    module.add_function(wrap_pyfunction!(align::pnp_ransac, module)?)?;
+    module.add_function(wrap_pyfunction!(align::epnp, module)?)?;
+    module.add_function(wrap_pyfunction!(align::refine_pose, module)?)?;
+    module.add_function(wrap_pyfunction!(align::kabsch, module)?)?;
+    module.add_function(wrap_pyfunction!(align::umeyama, module)?)?;
+    module.add_function(wrap_pyfunction!(align::icp, module)?)?;
+    module.add_function(wrap_pyfunction!(align::icp_to_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::normals_from_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::inpaint_depth, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::point_cloud, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::voxel_downsample, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::dominant_plane, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::fit_plane, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::sphere_directions, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::estimate_ppf, module)?)?;
+    for (name, register) in [
+        ("metrics", metrics::register as fn(&Bound<'_, PyModule>) -> PyResult<()>),
+        ("bop", bop::register),
+        ("coco", coco::register),
+    ] {
+        let part = PyModule::new(py, name)?;
+        register(&part)?;
+        module.add_submodule(&part)?;
+    }
+    Ok(())
+}

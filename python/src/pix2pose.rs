@@ -1,0 +1,338 @@
+//! `Pix2Pose`: poses from colour with a trained network (dissertation, chapter 3).
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList, PyType};
+use sixfold_geometry::{Pose, Rect};
+use sixfold_mesh::Mesh;
+use sixfold_nn::weights::WeightsError;
+use sixfold_pix2pose::depth::DepthScene;
+use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found, estimate};
+use sixfold_pix2pose::model::{ModelError, Pix2PoseModel};
+use sixfold_pix2pose::refine::{RefineOptions, refine};
+
+use crate::arrays::{self, about, bad, positive, seed};
+use crate::camera::PyCamera;
+use crate::guard::{interruptible, os_error};
+use crate::mesh::PyMesh;
+
+/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
+const SAME_BOX: f64 = 0.05;
+
+fn model_error(error: ModelError) -> PyErr {
+    match &error {
+        ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// The pose of one object in one box.
+#[pyclass(name = "Pix2PosePose", module = "sixfold", frozen)]
+pub(crate) struct Pix2PosePose {
+    /// The object.
+    #[pyo3(get)]
+    object_id: u32,
+    /// The pose, (4, 4) float64, metres; after alignment of the outline and with depth, where asked for.
+    #[pyo3(get)]
+    camera_from_object: Py<PyArray2<f64>>,
+    /// Correspondences that fit over the object's pixels, 0 to 1.
+    #[pyo3(get)]
+    score: f64,
+    /// Whether the mesh's outline was aligned with the image.
+    #[pyo3(get)]
+    refined: bool,
+    /// Whether the pose was aligned with depth.
+    #[pyo3(get)]
+    aligned_to_depth: bool,
+    /// As PnP left them, best first: dicts with camera_from_object (4, 4), score, inliers, threshold.
+    #[pyo3(get)]
+    hypotheses: Py<PyList>,
+    /// The square of the image that the last pass saw, (4,): x, y, width, height in pixels.
+    #[pyo3(get)]
+    window: Py<PyArray1<f64>>,
+    /// What the network saw, (side, side, 3) uint8.
+    #[pyo3(get)]
+    input: Py<PyArray3<u8>>,
+    /// Object coordinates it predicts, (side, side, 3) float32, normalised to -1 to 1 over the object's box.
+    #[pyo3(get)]
+    coordinates: Py<PyArray3<f32>>,
+    /// Their expected error, (side, side) float32, 0 to 1.
+    #[pyo3(get)]
+    error: Py<PyArray2<f32>>,
+    /// Probability that the object is visible, (side, side) float32.
+    #[pyo3(get)]
+    visible: Py<PyArray2<f32>>,
+    /// The correspondences of the best hypothesis: points (N, 3) in the object's frame, metres.
+    #[pyo3(get)]
+    object_points: Py<PyArray2<f64>>,
+    /// Their pixels, (N, 2).
+    #[pyo3(get)]
+    image_points: Py<PyArray2<f64>>,
+}
+
+#[pymethods]
+impl Pix2PosePose {
+    fn __repr__(&self) -> String {
+        format!("<Pix2PosePose: object {}, score {:.3}>", self.object_id, self.score)
+    }
+}
+
+/// What a call found in one box, before it becomes Python's.
+struct Posed {
+    object_id: u32,
+    camera_from_object: Pose,
+    refined: bool,
+    aligned: bool,
+    found: Found,
+}
+
+impl Posed {
+    fn into_python(self, py: Python<'_>) -> PyResult<Pix2PosePose> {
+        let Found { hypotheses, view, object_points, image_points, .. } = self.found;
+        let list = PyList::empty(py);
+        for h in &hypotheses {
+            let entry = PyDict::new(py);
+            entry.set_item("camera_from_object", arrays::from_pose(py, &h.camera_from_object)?)?;
+            entry.set_item("score", h.score)?;
+            entry.set_item("inliers", h.inliers)?;
+            entry.set_item("threshold", h.threshold)?;
+            list.append(entry)?;
+        }
+        let (w, p) = (view.window, view.prediction);
+        let side = p.side;
+        let coordinates = PyArray1::from_vec(py, p.coordinates.into_flattened()).reshape([side, side, 3])?;
+        Ok(Pix2PosePose {
+            object_id: self.object_id,
+            camera_from_object: arrays::from_pose(py, &self.camera_from_object)?.unbind(),
+            score: hypotheses.first().map_or(0.0, |h| h.score),
+            refined: self.refined,
+            aligned_to_depth: self.aligned,
+            hypotheses: list.unbind(),
+            window: PyArray1::from_vec(py, vec![w.x, w.y, w.width, w.height]).unbind(),
+            input: arrays::from_image_of(py, view.input)?.unbind(),
+            coordinates: coordinates.unbind(),
+            error: PyArray1::from_vec(py, p.error).reshape([side, side])?.unbind(),
+            visible: PyArray1::from_vec(py, p.visible).reshape([side, side])?.unbind(),
+            object_points: arrays::from_points3(py, &object_points)?.unbind(),
+            image_points: arrays::from_points2(py, image_points.into_iter().map(Some))?.unbind(),
+        })
+    }
+}
+
+/// A trained Pix2Pose network: poses of known objects from colour, in given boxes (Park et al. 2019). Made by `load`.
+///
+/// >>> pix2pose = Pix2Pose.load("weights/pix2pose-lmo.safetensors", camera=camera)  # doctest: +SKIP
+/// >>> poses = pix2pose(rgb, [[330, 120, 110, 150]], object_ids=[8])  # doctest: +SKIP
+#[pyclass(name = "Pix2Pose", module = "sixfold", frozen)]
+pub(crate) struct Pix2Pose {
+    model: Arc<Pix2PoseModel>,
+    camera: Option<PyCamera>,
+    meshes: Meshes,
+}
+
+type Meshes = BTreeMap<u32, Arc<Mesh>>;
+
+fn meshes_of(model: &Pix2PoseModel, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
+    let mut out = BTreeMap::new();
+    for (id, mesh) in meshes.unwrap_or_default() {
+        let (_, entry) =
+            model.object(id).map_err(|error| PyValueError::new_err(format!("meshes: {error}")))?;
+        let mesh = mesh.get().mesh.clone();
+        let scale = entry.scale();
+        let (low, high) = mesh.bounding_box();
+        let off = (low - (scale.centre - scale.half_size))
+            .amax()
+            .max((high - (scale.centre + scale.half_size)).amax());
+        if off > SAME_BOX * entry.diameter {
+            let size = 1000.0 * (high - low);
+            let own = 2000.0 * scale.half_size;
+            return Err(bad(
+                "meshes",
+                format!(
+                    "for object {id} a box of {:.1} x {:.1} x {:.1} mm as in training",
+                    own.x, own.y, own.z
+                ),
+                format!(
+                    "{:.1} x {:.1} x {:.1} mm, corners off by {:.1} mm (another object, unit or origin?)",
+                    size.x,
+                    size.y,
+                    size.z,
+                    1000.0 * off
+                ),
+            ));
+        }
+        out.insert(id, mesh);
+    }
+    Ok(out)
+}
+
+#[pymethods]
+impl Pix2Pose {
+    /// Reads a weight file (.safetensors) that `sixfold train pix2pose` wrote.
+    ///
+    /// camera: the camera of the images, unless every call names its own; meshes {object id: Mesh}: with an object's mesh
+    /// its outline is aligned with the image as the last step.
+    ///
+    /// Raises OSError when the file cannot be read, ValueError when it is no such model or a mesh is not that of its object.
+    #[classmethod]
+    #[pyo3(signature = (path, camera=None, meshes=None))]
+    fn load(
+        _class: &Bound<'_, PyType>,
+        py: Python<'_>,
+        path: PathBuf,
+        camera: Option<PyCamera>,
+        meshes: Option<BTreeMap<u32, Py<PyMesh>>>,
+    ) -> PyResult<Self> {
+        let model = interruptible(py, move |_| Pix2PoseModel::load(&path))?.map_err(model_error)?;
+        let meshes = meshes_of(&model, meshes)?;
+        Ok(Pix2Pose { model: Arc::new(model), camera, meshes })
+    }
+
+    /// What the model knows: a list of dicts with id, diameter (metres), centre and half_size (3,) of its coordinates in
+    /// metres, thresholds.
+    #[getter]
+    fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        crate::bop::json_to_python(py, &self.model.objects())
+    }
+
+    /// The model's card: what it was trained on, how, with which scores.
+    #[getter]
+    fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        crate::bop::json_to_python(py, self.model.card())
+    }
+
+    /// Looks for one object in every box of an image: a list with a Pix2PosePose for each box, None where it is not seen.
+    ///
+    /// rgb (H, W, 3) uint8, without lens distortion; boxes (N, 4) x, y, width, height in pixels; object_ids (N,), not
+    /// needed for a model of one object; camera, meshes: in place of those of `load`; depth (H, W) metres: poses of
+    /// objects with a mesh are aligned with it; thresholds on the expected error in place of the model's; two_stages=False
+    /// takes the poses of the first pass; refine=False leaves the outline alone. The same input and seed give the same
+    /// result. Ctrl-C is heard.
+    ///
+    /// Raises ValueError for an unknown object, a box without area or outside the image, an image of another size than the
+    /// camera's.
+    #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, crop_factor=1.5, seed=0))]
+    #[allow(clippy::too_many_arguments)]
+    fn __call__(
+        &self,
+        py: Python<'_>,
+        rgb: &Bound<'_, PyAny>,
+        boxes: &Bound<'_, PyAny>,
+        object_ids: Option<&Bound<'_, PyAny>>,
+        camera: Option<PyCamera>,
+        meshes: Option<BTreeMap<u32, Py<PyMesh>>>,
+        depth: Option<&Bound<'_, PyAny>>,
+        thresholds: Option<&Bound<'_, PyAny>>,
+        two_stages: bool,
+        refine: bool,
+        crop_factor: f64,
+        seed: i64,
+    ) -> PyResult<Vec<Option<Pix2PosePose>>> {
+        let image = arrays::rgb("rgb", rgb)?;
+        let boxes: Vec<Rect> = arrays::boxes("boxes", boxes)?;
+        let camera = camera.or(self.camera);
+        let camera = camera.ok_or_else(|| bad("camera", "the image's camera, here or in load", "None"))?;
+        let camera = camera.of_image("rgb", image.size())?;
+        let ids = match object_ids {
+            Some(ids) => arrays::ids("object_ids", ids)?,
+            None => match self.model.objects() {
+                [only] => vec![only.id; boxes.len()],
+                several => {
+                    let known: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
+                    let expected = format!("one id a box out of {}", known.join(", "));
+                    return Err(bad("object_ids", expected, "None"));
+                }
+            },
+        };
+        if ids.len() != boxes.len() {
+            return Err(bad("object_ids", format!("{} ids, one a box", boxes.len()), ids.len().to_string()));
+        }
+        for id in &ids {
+            self.model.object(*id).map_err(about("object_ids"))?;
+        }
+        let meshes = match meshes {
+            Some(meshes) => meshes_of(&self.model, Some(meshes))?,
+            None => self.meshes.clone(),
+        };
+        let depth = depth.map(|d| arrays::depth("depth", d)).transpose()?;
+        if let Some(image) = &depth {
+            camera.check_image(image.width(), image.height()).map_err(about("depth"))?;
+            if meshes.is_empty() {
+                return Err(bad("meshes", "the objects' meshes, which alignment with depth needs", "none"));
+            }
+        }
+        let thresholds = match thresholds {
+            Some(list) => arrays::numbers("thresholds", list)?.into_iter().map(|t| t as f32).collect(),
+            None => Vec::new(),
+        };
+        let options = EstimateOptions {
+            thresholds,
+            two_stages,
+            crop_factor: positive("crop_factor", crop_factor)?,
+            seed: self::seed(seed)?,
+            ..EstimateOptions::default()
+        };
+        let model = self.model.clone();
+        let found = interruptible(py, move |stop| {
+            let scene = depth.as_ref().map(|d| DepthScene::new(d, &camera));
+            let mut out: Vec<Option<Posed>> = Vec::with_capacity(boxes.len());
+            for (region, object_id) in boxes.iter().zip(ids) {
+                stop.check();
+                let Some(found) = estimate(&model, &image, &camera, object_id, region, &options)? else {
+                    out.push(None);
+                    continue;
+                };
+                let Some(best) = found.hypotheses.first() else {
+                    out.push(None);
+                    continue;
+                };
+                let mut posed = Posed {
+                    object_id,
+                    camera_from_object: best.camera_from_object,
+                    refined: false,
+                    aligned: false,
+                    found,
+                };
+                if let Some(mesh) = meshes.get(&object_id) {
+                    if refine {
+                        let aligned =
+                            self::refine(&image, &camera, mesh, &posed.found, &RefineOptions::default());
+                        posed.camera_from_object = aligned.camera_from_object;
+                        posed.refined = aligned.improved;
+                    }
+                    if let Some(scene) = &scene {
+                        let diameter = model.object(object_id).map(|(_, o)| o.diameter)?;
+                        // Too little depth on the object leaves the pose that colour gave.
+                        let start = posed.camera_from_object;
+                        if let Ok(aligned) = scene.align(mesh, diameter, &start, &posed.found) {
+                            posed.camera_from_object = aligned.camera_from_object;
+                            posed.aligned = true;
+                        }
+                    }
+                }
+                out.push(Some(posed));
+            }
+            Ok::<_, EstimateError>(out)
+        })?;
+        let found = found.map_err(|error| {
+            let argument = match &error {
+                EstimateError::Box(_) | EstimateError::Outside { .. } => "boxes",
+                EstimateError::Size { .. } => "rgb",
+                EstimateError::Distorted => "camera",
+                EstimateError::Model(_) => "object_ids",
+            };
+            PyValueError::new_err(format!("{argument}: {error}"))
+        })?;
+        found.into_iter().map(|posed| posed.map(|p| p.into_python(py)).transpose()).collect()
+    }
+
+    fn __repr__(&self) -> String {
+        let ids: Vec<String> = self.model.objects().iter().map(|o| o.id.to_string()).collect();
+        format!("<Pix2Pose: objects {}>", ids.join(", "))
+    }
+}
