@@ -218,7 +218,15 @@ mod tests {
 
     fn annotation(image_id: u32, category_id: u32, x: f64) -> Annotation {
         let bbox = Rect { x, y: 10.0, width: 20.0, height: 20.0 };
-        Annotation { scene_id: 1, image_id, category_id, bbox, area: 400.0, iscrowd: false, segmentation: None }
+        Annotation {
+            scene_id: 1,
+            image_id,
+            category_id,
+            bbox,
+            area: 400.0,
+            iscrowd: false,
+            segmentation: None,
+        }
     }
 
     fn detection(image_id: u32, category_id: u32, x: f64, score: f64) -> Detection {

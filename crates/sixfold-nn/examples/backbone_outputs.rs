@@ -1,9 +1,9 @@
 //! Feature maps, logits and gradients of a backbone with given PyTorch weights, for `checks/backbones_vs_pytorch.py`.
 //!
-//! `backbone_outputs resnet50|densenet121 WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
+//! `backbone_outputs resnet50|densenet121|efficientnet-lite0 WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
 //! (`batch x 3 x height x width`) and `factor` (of the last map's shape), the output the maps (`map0` ..) and the `logits`; of a
 //! training step the `loss` (mean of last map times factor, plus mean of the squared logits), every parameter's gradient and
-//! every running statistic's new value.
+//! every running statistic's new value. EfficientNet-Lite0, whose normalisation is folded, gives its seven maps alone.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -14,6 +14,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sixfold_nn::densenet::DenseNet121Config;
+use sixfold_nn::lite0::Lite0Config;
 use sixfold_nn::resnet::ResNet50Config;
 
 type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
@@ -21,7 +22,10 @@ type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [network, weights, input, output] = arguments.as_slice() else {
-        return Err("expected resnet50|densenet121 WEIGHTS INPUT.safetensors OUTPUT.safetensors".into());
+        return Err(
+            "expected resnet50|densenet121|efficientnet-lite0 WEIGHTS INPUT.safetensors OUTPUT.safetensors"
+                .into(),
+        );
     };
     let bytes = std::fs::read(input)?;
     let file = SafeTensors::deserialize(&bytes)?;
@@ -43,7 +47,17 @@ fn main() -> Result<(), Box<dyn Error>> {
             let network = DenseNet121Config::imagenet().from_pytorch(Path::new(weights), &device)?;
             run(network, data, |n, x| n.features(x), |n, m| n.classify_map(m), &mut outputs)?;
         }
-        other => return Err(format!("expected resnet50 or densenet121, found {other}").into()),
+        "efficientnet-lite0" => {
+            let device = Device::default();
+            let network = Lite0Config { stages: 7 }.from_pytorch(Path::new(weights), &device)?;
+            let [x, _] = data;
+            for (i, map) in network.forward(Tensor::from_data(x, &device)).into_iter().enumerate() {
+                keep(&mut outputs, format!("map{i}"), map)?;
+            }
+        }
+        other => {
+            return Err(format!("expected resnet50, densenet121 or efficientnet-lite0, found {other}").into());
+        }
     }
     write(&outputs, Path::new(output))
 }
