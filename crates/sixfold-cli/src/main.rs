@@ -27,7 +27,22 @@ pub(crate) enum Outcome {
     Incomplete,
 }
 
+/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end one in C, rather
+/// than with a message of a panic. What a command has to keep it writes to files.
+fn end_with_the_reader() {
+    let usual = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        let message = panic.payload().downcast_ref::<String>();
+        if message.is_some_and(|m| m.starts_with("failed printing to") && m.contains("Broken pipe")) {
+            // 128 and the number of SIGPIPE.
+            std::process::exit(141);
+        }
+        usual(panic);
+    }));
+}
+
 fn main() -> ExitCode {
+    end_with_the_reader();
     let arguments = Arguments::parse();
     progress::catch_interrupts();
     if let Some(threads) = arguments.threads {

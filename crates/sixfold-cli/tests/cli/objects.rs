@@ -147,3 +147,16 @@ fn every_command_has_help_with_an_example() {
     assert!(seen >= 11, "{seen} commands");
     assert!(sixfold(dir.path(), "--version").expect(0).stdout.starts_with("sixfold "));
 }
+
+#[test]
+fn a_reader_that_went_away_ends_the_program_without_a_panic() {
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_sixfold"))
+        .args(["completions", "bash"])
+        .stdout(writer)
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(141));
+    assert!(output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
+}
