@@ -5,7 +5,7 @@
 //! `lambda_1 * reconstruction + lambda_2 * error + adversarial`.
 
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
-use crate::model::{Network, paper_input, resnet_input};
+use crate::model::{paper_input, resnet_input};
 use crate::networks::ResNet50Generator;
 use crate::networks::{Discriminator, DiscriminatorConfig};
 use crate::networks::{GeneratorOutput, PaperGenerator};
@@ -78,8 +78,6 @@ pub trait Generator: Module {
     fn generate(&self, x: Tensor<4>) -> GeneratorOutput;
     /// Pixel values in 0..1 as the network takes them.
     fn input(rgb: &[f32]) -> Vec<f32>;
-    /// The network for a model file.
-    fn network(self) -> Network;
 }
 
 impl Generator for PaperGenerator {
@@ -89,9 +87,6 @@ impl Generator for PaperGenerator {
     fn input(rgb: &[f32]) -> Vec<f32> {
         paper_input(rgb)
     }
-    fn network(self) -> Network {
-        Network::Paper(Box::new(self))
-    }
 }
 
 impl Generator for ResNet50Generator {
@@ -100,9 +95,6 @@ impl Generator for ResNet50Generator {
     }
     fn input(rgb: &[f32]) -> Vec<f32> {
         resnet_input(rgb)
-    }
-    fn network(self) -> Network {
-        Network::ResNet50(Box::new(self))
     }
 }
 
@@ -240,7 +232,7 @@ pub fn train_adversarial<G: Generator>(
     options: &AdversarialOptions,
     stop: &AtomicBool,
     mut progress: impl FnMut(&TrainingRecord),
-) -> Result<TrainingOutcome, TrainingError> {
+) -> Result<TrainingOutcome<G>, TrainingError> {
     let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
     let side = source.options().size;
     if source.objects() != 1 || pool.is_empty() {
@@ -348,5 +340,5 @@ pub fn train_adversarial<G: Generator>(
             return Ok(TrainingOutcome::Interrupted { step });
         }
     }
-    Ok(TrainingOutcome::Finished(state.generator.valid().network()))
+    Ok(TrainingOutcome::Finished(state.generator.valid()))
 }

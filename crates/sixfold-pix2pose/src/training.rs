@@ -112,16 +112,26 @@ pub enum TrainingError {
     },
 }
 
-/// How a call of [`train`] ended.
+/// How a training ended.
 #[derive(Debug)]
-pub enum TrainingOutcome {
+pub enum TrainingOutcome<N = Network> {
     /// All steps are done.
-    Finished(Network),
+    Finished(N),
     /// It was asked to stop; a checkpoint of this step was written.
     Interrupted {
         /// Steps done.
         step: u64,
     },
+}
+
+impl<N> TrainingOutcome<N> {
+    /// The same with another form of the network.
+    pub fn map<M>(self, change: impl FnOnce(N) -> M) -> TrainingOutcome<M> {
+        match self {
+            TrainingOutcome::Finished(network) => TrainingOutcome::Finished(change(network)),
+            TrainingOutcome::Interrupted { step } => TrainingOutcome::Interrupted { step },
+        }
+    }
 }
 
 /// A batch: images of all objects, one object after another.

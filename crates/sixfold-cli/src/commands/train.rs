@@ -183,6 +183,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         NetworkKind::Paper => {
             let generator = PaperGeneratorConfig { seed: a.seed }.init(&device);
             train_adversarial(&source, &pools[0], generator, &device, &folder, &dissertation, stop, shown)?
+                .map(|n| Network::Paper(Box::new(n)))
         }
         NetworkKind::Resnet50 => {
             let config = ResNet50GeneratorConfig { seed: a.seed };
@@ -191,6 +192,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
                 None => config.init(&device),
             };
             train_adversarial(&source, &pools[0], generator, &device, &folder, &dissertation, stop, shown)?
+                .map(|n| Network::ResNet50(Box::new(n)))
         }
     };
     progress.finish();
