@@ -262,7 +262,13 @@ def test_views_are_read_as_they_look():
     wide = np.zeros((60, 6))
     wide[::2, ::2] = POINTS
     expected = sixfold.pnp_ransac(POINTS, PIXELS, CAMERA).camera_from_object
-    for points in (wide[::2, ::2], np.asfortranarray(POINTS), POINTS.astype(">f8"), POINTS[::-1][::-1], POINTS.tolist()):
+    for points in (
+        wide[::2, ::2],
+        np.asfortranarray(POINTS),
+        POINTS.astype(">f8"),
+        POINTS[::-1][::-1],
+        POINTS.tolist(),
+    ):
         assert (sixfold.pnp_ransac(points, PIXELS, CAMERA).camera_from_object == expected).all()
     transposed = sixfold.pose_exp([0, 0, 0.6, 0.1, 0.2, 0.3]).T
     assert (sixfold.render_depth(BOX, transposed.T, CAMERA) == DEPTH).all()
