@@ -316,8 +316,8 @@ impl PyMesh {
         seed: i64,
     ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<u32>>)> {
         let (count, seed) = (whole("count", count, 0)?, self::seed(seed)?);
-        if count > 1 << 28 {
-            return Err(bad("count", "at most 268435456", count.to_string()));
+        if count > 1 << 26 {
+            return Err(bad("count", "at most 67108864", count.to_string()));
         }
         let samples = free(py, || self.mesh.sample_surface(count, seed))?;
         Ok((
