@@ -16,8 +16,9 @@ use sixfold_nn::lite0::imagenet_encoder;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let steps = std::env::args().nth(1).map_or(Ok(60), |text| text.parse())?;
-    let vertices =
-        [[-0.05, -0.04, 0.0], [0.05, -0.03, 0.0], [0.0, 0.06, 0.0], [0.01, 0.0, 0.08]].map(Vec3::from).to_vec();
+    let vertices = [[-0.05, -0.04, 0.0], [0.05, -0.03, 0.0], [0.0, 0.06, 0.0], [0.01, 0.0, 0.08]]
+        .map(Vec3::from)
+        .to_vec();
     let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])?;
     let objects = vec![SceneObject { id: 1, mesh, diameter: 0.12 }];
     let options = SceneOptions { random_color_chance: 1.0, ..SceneOptions::default() };
