@@ -4,13 +4,13 @@
     pip install poselib==2.0.5 opencv-python-headless open3d small_gicp pycocotools scipy
     python python/benches/compare.py [pnp] [icp] [metrics] [coco] [render] [--cases N] [--toolkit DIR]
 
-Without a name all five run. A peer that is not installed is left out, and the table says so. Times include the way
+Without a name all five run. Open3D's wheel also asks for the system's libusb-1.0, libGL, libX11 and libgomp. A peer that is not installed is left out, and the table says so. Times include the way
 through Python (arrays in, arrays out). The scenes of `pnp` and `icp` are those of `benches/` beside the Rust sources.
 
 pnp      800 correspondences with 30, 60, 80 % outliers, threshold 3 pixels: PoseLib, OpenCV (AP3P, EPnP)
 icp      point to plane on a partly hidden object with strays: Open3D, small_gicp
 metrics  ADD, ADI, MSSD, MSPD, VSD: their definitions written out in numpy here; with --toolkit DIR (a checkout of
-         bop_toolkit) or an installed bop_toolkit_lib that, too
+         bop_toolkit, which wants pytz, imageio and pypng) or an installed bop_toolkit_lib that, too
 coco     twelve scores of random boxes and masks: pycocotools
 render   depth of a scanned-like surface: Open3D's ray caster; pixels at depth edges are left out
 """
@@ -72,7 +72,12 @@ def pnp(arguments):
     solvers = {"Sixfold AP3P": ours}
     poselib, cv2 = optional("poselib"), optional("cv2")
     if poselib:
-        theirs = {"model": "PINHOLE", "width": 640, "height": 480, "params": [scenes.FX, scenes.FY, scenes.CX, scenes.CY]}
+        theirs = {
+            "model": "PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [scenes.FX, scenes.FY, scenes.CX, scenes.CY],
+        }
 
         def run_poselib(points, pixels):
             pose, _ = poselib.estimate_absolute_pose(pixels, points, theirs, {"max_reproj_error": 3.0}, {})
@@ -85,7 +90,14 @@ def pnp(arguments):
 
             def run_opencv(points, pixels, flag=flag):
                 found, r, t, _ = cv2.solvePnPRansac(
-                    points, pixels, camera.matrix, None, iterationsCount=1000, reprojectionError=3.0, confidence=0.9999, flags=flag
+                    points,
+                    pixels,
+                    camera.matrix,
+                    None,
+                    iterationsCount=1000,
+                    reprojectionError=3.0,
+                    confidence=0.9999,
+                    flags=flag,
                 )
                 return (cv2.Rodrigues(r)[0], t.ravel()) if found else (np.eye(3), np.zeros(3))
 
@@ -119,7 +131,9 @@ def icp(arguments):
     def run_sixfold(cases):
         levels = [(distance, iterations, 1) for distance, iterations in scenes.LEVELS]
         for target, normals, source, source_normals, start, _ in cases:
-            found, ms = timed(lambda: sixfold.icp(source, target, normals, start, source_normals=source_normals, levels=levels))
+            found, ms = timed(
+                lambda: sixfold.icp(source, target, normals, start, source_normals=source_normals, levels=levels)
+            )
             yield found.target_from_source, 0.0, ms
 
     rng = np.random.default_rng(3)
@@ -138,7 +152,9 @@ def icp(arguments):
             shifts.append(1e3 * np.linalg.norm(pose[:3, 3] - case[5][:3, 3]))
             times.append(index + align)
         success = np.mean((np.array(turns) < 3) & (np.array(shifts) < 3))
-        print(f"  {name:22} {np.median(turns):6.3f} deg {np.median(shifts):8.3f} mm {success:9.1%} {np.median(times):10.2f} ms")
+        print(
+            f"  {name:22} {np.median(turns):6.3f} deg {np.median(shifts):8.3f} mm {success:9.1%} {np.median(times):10.2f} ms"
+        )
 
 
 class InNumpy:
@@ -178,12 +194,14 @@ def vsd_in_numpy(e, g, test, camera, diameter, taus, delta=0.015):
     seen_g = (g > 0) & ((g - test <= delta) | (test == 0))
     seen_e = (e > 0) & ((e - test <= delta) | (test == 0) | seen_g)
     both, either = seen_g & seen_e, seen_g | seen_e
+    if not either.any():
+        return np.ones(len(taus))
     off = np.abs(g[both] - e[both]) / diameter
-    return np.array([((off >= tau).sum() + either.sum() - both.sum()) / max(either.sum(), 1) for tau in taus])
+    return np.array([((off >= tau).sum() + either.sum() - both.sum()) / either.sum() for tau in taus])
 
 
 def compare_metrics(arguments):
-    from scenes import bumpy_mesh
+    from scenes import bumpy_mesh, posed
 
     if optional("scipy.spatial") is None:
         return
@@ -196,7 +214,7 @@ def compare_metrics(arguments):
     rng = np.random.default_rng(0)
 
     def pose():
-        return sixfold.pose_exp([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.6, 1.4), *rng.normal(size=3)])
+        return posed([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.6, 1.4)], rng.normal(size=3))
 
     def near(p):
         return sixfold.pose_exp(rng.normal(size=6) * [0.01, 0.01, 0.02, 0.1, 0.1, 0.1]) @ p
@@ -237,13 +255,19 @@ def compare_metrics(arguments):
         differences.append(np.abs(a - b).max())
         ours_ms.append(ms)
         numpy_ms.append(slow)
-    print(f"  vsd    {max(differences):20.1e}    {np.mean(ours_ms):25.3f} ms {np.mean(numpy_ms):8.3f} ms  from drawn depth images")
+    print(
+        f"  vsd    {max(differences):20.1e}    {np.mean(ours_ms):25.3f} ms {np.mean(numpy_ms):8.3f} ms  from drawn depth images"
+    )
 
 
 def compare_coco(arguments):
     from scenes import scenario
 
-    reference, scoring, runs = optional("pycocotools.coco"), optional("pycocotools.cocoeval"), optional("pycocotools.mask")
+    reference, scoring, runs = (
+        optional("pycocotools.coco"),
+        optional("pycocotools.cocoeval"),
+        optional("pycocotools.mask"),
+    )
     if not (reference and scoring and runs):
         return
     names = "ap ap50 ap75 ap_small ap_medium ap_large ar1 ar10 ar100 ar_small ar_medium ar_large".split()
@@ -256,7 +280,9 @@ def compare_coco(arguments):
                 for entry in truth["annotations"] + found:
                     x, y, w, h = (int(round(v)) for v in entry["bbox"])
                     mask = np.zeros((240, 320), bool)
-                    mask[max(y, 0) : y + h, max(x, 0) : x + w] = rng.random((240, 320))[max(y, 0) : y + h, max(x, 0) : x + w] < 0.9
+                    mask[max(y, 0) : y + h, max(x, 0) : x + w] = (
+                        rng.random((240, 320))[max(y, 0) : y + h, max(x, 0) : x + w] < 0.9
+                    )
                     entry["segmentation"] = coco.encode_mask(mask)
                     entry.setdefault("area", float(mask.sum()))
                 for entry in found:
@@ -290,7 +316,7 @@ def compare_coco(arguments):
 
 
 def compare_render(arguments):
-    from scenes import bumpy_mesh
+    from scenes import bumpy_mesh, posed
 
     o3d = optional("open3d")
     if not o3d:
@@ -304,7 +330,7 @@ def compare_render(arguments):
     rng = np.random.default_rng(0)
     differences, by_one, inside, ours_ms, all_ms, theirs_ms = [], 0, 0, [], [], []
     for _ in range(arguments.cases or 20):
-        pose = sixfold.pose_exp([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.25, 0.8), *rng.normal(size=3)])
+        pose = posed([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.25, 0.8)], rng.normal(size=3))
         ours, ms = timed(lambda: sixfold.render_depth(mesh, pose, camera))
         _, everything = timed(lambda: sixfold.render(mesh, pose, camera))
         # With z = 1 in the camera's frame the hit's parameter is the depth.
@@ -325,8 +351,12 @@ def compare_render(arguments):
         all_ms.append(everything)
         theirs_ms.append(slow)
     differences = np.concatenate(differences)
-    print(f"  {len(mesh.faces)} triangles, {len(ours_ms)} poses, {inside} pixels away from edges, {by_one} of them seen by one only")
-    print(f"  depth: largest difference {differences.max():.5f} mm, 99.9 % below {np.quantile(differences, 0.999):.5f} mm")
+    print(
+        f"  {len(mesh.faces)} triangles, {len(ours_ms)} poses, {inside} pixels away from edges, {by_one} of them seen by one only"
+    )
+    print(
+        f"  depth: largest difference {differences.max():.5f} mm, 99.9 % below {np.quantile(differences, 0.999):.5f} mm"
+    )
     print(
         f"  time: depth alone {np.median(ours_ms):.2f} ms, with normals, coordinates and colour {np.median(all_ms):.2f} ms, "
         f"Open3D (depth, scene built beforehand) {np.median(theirs_ms):.2f} ms"

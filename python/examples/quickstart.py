@@ -23,7 +23,9 @@ from sixfold import bop, metrics
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--data", type=pathlib.Path, default=ROOT / "data/demo", help="a BOP dataset (default: %(default)s)")
+parser.add_argument(
+    "--data", type=pathlib.Path, default=ROOT / "data/demo", help="a BOP dataset (default: %(default)s)"
+)
 parser.add_argument("--weights", type=pathlib.Path, default=ROOT / "weights/pix2pose-lmo.safetensors")
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for the picture")
 arguments = parser.parse_args()
@@ -83,8 +85,8 @@ panels[0, 1].scatter(*pixels[~inliers].T, s=2, c="#d55e00", label=f"{(~inliers).
 panels[0, 1].legend(loc="lower right")
 panels[0, 1].set_title("PnP with every second correspondence wrong")
 
-# %% ICP: the object's surface against the measured depth, from a pose that is off by 1 cm
-start = sixfold.pose_exp([0.006, -0.004, 0.007, 0.05, -0.04, 0.03]) @ truth[SHOWN]
+# %% ICP: the object's surface against the measured depth, from a pose that is off by 1 cm and 8 degrees
+start = truth[SHOWN] @ sixfold.pose_exp([0.006, -0.004, 0.007, 0.1, -0.08, 0.06])
 seen = sixfold.render(mesh, start, camera)
 surface = seen.coordinates[seen.mask]
 try:
@@ -151,7 +153,9 @@ for offset, (name, poses) in enumerate([("depth", from_depth), ("colour", from_c
         label=f"{name}: {right} of {len(labels)} right",
     )
     for i, share in zip(labels, shares):
-        print(f"  {name:6} object {i:2}: " + ("not found" if np.isnan(share) else f"{100 * share:5.1f} % of the diameter"))
+        print(
+            f"  {name:6} object {i:2}: " + ("not found" if np.isnan(share) else f"{100 * share:5.1f} % of the diameter")
+        )
 panels[1, 2].axhline(0.1, color="black", linewidth=1)
 panels[1, 2].set_xticks(range(len(labels)), [str(i) for i in labels])
 panels[1, 2].set_ylim(0, 0.5)

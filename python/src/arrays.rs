@@ -1,5 +1,5 @@
 //! numpy arrays to checked values and back. What comes in is copied once, because the interpreter lock is released while
-//! we read it and another thread could write to it meanwhile; what goes out is handed over without a copy.
+//! we read it and another thread could write to it meanwhile; images and masks are handed over without a copy.
 //!
 //! Every refusal is a `ValueError` with the argument's name, what was expected and what was found.
 

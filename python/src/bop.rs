@@ -389,6 +389,7 @@ fn ground_truth_visibility<'py>(
         Some(image) => camera.of_image("depth", image.size())?,
         None => camera.pinhole()?,
     };
+    PyCamera(camera).drawable()?;
     let delta = positive("delta", delta)?;
     let seen = free(py, || {
         let posed: Vec<_> = objects.iter().map(|(mesh, pose)| (mesh.as_ref(), *pose)).collect();

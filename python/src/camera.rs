@@ -22,6 +22,9 @@ use crate::guard::free;
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) struct PyCamera(pub(crate) Camera);
 
+/// Largest image that is drawn: 64 megapixels.
+const MOST_PIXELS: u64 = 1 << 26;
+
 impl PyCamera {
     /// The camera, or an error where only images without distortion are taken.
     pub(crate) fn pinhole(&self) -> PyResult<Camera> {
@@ -30,6 +33,20 @@ impl PyCamera {
                 "camera",
                 "one without distortion",
                 "lens distortion; undistort the image (undistort_rgb, undistort_depth) and give camera.without_distortion()",
+            ));
+        }
+        Ok(self.0)
+    }
+
+    /// The camera, or an error where an image of its size would not fit the memory: that would end the interpreter.
+    pub(crate) fn drawable(&self) -> PyResult<Camera> {
+        let pixels = self.0.width as u64 * self.0.height as u64;
+        if pixels > MOST_PIXELS {
+            let found = format!("{} x {}", self.0.width, self.0.height);
+            return Err(bad(
+                "camera",
+                format!("an image of at most {MOST_PIXELS} pixels to draw into"),
+                found,
             ));
         }
         Ok(self.0)

@@ -35,6 +35,9 @@ pub(crate) struct PyMesh {
     points: OnceLock<Arc<ModelPoints>>,
 }
 
+/// Direction and point of a symmetry axis.
+type Axis<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+
 fn unit(word: &str) -> PyResult<Unit> {
     word.parse().map_err(|error: UnitError| PyValueError::new_err(error.to_string()))
 }
@@ -251,10 +254,7 @@ impl PyMesh {
 
     /// The axes about which the object may turn freely: a list of (direction (3,), point (3,) in metres).
     #[getter]
-    fn symmetry_axes<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> Vec<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)> {
+    fn symmetry_axes<'py>(&self, py: Python<'py>) -> Vec<Axis<'py>> {
         let axes = self.continuous.iter();
         axes.map(|s| (arrays::from_vector3(py, &s.axis), arrays::from_vector3(py, &s.offset))).collect()
     }
@@ -316,8 +316,8 @@ impl PyMesh {
         seed: i64,
     ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<u32>>)> {
         let (count, seed) = (whole("count", count, 0)?, self::seed(seed)?);
-        if count > 1 << 28 {
-            return Err(bad("count", "at most 268435456", count.to_string()));
+        if count > 1 << 26 {
+            return Err(bad("count", "at most 67108864", count.to_string()));
         }
         let samples = free(py, || self.mesh.sample_surface(count, seed))?;
         Ok((

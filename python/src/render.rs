@@ -245,8 +245,16 @@ pub(crate) fn render(
     cull_back_faces: bool,
 ) -> PyResult<Rendering> {
     let pose = arrays::pose("camera_from_object", camera_from_object)?;
-    let style =
-        style(&camera.0, lights, background, specular, shininess, plain_color, near, cull_back_faces)?;
+    let style = style(
+        &camera.drawable()?,
+        lights,
+        background,
+        specular,
+        shininess,
+        plain_color,
+        near,
+        cull_back_faces,
+    )?;
     let objects = [(mesh.get().mesh.clone(), pose)];
     let mut drawn = free(py, || draw(&camera.0, &objects, &style))?;
     Ok(Rendering {
@@ -285,8 +293,16 @@ pub(crate) fn render_scene(
     cull_back_faces: bool,
 ) -> PyResult<SceneRendering> {
     let objects = posed_objects("objects", objects)?;
-    let style =
-        style(&camera.0, lights, background, specular, shininess, plain_color, near, cull_back_faces)?;
+    let style = style(
+        &camera.drawable()?,
+        lights,
+        background,
+        specular,
+        shininess,
+        plain_color,
+        near,
+        cull_back_faces,
+    )?;
     let drawn = free(py, || draw(&camera.0, &objects, &style))?;
     let (width, height) = (camera.0.width, camera.0.height);
     let masks: Vec<bool> = drawn.masks.into_iter().flat_map(Image::into_vec).collect();
@@ -341,8 +357,8 @@ pub(crate) fn render_depth<'py>(
     camera: PyCamera,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let pose = arrays::pose("camera_from_object", camera_from_object)?;
-    let mesh = mesh.get();
-    arrays::from_image(py, free(py, || sixfold_render::render_depth(&mesh.mesh, &pose, &camera.0))?)
+    let (mesh, camera) = (mesh.get(), camera.drawable()?);
+    arrays::from_image(py, free(py, || sixfold_render::render_depth(&mesh.mesh, &pose, &camera))?)
 }
 
 /// Depth (H, W) float32 in metres as a Kinect-class camera would measure it, from ideal depth (H, W) and the normals

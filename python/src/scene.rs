@@ -64,6 +64,8 @@ pub(crate) fn inpaint_depth<'py>(
     rounds: i64,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let (depth, rounds) = (arrays::depth("depth", depth)?, whole("rounds", rounds, 0)?);
+    // More rounds than the image has pixels along a side change nothing.
+    let rounds = rounds.min(depth.width().max(depth.height()));
     arrays::from_image(py, free(py, || sixfold_geometry::inpaint_depth(&depth, rounds))?)
 }
 
@@ -451,8 +453,8 @@ pub(crate) fn estimate_ppf(
 #[pyfunction]
 pub(crate) fn sphere_directions<'py>(py: Python<'py>, count: i64) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let count = whole("count", count, 0)?;
-    if count > 1 << 28 {
-        return Err(bad("count", "at most 268435456", count.to_string()));
+    if count > 1 << 26 {
+        return Err(bad("count", "at most 67108864", count.to_string()));
     }
     let directions: Vec<Vec3> = free(py, || sixfold_geometry::sphere_directions(count))?;
     arrays::from_points3(py, &directions)

@@ -5,7 +5,7 @@ import pathlib
 import pytest
 
 import sixfold
-from scenes import box_mesh, bumpy_mesh
+from scenes import box_mesh, bumpy_mesh, posed
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 
@@ -27,9 +27,7 @@ def bumpy():
 
 @pytest.fixture
 def pose():
-    camera_from_object = sixfold.pose_exp([0, 0, 0, 0.6, -0.4, 0.3])
-    camera_from_object[:3, 3] = (0.02, -0.03, 0.7)
-    return camera_from_object
+    return posed((0.02, -0.03, 0.7), (0.6, -0.4, 0.3))
 
 
 @pytest.fixture(scope="session")

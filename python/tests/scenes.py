@@ -5,6 +5,13 @@ import numpy as np
 import sixfold
 
 
+def posed(translation, turn):
+    """A pose from a translation in metres and a rotation vector in radians."""
+    pose = sixfold.pose_exp([0, 0, 0, *turn])
+    pose[:3, 3] = translation
+    return pose
+
+
 def box_mesh(size=(0.1, 0.06, 0.04), **kwargs):
     """A box around the origin, its faces looking outwards."""
     corners = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]) * size

@@ -196,6 +196,9 @@ def test_depth(call, wrong):
         ("background", lambda: sixfold.render(BOX, POSE, CAMERA, background=np.zeros((4, 4, 3), np.uint8))),
         ("lights", lambda: sixfold.render(BOX, POSE, CAMERA, lights=["sun"])),
         ("lights", lambda: sixfold.render(BOX, POSE, CAMERA, lights=3)),
+        ("camera", lambda: sixfold.render(BOX, POSE, sixfold.Camera(500, 500, 0, 0, 2**20, 2**20))),
+        ("camera", lambda: sixfold.render_depth(BOX, POSE, sixfold.Camera(500, 500, 0, 0, 2**20, 2**20))),
+        ("count", lambda: BOX.sample_surface(2**40)),
         ("near", lambda: sixfold.render(BOX, POSE, CAMERA, near=-1)),
         ("shininess", lambda: sixfold.render(BOX, POSE, CAMERA, shininess=np.nan)),
         ("objects", lambda: sixfold.render_scene([], CAMERA)),
@@ -262,7 +265,13 @@ def test_views_are_read_as_they_look():
     wide = np.zeros((60, 6))
     wide[::2, ::2] = POINTS
     expected = sixfold.pnp_ransac(POINTS, PIXELS, CAMERA).camera_from_object
-    for points in (wide[::2, ::2], np.asfortranarray(POINTS), POINTS.astype(">f8"), POINTS[::-1][::-1], POINTS.tolist()):
+    for points in (
+        wide[::2, ::2],
+        np.asfortranarray(POINTS),
+        POINTS.astype(">f8"),
+        POINTS[::-1][::-1],
+        POINTS.tolist(),
+    ):
         assert (sixfold.pnp_ransac(points, PIXELS, CAMERA).camera_from_object == expected).all()
     transposed = sixfold.pose_exp([0, 0, 0.6, 0.1, 0.2, 0.3]).T
     assert (sixfold.render_depth(BOX, transposed.T, CAMERA) == DEPTH).all()

@@ -141,9 +141,7 @@ def test_depth_becomes_points_normals_and_planes(camera):
 
 
 def test_ppf_finds_a_mesh_in_simulated_depth(camera, bumpy, pose):
-    table = sixfold.Mesh(
-        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
-    )
+    table = sixfold.Mesh(np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]])
     behind = sixfold.pose_exp([0, 0, 0.85, 0.3, 0, 0])
     drawn = sixfold.render_scene([(bumpy, pose), (table, behind)], camera)
     depth = sixfold.simulate_depth(drawn.depth, drawn.normals, seed=1)

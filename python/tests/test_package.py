@@ -57,14 +57,13 @@ def test_everything_is_documented_and_examples_run(name):
             for member in members(value):
                 assert inspect.getdoc(getattr(value, member)), f"{thing}.{member}"
     names = {**vars(sixfold), **{n: getattr(module, n) for n in module.__all__}}
-    finder = doctest.DocTestFinder(exclude_empty=True)
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
     for thing, value in public(module).items():
         for text in [value] + ([getattr(value, m) for m in members(value)] if inspect.isclass(value) else []):
             doc = inspect.getdoc(text) or ""
             test = doctest.DocTestParser().get_doctest(doc, dict(names), thing, None, 0)
             runner.run(test)
-    assert finder is not None and runner.summarize(verbose=False).failed == 0
+    assert runner.summarize(verbose=False).failed == 0
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise on Windows")

@@ -92,7 +92,7 @@ pub enum SceneError {
     /// There is nothing to learn.
     #[error("no object to learn was given; give at least one mesh")]
     NoObjects,
-    /// So many classes have no place in the labels of one image.
+    /// No picture can be had of an object.
     #[error(
         "object {id}: no photograph shows it and its mesh has neither colours nor texture; give photographs or a coloured mesh, or set random_color_chance above 0"
     )]
@@ -582,6 +582,16 @@ fn extremes(mesh: &Mesh) -> Vec<Vec3> {
     chosen.sort_unstable();
     chosen.dedup();
     chosen.into_iter().map(|i| vertices[i]).collect()
+}
+
+impl std::fmt::Debug for SceneSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SceneSource")
+            .field("objects", &self.objects.len())
+            .field("photographs", &self.photographs.len())
+            .field("options", &self.options)
+            .finish_non_exhaustive()
+    }
 }
 
 impl SceneOptions {

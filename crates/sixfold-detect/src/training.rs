@@ -104,12 +104,13 @@ struct Lesson {
 }
 
 impl State<'_> {
-    /// One image through the network and back.
-    fn learn(&self, image: &TrainingImage, positives: usize, masks: usize) -> Lesson {
+    /// One image through the network and back. `network` is this thread's own copy ([`Module::fork`]): graphs that share
+    /// parameters are one to Burn, and two threads that build and walk it lock each other out for good.
+    fn learn(&self, network: &Detector, image: &TrainingImage, positives: usize, masks: usize) -> Lesson {
         let side = self.side;
         let input = TensorData::new(image.input.clone(), [1, 3, side, side]);
         let DetectorOutput { scores, boxes, prototypes } =
-            self.network.forward(Tensor::from_data(input, self.device));
+            network.forward(Tensor::from_data(input, self.device));
         let raw_scores: Vec<Vec<f32>> = scores.iter().map(numbers).collect();
         let raw_boxes: Vec<Vec<f32>> = boxes.iter().map(numbers).collect();
         let raw_prototypes = numbers(&prototypes);
@@ -129,8 +130,8 @@ impl State<'_> {
         });
         let Some(sum) = products.reduce(|a, b| a + b) else { unreachable!("a detector has levels") };
         let mut gradients = sum.backward();
-        let encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
-        let heads = GradientsParams::from_module(&mut gradients, &self.network);
+        let encoder = GradientsParams::from_module(&mut gradients, &network.encoder);
+        let heads = GradientsParams::from_module(&mut gradients, network);
         Lesson { terms, encoder, heads }
     }
 }
@@ -151,7 +152,8 @@ impl Trainee for State<'_> {
             let workers: Vec<_> = (0..threads)
                 .map(|first| {
                     let images = batch.iter().skip(first).step_by(threads);
-                    scope.spawn(move || images.map(|i| state.learn(i, positives, masks)).collect())
+                    let network = state.network.clone().fork(state.device);
+                    scope.spawn(move || images.map(|i| state.learn(&network, i, positives, masks)).collect())
                 })
                 .collect();
             let join = |worker: std::thread::ScopedJoinHandle<'_, _>| match worker.join() {

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod dataset;
+mod detect;
 mod eval;
 mod image;
 mod objects;

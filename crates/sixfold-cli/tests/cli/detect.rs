@@ -1,0 +1,106 @@
+//! Detection from the command line: training, one image, a dataset, poses from the image alone, broken input.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::support::*;
+
+/// A few steps on small images: it knows next to nothing, but is whole.
+const TRAIN: &str = "train detector --dataset tiny --ids 1 --size 96 --batch 2 --out detector";
+const WEIGHTS: &str = "detector/model.safetensors";
+
+fn detect(rest: &str) -> String {
+    format!("detect --weights {WEIGHTS} {rest}")
+}
+
+fn json_of(file: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
+}
+
+#[test]
+fn a_detector_is_trained_and_used() {
+    let tiny = Tiny::coloured();
+    let trained = sixfold(tiny.path(), &format!("{TRAIN} --steps 120 --json")).expect(0).json();
+    assert_eq!((&trained["steps"], &trained["photographs"]), (&120.into(), &3.into()));
+    assert!(image::open(tiny.path().join("detector/training/curves.png")).is_ok());
+    let card = std::fs::read_to_string(tiny.path().join("detector/model.md")).unwrap();
+    assert!(card.contains("7/0 7/4 7/11"), "{card}");
+    // Nothing is left to do: the same again; other options need another folder.
+    let model = std::fs::read(tiny.path().join(WEIGHTS)).unwrap();
+    sixfold(tiny.path(), &format!("{TRAIN} --steps 120 --export")).expect(0);
+    assert!(!model.is_empty());
+    fails(tiny.path(), &format!("{TRAIN} --steps 121"), &["steps was 120, is 121", "another folder"]);
+
+    // One image: the object, its box, its mask, a picture.
+    let rgb = "--rgb tiny/test/000007/rgb/000004.png";
+    let json =
+        sixfold(tiny.path(), &detect(&format!("{rgb} --threshold 0.05 --per-object 1 --out one --json")));
+    let json = json.expect(0).json();
+    let found = &json["detections"][0];
+    assert_eq!(found["object_id"], 1);
+    assert!(found["mask_pixels"].as_u64().unwrap() > 0, "{json}");
+    let overlay = image::open(tiny.path().join("one/overlay.png")).unwrap().to_rgb8();
+    assert_eq!(overlay.dimensions(), (WIDTH as u32, HEIGHT as u32));
+    let coco = json_of(&tiny.path().join("one/detections.json"));
+    assert_eq!(coco[0]["segmentation"]["size"], serde_json::json!([HEIGHT, WIDTH]));
+    assert_eq!(coco[0]["bbox"], found["bbox"]);
+    // Nobody is that sure.
+    sixfold(tiny.path(), &detect(&format!("{rgb} --threshold 1"))).expect(1);
+
+    // All images, and their scores.
+    let all = detect("--dataset tiny --out found.json --overlays pictures --json");
+    let json = sixfold(tiny.path(), &all).expect(0).json();
+    assert_eq!(json["images"], 3);
+    assert!(image::open(tiny.path().join("pictures/000007_000004.png")).is_ok());
+    let eval = "eval --dataset tiny --detections found.json --min-score 0.05 --write-truth truth.json --json";
+    let scores = sixfold(tiny.path(), eval).expect(0).json();
+    assert_eq!(scores["images"], 3);
+    assert!(scores["box"]["ap50"].is_number() && scores["mask"]["ap50"].is_number(), "{scores}");
+    assert!(scores["found_at_half"][1]["recall_of"]["1"].is_number(), "{scores}");
+    let truth = json_of(&tiny.path().join("truth.json"));
+    assert_eq!(truth["images"].as_array().unwrap().len(), 3);
+    let except = r#"[{"scene_id": 7, "im_id": 4}]"#;
+    std::fs::write(tiny.path().join("except.json"), except).unwrap();
+    let json = sixfold(tiny.path(), &format!("{all} --except except.json")).expect(0).json();
+    assert_eq!(json["images"], 2);
+
+    // Objects it does not know.
+    fails(tiny.path(), &detect(&format!("{rgb} --ids 2")), &["--ids", "knows the objects 1", "not object 2"]);
+    let estimate = "estimate --dataset tiny --out r.csv --detector detector/model.safetensors";
+    fails(tiny.path(), estimate, &["detector", "not object 2"]);
+    fails(tiny.path(), "estimate --dataset tiny --out r.csv --boxes detect", &["--detector"]);
+}
+
+#[test]
+fn images_of_all_kinds() {
+    let tiny = Tiny::coloured();
+    sixfold(tiny.path(), &format!("{TRAIN} --steps 1")).expect(0);
+    let path = |name: &str| tiny.path().join(name);
+    image::GrayImage::from_pixel(33, 70, image::Luma([90])).save(path("grey.png")).unwrap();
+    image::RgbaImage::from_pixel(800, 20, image::Rgba([9, 90, 200, 30])).save(path("alpha.png")).unwrap();
+    image::RgbImage::from_pixel(1, 1, image::Rgb([9, 90, 200])).save(path("dot.png")).unwrap();
+    std::fs::write(path("empty.png"), b"").unwrap();
+    std::fs::write(path("broken.png"), b"\x89PNG\r\n\x1a\nnothing else").unwrap();
+    for name in ["grey.png", "alpha.png", "dot.png"] {
+        let run = sixfold(tiny.path(), &detect(&format!("--rgb {name} --json")));
+        assert!(run.code < 2, "{name}: {}", run.stderr);
+    }
+    for name in ["empty.png", "broken.png", "nowhere.png"] {
+        fails(tiny.path(), &detect(&format!("--rgb {name}")), &[name]);
+    }
+    fails(tiny.path(), &detect("--rgb grey.png --threshold 2"), &["threshold", "found 2"]);
+    fails(tiny.path(), "detect --weights grey.png --rgb grey.png", &["grey.png"]);
+    // A network of another kind.
+    let encoder =
+        concat!(env!("CARGO_MANIFEST_DIR"), "/../sixfold-nn/weights/efficientnet-lite0-encoder.safetensors");
+    fails(
+        tiny.path(),
+        &format!("detect --weights {encoder} --rgb grey.png"),
+        &["architecture", "detect-compact"],
+    );
+    // An unreadable image of a dataset costs itself only.
+    std::fs::write(path("tiny/test/000007/rgb/000004.png"), b"no image").unwrap();
+    let run = sixfold(tiny.path(), &detect("--dataset tiny --threshold 0 --out found.json")).expect(2);
+    assert!(run.stderr.contains("skipped image 7/4"), "{}", run.stderr);
+}
