@@ -58,6 +58,32 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     let base = RefineOptions::default();
+    // A second look at the box of the aligned pose, and both looks together.
+    let again: Vec<[Case; 2]> = cases
+        .iter()
+        .filter_map(|c| {
+            let mesh = &meshes[&c.object].1;
+            let pose = refine(&c.image, &c.camera, mesh, &c.found, &base).camera_from_object;
+            let pixels: Vec<_> =
+                mesh.vertices().iter().filter_map(|v| c.camera.project(&pose.transform_point(v))).collect();
+            let low = pixels.iter().fold(pixels[0], |a, b| a.inf(b));
+            let high = pixels.iter().fold(pixels[0], |a, b| a.sup(b));
+            let region =
+                sixfold_geometry::Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y };
+            let options = EstimateOptions::default();
+            let mut found = estimate(&model, &c.image, &c.camera, c.object, &region, &options).ok()??;
+            let case = |found: Found| Case {
+                object: c.object,
+                image: c.image.clone(),
+                camera: c.camera,
+                truth: c.truth,
+                found,
+            };
+            let alone = case(found.clone());
+            found.first_view = c.found.open_view.clone();
+            Some([alone, case(found)])
+        })
+        .collect();
     let with = |change: &dyn Fn(&mut RefineOptions)| {
         let mut options = base.clone();
         change(&mut options);
@@ -111,6 +137,17 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         cases.iter().map(|c| measured(c, &c.found.hypotheses[0].camera_from_object)).collect();
     println!("{} cases", cases.len());
     print("PnP", &before);
+    for (look, name) in ["second look", "both looks"].iter().enumerate() {
+        let errors: Vec<_> = again
+            .iter()
+            .map(|c| {
+                let c = &c[look];
+                let refined = refine(&c.image, &c.camera, &meshes[&c.object].1, &c.found, &base);
+                measured(c, &refined.camera_from_object)
+            })
+            .collect();
+        print(name, &errors);
+    }
     for (name, options) in &variants {
         let errors: Vec<_> = cases
             .par_iter()

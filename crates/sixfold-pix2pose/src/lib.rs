@@ -2,6 +2,7 @@
 //! from an RGB crop, and poses from them.
 
 pub mod adversarial;
+pub mod aligned;
 pub mod depth;
 pub mod estimate;
 pub mod loss;

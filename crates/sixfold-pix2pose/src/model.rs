@@ -1,5 +1,6 @@
 //! A trained model: the network with the objects it knows, as one file.
 
+use crate::aligned::Correction;
 use crate::loss::OutputKind;
 use crate::networks::{Compact, CompactConfig};
 use crate::networks::{GeneratorOutput, PaperGenerator, PaperGeneratorConfig};
@@ -11,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown,
 };
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Name of the compact network in weight files.
@@ -215,6 +217,17 @@ impl Pix2PoseModel {
             id,
             known: self.objects.iter().map(|o| o.id.to_string()).collect::<Vec<_>>().join(", "),
         })
+    }
+
+    /// Sets what aligned poses of its objects are off by; other objects stay as they are.
+    pub fn set_corrections(&mut self, corrections: &BTreeMap<u32, Correction>) {
+        for object in &mut self.objects {
+            if let Some(correction) = corrections.get(&object.id) {
+                object.correction = *correction;
+            }
+        }
+        self.card.objects =
+            self.objects.iter().map(|o| serde_json::to_value(o).unwrap_or_default()).collect();
     }
 
     /// Sizes of input and output.

@@ -1,5 +1,6 @@
 //! What a network has to know of an object: how its coordinates are normalised and under which turns it looks the same.
 
+use crate::aligned::Correction;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{KdTree, Pose, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
@@ -18,6 +19,9 @@ pub struct ObjectEntry {
     pub half_size: [f64; 3],
     /// Outlier thresholds on the expected error that are tried, the dissertation's theta_o.
     pub thresholds: Vec<f32>,
+    /// What aligned poses are off by.
+    #[serde(default)]
+    pub correction: Correction,
 }
 
 impl ObjectEntry {
@@ -29,6 +33,7 @@ impl ObjectEntry {
             centre: scale.centre.into(),
             half_size: scale.half_size.into(),
             thresholds: BOP_THRESHOLDS.to_vec(),
+            correction: Correction::default(),
         }
     }
 

@@ -7,11 +7,12 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Result, anyhow, bail};
 use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
+use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::{AlignedToDepth, DepthScene};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, View, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::object::ObjectEntry;
-use sixfold_pix2pose::refine::{RefineOptions, outline_mesh, refine};
+use sixfold_pix2pose::refine::outline_mesh;
 
 use crate::arguments::EstimateArguments;
 
@@ -19,8 +20,9 @@ use crate::arguments::EstimateArguments;
 #[derive(Clone)]
 pub(crate) struct Pix2Pose {
     model: Pix2PoseModel,
-    options: EstimateOptions,
-    refine: Option<RefineOptions>,
+    options: AlignOptions,
+    /// Whether outlines are aligned; otherwise poses are those of PnP.
+    aligns: bool,
     /// The objects' meshes as the alignment draws them, made when first needed.
     outlines: Arc<Mutex<BTreeMap<u32, Arc<Mesh>>>>,
 }
@@ -45,20 +47,19 @@ impl Pix2Pose {
             )
         })?;
         let pix2pose = Pix2Pose::load(weights)?;
-        let options = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
-        Ok(pix2pose.varied(options, a.refines()))
+        let estimate = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
+        Ok(pix2pose.varied(AlignOptions { estimate, ..AlignOptions::default() }, a.refines()))
     }
 
     /// The model of a weight file with the default options.
     pub fn load(weights: &Path) -> Result<Pix2Pose> {
-        let (options, refine) = (EstimateOptions::default(), Some(RefineOptions::default()));
-        Ok(Pix2Pose { model: Pix2PoseModel::load(weights)?, options, refine, outlines: Arc::default() })
+        let (model, options) = (Pix2PoseModel::load(weights)?, AlignOptions::default());
+        Ok(Pix2Pose { model, options, aligns: true, outlines: Arc::default() })
     }
 
     /// The same model used in another way.
-    pub fn varied(&self, options: EstimateOptions, refines: bool) -> Pix2Pose {
-        let refine = refines.then(RefineOptions::default);
-        Pix2Pose { model: self.model.clone(), options, refine, outlines: self.outlines.clone() }
+    pub fn varied(&self, options: AlignOptions, aligns: bool) -> Pix2Pose {
+        Pix2Pose { model: self.model.clone(), options, aligns, outlines: self.outlines.clone() }
     }
 
     pub fn model(&self) -> &Pix2PoseModel {
@@ -125,16 +126,24 @@ impl Pix2Pose {
         region: &Rect,
         mesh: Option<&Mesh>,
     ) -> Result<Option<Pix2PosePose>> {
-        let Some(found) = estimate(&self.model, image, camera, object_id, region, &self.options)? else {
+        if let (true, Some(mesh)) = (self.aligns, mesh) {
+            let outline = self.outline(object_id, mesh);
+            let (model, options) = (&self.model, &self.options);
+            let aligned = estimate_aligned(model, image, camera, object_id, region, &outline, options)?;
+            return Ok(aligned.map(|a| Pix2PosePose {
+                camera_from_object: a.camera_from_object,
+                score: a.score,
+                refined: a.improved,
+                found: a.found,
+            }));
+        }
+        let Some(found) = estimate(&self.model, image, camera, object_id, region, &self.options.estimate)?
+        else {
             return Ok(None);
         };
         let Some(best) = found.hypotheses.first() else { return Ok(None) };
-        let (score, mut camera_from_object, mut refined) = (best.score, best.camera_from_object, false);
-        if let (Some(options), Some(mesh)) = (&self.refine, mesh) {
-            let aligned = refine(image, camera, &self.outline(object_id, mesh), &found, options);
-            (camera_from_object, refined) = (aligned.camera_from_object, aligned.improved);
-        }
-        Ok(Some(Pix2PosePose { camera_from_object, score, refined, found }))
+        let (score, camera_from_object) = (best.score, best.camera_from_object);
+        Ok(Some(Pix2PosePose { camera_from_object, score, refined: false, found }))
     }
 
     /// The pose brought to a depth image; `None` where too little depth is measured on the object.

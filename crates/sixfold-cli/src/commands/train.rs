@@ -1,16 +1,22 @@
 //! `sixfold train`: posed photographs and meshes in, a model file out; interrupted at any time, it goes on.
 
+use std::collections::BTreeMap;
+use std::path::Path;
+
 use anyhow::{Context, Result, bail};
 use burn::tensor::Device;
 use serde::Serialize;
+use sixfold_mesh::Mesh;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use sixfold_pix2pose::adversarial::{AdversarialOptions, train_adversarial};
+use sixfold_pix2pose::aligned::measure_corrections;
 use sixfold_pix2pose::model::{ImageSizes, Network, Pix2PoseModel};
 use sixfold_pix2pose::networks::{CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
 use sixfold_pix2pose::object::{ObjectEntry, SymmetryMap, lmo_threshold};
-use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
+use sixfold_pix2pose::refine::outline_mesh;
+use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
 use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 
 use super::material::{Material, backgrounds, command_line, material};
@@ -59,7 +65,7 @@ pub(super) struct Summary {
     pub steps: u64,
     /// Of training; `None` where a model was only exported.
     pub seconds: Option<f64>,
-    pub losses: std::collections::BTreeMap<String, f64>,
+    pub losses: BTreeMap<String, f64>,
 }
 
 /// Trains, or goes on with a training, and writes the model.
@@ -103,7 +109,12 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         );
     }
     let sizes = ImageSizes { input: a.size, output: if compact { a.size / 2 } else { a.size } };
-    let photographs = real.len();
+    let photographs = real.clone();
+    let outlines: BTreeMap<u32, Mesh> = if photographs.is_empty() {
+        BTreeMap::new()
+    } else {
+        objects.iter().map(|o| (o.id, outline_mesh(&o.mesh))).collect()
+    };
     let entries: Vec<ObjectEntry> = objects
         .iter()
         .map(|o| {
@@ -148,9 +159,11 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
             bail!("{}: holds no checkpoint; train first", folder.display());
         };
         card.steps = step;
-        Pix2PoseModel::new(Network::Compact(Box::new(network)), entries, sizes, card).save(&path)?;
-        let (seconds, losses) = (None, std::collections::BTreeMap::new());
+        let model = Pix2PoseModel::new(Network::Compact(Box::new(network)), entries, sizes, card);
+        save_corrected(model, &path, &photographs, &outlines)?;
+        let (seconds, losses) = (None, BTreeMap::new());
         let model = path.display().to_string();
+        let photographs = photographs.len();
         return Ok(Summary { model, objects: ids, photographs, steps: step, seconds, losses });
     }
     let sample_options = SampleOptions {
@@ -164,7 +177,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         seed: a.seed,
         ..SampleOptions::default()
     };
-    eprintln!("making {} objects and {photographs} photographed instances ready", objects.len());
+    eprintln!("making {} objects and {} photographed instances ready", objects.len(), photographs.len());
     let source = SampleSource::new(objects, real, backgrounds, sample_options)?;
     let mut progress = Progress::new("steps", steps as usize);
     let mut last = TrainingRecord::default();
@@ -203,15 +216,35 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         }
     };
     card.steps = steps;
-    Pix2PoseModel::new(network, entries, sizes, card).save(&path)?;
+    let model = Pix2PoseModel::new(network, entries, sizes, card);
+    save_corrected(model, &path, &photographs, &outlines)?;
     Ok(Summary {
         model: path.display().to_string(),
         objects: ids,
-        photographs,
+        photographs: photographs.len(),
         steps,
         seconds: Some(last.seconds),
         losses: last.losses,
     })
+}
+
+/// Writes the model with what its aligned poses are off by on the photographs that it learnt from.
+fn save_corrected(
+    mut model: Pix2PoseModel,
+    path: &Path,
+    photographs: &[RealCrop],
+    outlines: &BTreeMap<u32, Mesh>,
+) -> Result<()> {
+    // First without: nothing that was trained may be lost.
+    model.save(path)?;
+    if photographs.is_empty() {
+        return Ok(());
+    }
+    let mut progress = Progress::new("alignment measured on the photographs", photographs.len());
+    let corrections = measure_corrections(&model, photographs, outlines, || progress.step(String::new()))?;
+    progress.finish();
+    model.set_corrections(&corrections);
+    Ok(model.save(path)?)
 }
 
 /// A symmetry that the mesh does not have misleads the training: say how far the surface is off.

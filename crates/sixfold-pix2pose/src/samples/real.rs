@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use sixfold_augment::{AffineMap, Coverage, Cutout};
 use sixfold_bop::{BopDataset, MaskKind, Models, ground_truth_visibility};
-use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2};
+use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
 
 use super::error::SampleError;
@@ -135,6 +135,12 @@ impl RealCrop {
     /// The object's pose.
     pub fn camera_from_object(&self) -> &Pose {
         &self.camera_from_object
+    }
+
+    /// The box of the visible part, pixels.
+    pub fn visible_box(&self) -> Rect {
+        let m = &self.visible;
+        Rect { x: m.x as f64, y: m.y as f64, width: m.width as f64, height: m.height as f64 }
     }
 
     /// Points of the image whose box is that of the visible part, however the image is turned.

@@ -17,7 +17,7 @@ use serde::Serialize;
 use sixfold_bop::{BopDataset, Models, Target, read_results};
 use sixfold_geometry::Rect;
 use sixfold_mesh::Mesh;
-use sixfold_pix2pose::estimate::{EstimateOptions, Quirks};
+use sixfold_pix2pose::estimate::Quirks;
 
 use self::row::{Row, Setting};
 use super::boxes::Boxes;
@@ -124,8 +124,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
     let mut rows = vec![];
     for setting in settings(a) {
         check_interrupt("the rows done so far are kept; run the same command again to go on")?;
-        let used =
-            pix2pose.varied(EstimateOptions { seed: a.seed, ..setting.options.clone() }, setting.refine);
+        let used = setting.of(&pix2pose, a.seed);
         rows.push(row::kept_or_made(&a.out, &setting.key, || bench.measure(&used, &setting, &a.out))?);
     }
     if let Some(file) = &a.published {
@@ -163,16 +162,20 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
 
 /// The ways of using the model that are compared.
 fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
-    let plain = |key: &str, title: &str| Setting {
-        key: key.to_string(),
-        title: title.to_string(),
-        options: EstimateOptions::default(),
-        refine: false,
-        noise: None,
-        detections: false,
-    };
+    let plain = Setting::plain;
     let mut all = vec![
-        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned (default)") },
+        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned, twice (default)") },
+        Setting {
+            refine: true,
+            correct: false,
+            ..plain("uncorrected", "default, without the training photographs' correction")
+        },
+        Setting {
+            refine: true,
+            correct: false,
+            second_look: false,
+            ..plain("one-look", "two stages, PnP, outline aligned once, no correction")
+        },
         plain("no-refinement", "two stages, PnP (the dissertation's method)"),
     ];
     let mut one_stage = plain("one-stage", "one stage, PnP");

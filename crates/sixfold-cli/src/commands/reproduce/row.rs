@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{Estimate, EvalOptions, Target, evaluate, write_results};
 use sixfold_geometry::Rect;
+use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::estimate::EstimateOptions;
 
 use super::Bench;
@@ -26,6 +27,10 @@ pub(super) struct Setting {
     pub options: EstimateOptions,
     /// Whether the outline is aligned at the end.
     pub refine: bool,
+    /// With it: whether the box of the aligned pose is looked at again.
+    pub second_look: bool,
+    /// With it: whether what the model is known to be off by is taken out.
+    pub correct: bool,
     /// Ground-truth boxes are moved and scaled by up to this share of their size.
     pub noise: Option<f64>,
     /// Boxes of the file of detections instead of the ground truth's.
@@ -88,6 +93,33 @@ pub(super) fn kept_or_made(folder: &Path, key: &str, make: impl FnOnce() -> Resu
     let row = make()?;
     write_atomically(&path, serde_json::to_string_pretty(&row)?.as_bytes())?;
     Ok(row)
+}
+
+impl Setting {
+    /// Both passes and PnP with the default options.
+    pub fn plain(key: &str, title: &str) -> Setting {
+        Setting {
+            key: key.to_string(),
+            title: title.to_string(),
+            options: EstimateOptions::default(),
+            refine: false,
+            second_look: true,
+            correct: true,
+            noise: None,
+            detections: false,
+        }
+    }
+
+    /// The model used in this way.
+    pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
+        let options = AlignOptions {
+            estimate: EstimateOptions { seed, ..self.options.clone() },
+            second_look: self.second_look,
+            correct: self.correct,
+            ..AlignOptions::default()
+        };
+        pix2pose.varied(options, self.refine)
+    }
 }
 
 impl Bench {

@@ -8,7 +8,6 @@ use std::path::Path;
 use anyhow::{Result, bail};
 use clap::Parser;
 use sixfold_bop::{Models, Target};
-use sixfold_pix2pose::estimate::EstimateOptions;
 
 use super::row::{self, Row, Setting};
 use super::{Bench, Regions, fourfold};
@@ -88,21 +87,14 @@ pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<
             let dataset = if made { &fourfold_folder } else { &a.dataset };
             let words = arguments(a, dataset, made, &names, &folder, training.more)?;
             let model = train_pix2pose(&words)?.model;
-            let options = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
-            let trained = Pix2Pose::load(Path::new(&model))?.varied(options.clone(), false);
             let what = if made {
                 "object with four equal sides".into()
             } else {
                 format!("objects {}", names.join(" and "))
             };
-            let setting = Setting {
-                key: key.clone(),
-                title: format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title),
-                options,
-                refine: false,
-                noise: None,
-                detections: false,
-            };
+            let title = format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title);
+            let setting = Setting::plain(&key, &title);
+            let trained = setting.of(&Pix2Pose::load(Path::new(&model))?, a.seed);
             match &fourfold_bench {
                 Some(bench) if made => bench.measure(&trained, &setting, &a.out),
                 _ => bench.of_objects(&ids).measure(&trained, &setting, &a.out),

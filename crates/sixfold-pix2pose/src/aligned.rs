@@ -1,0 +1,240 @@
+//! The whole way from a box to a pose: both passes and PnP, alignment of the outline, and both once more in the box of
+//! the aligned pose, less what the model is known to be off by.
+//!
+//! A box says where the object is seen; how large it appears, parts behind other things included, only its pose says. The
+//! second look has the object in its crop as the training had.
+
+use crate::estimate::{EstimateError, EstimateOptions, Found, estimate};
+use crate::model::Pix2PoseModel;
+use crate::refine::{RefineOptions, refine};
+use crate::samples::RealCrop;
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
+use sixfold_mesh::Mesh;
+use std::collections::BTreeMap;
+
+/// How aligned poses are estimated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AlignOptions {
+    /// Both passes and PnP.
+    pub estimate: EstimateOptions,
+    /// The alignment.
+    pub refine: RefineOptions,
+    /// Look again in the box of the aligned pose.
+    pub second_look: bool,
+    /// Take out what the model's object is known to be off by.
+    pub correct: bool,
+}
+
+impl Default for AlignOptions {
+    fn default() -> Self {
+        Self {
+            estimate: EstimateOptions::default(),
+            refine: RefineOptions::default(),
+            second_look: true,
+            correct: true,
+        }
+    }
+}
+
+/// A pose aligned with the image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Aligned {
+    /// The pose.
+    pub camera_from_object: Pose,
+    /// Score of the last look, 0 to 1.
+    pub score: f64,
+    /// Whether enough of the outline was found to align it.
+    pub improved: bool,
+    /// What the last look found.
+    pub found: Found,
+}
+
+/// By how much aligned poses were off on the photographs of the training, on average: annotations made in another sensor's
+/// image, a principal point a pixel away, a mesh a little larger than its object.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Correction {
+    /// Of the object's place in the image, pixels.
+    pub shift: [f64; 2],
+    /// Of its distance, as a share of it.
+    pub depth: f64,
+}
+
+impl Correction {
+    /// The pose without the error; rotation as it is.
+    pub fn apply(&self, camera: &Camera, camera_from_object: &Pose) -> Pose {
+        let t = camera_from_object.translation();
+        let Some(pixel) = camera.project(&t) else { return *camera_from_object };
+        let depth = t.z * (1.0 - self.depth);
+        let moved = camera.unproject(&(pixel - Vec2::from(self.shift)), depth);
+        Pose::new(camera_from_object.rotation(), moved)
+    }
+}
+
+/// Looks for one object in a box of a pinhole image and aligns it; `mesh` as [`crate::refine::outline_mesh`] makes it. `None`
+/// if its pixels are not in the box.
+///
+/// # Errors
+/// As [`estimate`].
+pub fn estimate_aligned(
+    model: &Pix2PoseModel,
+    image: &RgbImage,
+    camera: &Camera,
+    object_id: u32,
+    region: &Rect,
+    mesh: &Mesh,
+    options: &AlignOptions,
+) -> Result<Option<Aligned>, EstimateError> {
+    let look = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
+        let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
+            return Ok(None);
+        };
+        let refined = refine(image, camera, mesh, &found, &options.refine);
+        let score = found.hypotheses.first().map_or(0.0, |h| h.score);
+        let (camera_from_object, improved) = (refined.camera_from_object, refined.improved);
+        Ok(Some(Aligned { camera_from_object, score, improved, found }))
+    };
+    let Some(mut best) = look(region)? else { return Ok(None) };
+    if options.second_look
+        && best.improved
+        && let Some(whole) = projected_box(mesh, camera, &best.camera_from_object)
+        && alike(&whole, region)
+        && let Ok(Some(again)) = look(&whole)
+        && again.improved
+    {
+        best = again;
+    }
+    if options.correct && best.improved {
+        let correction = model.object(object_id)?.1.correction;
+        best.camera_from_object = correction.apply(camera, &best.camera_from_object);
+    }
+    Ok(Some(best))
+}
+
+/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
+fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for vertex in mesh.vertices() {
+        let pixel = camera.project(&pose.transform_point(vertex))?;
+        (low, high) = (low.inf(&pixel), high.sup(&pixel));
+    }
+    let size = high - low;
+    (size.x >= 2.0 && size.y >= 2.0).then_some(Rect { x: low.x, y: low.y, width: size.x, height: size.y })
+}
+
+/// Whether the box of a pose can be that of an object seen in `region`: it covers most of it, and is not many times larger.
+fn alike(whole: &Rect, region: &Rect) -> bool {
+    let common = whole.intersect(region).map_or(0.0, |r| r.width * r.height);
+    common > 0.5 * region.width * region.height
+        && whole.width.max(whole.height) < 4.0 * region.width.max(region.height)
+}
+
+/// Fewer photographs of an object say nothing of its distance.
+const LEAST_PHOTOGRAPHS: usize = 5;
+/// Poses turned further from the truth than this are wrong, not off.
+const SAME_ROTATION: f64 = 0.26;
+
+/// What aligned poses are off by on posed photographs, object by object. The shift is one for all, for it lies in camera and
+/// annotations; distances are drawn towards zero as far as their scatter does not tell them from it (empirical Bayes, James
+/// and Stein 1961).
+///
+/// # Errors
+/// As [`estimate`], for objects that the model does not know.
+pub fn measure_corrections(
+    model: &Pix2PoseModel,
+    photographs: &[RealCrop],
+    meshes: &BTreeMap<u32, Mesh>,
+    mut progress: impl FnMut(),
+) -> Result<BTreeMap<u32, Correction>, EstimateError> {
+    let options = AlignOptions { correct: false, ..AlignOptions::default() };
+    let mut shifts: [Vec<f64>; 2] = [vec![], vec![]];
+    let mut depths: BTreeMap<u32, Vec<f64>> = BTreeMap::new();
+    for photograph in photographs {
+        progress();
+        let id = photograph.object_id();
+        let Some(mesh) = meshes.get(&id) else { continue };
+        let (camera, truth) = (photograph.camera(), photograph.camera_from_object());
+        let region = photograph.visible_box();
+        let Some(aligned) = estimate_aligned(model, photograph.image(), camera, id, &region, mesh, &options)?
+        else {
+            continue;
+        };
+        let found = aligned.camera_from_object;
+        // A symmetric object found from its other side is left out as well.
+        if !aligned.improved || found.rotation().angle_to(&truth.rotation()) > SAME_ROTATION {
+            continue;
+        }
+        let (here, there) = (camera.project(&found.translation()), camera.project(&truth.translation()));
+        if let (Some(here), Some(there)) = (here, there) {
+            shifts[0].push(here.x - there.x);
+            shifts[1].push(here.y - there.y);
+        }
+        depths.entry(id).or_default().push(found.translation().z / truth.translation().z - 1.0);
+    }
+    let shift = shifts.map(|mut values| median(&mut values));
+    // Median, and the square of its standard error.
+    let measured: BTreeMap<u32, (f64, f64)> = depths
+        .into_iter()
+        .filter(|(_, values)| values.len() >= LEAST_PHOTOGRAPHS)
+        .map(|(id, mut values)| {
+            let middle = median(&mut values);
+            let mut away: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+            let error = 1.2533 * 1.4826 * median(&mut away) / (values.len() as f64).sqrt();
+            (id, (middle, error * error))
+        })
+        .collect();
+    let count = measured.len().max(1) as f64;
+    let scatter = measured.values().map(|(m, _)| m * m).sum::<f64>() / count;
+    let noise = measured.values().map(|(_, e)| e).sum::<f64>() / count;
+    let between = (scatter - noise).max(0.0);
+    let correction = |id: &u32| {
+        let depth = measured.get(id).map_or(0.0, |(middle, error)| {
+            let total = between + error;
+            if total > 0.0 { middle * between / total } else { 0.0 }
+        });
+        Correction { shift, depth }
+    };
+    Ok(meshes.keys().map(|id| (*id, correction(id))).collect())
+}
+
+/// The middle value, 0 of none.
+fn median(values: &mut [f64]) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::Vec3;
+
+    #[test]
+    fn a_correction_moves_the_object_in_the_image_and_along_its_view() {
+        let camera = Camera::new(500.0, 520.0, 320.0, 240.0, 640, 480).unwrap();
+        let pose = Pose::exp(&[0.1, -0.05, 0.9, 0.4, 0.2, -0.1].into());
+        let correction = Correction { shift: [1.0, -2.0], depth: 0.01 };
+        let moved = correction.apply(&camera, &pose);
+        let (before, after) =
+            (camera.project(&pose.translation()).unwrap(), camera.project(&moved.translation()).unwrap());
+        assert!((before - after - Vec2::new(1.0, -2.0)).norm() < 1e-9);
+        assert!((moved.translation().z - 0.99 * pose.translation().z).abs() < 1e-12);
+        assert_eq!(moved.rotation(), pose.rotation());
+        let none = Correction::default().apply(&camera, &pose);
+        assert!((none.translation() - pose.translation()).norm() < 1e-12);
+        // Behind the camera nothing can be said.
+        let behind = Pose::from_translation(Vec3::new(0.0, 0.0, -1.0));
+        assert_eq!(correction.apply(&camera, &behind), behind);
+    }
+
+    #[test]
+    fn a_second_look_needs_a_box_about_the_first() {
+        let region = Rect { x: 100.0, y: 100.0, width: 40.0, height: 40.0 };
+        let of = |x: f64, side: f64| Rect { x, y: x, width: side, height: side };
+        assert!(alike(&of(90.0, 80.0), &region));
+        assert!(!alike(&of(130.0, 40.0), &region));
+        assert!(!alike(&of(60.0, 200.0), &region));
+    }
+}
