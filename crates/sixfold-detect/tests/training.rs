@@ -102,7 +102,7 @@ fn interrupted_and_resumed_it_ends_with_the_same_bytes() {
 
 #[test]
 fn it_learns_two_objects() {
-    let options = TrainingOptions { steps: 160, warm_up: 20, ..TrainingOptions::default() };
+    let options = TrainingOptions { steps: 280, warm_up: 20, ..TrainingOptions::default() };
     let folder = tempfile::tempdir().unwrap();
     let path = run(folder.path(), 128, &options, None).unwrap().unwrap();
     let model = DetectorModel::load(&path).unwrap();
@@ -116,7 +116,7 @@ fn it_learns_two_objects() {
         let image: RgbImage = Image::from_fn(128, 128, |x, y| {
             [0, 1, 2].map(|c| (sample.rgb[c * plane + y * 128 + x] * 255.0).round() as u8)
         });
-        let detected = model.detect(&image, &DetectOptions { threshold: 0.3, ..model.options() }).unwrap();
+        let detected = model.detect(&image, &DetectOptions { threshold: 0.4, ..model.options() }).unwrap();
         let mut taken = vec![false; sample.annotation.instances.len()];
         for d in &detected {
             let hit = sample.annotation.instances.iter().position(|i| {
