@@ -1,9 +1,10 @@
-//! Options of the outline alignment one by one on estimated poses: DATASET TARGETS.json WEIGHTS.
+//! Options of the outline alignment one by one on estimated poses: DATASET TARGETS.json WEIGHTS [looks: only how often is looked].
 //!
 //! Prints the recall of ADD(-S) below a tenth of the diameter, and the median error along the view axis.
 use rayon::prelude::*;
 use sixfold_bop::{BopDataset, ModelPoints, Models, Placement, add, adi, ground_truth_visibility};
-use sixfold_geometry::{Camera, Pose, RgbImage};
+use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
+use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::refine::{RefineOptions, outline_mesh, refine};
@@ -16,6 +17,7 @@ struct Case {
     image: Arc<RgbImage>,
     camera: Camera,
     truth: Pose,
+    region: Rect,
     found: Found,
 }
 
@@ -53,37 +55,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let options = EstimateOptions::default();
             if let Some(found) = estimate(&model, &image, &camera, truth.obj_id, &region, &options)? {
                 let (object, truth, image) = (truth.obj_id, truth.camera_from_object, image.clone());
-                cases.push(Case { object, image, camera, truth, found });
+                cases.push(Case { object, image, camera, truth, region, found });
             }
         }
     }
     let base = RefineOptions::default();
-    // A second look at the box of the aligned pose, and both looks together.
-    let again: Vec<[Case; 2]> = cases
-        .iter()
-        .filter_map(|c| {
-            let mesh = &meshes[&c.object].1;
-            let pose = refine(&c.image, &c.camera, mesh, &c.found, &base).camera_from_object;
-            let pixels: Vec<_> =
-                mesh.vertices().iter().filter_map(|v| c.camera.project(&pose.transform_point(v))).collect();
-            let low = pixels.iter().fold(pixels[0], |a, b| a.inf(b));
-            let high = pixels.iter().fold(pixels[0], |a, b| a.sup(b));
-            let region =
-                sixfold_geometry::Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y };
-            let options = EstimateOptions::default();
-            let mut found = estimate(&model, &c.image, &c.camera, c.object, &region, &options).ok()??;
-            let case = |found: Found| Case {
-                object: c.object,
-                image: c.image.clone(),
-                camera: c.camera,
-                truth: c.truth,
-                found,
-            };
-            let alone = case(found.clone());
-            found.first_view = c.found.open_view.clone();
-            Some([alone, case(found)])
-        })
-        .collect();
     let with = |change: &dyn Fn(&mut RefineOptions)| {
         let mut options = base.clone();
         change(&mut options);
@@ -137,16 +113,28 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         cases.iter().map(|c| measured(c, &c.found.hypotheses[0].camera_from_object)).collect();
     println!("{} cases", cases.len());
     print("PnP", &before);
-    for (look, name) in ["second look", "both looks"].iter().enumerate() {
-        let errors: Vec<_> = again
-            .iter()
+    for (looks, shape, line) in
+        [(1, 30.0, 0.3), (2, 30.0, 0.3), (3, 30.0, 0.3), (2, 10.0, 0.3), (3, 10.0, 0.3), (2, 15.0, 0.5)]
+    {
+        let options = AlignOptions {
+            looks,
+            refine: RefineOptions { shape, line, ..base.clone() },
+            ..AlignOptions::default()
+        };
+        let errors: Vec<_> = cases
+            .par_iter()
             .map(|c| {
-                let c = &c[look];
-                let refined = refine(&c.image, &c.camera, &meshes[&c.object].1, &c.found, &base);
-                measured(c, &refined.camera_from_object)
+                let mesh = &meshes[&c.object].1;
+                let found =
+                    estimate_aligned(&model, &c.image, &c.camera, c.object, &c.region, mesh, &options);
+                let pose = found.ok().flatten().map_or(Pose::identity(), |a| a.camera_from_object);
+                measured(c, &pose)
             })
             .collect();
-        print(name, &errors);
+        print(&format!("looks {looks} shape {shape} line {line}"), &errors);
+    }
+    if arguments.len() > 3 {
+        return Ok(());
     }
     for (name, options) in &variants {
         let errors: Vec<_> = cases

@@ -10,7 +10,7 @@ use crate::refine::{RefineOptions, refine};
 use crate::samples::RealCrop;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
 
 /// How aligned poses are estimated.
@@ -20,8 +20,8 @@ pub struct AlignOptions {
     pub estimate: EstimateOptions,
     /// The alignment.
     pub refine: RefineOptions,
-    /// Look again in the box of the aligned pose.
-    pub second_look: bool,
+    /// Most looks: each but the first is into the box of the pose before, and none follows one that found the same box.
+    pub looks: usize,
     /// Take out what the model's object is known to be off by.
     pub correct: bool,
 }
@@ -31,7 +31,7 @@ impl Default for AlignOptions {
         Self {
             estimate: EstimateOptions::default(),
             refine: RefineOptions::default(),
-            second_look: true,
+            looks: 2,
             correct: true,
         }
     }
@@ -95,14 +95,17 @@ pub fn estimate_aligned(
         Ok(Some(Aligned { camera_from_object, score, improved, found }))
     };
     let Some(mut best) = look(region)? else { return Ok(None) };
-    if options.second_look
-        && best.improved
-        && let Some(whole) = projected_box(mesh, camera, &best.camera_from_object)
-        && alike(&whole, region)
-        && let Ok(Some(again)) = look(&whole)
-        && again.improved
-    {
-        best = again;
+    let mut looked_at = *region;
+    for _ in 1..options.looks.max(1) {
+        let Some(whole) = projected_box(mesh, camera, &best.camera_from_object) else { break };
+        if !best.improved || !alike(&whole, region) || same(&whole, &looked_at) {
+            break;
+        }
+        let Ok(Some(again)) = look(&whole) else { break };
+        if !again.improved {
+            break;
+        }
+        (best, looked_at) = (again, whole);
     }
     if options.correct && best.improved {
         let correction = model.object(object_id)?.1.correction;
@@ -129,21 +132,31 @@ fn alike(whole: &Rect, region: &Rect) -> bool {
         && whole.width.max(whole.height) < 4.0 * region.width.max(region.height)
 }
 
+/// Whether looking there would show the same.
+fn same(a: &Rect, b: &Rect) -> bool {
+    let near = |a: f64, b: f64| (a - b).abs() < 0.02 * b.abs().max(10.0);
+    let apart = (a.x + 0.5 * a.width - b.x - 0.5 * b.width).abs()
+        + (a.y + 0.5 * a.height - b.y - 0.5 * b.height).abs();
+    near(a.width, b.width) && near(a.height, b.height) && apart < 0.02 * b.width.max(b.height).max(10.0)
+}
+
 /// Fewer photographs of an object say nothing of its distance.
 const LEAST_PHOTOGRAPHS: usize = 5;
 /// Poses turned further from the truth than this are wrong, not off.
 const SAME_ROTATION: f64 = 0.26;
+/// Steps of a continuous symmetry, as a share of the diameter.
+const SYMMETRY_STEP: f64 = 0.1;
 
 /// What aligned poses are off by on posed photographs, object by object. The shift is one for all, for it lies in camera and
 /// annotations; distances are drawn towards zero as far as their scatter does not tell them from it (empirical Bayes, James
-/// and Stein 1961).
+/// and Stein 1961). `objects` are meshes as [`crate::refine::outline_mesh`] makes them, with their symmetries.
 ///
 /// # Errors
 /// As [`estimate`], for objects that the model does not know.
 pub fn measure_corrections(
     model: &Pix2PoseModel,
     photographs: &[RealCrop],
-    meshes: &BTreeMap<u32, Mesh>,
+    objects: &BTreeMap<u32, (Mesh, ModelInfo)>,
     mut progress: impl FnMut(),
 ) -> Result<BTreeMap<u32, Correction>, EstimateError> {
     let options = AlignOptions { correct: false, ..AlignOptions::default() };
@@ -152,16 +165,20 @@ pub fn measure_corrections(
     for photograph in photographs {
         progress();
         let id = photograph.object_id();
-        let Some(mesh) = meshes.get(&id) else { continue };
-        let (camera, truth) = (photograph.camera(), photograph.camera_from_object());
+        let Some((mesh, info)) = objects.get(&id) else { continue };
+        let camera = photograph.camera();
         let region = photograph.visible_box();
         let Some(aligned) = estimate_aligned(model, photograph.image(), camera, id, &region, mesh, &options)?
         else {
             continue;
         };
         let found = aligned.camera_from_object;
-        // A symmetric object found from its other side is left out as well.
-        if !aligned.improved || found.rotation().angle_to(&truth.rotation()) > SAME_ROTATION {
+        // Of the poses that look alike the nearest.
+        let away = |pose: &Pose| found.rotation().angle_to(&pose.rotation());
+        let alike = info.symmetry_poses(SYMMETRY_STEP).into_iter();
+        let truth = alike.map(|symmetry| *photograph.camera_from_object() * symmetry);
+        let Some(truth) = truth.min_by(|a, b| away(a).total_cmp(&away(b))) else { continue };
+        if !aligned.improved || away(&truth) > SAME_ROTATION {
             continue;
         }
         let (here, there) = (camera.project(&found.translation()), camera.project(&truth.translation()));
@@ -194,7 +211,7 @@ pub fn measure_corrections(
         });
         Correction { shift, depth }
     };
-    Ok(meshes.keys().map(|id| (*id, correction(id))).collect())
+    Ok(objects.keys().map(|id| (*id, correction(id))).collect())
 }
 
 /// The middle value, 0 of none.

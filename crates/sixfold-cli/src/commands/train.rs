@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use burn::tensor::Device;
 use serde::Serialize;
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
@@ -110,10 +110,10 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     }
     let sizes = ImageSizes { input: a.size, output: if compact { a.size / 2 } else { a.size } };
     let photographs = real.clone();
-    let outlines: BTreeMap<u32, Mesh> = if photographs.is_empty() {
+    let outlines: BTreeMap<u32, (Mesh, ModelInfo)> = if photographs.is_empty() {
         BTreeMap::new()
     } else {
-        objects.iter().map(|o| (o.id, outline_mesh(&o.mesh))).collect()
+        objects.iter().map(|o| (o.id, (outline_mesh(&o.mesh), o.info.clone()))).collect()
     };
     let entries: Vec<ObjectEntry> = objects
         .iter()
@@ -233,7 +233,7 @@ fn save_corrected(
     mut model: Pix2PoseModel,
     path: &Path,
     photographs: &[RealCrop],
-    outlines: &BTreeMap<u32, Mesh>,
+    outlines: &BTreeMap<u32, (Mesh, ModelInfo)>,
 ) -> Result<()> {
     // First without: nothing that was trained may be lost.
     model.save(path)?;

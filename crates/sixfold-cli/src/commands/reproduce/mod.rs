@@ -173,7 +173,7 @@ fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
         Setting {
             refine: true,
             correct: false,
-            second_look: false,
+            looks: 1,
             ..plain("one-look", "two stages, PnP, outline aligned once, no correction")
         },
         plain("no-refinement", "two stages, PnP (the dissertation's method)"),

@@ -27,8 +27,8 @@ pub(super) struct Setting {
     pub options: EstimateOptions,
     /// Whether the outline is aligned at the end.
     pub refine: bool,
-    /// With it: whether the box of the aligned pose is looked at again.
-    pub second_look: bool,
+    /// With it: how often is looked.
+    pub looks: usize,
     /// With it: whether what the model is known to be off by is taken out.
     pub correct: bool,
     /// Ground-truth boxes are moved and scaled by up to this share of their size.
@@ -103,7 +103,7 @@ impl Setting {
             title: title.to_string(),
             options: EstimateOptions::default(),
             refine: false,
-            second_look: true,
+            looks: AlignOptions::default().looks,
             correct: true,
             noise: None,
             detections: false,
@@ -114,7 +114,7 @@ impl Setting {
     pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
         let options = AlignOptions {
             estimate: EstimateOptions { seed, ..self.options.clone() },
-            second_look: self.second_look,
+            looks: self.looks,
             correct: self.correct,
             ..AlignOptions::default()
         };
