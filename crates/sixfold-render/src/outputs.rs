@@ -12,7 +12,8 @@ pub struct Surface {
     pub object: u32,
     /// Number of the face in that object's mesh.
     pub face: u32,
-    /// Weights of the face's three corners at the seen point (perspective-correct; they sum to 1).
+    /// Weights of the face's three corners at the seen point (perspective-correct; they sum to 1). A face without area, or
+    /// so large that its area is not a finite number, has all the weight at its first corner.
     pub barycentric: [f32; 3],
 }
 
@@ -83,8 +84,8 @@ impl Frame {
         out
     }
 
-    /// Unit normals in the camera frame, turned to the camera; zero where nothing is seen. Vertex normals are
-    /// interpolated where the mesh has them, otherwise each face is flat.
+    /// Unit normals in the camera frame, turned to the camera; zero where nothing is seen, or only a face so large that its
+    /// area is not a finite number. Vertex normals are interpolated where the mesh has them, otherwise each face is flat.
     pub fn normals(&self, objects: &[SceneObject<'_>]) -> NormalImage {
         let mut out = Image::filled(self.width(), self.height(), [0.0f32; 3]);
         self.for_surfaces(objects, |index, point, object, face, weights, corners| {
@@ -154,16 +155,18 @@ impl Frame {
     }
 }
 
-/// Weights of the corners at a point on their triangle; a degenerate triangle gives its first corner.
+/// Weights of the corners at a point on their triangle, each from 0 to 1. A triangle that is degenerate, or so large that its
+/// area is no longer a finite number, gives its first corner.
 fn barycentric(p: &Vec3, c: &[Vec3; 3]) -> [f64; 3] {
     let (e1, e2, q) = (c[1] - c[0], c[2] - c[0], p - c[0]);
     let n = e1.cross(&e2);
     let area = n.norm_squared();
-    if area <= 0.0 {
+    let (w1, w2) = (q.cross(&e2).dot(&n) / area, e1.cross(&q).dot(&n) / area);
+    if area <= 0.0 || !w1.is_finite() || !w2.is_finite() {
         return [1.0, 0.0, 0.0];
     }
-    let w1 = (q.cross(&e2).dot(&n) / area).clamp(0.0, 1.0);
-    let w2 = (e1.cross(&q).dot(&n) / area).clamp(0.0, 1.0 - w1);
+    let w1 = w1.clamp(0.0, 1.0);
+    let w2 = w2.clamp(0.0, 1.0 - w1);
     [1.0 - w1 - w2, w1, w2]
 }
 
@@ -182,7 +185,8 @@ pub(crate) fn surface_normal(
     });
     let normal = smooth.or_else(|| {
         let n = (corners[1] - corners[0]).cross(&(corners[2] - corners[0]));
-        n.try_normalize(1e-30)
+        // Of a face too large for its area to be a number, NaN.
+        n.try_normalize(1e-30).filter(|n| n.iter().all(|c| c.is_finite()))
     });
     match normal {
         Some(n) if n.dot(point) > 0.0 => -n,

@@ -266,3 +266,35 @@ fn a_used_canvas_gives_what_a_new_image_gives() {
         assert!(points.image().as_slice().iter().map(bits).eq(fresh.as_slice().iter().map(bits)));
     }
 }
+
+#[test]
+fn faces_of_extreme_size_have_weights_and_finite_normals() {
+    let camera = camera();
+    let mut seen = 0;
+    for size in [1e-300, 1e-160, 1e-80, 1e20, 1e76, 1e80, 1e154, 1e160, 1e300, 1e308] {
+        for z in [0.5, 1e6, 1e30, size] {
+            for corners in [
+                [[-size, -size, z], [size, -size, z], [0.0, size, z]],
+                [[-size, 0.0, z], [size, -1.0, z], [0.3, size, 1.5 * z]],
+                [[0.0, 0.0, z], [size, size, z], [-1.0, size, size]],
+            ] {
+                let mesh = mesh(&corners, &[[0, 1, 2]]);
+                let mesh = mesh.with_colors(vec![[255, 0, 0], [0, 255, 0], [0, 0, 255]]).unwrap();
+                let objects = [SceneObject { mesh: &mesh, camera_from_object: Pose::identity() }];
+                let mut frame = Frame::new(&camera);
+                frame.render(&objects, &RenderOptions::default());
+                for surface in frame.surfaces(&objects).as_slice().iter().flatten() {
+                    let weights = surface.barycentric;
+                    assert!(weights.iter().all(|w| (0.0..=1.0).contains(w)), "{corners:?}: {weights:?}");
+                    assert!((weights.iter().sum::<f32>() - 1.0).abs() < 1e-5, "{corners:?}: {weights:?}");
+                    seen += 1;
+                }
+                let normals = frame.normals(&objects);
+                assert!(normals.as_slice().as_flattened().iter().all(|c| c.is_finite()), "{corners:?}");
+                let lights = crate::Light::default_set();
+                crate::shade(&frame, &objects, &lights, &crate::Material::default(), None);
+            }
+        }
+    }
+    assert!(seen > 10_000, "{seen}");
+}
