@@ -249,11 +249,11 @@ fn mask_of(
     let (y0, y1) = span(c.corners[1], c.corners[3], height);
     let (columns, rows) = (x1 - x0, y1 - y0);
     let mut logits = vec![numbers[config.prototypes]; columns * rows];
-    for k in 0..config.prototypes {
+    for (k, number) in numbers[..config.prototypes].iter().enumerate() {
         for row in 0..rows {
             let source = &raw.prototypes[(k * height + y0 + row) * width + x0..][..columns];
             let target = &mut logits[row * columns..][..columns];
-            target.iter_mut().zip(source).for_each(|(t, s)| *t += numbers[k] * s);
+            target.iter_mut().zip(source).for_each(|(t, s)| *t += number * s);
         }
     }
     let at = |x: usize, y: usize| logits[y.min(rows - 1) * columns + x.min(columns - 1)];
@@ -346,7 +346,11 @@ mod tests {
         let config = DetectorConfig::compact(1);
         for (w, h) in [(1, 1), (33, 700), (2000, 10), (640, 480)] {
             let image = NetworkImage::new(&RgbImage::filled(w, h, [9; 3]), &config, 640).unwrap();
-            assert!(image.width % 32 == 0 && image.height % 32 == 0 && image.width.max(image.height) <= 640);
+            assert!(
+                image.width.is_multiple_of(32)
+                    && image.height.is_multiple_of(32)
+                    && image.width.max(image.height) <= 640
+            );
         }
         assert!(NetworkImage::new(&RgbImage::filled(0, 0, [9; 3]), &config, 640).is_none());
     }
