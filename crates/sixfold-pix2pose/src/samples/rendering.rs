@@ -50,7 +50,7 @@ pub(super) fn colors(
     (image, Coverage { width: camera.width, height: camera.height, data })
 }
 
-/// As [`colors`], in planes.
+/// The object's colours under random light, in planes, and its silhouette.
 pub fn color_patch(
     mesh: &Mesh,
     camera: &Camera,

@@ -164,7 +164,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
 fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
     let plain = Setting::plain;
     let mut all = vec![
-        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned, twice (default)") },
+        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned (default)") },
         Setting {
             refine: true,
             correct: false,
@@ -172,9 +172,8 @@ fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
         },
         Setting {
             refine: true,
-            correct: false,
-            looks: 1,
-            ..plain("one-look", "two stages, PnP, outline aligned once, no correction")
+            looks: 2,
+            ..plain("two-looks", "default, with a second look into the box of the aligned pose")
         },
         plain("no-refinement", "two stages, PnP (the dissertation's method)"),
     ];
