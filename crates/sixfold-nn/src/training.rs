@@ -105,6 +105,16 @@ pub enum Ending<T> {
     },
 }
 
+impl<T> Ending<T> {
+    /// The same with another form of what was trained.
+    pub fn map<U>(self, change: impl FnOnce(T) -> U) -> Ending<U> {
+        match self {
+            Ending::Finished(trained) => Ending::Finished(change(trained)),
+            Ending::Interrupted { step } => Ending::Interrupted { step },
+        }
+    }
+}
+
 /// Trains in `folder`, which gets checkpoints, `log.jsonl` and `curves.png`; goes on where a training with the same
 /// `options` left off there. `make_batch` gives the batch of a step, the same for the same step on any thread. `options`
 /// (a structure of named fields) is what the result depends on. `stop` ends the training after the current step.

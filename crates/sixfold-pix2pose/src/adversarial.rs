@@ -17,15 +17,14 @@ use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use sixfold_nn::checkpoint::{Checkpoint, CheckpointWriter};
+use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use sixfold_nn::schedule::LearningRate;
-use sixfold_nn::training_log::{TrainingLog, TrainingRecord, draw_curves, read_training_log};
+use sixfold_nn::training::{Course, Trainee, run};
+use sixfold_nn::training_log::TrainingRecord;
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::sync::atomic::AtomicBool;
 
 /// How to train. The defaults are the dissertation's (section 3.4.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -99,42 +98,29 @@ impl Generator for ResNet50Generator {
 }
 
 /// What is trained, and what trains it.
-struct State<G> {
+struct State<'a, G> {
     generator: G,
     discriminator: Discriminator,
     generator_optimiser: ModuleOptimizer,
     discriminator_optimiser: ModuleOptimizer,
+    pool: &'a [SymmetryMap],
+    /// Of the images, pixels.
+    side: usize,
+    options: &'a AdversarialOptions,
+    device: &'a Device,
 }
 
-impl<G: Generator> State<G> {
-    fn write(
-        &self,
-        step: u64,
-        seconds: f64,
-        options: &AdversarialOptions,
-        folder: &Path,
-    ) -> Result<(), TrainingError> {
-        CheckpointWriter::new(step)
-            .module("generator", &self.generator)?
-            .module("discriminator", &self.discriminator)?
-            .optimiser("generator", &self.generator_optimiser)?
-            .optimiser("discriminator", &self.discriminator_optimiser)?
-            .state("adversarial options", options)?
-            .state("seconds", &seconds)?
-            .write(folder)?;
-        Ok(())
-    }
+/// The samples of an iteration, and which it is.
+struct Batch {
+    samples: Vec<Sample>,
+    step: u64,
+}
 
-    /// One iteration on a batch.
-    fn step(
-        &mut self,
-        samples: &[Sample],
-        pool: &[SymmetryMap],
-        side: usize,
-        options: &AdversarialOptions,
-        (step, rate): (u64, f64),
-        device: &Device,
-    ) -> BTreeMap<String, f64> {
+impl<G: Generator> Trainee for State<'_, G> {
+    type Batch = Batch;
+
+    fn step(&mut self, Batch { samples, step }: Batch, rate: f64) -> BTreeMap<String, f64> {
+        let Self { pool, side, options, device, .. } = *self;
         let count = samples.len();
         let gather =
             |part: fn(&Sample) -> &[f32]| samples.iter().flat_map(part).copied().collect::<Vec<f32>>();
@@ -180,6 +166,26 @@ impl<G: Generator> State<G> {
         losses
     }
 
+    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
+        checkpoint
+            .module("generator", &self.generator)?
+            .module("discriminator", &self.discriminator)?
+            .optimiser("generator", &self.generator_optimiser)?
+            .optimiser("discriminator", &self.discriminator_optimiser)
+    }
+
+    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
+        Ok(State {
+            generator: checkpoint.module("generator", self.generator)?,
+            discriminator: checkpoint.module("discriminator", self.discriminator)?,
+            generator_optimiser: checkpoint.optimiser("generator", self.generator_optimiser)?,
+            discriminator_optimiser: checkpoint.optimiser("discriminator", self.discriminator_optimiser)?,
+            ..self
+        })
+    }
+}
+
+impl<G: Generator> State<'_, G> {
     /// One step of the discriminator on generated, then on rendered coordinates; its mean loss.
     fn teach(
         &mut self,
@@ -231,7 +237,7 @@ pub fn train_adversarial<G: Generator>(
     folder: &Path,
     options: &AdversarialOptions,
     stop: &AtomicBool,
-    mut progress: impl FnMut(&TrainingRecord),
+    progress: impl FnMut(&TrainingRecord),
 ) -> Result<TrainingOutcome<G>, TrainingError> {
     let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
     let side = source.options().size;
@@ -245,100 +251,40 @@ pub fn train_adversarial<G: Generator>(
             format!("{side} and {}", source.options().target()),
         );
     }
-    for (field, value) in [
-        ("batch", options.batch as u64),
-        ("log_every", options.log_every),
-        ("checkpoint_every", options.checkpoint_every),
-        ("decay_every", options.decay_every),
-    ] {
+    for (field, value) in [("batch", options.batch as u64), ("decay_every", options.decay_every)] {
         if value == 0 {
             return wrong(field, "at least 1", "0".to_string());
         }
     }
-    let schedule = LearningRate::StepDecay {
-        rate: options.learning_rate,
-        factor: 0.1,
-        at: (1..).map(|n| n * options.decay_every).take_while(|at| *at < options.steps).collect(),
-    };
-    schedule.check()?;
     let optimiser = || AdamConfig::new().init();
-    let mut state = State {
+    let state = State {
         generator,
         discriminator: DiscriminatorConfig { seed: options.seed }.init(device),
         generator_optimiser: optimiser(),
         discriminator_optimiser: optimiser(),
+        pool: if options.transformer_loss { pool } else { &pool[..1] },
+        side,
+        options,
+        device,
     };
-    let (mut step, mut before) = (0, 0.0);
-    if let Some(checkpoint) = Checkpoint::latest(folder)? {
-        let found: AdversarialOptions = checkpoint.state("adversarial options")?;
-        let neutral =
-            |o: &AdversarialOptions| AdversarialOptions { checkpoint_every: 1, log_every: 1, ..o.clone() };
-        if neutral(&found) != neutral(options) {
-            return Err(TrainingError::OtherTraining {
-                folder: folder.display().to_string(),
-                difference: format!("found {found:?}, asked for {options:?}"),
-            });
-        }
-        state.generator = checkpoint.module("generator", state.generator)?;
-        state.discriminator = checkpoint.module("discriminator", state.discriminator)?;
-        state.generator_optimiser = checkpoint.optimiser("generator", state.generator_optimiser)?;
-        state.discriminator_optimiser =
-            checkpoint.optimiser("discriminator", state.discriminator_optimiser)?;
-        before = checkpoint.state("seconds")?;
-        step = checkpoint.step();
-    }
-    let log_path = folder.join("log.jsonl");
-    if step == 0 {
-        state.write(0, 0.0, options, folder)?;
-    }
-    let mut log = TrainingLog::open(&log_path, step)?;
-    let began = Instant::now();
-    let (mut since, mut counted) = (Instant::now(), 0u32);
-    let mut sums: BTreeMap<String, f64> = BTreeMap::new();
-    while step < options.steps {
+    let course = Course {
+        steps: options.steps,
+        schedule: LearningRate::StepDecay {
+            rate: options.learning_rate,
+            factor: 0.1,
+            at: (1..).map(|n| n * options.decay_every).take_while(|at| *at < options.steps).collect(),
+        },
+        samples_per_step: options.batch,
+        log_every: options.log_every,
+        checkpoint_every: options.checkpoint_every,
+        sample_threads: 2,
+    };
+    let decisive = AdversarialOptions { checkpoint_every: 0, log_every: 0, ..options.clone() };
+    let batch = |step| {
         let first = step * options.batch as u64;
-        let samples: Vec<Sample> = (0..options.batch as u64)
-            .into_par_iter()
-            .map(|image| source.sample(0, options.seed, first + image))
-            .collect();
-        let rate = schedule.at(step);
-        let pool = if options.transformer_loss { pool } else { &pool[..1] };
-        let losses = state.step(&samples, pool, side, options, (step, rate), device);
-        if losses.values().any(|v| !v.is_finite()) {
-            return Err(TrainingError::NotFinite { step, rate });
-        }
-        step += 1;
-        counted += 1;
-        for (name, value) in losses {
-            *sums.entry(name).or_default() += value;
-        }
-        let last = step == options.steps;
-        if step % options.log_every == 0 || last {
-            let record = TrainingRecord {
-                step,
-                seconds: before + began.elapsed().as_secs_f64(),
-                learning_rate: rate,
-                samples_per_second: f64::from(counted) * options.batch as f64 / since.elapsed().as_secs_f64(),
-                losses: std::mem::take(&mut sums)
-                    .into_iter()
-                    .map(|(name, sum)| (name, sum / f64::from(counted)))
-                    .collect(),
-            };
-            (since, counted) = (Instant::now(), 0);
-            log.append(&record)?;
-            progress(&record);
-        }
-        let stopped = stop.load(Ordering::Relaxed);
-        if step % options.checkpoint_every == 0 || last || stopped {
-            state.write(step, before + began.elapsed().as_secs_f64(), options, folder)?;
-            let records = read_training_log(&log_path)?;
-            if !records.is_empty() {
-                draw_curves(&records, &folder.join("curves.png"))?;
-            }
-        }
-        if stopped && !last {
-            return Ok(TrainingOutcome::Interrupted { step });
-        }
-    }
-    Ok(TrainingOutcome::Finished(state.generator.valid()))
+        let samples = (first..first + options.batch as u64).map(|n| source.sample(0, options.seed, n));
+        Batch { samples: samples.collect(), step }
+    };
+    let ending = run(state, batch, &course, &decisive, folder, stop, progress)?;
+    Ok(ending.map(|state| state.generator.valid()))
 }

@@ -1,4 +1,4 @@
-//! The training loop of the compact network: samples made on the fly, checkpoints, interruption and resume.
+//! The training of the compact network: what a step is, and the samples that it learns from.
 
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::{Network, network_input};
@@ -10,15 +10,12 @@ use burn::optim::{AdamWConfig, GradientsAccumulator, GradientsParams, ModuleOpti
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use sixfold_nn::schedule::{LearningRate, LearningRateError};
-use sixfold_nn::training_log::{
-    TrainingLog, TrainingLogError, TrainingRecord, draw_curves, read_training_log,
-};
+use sixfold_nn::schedule::LearningRate;
+use sixfold_nn::training::{Course, Ending, Trainee, run};
+use sixfold_nn::training_log::TrainingRecord;
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, sync_channel};
-use std::time::Instant;
+use std::sync::atomic::AtomicBool;
 
 /// How to train.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -68,71 +65,10 @@ impl Default for TrainingOptions {
     }
 }
 
-/// Why a training could not go on. What was trained until the last checkpoint is kept.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainingError {
-    /// An option is out of range.
-    #[error("training option {field}: expected {expected}, found {found}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it must be.
-        expected: &'static str,
-        /// What it is.
-        found: String,
-    },
-    /// The learning rate.
-    #[error(transparent)]
-    LearningRate(#[from] LearningRateError),
-    /// Reading or writing a checkpoint.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// Reading or writing the log.
-    #[error(transparent)]
-    Log(#[from] TrainingLogError),
-    /// The folder holds a training with other options.
-    #[error(
-        "{folder}: holds a training with other options ({difference}); go on with the same ones, or start anew in another folder"
-    )]
-    OtherTraining {
-        /// The folder.
-        folder: String,
-        /// Which option differs, and how.
-        difference: String,
-    },
-    /// The loss is no number any more.
-    #[error(
-        "step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})"
-    )]
-    NotFinite {
-        /// The step.
-        step: u64,
-        /// The learning rate.
-        rate: f64,
-    },
-}
+pub use sixfold_nn::training::TrainingError;
 
 /// How a training ended.
-#[derive(Debug)]
-pub enum TrainingOutcome<N = Network> {
-    /// All steps are done.
-    Finished(N),
-    /// It was asked to stop; a checkpoint of this step was written.
-    Interrupted {
-        /// Steps done.
-        step: u64,
-    },
-}
-
-impl<N> TrainingOutcome<N> {
-    /// The same with another form of the network.
-    pub fn map<M>(self, change: impl FnOnce(N) -> M) -> TrainingOutcome<M> {
-        match self {
-            TrainingOutcome::Finished(network) => TrainingOutcome::Finished(change(network)),
-            TrainingOutcome::Interrupted { step } => TrainingOutcome::Interrupted { step },
-        }
-    }
-}
+pub type TrainingOutcome<N = Network> = Ending<N>;
 
 /// A batch: images of all objects, one object after another.
 struct Batch {
@@ -156,40 +92,22 @@ fn make_batch(source: &SampleSource, options: &TrainingOptions, step: u64) -> Ba
     batch
 }
 
-struct State {
+struct State<'a> {
     network: Compact,
     encoder: ModuleOptimizer,
     decoders: ModuleOptimizer,
+    pools: &'a [Vec<SymmetryMap>],
+    /// Of the input, pixels.
+    side: usize,
+    options: &'a TrainingOptions,
+    device: &'a Device,
 }
 
-impl State {
-    fn write(
-        &self,
-        step: u64,
-        seconds: f64,
-        options: &TrainingOptions,
-        folder: &Path,
-    ) -> Result<(), TrainingError> {
-        CheckpointWriter::new(step)
-            .module("network", &self.network)?
-            .optimiser("encoder", &self.encoder)?
-            .optimiser("decoders", &self.decoders)?
-            .state("options", options)?
-            .state("seconds", &seconds)?
-            .write(folder)?;
-        Ok(())
-    }
+impl Trainee for State<'_> {
+    type Batch = Batch;
 
-    /// One step: losses by name.
-    fn step(
-        &mut self,
-        batch: Batch,
-        pools: &[Vec<SymmetryMap>],
-        side: usize,
-        options: &TrainingOptions,
-        rate: f64,
-        device: &Device,
-    ) -> BTreeMap<String, f64> {
+    fn step(&mut self, batch: Batch, rate: f64) -> BTreeMap<String, f64> {
+        let Self { pools, side, options, device, .. } = *self;
         let count = options.per_object;
         let images = pools.len() * count;
         let kind = OutputKind::Compact;
@@ -238,6 +156,22 @@ impl State {
             .map(|(name, value)| (name.to_string(), value))
             .into()
     }
+
+    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
+        checkpoint
+            .module("network", &self.network)?
+            .optimiser("encoder", &self.encoder)?
+            .optimiser("decoders", &self.decoders)
+    }
+
+    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
+        Ok(State {
+            network: checkpoint.module("network", self.network)?.freeze(self.options.frozen_stages),
+            encoder: checkpoint.optimiser("encoder", self.encoder)?,
+            decoders: checkpoint.optimiser("decoders", self.decoders)?,
+            ..self
+        })
+    }
 }
 
 /// Trains a compact network, whose tensors are on the autodiff `device`, on `source`; `pools` holds every object's symmetries, the identity first.
@@ -256,108 +190,37 @@ pub fn train(
     folder: &Path,
     options: &TrainingOptions,
     stop: &AtomicBool,
-    mut progress: impl FnMut(&TrainingRecord),
+    progress: impl FnMut(&TrainingRecord),
 ) -> Result<TrainingOutcome, TrainingError> {
     let schedule = check(source, pools, options)?;
-    let optimiser = || AdamWConfig::new().with_weight_decay(options.weight_decay).init();
-    let mut state = State { network, encoder: optimiser(), decoders: optimiser() };
-    if state.network.decoders.len() != pools.len() {
-        let found = format!("{} decoders for {} objects", state.network.decoders.len(), pools.len());
+    if network.decoders.len() != pools.len() {
+        let found = format!("{} decoders for {} objects", network.decoders.len(), pools.len());
         return Err(TrainingError::Option { field: "network", expected: "one decoder an object", found });
     }
-    let (mut step, mut before) = (0, 0.0);
-    if let Some(checkpoint) = Checkpoint::latest(folder)? {
-        let found: TrainingOptions = checkpoint.state("options")?;
-        if let Some(difference) = difference(&found, options) {
-            return Err(TrainingError::OtherTraining { folder: folder.display().to_string(), difference });
-        }
-        state.network = checkpoint.module("network", state.network)?;
-        state.encoder = checkpoint.optimiser("encoder", state.encoder)?;
-        state.decoders = checkpoint.optimiser("decoders", state.decoders)?;
-        before = checkpoint.state("seconds")?;
-        step = checkpoint.step();
-    } else {
-        state.write(0, 0.0, options, folder)?;
-    }
-    state.network = state.network.freeze(options.frozen_stages);
-    let log_path = folder.join("log.jsonl");
-    let mut log = TrainingLog::open(&log_path, step)?;
-    let began = Instant::now();
-    let producers = options.sample_threads.max(1);
-    let quit = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        // Thread i makes the batches i, i + n, i + 2n, ...: which thread makes a batch does not change it.
-        let batches: Vec<Receiver<Batch>> = (0..producers)
-            .map(|producer| {
-                let (send, receive) = sync_channel(2);
-                let (first, quit) = (step + producer as u64, &quit);
-                scope.spawn(move || {
-                    for number in (first..options.steps).step_by(producers) {
-                        if quit.load(Ordering::Relaxed)
-                            || send.send(make_batch(source, options, number)).is_err()
-                        {
-                            return;
-                        }
-                    }
-                });
-                receive
-            })
-            .collect();
-        let outcome = (|| {
-            let first = step;
-            let mut sums: BTreeMap<String, f64> = BTreeMap::new();
-            let (mut since, mut counted) = (Instant::now(), 0);
-            while step < options.steps {
-                let Ok(batch) = batches[((step - first) % producers as u64) as usize].recv() else {
-                    // A thread of samples ended early: it panicked, and the scope will say so.
-                    return Ok(TrainingOutcome::Interrupted { step });
-                };
-                let rate = schedule.at(step);
-                let side = source.options().size;
-                let losses = state.step(batch, pools, side, options, rate, device);
-                if losses.values().any(|v| !v.is_finite()) {
-                    return Err(TrainingError::NotFinite { step, rate });
-                }
-                step += 1;
-                counted += 1;
-                for (name, value) in losses {
-                    *sums.entry(name).or_default() += value;
-                }
-                let last = step == options.steps;
-                if step % options.log_every == 0 || last {
-                    let record = TrainingRecord {
-                        step,
-                        seconds: before + began.elapsed().as_secs_f64(),
-                        learning_rate: rate,
-                        samples_per_second: (counted as usize * options.per_object * pools.len()) as f64
-                            / since.elapsed().as_secs_f64(),
-                        losses: std::mem::take(&mut sums)
-                            .into_iter()
-                            .map(|(name, sum)| (name, sum / f64::from(counted)))
-                            .collect(),
-                    };
-                    (since, counted) = (Instant::now(), 0);
-                    log.append(&record)?;
-                    progress(&record);
-                }
-                let stopped = stop.load(Ordering::Relaxed);
-                if step % options.checkpoint_every == 0 || last || stopped {
-                    state.write(step, before + began.elapsed().as_secs_f64(), options, folder)?;
-                    let records = read_training_log(&log_path)?;
-                    if !records.is_empty() {
-                        draw_curves(&records, &folder.join("curves.png"))?;
-                    }
-                }
-                if stopped && !last {
-                    return Ok(TrainingOutcome::Interrupted { step });
-                }
-            }
-            Ok(TrainingOutcome::Finished(Network::Compact(Box::new(state.network.valid()))))
-        })();
-        quit.store(true, Ordering::Relaxed);
-        drop(batches);
-        outcome
-    })
+    let optimiser = || AdamWConfig::new().with_weight_decay(options.weight_decay).init();
+    let state = State {
+        network: network.freeze(options.frozen_stages),
+        encoder: optimiser(),
+        decoders: optimiser(),
+        pools,
+        side: source.options().size,
+        options,
+        device,
+    };
+    let course = Course {
+        steps: options.steps,
+        schedule,
+        samples_per_step: options.per_object * pools.len(),
+        log_every: options.log_every,
+        checkpoint_every: options.checkpoint_every,
+        sample_threads: options.sample_threads,
+    };
+    // How often is logged and saved, and by how many threads, does not change the result.
+    let decisive =
+        TrainingOptions { checkpoint_every: 0, log_every: 0, sample_threads: 0, ..options.clone() };
+    let batch = |step| make_batch(source, options, step);
+    let ending = run(state, batch, &course, &decisive, folder, stop, progress)?;
+    Ok(ending.map(|state| Network::Compact(Box::new(state.network.valid()))))
 }
 
 /// The network of the last checkpoint in `folder`, filled into `network`, and the steps it has done; `None` if there is
@@ -391,40 +254,16 @@ fn check(
             format!("{side} and {target}"),
         );
     }
-    for (field, value) in [
-        ("per_object", options.per_object as u64),
-        ("log_every", options.log_every),
-        ("checkpoint_every", options.checkpoint_every),
-    ] {
-        if value == 0 {
-            return wrong(field, "at least 1", "0".to_string());
-        }
+    if options.per_object == 0 {
+        return wrong("per_object", "at least 1", "0".to_string());
     }
     if !(0.0..=1.0).contains(&options.encoder_share) {
         return wrong("encoder_share", "0 to 1", options.encoder_share.to_string());
     }
-    let schedule = LearningRate::Cosine {
+    Ok(LearningRate::Cosine {
         rate: options.learning_rate,
         last: 0.0,
         warm_up: options.warm_up.min(options.steps.saturating_sub(1)),
         steps: options.steps,
-    };
-    schedule.check()?;
-    Ok(schedule)
-}
-
-/// The first option that changes the result and differs; how often to log or save does not.
-fn difference(found: &TrainingOptions, asked: &TrainingOptions) -> Option<String> {
-    let neutral = |options: &TrainingOptions| TrainingOptions {
-        checkpoint_every: 0,
-        log_every: 0,
-        sample_threads: 0,
-        ..options.clone()
-    };
-    let (found, asked) =
-        (serde_json::to_value(neutral(found)).ok()?, serde_json::to_value(neutral(asked)).ok()?);
-    let (found, asked) = (found.as_object()?, asked.as_object()?);
-    found.iter().find(|(name, value)| asked.get(*name) != Some(*value)).map(|(name, value)| {
-        format!("{name} was {value}, is {}", asked.get(name).cloned().unwrap_or_default())
     })
 }
