@@ -1,0 +1,327 @@
+//! The geometric planner: two contacts whose normals face away from each other, sampled on the cloud of one view.
+//!
+//! A pair of contacts holds by friction when the line between them lies inside both friction cones (Nguyen 1988,
+//! "Constructing force-closure grasps"; for points with normals Chen and Burdick 1993). As in Ten Pas et al. 2017 ("Grasp
+//! pose detection in point clouds") a contact is drawn from the cloud, the closing direction from its normal, and the
+//! approach from the directions around it; unlike there, no network judges the result, so this is no GPD but the
+//! antipodal planner that GPD filters. Nothing is known of the robot's arm: what it cannot reach is not left out.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use sixfold_geometry::{Pose, Vec3};
+use thiserror::Error;
+
+use crate::{
+    AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper,
+    complete_by_mirrors, gripper_pose,
+};
+
+/// An option out of range.
+#[derive(Debug, Error, Clone, PartialEq)]
+#[error("option {field}: found {found}, expected {expected}")]
+pub struct OptionsError {
+    /// Name of the field.
+    pub field: &'static str,
+    /// What it holds.
+    pub found: f64,
+    /// What it may hold.
+    pub expected: &'static str,
+}
+
+/// How the planner samples.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AntipodalOptions {
+    /// First contacts that are drawn.
+    pub samples: usize,
+    /// Closing directions per contact: the normal itself and others inside the friction cone.
+    pub closings: usize,
+    /// Approach directions around each closing direction, over 180 degrees about the one from above.
+    pub approaches: usize,
+    /// Room between the object and each pad when the gripper comes, metres.
+    pub clearance: f64,
+    /// Points this near to the outermost ones belong to the contact, metres.
+    pub contact_depth: f64,
+    /// Largest angle of the approach from straight down, radians. Without a table: from the viewing direction.
+    pub max_tilt: f64,
+    /// Assume the unseen side from symmetry.
+    pub completion: Option<CompletionOptions>,
+    /// Seed of the draws.
+    pub seed: u64,
+}
+
+impl Default for AntipodalOptions {
+    fn default() -> Self {
+        AntipodalOptions {
+            samples: 400,
+            closings: 3,
+            approaches: 7,
+            clearance: 0.012,
+            contact_depth: 0.004,
+            max_tilt: FRAC_PI_2,
+            completion: Some(CompletionOptions::default()),
+            seed: 0,
+        }
+    }
+}
+
+impl AntipodalOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`OptionsError`], naming the first field out of range.
+    pub fn check(&self) -> Result<(), OptionsError> {
+        for (field, found) in
+            [("samples", self.samples), ("closings", self.closings), ("approaches", self.approaches)]
+        {
+            if !(1..=1_000_000).contains(&found) {
+                return Err(OptionsError { field, found: found as f64, expected: "1 to 1000000" });
+            }
+        }
+        for (field, found, low, high, expected) in [
+            ("clearance", self.clearance, 0.0, 0.1, "0 to 0.1 m"),
+            ("contact_depth", self.contact_depth, 1e-4, 0.05, "0.0001 to 0.05 m"),
+            ("max_tilt", self.max_tilt, 0.0, std::f64::consts::PI, "0 to pi radians"),
+        ] {
+            if !(found >= low && found <= high) {
+                return Err(OptionsError { field, found, expected });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Proposes grasps on the object of a view, in the order of the samples they came from. Every one stands clear of the
+/// cloud, of the assumed points and of the table, and has both contacts inside their friction cones. The same seed gives
+/// the same grasps at any number of threads.
+///
+/// # Errors
+/// [`OptionsError`].
+pub fn antipodal_grasps(
+    view: &GraspView,
+    gripper: &Gripper,
+    options: &AntipodalOptions,
+) -> Result<Vec<Grasp>, OptionsError> {
+    options.check()?;
+    let object = match &options.completion {
+        Some(completion) => complete_by_mirrors(view, completion),
+        None => CompletedObject {
+            cloud: view.object.clone(),
+            observed: view.object.len(),
+            planes: vec![],
+        },
+    };
+    if object.cloud.is_empty() || object.cloud.normals.len() != object.cloud.len() {
+        return Ok(vec![]);
+    }
+    let scene = CollisionScene::new(&[&object.cloud, &view.obstacles], view.table);
+    let planner = Planner {
+        gripper,
+        options,
+        down: view.table.map_or_else(Vec3::z, |t| -t.normal),
+        centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
+        object,
+        scene,
+        cone: gripper.friction.atan(),
+    };
+    let grasps: Vec<Vec<Grasp>> = (0..options.samples)
+        .into_par_iter()
+        .map(|sample| {
+            let mut random = ChaCha8Rng::seed_from_u64(options.seed);
+            random.set_stream(sample as u64);
+            planner.sample(&mut random)
+        })
+        .collect();
+    Ok(grasps.concat())
+}
+
+struct Planner<'a> {
+    gripper: &'a Gripper,
+    options: &'a AntipodalOptions,
+    /// The direction from which an approach may tilt.
+    down: Vec3,
+    centre: Vec3,
+    object: CompletedObject,
+    scene: CollisionScene,
+    /// Half angle of the friction cone, radians.
+    cone: f64,
+}
+
+impl Planner<'_> {
+    /// All grasps from one first contact.
+    fn sample(&self, random: &mut ChaCha8Rng) -> Vec<Grasp> {
+        let cloud = &self.object.cloud;
+        let first = random.random_range(0..cloud.len());
+        let (p, n) = (cloud.points[first], cloud.normals[first]);
+        let mut grasps = vec![];
+        for k in 0..self.options.closings {
+            let (turn, tilt): (f64, f64) = (random.random::<f64>() * TAU, random.random::<f64>().sqrt());
+            let closing = if k == 0 { -n } else { tilted(&-n, turn, tilt * 0.8 * self.cone) };
+            for width in self.widths(&p, &closing) {
+                let centre = p + closing * (0.5 * width);
+                for approach in self.approaches(&closing) {
+                    grasps.extend(self.deepest(&centre, &closing, &approach, width));
+                }
+            }
+        }
+        grasps
+    }
+
+    /// Distances along the closing direction at which a second contact faces away, at most three.
+    fn widths(&self, p: &Vec3, closing: &Vec3) -> Vec<f64> {
+        const RADIUS: f64 = 0.005;
+        const GAP: f64 = 0.006;
+        let limit = self.gripper.max_opening - 0.004;
+        let cloud = &self.object.cloud;
+        let mut hits: Vec<f64> = cloud
+            .points
+            .iter()
+            .zip(&cloud.normals)
+            .filter_map(|(q, n)| {
+                let d = q - p;
+                let t = d.dot(closing);
+                let near = t > 0.002 && t < limit && (d - closing * t).norm_squared() < RADIUS * RADIUS;
+                (near && n.dot(closing) > self.cone.cos()).then_some(t)
+            })
+            .collect();
+        hits.sort_by(f64::total_cmp);
+        let mut widths: Vec<Vec<f64>> = vec![];
+        for t in hits {
+            match widths.last_mut() {
+                Some(group) if t - group[group.len() - 1] < GAP => group.push(t),
+                _ => widths.push(vec![t]),
+            }
+        }
+        widths.iter().take(3).map(|group| group[group.len() / 2]).collect()
+    }
+
+    /// Approach directions upright to the closing direction, those from above first.
+    fn approaches(&self, closing: &Vec3) -> Vec<Vec3> {
+        let steepest = (self.down - closing * self.down.dot(closing)).try_normalize(0.05);
+        let start = steepest.unwrap_or_else(|| {
+            let any = if closing.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
+            closing.cross(&any).normalize()
+        });
+        let side = closing.cross(&start);
+        let n = self.options.approaches as i32;
+        (0..n)
+            .map(|k| {
+                // 0, 1, -1, 2, -2, ... steps, over 180 degrees.
+                let step = if k % 2 == 1 { (k + 1) / 2 } else { -(k / 2) };
+                let angle = f64::from(step) * 2.0 * FRAC_PI_2 / f64::from(n.max(2) - 1);
+                start * angle.cos() + side * angle.sin()
+            })
+            .filter(|a| a.dot(&self.down) >= self.options.max_tilt.cos() - 1e-9)
+            .collect()
+    }
+
+    /// The grasp that reaches furthest over the object along an approach, if there is one.
+    fn deepest(&self, centre: &Vec3, closing: &Vec3, approach: &Vec3, width: f64) -> Option<Grasp> {
+        let length = self.gripper.finger_length;
+        let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
+        [0.9, 0.6, 0.35, 0.2].into_iter().find_map(|share| {
+            let tip = centre + approach * (share * length);
+            let pose = gripper_pose(&tip, approach, closing)?;
+            self.grasp(&pose, opening)
+        })
+    }
+
+    /// The grasp at about this pose: moved along x so that the object is midway between the pads, tested and judged.
+    fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
+        if self.scene.hit(self.gripper, pose, opening).is_some() {
+            return None;
+        }
+        let (low, high) = self.extent(&self.between(pose, opening))?;
+        let width = high - low;
+        let centred = *pose * Pose::from_translation(Vec3::new(0.5 * (low + high), 0.0, 0.0));
+        let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
+        if opening < width + 0.003 || self.scene.hit(self.gripper, &centred, opening).is_some() {
+            return None;
+        }
+        let between = self.between(&centred, opening);
+        let quality = self.judge(&between, &centred)?;
+        Some(Grasp { camera_from_gripper: centred, opening, width, quality })
+    }
+
+    /// Points between the pads, in the gripper's frame: index and point.
+    fn between(&self, pose: &Pose, opening: f64) -> Vec<(usize, Vec3)> {
+        let rotation = pose.rotation_matrix().transpose();
+        let origin = pose.translation();
+        let (half_opening, half_width) = (0.5 * opening, 0.5 * self.gripper.finger_width);
+        let length = self.gripper.finger_length;
+        let reach = half_opening.max(half_width) + length;
+        let points = self.object.cloud.points.iter().enumerate();
+        points
+            .filter_map(|(i, p)| {
+                let d = p - origin;
+                if d.norm_squared() > reach * reach {
+                    return None;
+                }
+                let q = rotation * d;
+                (q.x.abs() < half_opening && q.y.abs() < half_width && q.z < 0.0 && q.z > -length)
+                    .then_some((i, q))
+            })
+            .collect()
+    }
+
+    /// How far the points between the pads reach along x, without the two outermost on each side.
+    fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
+        if between.len() < 8 {
+            return None;
+        }
+        let mut x: Vec<f64> = between.iter().map(|(_, q)| q.x).collect();
+        x.sort_by(f64::total_cmp);
+        Some((x[2], x[x.len() - 3]))
+    }
+
+    /// The quality of the contacts; `None` when one of them is outside its friction cone.
+    fn judge(&self, between: &[(usize, Vec3)], pose: &Pose) -> Option<AntipodalQuality> {
+        let (low, high) = self.extent(between)?;
+        let closing = pose.transform_direction(&Vec3::x());
+        let depth = self.options.contact_depth;
+        let mut angle = 0.0f64;
+        let mut support = f64::INFINITY;
+        let (mut seen, mut all) = (0usize, 0usize);
+        for side in [-1.0, 1.0] {
+            let edge = if side < 0.0 { low + depth } else { high - depth };
+            let contact: Vec<usize> =
+                between.iter().filter(|(_, q)| (q.x - edge) * side >= 0.0).map(|(i, _)| *i).collect();
+            let sum: Vec3 = contact.iter().map(|&i| self.object.cloud.normals[i]).sum();
+            let normal = sum.try_normalize(1e-9)?;
+            angle = angle.max((normal.dot(&closing) * side).clamp(-1.0, 1.0).acos());
+            let area = contact.len() as f64 * CLOUD_STEP * CLOUD_STEP;
+            support = support.min(area / (0.5 * self.gripper.finger_width * 0.015));
+            seen += contact.iter().filter(|&&i| i < self.object.observed).count();
+            all += contact.len();
+        }
+        if angle > self.cone || all == 0 {
+            return None;
+        }
+        let middle: Vec3 =
+            between.iter().map(|(i, _)| self.object.cloud.points[*i]).sum::<Vec3>() / between.len() as f64;
+        // The horizontal distance from the middle of what is held to the line of gravity through the object's middle,
+        // less what lies along the closing axis, about which the pads' friction does not have to hold.
+        let lever = self.centre - middle;
+        let lever = lever - self.down * lever.dot(&self.down);
+        let across = lever - closing * lever.dot(&closing);
+        Some(AntipodalQuality {
+            alignment: (1.0 - angle / self.cone).clamp(0.0, 1.0),
+            support: support.min(1.0),
+            centring: (-across.norm() / 0.05).exp(),
+            observed: seen as f64 / all as f64,
+        })
+    }
+}
+
+/// Area of surface that a point of the thinned cloud stands for is the square of this, metres.
+const CLOUD_STEP: f64 = 0.003;
+
+/// A direction tilted by `tilt` radians towards the side that `turn` says.
+fn tilted(direction: &Vec3, turn: f64, tilt: f64) -> Vec3 {
+    let any = if direction.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
+    let u = direction.cross(&any).normalize();
+    let v = direction.cross(&u);
+    direction * tilt.cos() + (u * turn.cos() + v * turn.sin()) * tilt.sin()
+}

@@ -1,0 +1,105 @@
+//! Proposals that mean the same grasp, joined: within 5 cm and 15 degrees (dissertation, section 6.3.2).
+//!
+//! The dissertation executes the mean pose of the cluster with the highest summed score. A mean of free poses need not be
+//! free and its fingers need not stand across the object, so a cluster here is represented by its best member.
+
+use crate::{Grasp, OptionsError};
+
+/// How near two grasps are that count as one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClusterOptions {
+    /// Largest distance of the tips' middles, metres.
+    pub distance: f64,
+    /// Largest angle between the orientations, radians; the gripper's half turn counts as none.
+    pub angle: f64,
+}
+
+impl Default for ClusterOptions {
+    fn default() -> Self {
+        ClusterOptions { distance: 0.05, angle: 15f64.to_radians() }
+    }
+}
+
+impl ClusterOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`OptionsError`]: a distance or an angle that is not finite and above zero.
+    pub fn check(&self) -> Result<(), OptionsError> {
+        for (field, found) in [("distance", self.distance), ("angle", self.angle)] {
+            if !(found > 0.0 && found.is_finite()) {
+                return Err(OptionsError { field, found, expected: "a finite number above 0" });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Grasps that mean the same.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GraspCluster {
+    /// The member with the highest quality.
+    pub best: Grasp,
+    /// How many proposals were joined.
+    pub members: usize,
+    /// The sum of their qualities.
+    pub score: f64,
+}
+
+/// Joins grasps, best first: the best grasp left takes all that are near to it. The clusters come in the order of their
+/// score, the highest first; equal ones in the order of their best members.
+pub fn cluster_grasps(grasps: &[Grasp], options: &ClusterOptions) -> Vec<GraspCluster> {
+    let mut order: Vec<usize> = (0..grasps.len()).collect();
+    order.sort_by(|&a, &b| {
+        grasps[b].quality.total().total_cmp(&grasps[a].quality.total()).then(a.cmp(&b))
+    });
+    let mut left = vec![true; grasps.len()];
+    let mut clusters = vec![];
+    for &seed in &order {
+        if !left[seed] {
+            continue;
+        }
+        let mut cluster = GraspCluster { best: grasps[seed], members: 0, score: 0.0 };
+        for &i in &order {
+            let (distance, angle) = grasps[seed].difference(&grasps[i]);
+            if left[i] && distance <= options.distance && angle <= options.angle {
+                left[i] = false;
+                cluster.members += 1;
+                cluster.score += grasps[i].quality.total();
+            }
+        }
+        clusters.push(cluster);
+    }
+    clusters.sort_by(|a, b| b.score.total_cmp(&a.score));
+    clusters
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::AntipodalQuality;
+    use sixfold_geometry::Pose;
+
+    fn grasp(twist: [f64; 6], alignment: f64) -> Grasp {
+        let quality = AntipodalQuality { alignment, support: 1.0, centring: 1.0, observed: 1.0 };
+        Grasp { camera_from_gripper: Pose::exp(&twist.into()), opening: 0.05, width: 0.04, quality }
+    }
+
+    #[test]
+    fn near_ones_are_joined_and_the_half_turn_is_near() {
+        let pi = std::f64::consts::PI;
+        let grasps = [
+            grasp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], 0.5),
+            grasp([0.03, 0.0, 0.5, 0.0, 0.0, 0.1], 0.9),
+            grasp([0.0, 0.0, 0.5, 0.0, 0.0, pi], 0.4),
+            grasp([0.2, 0.0, 0.5, 0.0, 0.0, 0.0], 1.0),
+            grasp([0.0, 0.0, 0.5, 0.0, 0.6, 0.0], 0.1),
+        ];
+        let clusters = cluster_grasps(&grasps, &ClusterOptions::default());
+        assert_eq!(clusters.iter().map(|c| c.members).collect::<Vec<_>>(), [3, 1, 1]);
+        assert_eq!(clusters[0].best, grasps[1]);
+        assert!(cluster_grasps(&[], &ClusterOptions::default()).is_empty());
+        let wrong = ClusterOptions { angle: f64::NAN, ..ClusterOptions::default() }.check().unwrap_err();
+        assert!(wrong.to_string().contains("angle"), "{wrong}");
+    }
+}

@@ -1,0 +1,171 @@
+//! What the camera did not see, assumed from symmetry.
+//!
+//! One view shows half of an object, and a gripper has to close on the other half as well. Most things that stand on
+//! tables are symmetric about an upright plane, so the seen points are mirrored at the plane that contradicts the image
+//! least: a mirrored point may lie behind what was seen, never in front of it (Bohg et al. 2011, "Mind the gap: robotic
+//! grasping under incomplete observation", ICRA). A second plane about upright to the first is used when it is as good.
+
+use sixfold_geometry::{KdTree, Plane, PointCloud, Vec3};
+
+use crate::GraspView;
+
+/// How mirror planes are searched.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CompletionOptions {
+    /// Directions of upright planes that are tried.
+    pub directions: usize,
+    /// Distance between the planes tried in one direction, metres.
+    pub step: f64,
+    /// How far planes are shifted from the middle of the seen points, in steps to both sides.
+    pub shifts: i32,
+    /// A mirrored point this far in front of what was measured contradicts it, metres.
+    pub tolerance: f64,
+    /// Largest share of mirrored points that may contradict the image.
+    pub max_contradiction: f64,
+}
+
+impl Default for CompletionOptions {
+    fn default() -> Self {
+        CompletionOptions { directions: 24, step: 0.006, shifts: 6, tolerance: 0.01, max_contradiction: 0.08 }
+    }
+}
+
+/// The object's points, seen and assumed, in the camera's frame.
+#[derive(Debug, Clone, Default)]
+pub struct CompletedObject {
+    /// Points and their normals; the seen ones come first.
+    pub cloud: PointCloud,
+    /// How many of them were seen.
+    pub observed: usize,
+    /// The mirror planes used, at most two.
+    pub planes: Vec<Plane>,
+}
+
+/// What the image says of a point that nobody saw.
+#[derive(Clone, Copy, PartialEq)]
+enum Verdict {
+    /// Something further away was measured there.
+    Contradicted,
+    /// The object's surface was measured there.
+    Supported,
+    /// It lies behind the object.
+    Hidden,
+    /// The image does not say.
+    Unknown,
+}
+
+/// Completes the object of a view. Without a table there is no upright, and nothing is assumed.
+pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> CompletedObject {
+    let mut done =
+        CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] };
+    let Some(table) = view.table else { return done };
+    if view.object.normals.len() != view.object.len() || view.object.is_empty() {
+        return done;
+    }
+    let any = if table.normal.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
+    let u = table.normal.cross(&any).normalize();
+    let v = table.normal.cross(&u);
+    let stride = view.object.len().div_ceil(400).max(1);
+    let probes: Vec<Vec3> = view.object.points.iter().step_by(stride).copied().collect();
+    let mut found: Vec<(f64, Plane)> = vec![];
+    for k in 0..options.directions {
+        let angle = std::f64::consts::PI * k as f64 / options.directions as f64;
+        let normal = u * angle.cos() + v * angle.sin();
+        let mut along: Vec<f64> = probes.iter().map(|p| normal.dot(p)).collect();
+        along.sort_by(f64::total_cmp);
+        let at = |share: f64| along[(share * (along.len() - 1) as f64) as usize];
+        let middle = 0.5 * (at(0.02) + at(0.98));
+        let best = (-options.shifts..=options.shifts)
+            .filter_map(|shift| {
+                let plane = Plane { normal, offset: middle + f64::from(shift) * options.step };
+                judge(view, &probes, &plane, options).map(|score| (score, plane))
+            })
+            .fold(None, |best: Option<(f64, Plane)>, next| match best {
+                Some(b) if b.0 >= next.0 => Some(b),
+                _ => Some(next),
+            });
+        found.extend(best);
+    }
+    let best = |found: &[(f64, Plane)], other: Option<&Plane>| {
+        found
+            .iter()
+            .filter(|(_, p)| other.is_none_or(|o| p.normal.dot(&o.normal).abs() < 0.35))
+            .fold(None, |best: Option<(f64, Plane)>, next| match best {
+                Some(b) if b.0 >= next.0 => Some(b),
+                _ => Some(*next),
+            })
+    };
+    let Some((first_score, first)) = best(&found, None) else { return done };
+    done.planes.push(first);
+    if let Some((score, second)) = best(&found, Some(&first))
+        && score > 0.8 * first_score
+    {
+        done.planes.push(second);
+    }
+    let planes = done.planes.clone();
+    for plane in &planes {
+        add_mirrored(view, &mut done, plane, options);
+    }
+    done
+}
+
+/// How well the image agrees with the mirrored points; `None` when it contradicts them.
+fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionOptions) -> Option<f64> {
+    let (mut contradicted, mut supported, mut hidden) = (0usize, 0usize, 0usize);
+    for p in probes {
+        match verdict(view, &mirror(plane, p), options.tolerance) {
+            Verdict::Contradicted => contradicted += 1,
+            Verdict::Supported => supported += 1,
+            Verdict::Hidden => hidden += 1,
+            Verdict::Unknown => {}
+        }
+    }
+    let share = |count: usize| count as f64 / probes.len() as f64;
+    // Hidden points agree with everything, so they count for less than those that were seen again.
+    (share(contradicted) <= options.max_contradiction)
+        .then(|| share(supported) + 0.5 * share(hidden) - 2.0 * share(contradicted))
+}
+
+fn mirror(plane: &Plane, p: &Vec3) -> Vec3 {
+    p - plane.normal * (2.0 * plane.distance(p))
+}
+
+fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
+    let Some(pixel) = view.camera.project(p) else { return Verdict::Unknown };
+    let (x, y) = (pixel.x.round(), pixel.y.round());
+    if x < 0.0 || y < 0.0 || x >= view.depth.width() as f64 || y >= view.depth.height() as f64 {
+        return Verdict::Unknown;
+    }
+    let at = (x as usize, y as usize);
+    let measured = f64::from(view.depth[at]);
+    if measured <= 0.0 {
+        return Verdict::Unknown;
+    }
+    if measured - p.z > tolerance {
+        return Verdict::Contradicted;
+    }
+    if !view.mask[at] {
+        // In front of the table or of another thing by less than the tolerance, or behind another thing.
+        return Verdict::Unknown;
+    }
+    if p.z - measured > tolerance { Verdict::Hidden } else { Verdict::Supported }
+}
+
+/// Adds the mirror images of all points that lie where nothing was seen.
+fn add_mirrored(view: &GraspView, done: &mut CompletedObject, plane: &Plane, options: &CompletionOptions) {
+    let tree = KdTree::new(&done.cloud.points);
+    let mut points = vec![];
+    let mut normals = vec![];
+    for (p, n) in done.cloud.points.iter().zip(&done.cloud.normals) {
+        let q = mirror(plane, p);
+        let verdict = verdict(view, &q, options.tolerance);
+        let known = tree.nearest(&q).is_some_and(|near| near.distance < 0.006);
+        if verdict == Verdict::Contradicted || known {
+            continue;
+        }
+        points.push(q);
+        normals.push(n - plane.normal * (2.0 * plane.normal.dot(n)));
+    }
+    done.cloud.points.extend(points);
+    done.cloud.normals.extend(normals);
+}

@@ -1,0 +1,40 @@
+//! Grasps of a parallel-jaw gripper: the gripper, where it may go, and where it should.
+//!
+//! The gripper's frame, everywhere in Sixfold: the origin lies midway between the two finger tips, `z` is the approach
+//! direction (from the palm to the tips and on to the object), `x` the closing direction (from one finger to the
+//! other), `y = z × x` runs across the fingers. Turned by half a turn about `z`, the gripper is the same gripper.
+//! Lengths are in metres, forces in newtons.
+//!
+//! A depth image becomes a [`GraspView`] (the object's cloud, what else is there, the table). [`antipodal_grasps`] proposes
+//! grasps on it from geometry alone, [`cluster_grasps`] joins proposals that mean the same grasp, and [`draw_grasps`]
+//! shows them.
+//!
+//! ```
+//! use sixfold_grasp::Gripper;
+//! let gripper = Gripper::built_in("jaws-85").unwrap();
+//! assert_eq!(gripper.max_opening, 0.085);
+//! assert!(gripper.check("jaws-85").is_ok());
+//! ```
+
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+mod antipodal;
+mod cluster;
+mod collision;
+mod completion;
+mod draw;
+mod grasp;
+mod gripper;
+mod gripper_file;
+mod view;
+
+pub use antipodal::{AntipodalOptions, OptionsError, antipodal_grasps};
+pub use cluster::{ClusterOptions, GraspCluster, cluster_grasps};
+pub use collision::{CollisionScene, Hit};
+pub use completion::{CompletedObject, CompletionOptions, complete_by_mirrors};
+pub use draw::{DrawnGrasp, draw_grasps};
+pub use grasp::{AntipodalQuality, Grasp, gripper_pose};
+pub use gripper::{Gripper, GripperBox};
+pub use gripper_file::{GripperError, parse_gripper, read_gripper};
+pub use view::{GraspView, ViewError, ViewOptions, find_objects};

@@ -1,0 +1,381 @@
+//! What one depth image tells about an object to be grasped: its points, the points around it, the table.
+
+use std::collections::VecDeque;
+
+use sixfold_geometry::{
+    Camera, CameraError, DepthImage, Image, Mask, NormalOptions, Plane, PlaneOptions, PointCloud, Rect, Vec2,
+    Vec3, dominant_plane, inpaint_depth, normals_from_depth,
+};
+use thiserror::Error;
+
+/// Why a depth image shows no object to grasp.
+#[derive(Debug, Error, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum ViewError {
+    /// The image does not belong to the camera.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The mask does not belong to the image.
+    #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}: give the mask of this image")]
+    MaskSize {
+        /// Width of the mask.
+        found_width: usize,
+        /// Height of the mask.
+        found_height: usize,
+        /// Width of the depth image.
+        width: usize,
+        /// Height of the depth image.
+        height: usize,
+    },
+    /// No pixel has depth.
+    #[error("the depth image has no valid pixel (all {pixels} are zero or not finite): check the file and its depth scale")]
+    NoDepth {
+        /// Pixels in the image.
+        pixels: usize,
+    },
+    /// All depth lies where no tabletop object can be.
+    #[error(
+        "the depth lies between {nearest:.4} m and {farthest:.4} m, outside 0.05 m to 20 m: is the depth scale wrong by a factor of 1000?"
+    )]
+    Scale {
+        /// Smallest valid depth in metres.
+        nearest: f32,
+        /// Largest valid depth in metres.
+        farthest: f32,
+    },
+    /// The mask has no pixel.
+    #[error("the mask is empty: no pixel is above zero; mark the pixels of the object")]
+    EmptyMask,
+    /// The mask has pixels, but next to nothing was measured there.
+    #[error(
+        "the mask has {pixels} pixels, {measured} of them with depth, expected at least {expected}: the sensor saw nothing there (a glossy or transparent object?), or mask and depth do not belong together"
+    )]
+    NoDepthInMask {
+        /// Pixels of the mask.
+        pixels: usize,
+        /// Those with a valid depth above the table.
+        measured: usize,
+        /// How many are needed.
+        expected: usize,
+    },
+    /// The mask covers things that lie apart.
+    #[error(
+        "the mask covers {parts} things that lie apart (the largest two have {first} and {second} pixels), expected one object: split the mask"
+    )]
+    SeveralObjects {
+        /// How many parts there are.
+        parts: usize,
+        /// Pixels of the largest part.
+        first: usize,
+        /// Pixels of the second largest.
+        second: usize,
+    },
+}
+
+/// How a view is prepared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ViewOptions {
+    /// How normals are computed.
+    pub normals: NormalOptions,
+    /// Rounds of in-painting before normals are computed.
+    pub inpaint_rounds: usize,
+    /// How the table is searched.
+    pub plane: PlaneOptions,
+    /// Points lower than this above the table belong to the table, metres.
+    pub table_margin: f64,
+    /// Neighbouring pixels further apart than this do not belong to the same object, metres.
+    pub gap: f64,
+    /// Least number of measured pixels of an object.
+    pub min_pixels: usize,
+    /// What lies within this distance around the object's box is kept as obstacle, metres.
+    pub surroundings: f64,
+    /// The object's cloud is thinned to this, metres.
+    pub step: f64,
+    /// Depth beyond this is left out, metres.
+    pub max_depth: f64,
+    /// Seed of the plane search.
+    pub seed: u64,
+}
+
+impl Default for ViewOptions {
+    fn default() -> Self {
+        ViewOptions {
+            normals: NormalOptions { radius: 4, ..NormalOptions::default() },
+            inpaint_rounds: 2,
+            plane: PlaneOptions::default(),
+            table_margin: 0.008,
+            gap: 0.015,
+            min_pixels: 150,
+            surroundings: 0.2,
+            step: 0.003,
+            max_depth: 3.0,
+            seed: 0,
+        }
+    }
+}
+
+/// A depth image prepared for grasping; everything is in the camera's frame.
+#[derive(Debug, Clone)]
+pub struct GraspView {
+    /// The camera, without distortion.
+    pub camera: Camera,
+    /// Depth as measured, metres, 0 where nothing was measured.
+    pub depth: DepthImage,
+    /// The object's pixels: of the mask, measured, above the table.
+    pub mask: Mask,
+    /// The table, its normal up; `None` when no plane was found.
+    pub table: Option<Plane>,
+    /// The object's points with their normals, thinned.
+    pub object: PointCloud,
+    /// What else stands around the object, without the table and without normals.
+    pub obstacles: PointCloud,
+    /// The object touches the edge of the image: a part of it was not seen.
+    pub cut_by_edge: bool,
+}
+
+impl GraspView {
+    /// Prepares the view of the object in `mask`, from a depth image in metres of a camera without distortion (undo it
+    /// first).
+    ///
+    /// # Errors
+    /// [`ViewError`].
+    pub fn new(
+        depth: &DepthImage,
+        camera: &Camera,
+        mask: &Mask,
+        options: &ViewOptions,
+    ) -> Result<GraspView, ViewError> {
+        let depth = checked(depth, camera, options)?;
+        if mask.size() != depth.size() {
+            return Err(ViewError::MaskSize {
+                found_width: mask.width(),
+                found_height: mask.height(),
+                width: depth.width(),
+                height: depth.height(),
+            });
+        }
+        let pixels = mask.as_slice().iter().filter(|m| **m).count();
+        if pixels == 0 {
+            return Err(ViewError::EmptyMask);
+        }
+        let table = table(&depth, camera, options);
+        let above = above_table(&depth, camera, table.as_ref(), 0.5 * options.table_margin);
+        let mut object = Mask::from_fn(depth.width(), depth.height(), |x, y| mask[(x, y)] && above[(x, y)]);
+        let parts = components(&object, &depth, camera, options.gap);
+        let measured = parts.iter().map(Vec::len).sum();
+        let largest = parts.first().map_or(0, Vec::len);
+        if largest < options.min_pixels {
+            return Err(ViewError::NoDepthInMask { pixels, measured, expected: options.min_pixels });
+        }
+        if let Some(second) = parts.get(1).filter(|p| p.len() >= options.min_pixels && 4 * p.len() > largest)
+            && apart(&parts[0], second, &depth, camera)
+        {
+            let large = parts.iter().filter(|p| p.len() >= options.min_pixels).count();
+            return Err(ViewError::SeveralObjects { parts: large, first: largest, second: second.len() });
+        }
+        // Specks are noise; parts of some size may be one object behind a bar.
+        object = Mask::filled(depth.width(), depth.height(), false);
+        for &pixel in parts.iter().filter(|p| 20 * p.len() >= largest).flatten() {
+            object.as_mut_slice()[pixel] = true;
+        }
+        Ok(Self::of_object(depth, camera, object, table, options))
+    }
+
+    fn of_object(
+        depth: DepthImage,
+        camera: &Camera,
+        mask: Mask,
+        table: Option<Plane>,
+        options: &ViewOptions,
+    ) -> GraspView {
+        let (width, height) = depth.size();
+        let (mut x0, mut y0, mut x1, mut y1) = (width, height, 0, 0);
+        let mut nearest = f64::INFINITY;
+        for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+            if mask[(x, y)] {
+                (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x), y1.max(y));
+                nearest = nearest.min(f64::from(depth[(x, y)]));
+            }
+        }
+        let cut_by_edge = x0 == 0 || y0 == 0 || x1 + 1 == width || y1 + 1 == height;
+        // Only the surroundings are worked on: whole images cost ten times as much.
+        let reach = (options.surroundings * camera.fx.max(camera.fy) / nearest.max(0.05)).ceil() as usize;
+        let (left, top) = (x0.saturating_sub(reach), y0.saturating_sub(reach));
+        let (right, bottom) = ((x1 + 1 + reach).min(width), (y1 + 1 + reach).min(height));
+        let rect = Rect {
+            x: left as f64,
+            y: top as f64,
+            width: (right - left) as f64,
+            height: (bottom - top) as f64,
+        };
+        let near = camera.crop(&rect);
+        let part = Image::from_fn(right - left, bottom - top, |x, y| depth[(left + x, top + y)]);
+        let normals = normals_from_depth(&inpaint_depth(&part, options.inpaint_rounds), &near, &options.normals);
+        let only = |keep: &dyn Fn(usize, usize) -> bool| {
+            Image::from_fn(part.width(), part.height(), |x, y| if keep(x, y) { part[(x, y)] } else { 0.0 })
+        };
+        let inside = |x: usize, y: usize| mask[(left + x, top + y)];
+        let known = |x: usize, y: usize| inside(x, y) && normals[(x, y)] != [0.0; 3];
+        let mut object = PointCloud::from_depth(&only(&known), Some(&normals), &near)
+            .voxel_downsample(options.step, 60f64.to_radians());
+        if object.normals.len() != object.points.len() {
+            object.normals.clear();
+        }
+        // The table's noise reaches higher than its margin; what is as low as that the table's plane stands for.
+        let above = above_table(&part, &near, table.as_ref(), 1.5 * options.table_margin);
+        let obstacles =
+            PointCloud::from_depth(&only(&|x, y| !inside(x, y) && above[(x, y)]), None, &near)
+                .voxel_downsample(2.0 * options.step, 1.0);
+        let obstacles = PointCloud { points: without_specks(obstacles.points), normals: vec![] };
+        GraspView { camera: *camera, depth, mask, table, object, obstacles, cut_by_edge }
+    }
+}
+
+/// Points with at least two others within 2 cm: flying pixels are lonely.
+fn without_specks(points: Vec<Vec3>) -> Vec<Vec3> {
+    let tree = sixfold_geometry::KdTree::new(&points);
+    points.iter().filter(|p| tree.within(p, 0.02).len() > 3).copied().collect()
+}
+
+/// Masks of the things that stand on the table, largest first; none without a table.
+///
+/// # Errors
+/// [`ViewError`] for a depth image that is unusable or of another size than the camera.
+pub fn find_objects(
+    depth: &DepthImage,
+    camera: &Camera,
+    options: &ViewOptions,
+) -> Result<Vec<Mask>, ViewError> {
+    let depth = checked(depth, camera, options)?;
+    let Some(table) = table(&depth, camera, options) else { return Ok(vec![]) };
+    // What stands on the table stands over a measured part of it: the room behind the table's edge does not.
+    let above = above_table(&depth, camera, Some(&table), options.table_margin);
+    let on_table = footprint(&depth, camera, &table, options);
+    let candidates = Image::from_fn(depth.width(), depth.height(), |x, y| {
+        above[(x, y)] && on_table(&point_at(&depth, camera, x, y))
+    });
+    let parts = components(&candidates, &depth, camera, options.gap);
+    Ok(parts
+        .into_iter()
+        .filter(|part| part.len() >= options.min_pixels)
+        .map(|part| {
+            let mut mask = Mask::filled(depth.width(), depth.height(), false);
+            for pixel in part {
+                mask.as_mut_slice()[pixel] = true;
+            }
+            mask
+        })
+        .collect())
+}
+
+/// Whether a point lies over the part of the table that was measured: within the box around its points along two
+/// directions of the plane.
+fn footprint(
+    depth: &DepthImage,
+    camera: &Camera,
+    table: &Plane,
+    options: &ViewOptions,
+) -> impl Fn(&Vec3) -> bool {
+    let any = if table.normal.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
+    let u = table.normal.cross(&any).normalize();
+    let v = table.normal.cross(&u);
+    let (mut along_u, mut along_v) = (vec![], vec![]);
+    for (x, y) in (0..depth.height()).step_by(4).flat_map(|y| (0..depth.width()).step_by(4).map(move |x| (x, y))) {
+        if depth[(x, y)] > 0.0 {
+            let p = point_at(depth, camera, x, y);
+            if table.distance(&p).abs() < options.plane.threshold {
+                along_u.push(u.dot(&p));
+                along_v.push(v.dot(&p));
+            }
+        }
+    }
+    let range = |mut values: Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        let at = |share: f64| {
+            values.get((share * values.len().saturating_sub(1) as f64) as usize).copied().unwrap_or(0.0)
+        };
+        (at(0.01), at(0.99))
+    };
+    let (u_range, v_range) = (range(along_u), range(along_v));
+    move |p| {
+        let (a, b) = (u.dot(p), v.dot(p));
+        a > u_range.0 && a < u_range.1 && b > v_range.0 && b < v_range.1
+    }
+}
+
+fn checked(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Result<DepthImage, ViewError> {
+    camera.check()?;
+    camera.check_image(depth.width(), depth.height())?;
+    let depth = depth.map(|&z| if z > 0.0 && z.is_finite() { z } else { 0.0 });
+    let valid = depth.as_slice().iter().copied().filter(|&z| z > 0.0);
+    let (nearest, farthest) = valid.fold((f32::INFINITY, 0f32), |(a, b), z| (a.min(z), b.max(z)));
+    if farthest == 0.0 {
+        return Err(ViewError::NoDepth { pixels: depth.as_slice().len() });
+    }
+    if farthest < 0.05 || nearest > 20.0 {
+        return Err(ViewError::Scale { nearest, farthest });
+    }
+    Ok(depth.map(|&z| if f64::from(z) <= options.max_depth { z } else { 0.0 }))
+}
+
+fn point_at(depth: &DepthImage, camera: &Camera, x: usize, y: usize) -> Vec3 {
+    camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(depth[(x, y)]))
+}
+
+/// The table, from every third pixel in both directions.
+fn table(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Option<Plane> {
+    let thinned = Image::from_fn(depth.width(), depth.height(), |x, y| {
+        if x % 3 == 0 && y % 3 == 0 { depth[(x, y)] } else { 0.0 }
+    });
+    dominant_plane(&PointCloud::from_depth(&thinned, None, camera), &options.plane, options.seed)
+}
+
+/// Pixels whose point is more than `margin` above the table; all measured ones without a table.
+fn above_table(depth: &DepthImage, camera: &Camera, table: Option<&Plane>, margin: f64) -> Mask {
+    Mask::from_fn(depth.width(), depth.height(), |x, y| {
+        depth[(x, y)] > 0.0 && table.is_none_or(|t| t.distance(&point_at(depth, camera, x, y)) > margin)
+    })
+}
+
+/// Pixels that hang together, largest part first: neighbours up to two pixels away whose points are nearer than `gap`.
+fn components(mask: &Mask, depth: &DepthImage, camera: &Camera, gap: f64) -> Vec<Vec<usize>> {
+    let (width, height) = mask.size();
+    let mut left = mask.as_slice().to_vec();
+    let mut parts = vec![];
+    for start in 0..left.len() {
+        if !left[start] {
+            continue;
+        }
+        left[start] = false;
+        let mut part = vec![start];
+        let mut queue = VecDeque::from([start]);
+        while let Some(pixel) = queue.pop_front() {
+            let (x, y) = (pixel % width, pixel / width);
+            let here = point_at(depth, camera, x, y);
+            for v in y.saturating_sub(2)..(y + 3).min(height) {
+                for u in x.saturating_sub(2)..(x + 3).min(width) {
+                    let next = v * width + u;
+                    if left[next] && (point_at(depth, camera, u, v) - here).norm() < gap {
+                        left[next] = false;
+                        part.push(next);
+                        queue.push_back(next);
+                    }
+                }
+            }
+        }
+        parts.push(part);
+    }
+    // Stable: equal parts stay in the order of their first pixels.
+    parts.sort_by_key(|part| std::cmp::Reverse(part.len()));
+    parts
+}
+
+/// Whether two parts are two things: no point of one is within 4 cm of the other.
+fn apart(a: &[usize], b: &[usize], depth: &DepthImage, camera: &Camera) -> bool {
+    let points = |part: &[usize]| -> Vec<Vec3> {
+        let width = depth.width();
+        part.iter().step_by(3).map(|&i| point_at(depth, camera, i % width, i / width)).collect()
+    };
+    let tree = sixfold_geometry::KdTree::new(&points(a));
+    points(b).iter().all(|p| tree.nearest(p).is_none_or(|n| n.distance > 0.04))
+}

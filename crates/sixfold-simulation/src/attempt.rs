@@ -1,0 +1,173 @@
+//! One whole attempt: an object comes to rest, a depth camera looks, the planner proposes, the hand tries.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, Grasp, GraspView, Gripper, ViewOptions, antipodal_grasps, cluster_grasps,
+    find_objects,
+};
+use sixfold_mesh::Mesh;
+use sixfold_render::DepthSensor;
+
+use crate::{
+    ConvexParts, Outcome, SimulatedView, SimulationError, TrialOptions, TrialReport, ViewPoint, settle,
+    simulate_view, try_grasp,
+};
+
+/// What is drawn anew in every attempt, and with what it is tried.
+#[derive(Debug, Clone, Copy)]
+pub struct AttemptOptions {
+    /// Let the object fall in any orientation; otherwise it stands with its own z axis up, turned about it.
+    pub any_orientation: bool,
+    /// The camera's elevation above the table, smallest and largest, radians.
+    pub elevation: (f64, f64),
+    /// The camera's distance, smallest and largest, metres.
+    pub distance: (f64, f64),
+    /// The depth camera's noise.
+    pub sensor: Option<DepthSensor>,
+    /// How the view is prepared.
+    pub view: ViewOptions,
+    /// How grasps are proposed.
+    pub planner: AntipodalOptions,
+    /// How proposals are joined.
+    pub clusters: ClusterOptions,
+    /// How they are tried.
+    pub trial: TrialOptions,
+}
+
+impl Default for AttemptOptions {
+    fn default() -> Self {
+        AttemptOptions {
+            any_orientation: false,
+            elevation: (30f64.to_radians(), 60f64.to_radians()),
+            distance: (0.7, 1.0),
+            sensor: Some(DepthSensor::kinect()),
+            view: ViewOptions::default(),
+            planner: AntipodalOptions::default(),
+            clusters: ClusterOptions::default(),
+            trial: TrialOptions::default(),
+        }
+    }
+}
+
+/// How an attempt ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ending {
+    /// The object did not come to rest on the table: not an attempt of the planner.
+    NoRest,
+    /// Nothing was found on the table.
+    NotSeen,
+    /// No grasp was proposed.
+    NoProposal,
+    /// A grasp was tried.
+    Tried(Outcome),
+}
+
+impl Ending {
+    /// Whether the object was held.
+    pub fn is_success(self) -> bool {
+        self == Ending::Tried(Outcome::Held)
+    }
+}
+
+/// One attempt.
+#[derive(Debug, Clone)]
+pub struct Attempt {
+    /// How it ended.
+    pub ending: Ending,
+    /// Where the object lay.
+    pub world_from_object: Pose,
+    /// What was seen.
+    pub view: Option<SimulatedView>,
+    /// The grasps that were proposed, clusters' best members in the order of their rank.
+    pub proposals: Vec<Grasp>,
+    /// What happened to the first of them.
+    pub report: Option<TrialReport>,
+    /// Time from the depth image to the ranked proposals, seconds.
+    pub planning_seconds: f64,
+    /// Time for the physics trial, seconds.
+    pub trial_seconds: f64,
+}
+
+/// Makes attempt `number`: pose, view point and noise are drawn from `seed` and `number` alone.
+///
+/// # Errors
+/// [`SimulationError`] for options out of range.
+pub fn attempt(
+    mesh: &Mesh,
+    parts: &ConvexParts,
+    gripper: &Gripper,
+    options: &AttemptOptions,
+    seed: u64,
+    number: u64,
+) -> Result<Attempt, SimulationError> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(number);
+    let yaw = random.random_range(-std::f64::consts::PI..std::f64::consts::PI);
+    let upright = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, yaw].into());
+    let any: [f64; 4] = std::array::from_fn(|_| random.random_range(-1.0..1.0));
+    let start = if options.any_orientation {
+        let q = Quaternion::new(any[0], any[1], any[2], any[3]);
+        Pose::new(UnitQuaternion::from_quaternion(q), Vec3::zeros())
+    } else {
+        upright
+    };
+    let mut draw = |(low, high): (f64, f64)| low + (high - low) * random.random::<f64>();
+    let azimuth = draw((-std::f64::consts::PI, std::f64::consts::PI));
+    let elevation = draw(options.elevation);
+    let distance = draw(options.distance);
+    let offset = Vec3::new(draw((-0.05, 0.05)), draw((-0.05, 0.05)), 0.0);
+    let noise: u64 = random.random();
+
+    let mut result = Attempt {
+        ending: Ending::NoRest,
+        world_from_object: start,
+        view: None,
+        proposals: vec![],
+        report: None,
+        planning_seconds: 0.0,
+        trial_seconds: 0.0,
+    };
+    let Some(rest) = settle(parts, &start)? else { return Ok(result) };
+    // Back to the middle of the table, wherever it rolled.
+    let (low, high) = mesh.transformed(&rest).bounding_box();
+    let middle = (low + high) * 0.5;
+    let rest = rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0));
+    result.world_from_object = rest;
+    let point = ViewPoint {
+        azimuth,
+        elevation,
+        distance,
+        target: offset + Vec3::z() * (0.5 * (high.z - low.z)),
+    };
+    result.ending = Ending::NotSeen;
+    let Ok(seen) = simulate_view(mesh, &rest, &point, options.sensor.as_ref(), noise) else {
+        return Ok(result);
+    };
+    let began = std::time::Instant::now();
+    let world_from_camera = seen.world_from_camera;
+    let view_options = ViewOptions { seed: noise, ..options.view };
+    let masks = find_objects(&seen.depth, &seen.camera, &view_options).unwrap_or_default();
+    let view = masks.first().and_then(|mask| GraspView::new(&seen.depth, &seen.camera, mask, &view_options).ok());
+    result.view = Some(seen);
+    let Some(view) = view else { return Ok(result) };
+    result.ending = Ending::NoProposal;
+    let planner = AntipodalOptions { seed: noise, ..options.planner };
+    let grasps = antipodal_grasps(&view, gripper, &planner)
+        .map_err(|e| SimulationError::Option { field: e.field, found: e.found, expected: e.expected })?;
+    let clusters = cluster_grasps(&grasps, &options.clusters);
+    result.planning_seconds = began.elapsed().as_secs_f64();
+    result.proposals = clusters.iter().map(|c| c.best).collect();
+    let Some(grasp) = result.proposals.first() else { return Ok(result) };
+    let began = std::time::Instant::now();
+    let world_from_gripper = world_from_camera * grasp.camera_from_gripper;
+    let report = try_grasp(parts, &rest, gripper, &world_from_gripper, grasp.opening, &options.trial)?;
+    result.trial_seconds = began.elapsed().as_secs_f64();
+    result.report = Some(report);
+    result.ending = Ending::Tried(report.outcome);
+    Ok(result)
+}

@@ -1,0 +1,42 @@
+//! A simulated robot: a parallel-jaw gripper that tries grasps in a physics engine.
+//!
+//! The gripper comes along its approach direction, closes with a limited force, lifts, and shakes. What holds the object is
+//! Coulomb friction and nothing else: no finger is glued to anything, and none is driven with unlimited force. A trial is a
+//! function of its arguments: the same numbers in, the same numbers out, on every machine.
+//!
+//! The world's frame: `z` up, the table's top at `z = 0`. Metres, kilograms, newtons, seconds. The engine (Rapier) counts
+//! in `f32`; what goes in and comes out is `f64`.
+//!
+//! ```
+//! use sixfold_geometry::{Pose, Vec3};
+//! use sixfold_grasp::{Gripper, gripper_pose};
+//! use sixfold_simulation::{ConvexParts, Outcome, TrialOptions, shapes, try_grasp};
+//! let cube = ConvexParts::of_convex(&shapes::cuboid(Vec3::repeat(0.05)).unwrap())?;
+//! let world_from_object = Pose::from_translation(Vec3::new(0.0, 0.0, 0.025));
+//! let gripper = Gripper::built_in("jaws-85").unwrap();
+//! let grasp = gripper_pose(&Vec3::new(0.0, 0.0, 0.01), &-Vec3::z(), &Vec3::x()).unwrap();
+//! let report = try_grasp(&cube, &world_from_object, &gripper, &grasp, 0.07, &TrialOptions::default())?;
+//! assert_eq!(report.outcome, Outcome::Held);
+//! # Ok::<(), sixfold_simulation::SimulationError>(())
+//! ```
+
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+mod attempt;
+mod error;
+mod parts;
+mod settle;
+pub mod shapes;
+mod statistics;
+mod trial;
+mod view;
+mod world;
+
+pub use attempt::{Attempt, AttemptOptions, Ending, attempt};
+pub use error::SimulationError;
+pub use parts::{ConvexParts, PartsOptions};
+pub use settle::settle;
+pub use statistics::wilson_interval;
+pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};
+pub use view::{SimulatedView, ViewPoint, simulate_view};
