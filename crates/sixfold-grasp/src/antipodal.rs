@@ -2,16 +2,16 @@
 //!
 //! A pair of contacts holds by friction when the line between them lies inside both friction cones (Nguyen 1988,
 //! "Constructing force-closure grasps"; for points with normals Chen and Burdick 1993). As in Ten Pas et al. 2017 ("Grasp
-//! pose detection in point clouds") a contact is drawn from the cloud, the closing direction from its normal, and the
+//! pose detection in point clouds") a contact is drawn from the cloud, the closing direction from its normal or a second contact, and the
 //! approach from the directions around it; unlike there, no network judges the result, so this is no GPD but the
 //! antipodal planner that GPD filters. Nothing is known of the robot's arm: what it cannot reach is not left out.
 
-use std::f64::consts::{FRAC_PI_2, TAU};
+use std::f64::consts::FRAC_PI_2;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{KdTree, Pose, Vec3};
 use thiserror::Error;
 
 use crate::{
@@ -34,9 +34,13 @@ pub struct OptionsError {
 /// How the planner samples.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AntipodalOptions {
-    /// First contacts that are drawn.
+    /// First contacts that are drawn in one round.
     pub samples: usize,
-    /// Closing directions per contact: the normal itself and others inside the friction cone.
+    /// Most rounds; there is another one while fewer than `enough` grasps were found.
+    pub rounds: usize,
+    /// See `rounds`.
+    pub enough: usize,
+    /// Closing directions per contact: against its normal, and towards drawn second contacts.
     pub closings: usize,
     /// Approach directions around each closing direction, over 180 degrees about the one from above.
     pub approaches: usize,
@@ -56,6 +60,8 @@ impl Default for AntipodalOptions {
     fn default() -> Self {
         AntipodalOptions {
             samples: 400,
+            rounds: 4,
+            enough: 25,
             closings: 3,
             approaches: 7,
             clearance: 0.012,
@@ -74,7 +80,12 @@ impl AntipodalOptions {
     /// [`OptionsError`], naming the first field out of range.
     pub fn check(&self) -> Result<(), OptionsError> {
         for (field, found) in
-            [("samples", self.samples), ("closings", self.closings), ("approaches", self.approaches)]
+            [
+                ("samples", self.samples),
+                ("rounds", self.rounds),
+                ("closings", self.closings),
+                ("approaches", self.approaches),
+            ]
         {
             if !(1..=1_000_000).contains(&found) {
                 return Err(OptionsError { field, found: found as f64, expected: "1 to 1000000" });
@@ -122,19 +133,29 @@ pub fn antipodal_grasps(
         options,
         down: view.table.map_or_else(Vec3::z, |t| -t.normal),
         centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
+        tree: KdTree::new(&object.cloud.points),
         object,
         scene,
         cone: gripper.friction.atan(),
+        step: view.step,
     };
-    let grasps: Vec<Vec<Grasp>> = (0..options.samples)
-        .into_par_iter()
-        .map(|sample| {
-            let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-            random.set_stream(sample as u64);
-            planner.sample(&mut random)
-        })
-        .collect();
-    Ok(grasps.concat())
+    let mut grasps = vec![];
+    for round in 0..options.rounds {
+        if round > 0 && grasps.len() >= options.enough {
+            break;
+        }
+        let samples = round * options.samples..(round + 1) * options.samples;
+        let found: Vec<Vec<Grasp>> = samples
+            .into_par_iter()
+            .map(|sample| {
+                let mut random = ChaCha8Rng::seed_from_u64(options.seed);
+                random.set_stream(sample as u64);
+                planner.sample(&mut random)
+            })
+            .collect();
+        grasps.extend(found.into_iter().flatten());
+    }
+    Ok(grasps)
 }
 
 struct Planner<'a> {
@@ -144,9 +165,12 @@ struct Planner<'a> {
     down: Vec3,
     centre: Vec3,
     object: CompletedObject,
+    tree: KdTree,
     scene: CollisionScene,
     /// Half angle of the friction cone, radians.
     cone: f64,
+    /// A point stands for the square of this of surface, metres.
+    step: f64,
 }
 
 impl Planner<'_> {
@@ -157,8 +181,8 @@ impl Planner<'_> {
         let (p, n) = (cloud.points[first], cloud.normals[first]);
         let mut grasps = vec![];
         for k in 0..self.options.closings {
-            let (turn, tilt): (f64, f64) = (random.random::<f64>() * TAU, random.random::<f64>().sqrt());
-            let closing = if k == 0 { -n } else { tilted(&-n, turn, tilt * 0.8 * self.cone) };
+            let closing = if k == 0 { Some(-n) } else { self.towards_partner(&p, &n, random) };
+            let Some(closing) = closing else { continue };
             for width in self.widths(&p, &closing) {
                 let centre = p + closing * (0.5 * width);
                 for approach in self.approaches(&closing) {
@@ -167,6 +191,32 @@ impl Planner<'_> {
             }
         }
         grasps
+    }
+
+    /// The direction to a second contact that is drawn from the cloud: one of a few whose friction cones both hold the line
+    /// between the contacts. Half of the draws are from the neighbourhood: walls and handles are thin.
+    fn towards_partner(&self, p: &Vec3, n: &Vec3, random: &mut ChaCha8Rng) -> Option<Vec3> {
+        const DRAWS: usize = 40;
+        const NEIGHBOURHOOD: f64 = 0.02;
+        let cloud = &self.object.cloud;
+        let cosine = self.cone.cos();
+        let mut near: Vec<usize> = self.tree.within(p, NEIGHBOURHOOD).iter().map(|n| n.index).collect();
+        // Behind the surface only: the other side of a wall faces away.
+        near.retain(|&i| cloud.normals[i].dot(n) < -0.5);
+        (0..DRAWS).find_map(|k| {
+            let i = if k % 2 == 0 && !near.is_empty() {
+                near[random.random_range(0..near.len())]
+            } else {
+                random.random_range(0..cloud.len())
+            };
+            let way = cloud.points[i] - p;
+            let length = way.norm();
+            if length < 0.002 || length > self.gripper.max_opening {
+                return None;
+            }
+            let closing = way / length;
+            (-n.dot(&closing) > cosine && cloud.normals[i].dot(&closing) > cosine).then_some(closing)
+        })
     }
 
     /// Distances along the closing direction at which a second contact faces away, at most three.
@@ -280,18 +330,23 @@ impl Planner<'_> {
     fn judge(&self, between: &[(usize, Vec3)], pose: &Pose) -> Option<AntipodalQuality> {
         let (low, high) = self.extent(between)?;
         let closing = pose.transform_direction(&Vec3::x());
-        let depth = self.options.contact_depth;
+        // Of a thin wall each pad meets its own side only.
+        let depth = self.options.contact_depth.min(0.4 * (high - low));
         let mut angle = 0.0f64;
         let mut support = f64::INFINITY;
         let (mut seen, mut all) = (0usize, 0usize);
         for side in [-1.0, 1.0] {
             let edge = if side < 0.0 { low + depth } else { high - depth };
-            let contact: Vec<usize> =
-                between.iter().filter(|(_, q)| (q.x - edge) * side >= 0.0).map(|(i, _)| *i).collect();
+            let faces = |i: usize| self.object.cloud.normals[i].dot(&closing) * side > 0.0;
+            let contact: Vec<usize> = between
+                .iter()
+                .filter(|(i, q)| (q.x - edge) * side >= 0.0 && faces(*i))
+                .map(|(i, _)| *i)
+                .collect();
             let sum: Vec3 = contact.iter().map(|&i| self.object.cloud.normals[i]).sum();
             let normal = sum.try_normalize(1e-9)?;
             angle = angle.max((normal.dot(&closing) * side).clamp(-1.0, 1.0).acos());
-            let area = contact.len() as f64 * CLOUD_STEP * CLOUD_STEP;
+            let area = contact.len() as f64 * self.step * self.step;
             support = support.min(area / (0.5 * self.gripper.finger_width * 0.015));
             seen += contact.iter().filter(|&&i| i < self.object.observed).count();
             all += contact.len();
@@ -313,15 +368,4 @@ impl Planner<'_> {
             observed: seen as f64 / all as f64,
         })
     }
-}
-
-/// Area of surface that a point of the thinned cloud stands for is the square of this, metres.
-const CLOUD_STEP: f64 = 0.003;
-
-/// A direction tilted by `tilt` radians towards the side that `turn` says.
-fn tilted(direction: &Vec3, turn: f64, tilt: f64) -> Vec3 {
-    let any = if direction.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
-    let u = direction.cross(&any).normalize();
-    let v = direction.cross(&u);
-    direction * tilt.cos() + (u * turn.cos() + v * turn.sin()) * tilt.sin()
 }

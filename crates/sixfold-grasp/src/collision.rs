@@ -31,9 +31,9 @@ pub struct CollisionScene {
 
 impl CollisionScene {
     /// Points closer together than this are one, metres.
-    const STEP: f64 = 0.003;
+    const STEP: f64 = 0.004;
 
-    /// A scene of clouds (thinned to 3 mm) and a table whose normal points up, with margins of 2 mm to points and 3 mm to the
+    /// A scene of clouds (thinned to 4 mm) and a table whose normal points up, with margins of 2 mm to points and 3 mm to the
     /// table.
     pub fn new(clouds: &[&PointCloud], table: Option<Plane>) -> CollisionScene {
         let points = clouds.iter().flat_map(|cloud| cloud.points.iter().copied()).collect();

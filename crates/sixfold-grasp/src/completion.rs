@@ -3,7 +3,7 @@
 //! One view shows half of an object, and a gripper has to close on the other half as well. Most things that stand on
 //! tables are symmetric about an upright plane, so the seen points are mirrored at the plane that contradicts the image
 //! least: a mirrored point may lie behind what was seen, never in front of it (Bohg et al. 2011, "Mind the gap: robotic
-//! grasping under incomplete observation", ICRA). A second plane about upright to the first is used when it is as good.
+//! grasping under incomplete observation", ICRA). A second plane about upright to the first is used when it agrees as well.
 
 use sixfold_geometry::{KdTree, Plane, PointCloud, Vec3};
 
@@ -22,11 +22,13 @@ pub struct CompletionOptions {
     pub tolerance: f64,
     /// Largest share of mirrored points that may contradict the image.
     pub max_contradiction: f64,
+    /// Least agreement of a second plane: the share of mirrored points that were seen, plus half the share of hidden ones.
+    pub min_agreement: f64,
 }
 
 impl Default for CompletionOptions {
     fn default() -> Self {
-        CompletionOptions { directions: 24, step: 0.006, shifts: 6, tolerance: 0.01, max_contradiction: 0.08 }
+        CompletionOptions { directions: 24, step: 0.006, shifts: 6, tolerance: 0.01, max_contradiction: 0.08, min_agreement: 0.3 }
     }
 }
 
@@ -95,10 +97,10 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
                 _ => Some(*next),
             })
     };
-    let Some((first_score, first)) = best(&found, None) else { return done };
+    let Some((_, first)) = best(&found, None) else { return done };
     done.planes.push(first);
     if let Some((score, second)) = best(&found, Some(&first))
-        && score > 0.8 * first_score
+        && score > options.min_agreement
     {
         done.planes.push(second);
     }

@@ -129,6 +129,8 @@ pub struct GraspView {
     pub object: PointCloud,
     /// What else stands around the object, without the table and without normals.
     pub obstacles: PointCloud,
+    /// What the object's cloud was thinned to, metres.
+    pub step: f64,
     /// The object touches the edge of the image: a part of it was not seen.
     pub cut_by_edge: bool,
 }
@@ -227,7 +229,7 @@ impl GraspView {
             PointCloud::from_depth(&only(&|x, y| !inside(x, y) && above[(x, y)]), None, &near)
                 .voxel_downsample(2.0 * options.step, 1.0);
         let obstacles = PointCloud { points: without_specks(obstacles.points), normals: vec![] };
-        GraspView { camera: *camera, depth, mask, table, object, obstacles, cut_by_edge }
+        GraspView { camera: *camera, depth, mask, table, object, obstacles, step: options.step, cut_by_edge }
     }
 }
 

@@ -132,7 +132,7 @@ pub fn attempt(
         planning_seconds: 0.0,
         trial_seconds: 0.0,
     };
-    let Some(rest) = settle(parts, &start)? else { return Ok(result) };
+    let Some(rest) = settle(parts, &start) else { return Ok(result) };
     // Back to the middle of the table, wherever it rolled.
     let (low, high) = mesh.transformed(&rest).bounding_box();
     let middle = (low + high) * 0.5;

@@ -26,7 +26,7 @@ pub struct PartsOptions {
 
 impl Default for PartsOptions {
     fn default() -> Self {
-        PartsOptions { voxel: 0.002, max_parts: 48, concavity: 0.002, max_faces: 8000 }
+        PartsOptions { voxel: 0.002, max_parts: 48, concavity: 0.004, max_faces: 8000 }
     }
 }
 
@@ -72,6 +72,9 @@ impl ConvexParts {
                 faces: 0,
                 advice: "a list of points has no surface, give a mesh with faces",
             });
+        }
+        if is_convex(mesh) {
+            return Self::of_convex(mesh);
         }
         let (low, high) = mesh.bounding_box();
         let simple;
@@ -131,6 +134,19 @@ impl ConvexParts {
             })
             .collect()
     }
+}
+
+/// Whether a closed mesh fills its hull to 97 % (scans are never exactly convex).
+fn is_convex(mesh: &Mesh) -> bool {
+    let volume = |mesh: &Mesh| -> f64 {
+        (0..mesh.faces().len())
+            .map(|face| {
+                let [a, b, c] = mesh.triangle(face);
+                a.dot(&b.cross(&c)) / 6.0
+            })
+            .sum()
+    };
+    mesh.convex_hull().is_ok_and(|hull| (0.97..=1.03).contains(&(volume(mesh).abs() / volume(&hull))))
 }
 
 /// To the engine's numbers.

@@ -2,16 +2,13 @@
 
 use sixfold_geometry::{Pose, Vec3};
 
-use crate::world::{body_pose, insert_object, velocity, world};
-use crate::{ConvexParts, SimulationError};
+use crate::world::{body_pose, insert_object, world};
+use crate::ConvexParts;
 
 /// Lets an object fall onto the table from a pose above it (the lowest point is put 2 mm over the table) and gives the
 /// pose in which it rests; `None` when it still moves after four seconds or rolled off further than half a metre.
 /// Its turning is damped, so that round things do not roll for ever.
-///
-/// # Errors
-/// [`SimulationError`], as [`ConvexParts`] has no part: never for parts that were made.
-pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Result<Option<Pose>, SimulationError> {
+pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     const STEP: f64 = 0.002;
     let lowest = parts
         .parts()
@@ -23,24 +20,21 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Result<Option<Po
         .with_translation(world_from_object.translation() + Vec3::z() * (0.002 - lowest));
     let mut world = world(STEP, 120.0, 0.5);
     let (object, _) = insert_object(&mut world, parts, &start, 0.2, 4.0);
-    let mut quiet = 0;
+    // A body on many contacts trembles and creeps by micrometres a step for ever: what counts is whether it gets anywhere
+    // in 0.2 s.
     let mut last = start;
-    for _ in 0..2000 {
-        world.step();
+    for _ in 0..20 {
+        for _ in 0..100 {
+            world.step();
+        }
         let pose = body_pose(&world, object);
-        let turned = pose.rotation_angle_to(&last);
-        last = pose;
-        if velocity(&world, object).norm() < 0.003 && turned < 0.05 * STEP {
-            quiet += 1;
-        } else {
-            quiet = 0;
-        }
-        if quiet >= 100 {
+        if pose.distance_to(&last) < 0.001 && pose.rotation_angle_to(&last) < 0.01 {
             let there = pose.translation() - start.translation();
-            return Ok((there.xy().norm() < 0.5 && pose.translation().z > -0.1).then_some(pose));
+            return (there.xy().norm() < 0.5 && pose.translation().z > -0.1).then_some(pose);
         }
+        last = pose;
     }
-    Ok(None)
+    None
 }
 
 #[cfg(test)]
@@ -52,9 +46,9 @@ mod tests {
     fn a_tilted_box_comes_to_lie_on_a_side() {
         let parts = ConvexParts::of_convex(&shapes::cuboid(Vec3::new(0.1, 0.06, 0.04)).unwrap()).unwrap();
         let tilted = Pose::exp(&[0.0, 0.0, 0.2, 0.3, 0.1, 0.5].into());
-        let rest = settle(&parts, &tilted).unwrap().unwrap();
+        let rest = settle(&parts, &tilted).unwrap();
         assert!((rest.translation().z - 0.02).abs() < 0.001, "{:?}", rest.translation());
         assert!(rest.transform_direction(&Vec3::z()).z > 0.999);
-        assert_eq!(settle(&parts, &tilted).unwrap().unwrap(), rest);
+        assert_eq!(settle(&parts, &tilted).unwrap(), rest);
     }
 }

@@ -48,7 +48,7 @@ pub(crate) fn insert_object(
     parts: &ConvexParts,
     world_from_object: &Pose,
     mass: f64,
-    angular_damping: f64,
+    damping: f64,
 ) -> (RigidBodyHandle, ColliderHandle) {
     let collider = ColliderBuilder::compound(parts.shapes())
         .mass(mass as f32)
@@ -57,7 +57,8 @@ pub(crate) fn insert_object(
         .collision_groups(OBJECT);
     let body = RigidBodyBuilder::dynamic()
         .pose(to_engine(world_from_object))
-        .angular_damping(angular_damping as f32)
+        .angular_damping(damping as f32)
+        .linear_damping(0.25 * damping as f32)
         .can_sleep(false);
     world.insert(body, collider)
 }
