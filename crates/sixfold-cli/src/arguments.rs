@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
 
+use crate::commands::grasp::arguments::GraspArguments;
+
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]
 #[command(
@@ -43,6 +45,11 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold eval --dataset lmo --results results.csv --curves curves.png"
     )]
     Eval(EvalArguments),
+    /// Grasps of a parallel-jaw gripper: propose them from depth, try them in simulation
+    #[command(
+        after_help = "Example:\n  sixfold grasp propose --depth d.png --camera camera.json --mask mask.png --out out"
+    )]
+    Grasp(GraspArguments),
     /// Render an object: depth, mask, normals, object coordinates, colour
     #[command(
         after_help = "Example:\n  sixfold render --object mug.ply --unit mm --camera camera.json --pose 0,0,0.6,0.5,0,0 --out out/mug"

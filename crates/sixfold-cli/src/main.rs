@@ -56,6 +56,7 @@ fn main() -> ExitCode {
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Detect(a) => commands::detect::run(a),
         Command::Eval(a) => commands::eval::run(a),
+        Command::Grasp(a) => commands::grasp::run(a),
         Command::Render(a) => commands::render::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),
         Command::Train(a) => commands::train::run(a),

@@ -43,6 +43,12 @@ pub enum ViewError {
         /// Largest valid depth in metres.
         farthest: f32,
     },
+    /// There is no plane that could be a table.
+    #[error("no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object")]
+    NoTable {
+        /// Least share of the points, in per cent.
+        share: f64,
+    },
     /// The mask has no pixel.
     #[error("the mask is empty: no pixel is above zero; mark the pixels of the object")]
     EmptyMask,
@@ -239,17 +245,18 @@ fn without_specks(points: Vec<Vec3>) -> Vec<Vec3> {
     points.iter().filter(|p| tree.within(p, 0.02).len() > 3).copied().collect()
 }
 
-/// Masks of the things that stand on the table, largest first; none without a table.
+/// Masks of the things that stand on the table, largest first.
 ///
 /// # Errors
-/// [`ViewError`] for a depth image that is unusable or of another size than the camera.
+/// [`ViewError`] for a depth image that is unusable or of another size than the camera, and [`ViewError::NoTable`].
 pub fn find_objects(
     depth: &DepthImage,
     camera: &Camera,
     options: &ViewOptions,
 ) -> Result<Vec<Mask>, ViewError> {
     let depth = checked(depth, camera, options)?;
-    let Some(table) = table(&depth, camera, options) else { return Ok(vec![]) };
+    let table = table(&depth, camera, options)
+        .ok_or(ViewError::NoTable { share: 100.0 * options.plane.min_share })?;
     // What stands on the table stands over a measured part of it: the room behind the table's edge does not.
     let above = above_table(&depth, camera, Some(&table), options.table_margin);
     let on_table = footprint(&depth, camera, &table, options);

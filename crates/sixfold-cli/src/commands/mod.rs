@@ -9,6 +9,7 @@ pub(crate) mod estimate;
 pub(crate) mod estimate_dataset;
 pub(crate) mod estimate_rgb;
 pub(crate) mod eval;
+pub(crate) mod grasp;
 pub(crate) mod material;
 pub(crate) mod object;
 pub(crate) mod pix2pose;

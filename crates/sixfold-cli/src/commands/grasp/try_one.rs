@@ -1,0 +1,128 @@
+//! `sixfold grasp try`: one grasp in the physics engine.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, anyhow, bail};
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::nalgebra::Matrix4;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::{Gripper, gripper_pose};
+use sixfold_simulation::{
+    ConvexParts, Outcome as Trial, PartsOptions, TrialOptions, TrialReport, settle, try_grasp,
+};
+
+use super::arguments::{PhysicsArguments, TryArguments};
+use crate::Outcome;
+use crate::objects;
+use crate::output::{pose_rows, report};
+
+/// Gripper and trial as the command line sets them, tested.
+pub(super) fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
+    let mut gripper = super::gripper(&a.gripper)?;
+    gripper.friction = a.friction.unwrap_or(gripper.friction);
+    gripper.force = a.force.unwrap_or(gripper.force);
+    gripper.check(&a.gripper).context("--friction and --force change the gripper")?;
+    let options = TrialOptions { mass: a.mass, ..TrialOptions::default() };
+    options.check()?;
+    Ok((gripper, options))
+}
+
+pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
+    let (gripper, options) = physics(&a.physics)?;
+    let object = objects::find(&a.object, a.unit, &a.store)?;
+    let parts = ConvexParts::of_mesh(&object.mesh, &PartsOptions::default())
+        .with_context(|| a.object.clone())?;
+    let (world_from_object, world_from_gripper, opening) = match &a.grasp {
+        Some(path) => read_grasp(path)?,
+        None => {
+            let rest = settle(&parts, &Pose::identity())
+                .ok_or_else(|| anyhow!("{}: the object does not come to rest on the table", a.object))?;
+            let (low, high) = object.mesh.transformed(&rest).bounding_box();
+            let middle = (low + high) * 0.5;
+            let rest = rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0));
+            let tip = a.tip.as_deref().ok_or_else(|| anyhow!("--tip X,Y,Z is missing"))?;
+            let pose = gripper_pose(
+                &three("--tip", tip)?,
+                &three("--approach", &a.approach)?,
+                &three("--closing", &a.closing)?,
+            )
+            .ok_or_else(|| {
+                anyhow!("--approach and --closing: found {:?} and {:?}, expected two different directions", a.approach, a.closing)
+            })?;
+            (rest, pose, a.opening.unwrap_or(gripper.max_opening))
+        }
+    };
+    let result = try_grasp(&parts, &world_from_object, &gripper, &world_from_gripper, opening, &options)?;
+    let whole = Whole {
+        object: object.name.clone(),
+        gripper: gripper.name.clone(),
+        world_from_object: pose_rows(&world_from_object),
+        world_from_gripper: pose_rows(&world_from_gripper),
+        opening,
+        report: result,
+    };
+    report(&a.json, &whole, || {
+        println!("{}: {}", whole.object, words(result.outcome));
+        println!(
+            "gap {:.1} mm, raised {:.1} mm, slid {:.1} mm and turned {:.1} degrees in the hand, pushed {:.1} mm before the lift",
+            1e3 * result.gap,
+            1e3 * result.raised,
+            1e3 * result.slip,
+            result.turn.to_degrees(),
+            1e3 * result.pushed
+        );
+    })?;
+    Ok(if result.outcome == Trial::Held { Outcome::Found } else { Outcome::NothingFound })
+}
+
+#[derive(Serialize)]
+struct Whole {
+    object: String,
+    gripper: String,
+    world_from_object: [[f64; 4]; 4],
+    world_from_gripper: [[f64; 4]; 4],
+    opening: f64,
+    report: TrialReport,
+}
+
+/// An outcome as people say it.
+pub(super) fn words(outcome: Trial) -> &'static str {
+    match outcome {
+        Trial::Held => "held",
+        Trial::Blocked => "the gripper cannot get there",
+        Trial::Missed => "the fingers closed on nothing",
+        Trial::LostInLift => "lost in the lift",
+        Trial::LostInShake => "lost in the shake",
+    }
+}
+
+#[derive(Deserialize)]
+struct GraspFile {
+    world_from_object: [[f64; 4]; 4],
+    world_from_gripper: [[f64; 4]; 4],
+    opening: f64,
+}
+
+fn read_grasp(path: &Path) -> Result<(Pose, Pose, f64)> {
+    let file = path.display();
+    let text = std::fs::read_to_string(path).with_context(|| file.to_string())?;
+    let grasp: GraspFile = serde_json::from_str(&text).with_context(|| {
+        format!("{file}: expected world_from_object, world_from_gripper (4x4, metres) and opening (metres)")
+    })?;
+    let pose = |field: &str, rows: [[f64; 4]; 4]| {
+        Pose::from_matrix(&Matrix4::from_fn(|i, j| rows[i][j]))
+            .with_context(|| format!("{file}: field {field}"))
+    };
+    Ok((
+        pose("world_from_object", grasp.world_from_object)?,
+        pose("world_from_gripper", grasp.world_from_gripper)?,
+        grasp.opening,
+    ))
+}
+
+fn three(option: &str, numbers: &[f64]) -> Result<Vec3> {
+    match numbers {
+        [x, y, z] if numbers.iter().all(|v| v.is_finite()) => Ok(Vec3::new(*x, *y, *z)),
+        _ => bail!("{option}: found {numbers:?}, expected three finite numbers"),
+    }
+}
