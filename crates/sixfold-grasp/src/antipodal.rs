@@ -15,7 +15,7 @@ use sixfold_geometry::{KdTree, Pose, Vec3};
 use thiserror::Error;
 
 use crate::{
-    AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper,
+    AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper, assume_walls,
     complete_by_mirrors, gripper_pose,
 };
 
@@ -50,7 +50,7 @@ pub struct AntipodalOptions {
     pub contact_depth: f64,
     /// Largest angle of the approach from straight down, radians. Without a table: from the viewing direction.
     pub max_tilt: f64,
-    /// Assume the unseen side from symmetry.
+    /// Assume the unseen side from symmetry and, where that gives no grasp, walls under the outline.
     pub completion: Option<CompletionOptions>,
     /// Seed of the draws.
     pub seed: u64,
@@ -116,26 +116,41 @@ pub fn antipodal_grasps(
     options: &AntipodalOptions,
 ) -> Result<Vec<Grasp>, OptionsError> {
     options.check()?;
-    let object = match &options.completion {
-        Some(completion) => complete_by_mirrors(view, completion),
-        None => CompletedObject {
-            cloud: view.object.clone(),
-            observed: view.object.len(),
-            planes: vec![],
-        },
+    let seen = || CompletedObject {
+        cloud: view.object.clone(),
+        observed: view.object.len(),
+        planes: vec![],
     };
-    if object.cloud.is_empty() || object.cloud.normals.len() != object.cloud.len() {
-        return Ok(vec![]);
+    let Some(completion) = &options.completion else {
+        return Ok(search(view, gripper, seen(), options));
+    };
+    let mut object = complete_by_mirrors(view, completion);
+    let grasps = search(view, gripper, object.clone(), options);
+    if !grasps.is_empty() {
+        return Ok(grasps);
     }
-    let scene = CollisionScene::new(&[&object.cloud, &view.obstacles], view.table);
+    assume_walls(view, &mut object, completion);
+    Ok(search(view, gripper, object, options))
+}
+
+/// Rounds of samples on a cloud.
+fn search(
+    view: &GraspView,
+    gripper: &Gripper,
+    object: CompletedObject,
+    options: &AntipodalOptions,
+) -> Vec<Grasp> {
+    if object.cloud.is_empty() || object.cloud.normals.len() != object.cloud.len() {
+        return vec![];
+    }
     let planner = Planner {
         gripper,
         options,
         down: view.table.map_or_else(Vec3::z, |t| -t.normal),
         centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
         tree: KdTree::new(&object.cloud.points),
+        scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
         object,
-        scene,
         cone: gripper.friction.atan(),
         step: view.step,
     };
@@ -155,7 +170,7 @@ pub fn antipodal_grasps(
             .collect();
         grasps.extend(found.into_iter().flatten());
     }
-    Ok(grasps)
+    grasps
 }
 
 struct Planner<'a> {

@@ -5,6 +5,8 @@
 //! least: a mirrored point may lie behind what was seen, never in front of it (Bohg et al. 2011, "Mind the gap: robotic
 //! grasping under incomplete observation", ICRA). A second plane about upright to the first is used when it agrees as well.
 
+use std::collections::BTreeMap;
+
 use sixfold_geometry::{KdTree, Plane, PointCloud, Vec3};
 
 use crate::GraspView;
@@ -151,6 +153,59 @@ fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
         return Verdict::Unknown;
     }
     if p.z - measured > tolerance { Verdict::Hidden } else { Verdict::Supported }
+}
+
+/// Adds upright walls under the outline of what was seen and mirrored, down to the table: the assumption for low things
+/// whose sides the camera looks over (a banana, a pair of scissors). Their normals are level and look outwards. Points that
+/// contradict the image or lie where a point is known are left out, so a second call adds nothing. Does nothing without a
+/// table.
+pub fn assume_walls(view: &GraspView, object: &mut CompletedObject, options: &CompletionOptions) {
+    let Some(table) = view.table else { return };
+    let cell = view.step.max(1e-4);
+    let any = if table.normal.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
+    let u = table.normal.cross(&any).normalize();
+    let v = table.normal.cross(&u);
+    // The highest point over each cell of the table, in the order of the cells.
+    let mut heights: BTreeMap<(i64, i64), f64> = BTreeMap::new();
+    for p in &object.cloud.points {
+        let key = ((u.dot(p) / cell).floor() as i64, (v.dot(p) / cell).floor() as i64);
+        let height = heights.entry(key).or_insert(0.0);
+        *height = height.max(table.distance(p));
+    }
+    let near = |(a, b): (i64, i64), reach: i64| {
+        (-reach..=reach).flat_map(move |i| (-reach..=reach).map(move |j| (a + i, b + j, i, j)))
+    };
+    let tree = KdTree::new(&object.cloud.points);
+    let mut points = vec![];
+    let mut normals = vec![];
+    for (&(a, b), &top) in &heights {
+        if [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().all(|(i, j)| heights.contains_key(&(a + i, b + j))) {
+            continue;
+        }
+        // Outwards is away from the occupied cells around; holes of the cloud have such cells on all sides.
+        let inwards = near((a, b), 3)
+            .filter(|(x, y, _, _)| heights.contains_key(&(*x, *y)))
+            .fold((0.0, 0.0), |sum, (_, _, i, j)| (sum.0 + i as f64, sum.1 + j as f64));
+        let around = near((a, b), 3).filter(|(x, y, _, _)| heights.contains_key(&(*x, *y))).count();
+        let Some(outwards) = (-(u * inwards.0 + v * inwards.1)).try_normalize(0.5 * around as f64) else {
+            continue;
+        };
+        let foot = u * ((a as f64 + 0.5) * cell)
+            + v * ((b as f64 + 0.5) * cell)
+            + table.normal * table.offset;
+        let mut height = cell;
+        while height < top {
+            let p = foot + table.normal * height;
+            let known = tree.nearest(&p).is_some_and(|n| n.distance < cell);
+            if !known && verdict(view, &p, options.tolerance) != Verdict::Contradicted {
+                points.push(p);
+                normals.push(outwards);
+            }
+            height += cell;
+        }
+    }
+    object.cloud.points.extend(points);
+    object.cloud.normals.extend(normals);
 }
 
 /// Adds the mirror images of all points that lie where nothing was seen.

@@ -32,7 +32,7 @@ mod view;
 pub use antipodal::{AntipodalOptions, OptionsError, antipodal_grasps};
 pub use cluster::{ClusterOptions, GraspCluster, cluster_grasps};
 pub use collision::{CollisionScene, Hit};
-pub use completion::{CompletedObject, CompletionOptions, complete_by_mirrors};
+pub use completion::{CompletedObject, CompletionOptions, assume_walls, complete_by_mirrors};
 pub use draw::{DrawnGrasp, draw_grasps};
 pub use grasp::{AntipodalQuality, Grasp, gripper_pose};
 pub use gripper::{Gripper, GripperBox};

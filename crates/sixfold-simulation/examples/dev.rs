@@ -12,6 +12,9 @@ fn main() {
         objects.push(("cube5".into(), shapes::cuboid(Vec3::repeat(0.05)).unwrap()));
         objects.push(("box".into(), shapes::cuboid(Vec3::new(0.06, 0.16, 0.2)).unwrap()));
         objects.push(("flatbox".into(), shapes::cuboid(Vec3::new(0.09, 0.13, 0.03)).unwrap()));
+        objects.push(("bar".into(), shapes::cuboid(Vec3::new(0.18, 0.025, 0.022)).unwrap()));
+        objects.push(("lying".into(), shapes::cylinder(0.018, 0.16).unwrap().transformed(&sixfold_geometry::Pose::exp(&[0.0, 0.0, 0.0, 0.0, 1.5707963, 0.0].into()))));
+        objects.push(("bent".into(), sixfold_mesh::Mesh::merged(&[shapes::cuboid(Vec3::new(0.1, 0.03, 0.03)).unwrap(), shapes::cuboid(Vec3::new(0.1, 0.03, 0.03)).unwrap().transformed(&sixfold_geometry::Pose::exp(&[0.08, 0.025, 0.0, 0.0, 0.0, 0.6].into()))]).unwrap()));
         objects.push(("can".into(), shapes::cylinder(0.035, 0.1).unwrap()));
         objects.push(("bigcan".into(), shapes::cylinder(0.05, 0.14).unwrap()));
         objects.push(("bottle".into(), shapes::bottle(0.035, 0.2).unwrap()));

@@ -18,7 +18,7 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
         .fold(f64::INFINITY, f64::min);
     let start = world_from_object
         .with_translation(world_from_object.translation() + Vec3::z() * (0.002 - lowest));
-    let mut world = world(STEP, 120.0, 0.5);
+    let mut world = world(STEP, 60.0, 0.8);
     let (object, _) = insert_object(&mut world, parts, &start, 0.2, 4.0);
     // A body on many contacts trembles and creeps by micrometres a step for ever: what counts is whether it gets anywhere
     // in 0.2 s.

@@ -133,7 +133,7 @@ pub(crate) struct MeasureArguments {
     /// Unit of the mesh files: m, cm, mm, in
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm"}, ...]
+    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm", "up": "z"}, ...]
     #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
     pub list: Option<PathBuf>,
     /// Folder that the list's meshes are in (default: the list's own)

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
+use sixfold_geometry::Pose;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_simulation::{
@@ -223,6 +224,30 @@ struct Listed {
     class: String,
     mesh: PathBuf,
     unit: Unit,
+    /// The axis of the mesh that points up when the object stands.
+    #[serde(default)]
+    up: Up,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "lowercase")]
+enum Up {
+    X,
+    Y,
+    #[default]
+    Z,
+}
+
+impl Up {
+    /// Turns the axis to z.
+    fn turn(&self) -> Pose {
+        let quarter = std::f64::consts::FRAC_PI_2;
+        match self {
+            Up::X => Pose::exp(&[0.0, 0.0, 0.0, 0.0, -quarter, 0.0].into()),
+            Up::Y => Pose::exp(&[0.0, 0.0, 0.0, quarter, 0.0, 0.0].into()),
+            Up::Z => Pose::identity(),
+        }
+    }
 }
 
 /// Class, name and mesh of every object.
@@ -250,7 +275,7 @@ fn named_objects(a: &MeasureArguments) -> Result<Vec<(String, String, Mesh)>> {
     listed
         .into_iter()
         .map(|l| {
-            let mesh = read_mesh(folder.join(&l.mesh), l.unit)?;
+            let mesh = read_mesh(folder.join(&l.mesh), l.unit)?.transformed(&l.up.turn());
             Ok((l.class, l.mesh.display().to_string(), mesh))
         })
         .collect()
