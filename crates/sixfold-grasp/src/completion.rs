@@ -24,7 +24,8 @@ pub struct CompletionOptions {
     pub tolerance: f64,
     /// Largest share of mirrored points that may contradict the image.
     pub max_contradiction: f64,
-    /// Least agreement of a second plane: the share of mirrored points that were seen, plus half the share of hidden ones.
+    /// Least agreement of a second plane: the share of mirrored points that were seen (less where they
+    /// are off), plus half the share of hidden ones.
     pub min_agreement: f64,
 }
 
@@ -50,8 +51,8 @@ pub struct CompletedObject {
 enum Verdict {
     /// Something further away was measured there.
     Contradicted,
-    /// The object's surface was measured there.
-    Supported,
+    /// The object's surface was measured there, this far off (metres).
+    Supported(f64),
     /// It lies behind the object.
     Hidden,
     /// The image does not say.
@@ -115,16 +116,16 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
 
 /// How well the image agrees with the mirrored points; `None` when it contradicts them.
 fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionOptions) -> Option<f64> {
-    let (mut contradicted, mut supported, mut hidden) = (0usize, 0usize, 0usize);
+    let (mut contradicted, mut supported, mut hidden) = (0.0, 0.0, 0.0);
     for p in probes {
         match verdict(view, &mirror(plane, p), options.tolerance) {
-            Verdict::Contradicted => contradicted += 1,
-            Verdict::Supported => supported += 1,
-            Verdict::Hidden => hidden += 1,
+            Verdict::Contradicted => contradicted += 1.0,
+            Verdict::Supported(off) => supported += 1.0 - off / options.tolerance,
+            Verdict::Hidden => hidden += 1.0,
             Verdict::Unknown => {}
         }
     }
-    let share = |count: usize| count as f64 / probes.len() as f64;
+    let share = |count: f64| count / probes.len() as f64;
     // Hidden points agree with everything, so they count for less than those that were seen again.
     (share(contradicted) <= options.max_contradiction)
         .then(|| share(supported) + 0.5 * share(hidden) - 2.0 * share(contradicted))
@@ -152,7 +153,7 @@ fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
         // In front of the table or of another thing by less than the tolerance, or behind another thing.
         return Verdict::Unknown;
     }
-    if p.z - measured > tolerance { Verdict::Hidden } else { Verdict::Supported }
+    if p.z - measured > tolerance { Verdict::Hidden } else { Verdict::Supported((p.z - measured).abs()) }
 }
 
 /// Adds upright walls under the outline of what was seen and mirrored, down to the table: the assumption for low things
