@@ -15,8 +15,8 @@ use sixfold_geometry::{KdTree, Pose, Vec3};
 use thiserror::Error;
 
 use crate::{
-    AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper, assume_walls,
-    complete_by_mirrors, gripper_pose,
+    AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper,
+    assume_walls, complete_by_mirrors, gripper_pose,
 };
 
 /// An option out of range.
@@ -79,14 +79,12 @@ impl AntipodalOptions {
     /// # Errors
     /// [`OptionsError`], naming the first field out of range.
     pub fn check(&self) -> Result<(), OptionsError> {
-        for (field, found) in
-            [
-                ("samples", self.samples),
-                ("rounds", self.rounds),
-                ("closings", self.closings),
-                ("approaches", self.approaches),
-            ]
-        {
+        for (field, found) in [
+            ("samples", self.samples),
+            ("rounds", self.rounds),
+            ("closings", self.closings),
+            ("approaches", self.approaches),
+        ] {
             if !(1..=1_000_000).contains(&found) {
                 return Err(OptionsError { field, found: found as f64, expected: "1 to 1000000" });
             }
@@ -116,11 +114,7 @@ pub fn antipodal_grasps(
     options: &AntipodalOptions,
 ) -> Result<Vec<Grasp>, OptionsError> {
     options.check()?;
-    let seen = || CompletedObject {
-        cloud: view.object.clone(),
-        observed: view.object.len(),
-        planes: vec![],
-    };
+    let seen = || CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] };
     let Some(completion) = &options.completion else {
         return Ok(search(view, gripper, seen(), options));
     };

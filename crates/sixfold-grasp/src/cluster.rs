@@ -50,9 +50,7 @@ pub struct GraspCluster {
 /// score, the highest first; equal ones in the order of their best members.
 pub fn cluster_grasps(grasps: &[Grasp], options: &ClusterOptions) -> Vec<GraspCluster> {
     let mut order: Vec<usize> = (0..grasps.len()).collect();
-    order.sort_by(|&a, &b| {
-        grasps[b].quality.total().total_cmp(&grasps[a].quality.total()).then(a.cmp(&b))
-    });
+    order.sort_by(|&a, &b| grasps[b].quality.total().total_cmp(&grasps[a].quality.total()).then(a.cmp(&b)));
     let mut left = vec![true; grasps.len()];
     let mut clusters = vec![];
     for &seed in &order {

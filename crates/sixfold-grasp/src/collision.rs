@@ -61,10 +61,10 @@ impl CollisionScene {
             }
         }
         // All parts lie within the box around them: most points are sorted out by it.
-        let around = boxes.iter().skip(1).fold(boxes[0], |a, b| GripperBox {
-            low: a.low.inf(&b.low),
-            high: a.high.sup(&b.high),
-        });
+        let around = boxes
+            .iter()
+            .skip(1)
+            .fold(boxes[0], |a, b| GripperBox { low: a.low.inf(&b.low), high: a.high.sup(&b.high) });
         let rotation = camera_from_gripper.rotation_matrix().transpose();
         let origin = camera_from_gripper.translation();
         let inside = |p: Vec3| {

@@ -31,7 +31,14 @@ pub struct CompletionOptions {
 
 impl Default for CompletionOptions {
     fn default() -> Self {
-        CompletionOptions { directions: 24, step: 0.006, shifts: 6, tolerance: 0.01, max_contradiction: 0.08, min_agreement: 0.3 }
+        CompletionOptions {
+            directions: 24,
+            step: 0.006,
+            shifts: 6,
+            tolerance: 0.01,
+            max_contradiction: 0.08,
+            min_agreement: 0.3,
+        }
     }
 }
 
@@ -92,13 +99,13 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
         found.extend(best);
     }
     let best = |found: &[(f64, Plane)], other: Option<&Plane>| {
-        found
-            .iter()
-            .filter(|(_, p)| other.is_none_or(|o| p.normal.dot(&o.normal).abs() < 0.35))
-            .fold(None, |best: Option<(f64, Plane)>, next| match best {
+        found.iter().filter(|(_, p)| other.is_none_or(|o| p.normal.dot(&o.normal).abs() < 0.35)).fold(
+            None,
+            |best: Option<(f64, Plane)>, next| match best {
                 Some(b) if b.0 >= next.0 => Some(b),
                 _ => Some(*next),
-            })
+            },
+        )
     };
     let Some((_, first)) = best(&found, None) else { return done };
     done.planes.push(first);
@@ -191,9 +198,8 @@ pub fn assume_walls(view: &GraspView, object: &mut CompletedObject, options: &Co
         let Some(outwards) = (-(u * inwards.0 + v * inwards.1)).try_normalize(0.5 * around as f64) else {
             continue;
         };
-        let foot = u * ((a as f64 + 0.5) * cell)
-            + v * ((b as f64 + 0.5) * cell)
-            + table.normal * table.offset;
+        let foot =
+            u * ((a as f64 + 0.5) * cell) + v * ((b as f64 + 0.5) * cell) + table.normal * table.offset;
         let mut height = cell;
         while height < top {
             let p = foot + table.normal * height;

@@ -52,8 +52,7 @@ pub fn draw_grasps(
             let edge = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)]
                 .into_iter()
                 .any(|(u, v)| side(u, v) != here);
-            let hidden =
-                depth.is_some_and(|d| d[(x, y)] > 0.0 && d[(x, y)] < rendered[(x, y)] - 0.005);
+            let hidden = depth.is_some_and(|d| d[(x, y)] > 0.0 && d[(x, y)] < rendered[(x, y)] - 0.005);
             let strength = match (edge, hidden) {
                 (true, false) => 1.0,
                 (true, true) => 0.6,

@@ -139,11 +139,7 @@ impl Gripper {
             ),
             high: Vec3::new(self.palm_width / 2.0, self.palm_depth / 2.0, -self.finger_length),
         };
-        [
-            finger(-half - self.finger_thickness, -half),
-            finger(half, half + self.finger_thickness),
-            palm,
-        ]
+        [finger(-half - self.finger_thickness, -half), finger(half, half + self.finger_thickness), palm]
     }
 
     /// The gripper as a mesh in its own frame, for pictures. The palm is drawn a third as high as it is, so that it hides

@@ -84,8 +84,8 @@ pub fn read_gripper(path: impl AsRef<Path>) -> Result<Gripper, GripperError> {
 /// # Errors
 /// [`GripperError::Json`], and [`GripperError::Field`] or [`GripperError::Unknown`] for the first field that is wrong.
 pub fn parse_gripper(text: &str, file: &str) -> Result<Gripper, GripperError> {
-    let value: Value = serde_json::from_str(text)
-        .map_err(|source| GripperError::Json { file: file.to_owned(), source })?;
+    let value: Value =
+        serde_json::from_str(text).map_err(|source| GripperError::Json { file: file.to_owned(), source })?;
     let wrong = |field: &'static str, found: String, expected: &str| GripperError::Field {
         file: file.to_owned(),
         field,
@@ -154,7 +154,11 @@ mod tests {
         };
         for (from, to, parts) in [
             ("\"max_opening\": 0.085", "\"max_opening\": 85", vec!["max_opening", "found 85", "write 0.085"]),
-            ("\"finger_width\": 0.022", "\"finger_width\": -0.022", vec!["finger_width", "found -0.022", "0.001 to 0.2 m"]),
+            (
+                "\"finger_width\": 0.022",
+                "\"finger_width\": -0.022",
+                vec!["finger_width", "found -0.022", "0.001 to 0.2 m"],
+            ),
             ("\"finger_length\": 0.045,", "", vec!["finger_length", "found nothing", "a number"]),
             ("\"force\": 30.0", "\"force\": \"30\"", vec!["force", "found \"30\"", "a number"]),
             ("\"friction\": 0.5", "\"friction\": 0", vec!["friction", "found 0", "0.01 to 2"]),

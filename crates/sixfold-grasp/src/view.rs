@@ -16,7 +16,9 @@ pub enum ViewError {
     #[error(transparent)]
     Camera(#[from] CameraError),
     /// The mask does not belong to the image.
-    #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}: give the mask of this image")]
+    #[error(
+        "the mask is {found_width}x{found_height}, the depth image {width}x{height}: give the mask of this image"
+    )]
     MaskSize {
         /// Width of the mask.
         found_width: usize,
@@ -28,7 +30,9 @@ pub enum ViewError {
         height: usize,
     },
     /// No pixel has depth.
-    #[error("the depth image has no valid pixel (all {pixels} are zero or not finite): check the file and its depth scale")]
+    #[error(
+        "the depth image has no valid pixel (all {pixels} are zero or not finite): check the file and its depth scale"
+    )]
     NoDepth {
         /// Pixels in the image.
         pixels: usize,
@@ -44,7 +48,9 @@ pub enum ViewError {
         farthest: f32,
     },
     /// There is no plane that could be a table.
-    #[error("no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object")]
+    #[error(
+        "no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object"
+    )]
     NoTable {
         /// Least share of the points, in per cent.
         share: f64,
@@ -218,7 +224,8 @@ impl GraspView {
         };
         let near = camera.crop(&rect);
         let part = Image::from_fn(right - left, bottom - top, |x, y| depth[(left + x, top + y)]);
-        let normals = normals_from_depth(&inpaint_depth(&part, options.inpaint_rounds), &near, &options.normals);
+        let normals =
+            normals_from_depth(&inpaint_depth(&part, options.inpaint_rounds), &near, &options.normals);
         let only = |keep: &dyn Fn(usize, usize) -> bool| {
             Image::from_fn(part.width(), part.height(), |x, y| if keep(x, y) { part[(x, y)] } else { 0.0 })
         };
@@ -231,9 +238,8 @@ impl GraspView {
         }
         // The table's noise reaches higher than its margin; what is as low as that the table's plane stands for.
         let above = above_table(&part, &near, table.as_ref(), 1.5 * options.table_margin);
-        let obstacles =
-            PointCloud::from_depth(&only(&|x, y| !inside(x, y) && above[(x, y)]), None, &near)
-                .voxel_downsample(2.0 * options.step, 1.0);
+        let obstacles = PointCloud::from_depth(&only(&|x, y| !inside(x, y) && above[(x, y)]), None, &near)
+            .voxel_downsample(2.0 * options.step, 1.0);
         let obstacles = PointCloud { points: without_specks(obstacles.points), normals: vec![] };
         GraspView { camera: *camera, depth, mask, table, object, obstacles, step: options.step, cut_by_edge }
     }
@@ -289,7 +295,9 @@ fn footprint(
     let u = table.normal.cross(&any).normalize();
     let v = table.normal.cross(&u);
     let (mut along_u, mut along_v) = (vec![], vec![]);
-    for (x, y) in (0..depth.height()).step_by(4).flat_map(|y| (0..depth.width()).step_by(4).map(move |x| (x, y))) {
+    for (x, y) in
+        (0..depth.height()).step_by(4).flat_map(|y| (0..depth.width()).step_by(4).map(move |x| (x, y)))
+    {
         if depth[(x, y)] > 0.0 {
             let p = point_at(depth, camera, x, y);
             if table.distance(&p).abs() < options.plane.threshold {

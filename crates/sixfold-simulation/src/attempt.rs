@@ -6,8 +6,8 @@ use serde::Serialize;
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, Grasp, GraspView, Gripper, ViewOptions, antipodal_grasps, cluster_grasps,
-    find_objects,
+    AntipodalOptions, ClusterOptions, Grasp, GraspView, Gripper, ViewOptions, antipodal_grasps,
+    cluster_grasps, find_objects,
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::DepthSensor;
@@ -138,12 +138,8 @@ pub fn attempt(
     let middle = (low + high) * 0.5;
     let rest = rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0));
     result.world_from_object = rest;
-    let point = ViewPoint {
-        azimuth,
-        elevation,
-        distance,
-        target: offset + Vec3::z() * (0.5 * (high.z - low.z)),
-    };
+    let point =
+        ViewPoint { azimuth, elevation, distance, target: offset + Vec3::z() * (0.5 * (high.z - low.z)) };
     result.ending = Ending::NotSeen;
     let Ok(seen) = simulate_view(mesh, &rest, &point, options.sensor.as_ref(), noise) else {
         return Ok(result);
@@ -152,13 +148,17 @@ pub fn attempt(
     let world_from_camera = seen.world_from_camera;
     let view_options = ViewOptions { seed: noise, ..options.view };
     let masks = find_objects(&seen.depth, &seen.camera, &view_options).unwrap_or_default();
-    let view = masks.first().and_then(|mask| GraspView::new(&seen.depth, &seen.camera, mask, &view_options).ok());
+    let view =
+        masks.first().and_then(|mask| GraspView::new(&seen.depth, &seen.camera, mask, &view_options).ok());
     result.view = Some(seen);
     let Some(view) = view else { return Ok(result) };
     result.ending = Ending::NoProposal;
     let planner = AntipodalOptions { seed: noise, ..options.planner };
-    let grasps = antipodal_grasps(&view, gripper, &planner)
-        .map_err(|e| SimulationError::Option { field: e.field, found: e.found, expected: e.expected })?;
+    let grasps = antipodal_grasps(&view, gripper, &planner).map_err(|e| SimulationError::Option {
+        field: e.field,
+        found: e.found,
+        expected: e.expected,
+    })?;
     let clusters = cluster_grasps(&grasps, &options.clusters);
     result.planning_seconds = began.elapsed().as_secs_f64();
     result.proposals = clusters.iter().map(|c| c.best).collect();

@@ -95,7 +95,10 @@ impl ConvexParts {
         };
         let decomposition = VHACD::decompose(&parameters, &points, mesh.faces(), true);
         let hulls = decomposition.compute_exact_convex_hulls(&points, mesh.faces());
-        Self::from_points(hulls.into_iter().map(|(points, _)| points.iter().map(vec3).collect()).collect(), mesh)
+        Self::from_points(
+            hulls.into_iter().map(|(points, _)| points.iter().map(vec3).collect()).collect(),
+            mesh,
+        )
     }
 
     /// Keeps the hulls' corners of all groups of points that have a volume.

@@ -2,8 +2,8 @@
 
 use sixfold_geometry::{Pose, Vec3};
 
-use crate::world::{body_pose, insert_object, world};
 use crate::ConvexParts;
+use crate::world::{body_pose, insert_object, world};
 
 /// Lets an object fall onto the table from a pose above it (the lowest point is put 2 mm over the table) and gives the
 /// pose in which it rests; `None` when it still moves after four seconds or rolled off further than half a metre.
@@ -16,8 +16,8 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
         .flatten()
         .map(|p| world_from_object.transform_point(p).z)
         .fold(f64::INFINITY, f64::min);
-    let start = world_from_object
-        .with_translation(world_from_object.translation() + Vec3::z() * (0.002 - lowest));
+    let start =
+        world_from_object.with_translation(world_from_object.translation() + Vec3::z() * (0.002 - lowest));
     let mut world = world(STEP, 60.0, 0.8);
     let (object, _) = insert_object(&mut world, parts, &start, 0.2, 4.0);
     // A body on many contacts trembles and creeps by micrometres a step for ever: what counts is whether it gets anywhere

@@ -314,9 +314,10 @@ impl Run {
     /// stand-off.
     fn blocked(&self, gripper: &Gripper, world_from_gripper: &Pose, opening: f64) -> bool {
         let boxes = gripper.boxes(opening);
-        if boxes.iter().any(|part| {
-            part.corners().iter().any(|c| world_from_gripper.transform_point(c).z < 0.0)
-        }) {
+        if boxes
+            .iter()
+            .any(|part| part.corners().iter().any(|c| world_from_gripper.transform_point(c).z < 0.0))
+        {
             return true;
         }
         let Some(object) = self.world.colliders.get(self.object_collider) else { return true };

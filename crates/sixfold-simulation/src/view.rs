@@ -21,11 +21,8 @@ impl ViewPoint {
     /// The camera's pose: x to the right and level, y down, z to the target. Straight from above, x is level all the same.
     pub fn world_from_camera(&self) -> Pose {
         let (azimuth, elevation) = (self.azimuth, self.elevation);
-        let back = Vec3::new(
-            elevation.cos() * azimuth.cos(),
-            elevation.cos() * azimuth.sin(),
-            elevation.sin(),
-        );
+        let back =
+            Vec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
         let right = Vec3::new(-azimuth.sin(), azimuth.cos(), 0.0);
         let z = -back;
         let down = z.cross(&right);
@@ -65,11 +62,8 @@ pub fn simulate_view(
     let corners = [(-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, 0.8)];
     let corners = corners.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec();
     let table = Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok();
-    let mut objects =
-        vec![SceneObject { mesh, camera_from_object: camera_from_world * *world_from_object }];
-    objects.extend(
-        table.as_ref().map(|mesh| SceneObject { mesh, camera_from_object: camera_from_world }),
-    );
+    let mut objects = vec![SceneObject { mesh, camera_from_object: camera_from_world * *world_from_object }];
+    objects.extend(table.as_ref().map(|mesh| SceneObject { mesh, camera_from_object: camera_from_world }));
     let mut frame = Frame::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let ideal = frame.depth();

@@ -2,7 +2,7 @@
 
 use sixfold_geometry::{DepthImage, Mask, Pose, Vec3};
 use sixfold_grasp::{
-    AntipodalOptions, CompletionOptions, Gripper, GraspView, ViewError, ViewOptions, antipodal_grasps,
+    AntipodalOptions, CompletionOptions, GraspView, Gripper, ViewError, ViewOptions, antipodal_grasps,
     complete_by_mirrors, find_objects,
 };
 use sixfold_mesh::Mesh;
@@ -84,7 +84,8 @@ fn every_grasp_fits_the_gripper_and_stands_clear_of_the_table() {
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let again = one.install(|| antipodal_grasps(&view, &gripper, &AntipodalOptions::default())).unwrap();
     assert_eq!(grasps, again);
-    let other = antipodal_grasps(&view, &gripper, &AntipodalOptions { seed: 1, ..AntipodalOptions::default() });
+    let other =
+        antipodal_grasps(&view, &gripper, &AntipodalOptions { seed: 1, ..AntipodalOptions::default() });
     assert_ne!(grasps, other.unwrap());
 }
 
@@ -107,12 +108,16 @@ fn what_shows_no_object_is_refused_with_a_reason() {
     let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     let (depth, camera) = (&seen.depth, &seen.camera);
     let options = ViewOptions::default();
-    let refused = |depth: &DepthImage, mask: &Mask| GraspView::new(depth, camera, mask, &options).unwrap_err();
+    let refused =
+        |depth: &DepthImage, mask: &Mask| GraspView::new(depth, camera, mask, &options).unwrap_err();
     let (width, height) = depth.size();
     let full = |value| Mask::filled(width, height, value);
     assert_eq!(refused(depth, &full(false)), ViewError::EmptyMask);
     assert!(matches!(refused(depth, &Mask::filled(10, 10, true)), ViewError::MaskSize { .. }));
-    assert!(matches!(refused(&DepthImage::filled(width, height, 0.0), &full(true)), ViewError::NoDepth { .. }));
+    assert!(matches!(
+        refused(&DepthImage::filled(width, height, 0.0), &full(true)),
+        ViewError::NoDepth { .. }
+    ));
     let thousand = depth.map(|z| z * 1000.0);
     assert!(refused(&thousand, &full(true)).to_string().contains("factor of 1000"));
     // A mask of the bare table: nothing in it stands above it.
@@ -128,16 +133,25 @@ fn what_shows_no_object_is_refused_with_a_reason() {
     assert!(matches!(error, ViewError::SeveralObjects { parts: 2, .. }), "{error}");
     assert_eq!(find_objects(&seen.depth, &seen.camera, &options).unwrap().len(), 2);
     // No table: a wall of noise-free steps is no plane.
-    let stairs = DepthImage::from_fn(width, height, |x, y| 0.5 + 0.05 * ((x / 40 + 3 * (y / 40)) % 11) as f32);
+    let stairs =
+        DepthImage::from_fn(width, height, |x, y| 0.5 + 0.05 * ((x / 40 + 3 * (y / 40)) % 11) as f32);
     assert!(matches!(
-        find_objects(&stairs, camera, &ViewOptions { plane: sixfold_geometry::PlaneOptions { min_share: 0.5, ..options.plane }, ..options }),
+        find_objects(
+            &stairs,
+            camera,
+            &ViewOptions {
+                plane: sixfold_geometry::PlaneOptions { min_share: 0.5, ..options.plane },
+                ..options
+            }
+        ),
         Err(ViewError::NoTable { .. })
     ));
 }
 
 #[test]
 fn an_object_at_the_edge_of_the_image_is_marked_as_cut() {
-    let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::from_translation(Vec3::new(0.0, 0.45, 0.0)));
+    let seen =
+        look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::from_translation(Vec3::new(0.0, 0.45, 0.0)));
     assert!(view_of(&seen).cut_by_edge);
     let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     assert!(!view_of(&seen).cut_by_edge);

@@ -91,7 +91,8 @@ fn the_same_trial_gives_the_same_numbers() {
     let parts = ConvexParts::of_mesh(&bowl, &PartsOptions::default()).unwrap();
     assert_eq!(parts, ConvexParts::of_mesh(&bowl, &PartsOptions::default()).unwrap());
     let grasp = from_above(Vec3::new(0.056, 0.0, 0.03));
-    let run = || try_grasp(&parts, &Pose::identity(), &hand(), &grasp, 0.03, &TrialOptions::default()).unwrap();
+    let run =
+        || try_grasp(&parts, &Pose::identity(), &hand(), &grasp, 0.03, &TrialOptions::default()).unwrap();
     let first = run();
     assert_eq!(first, run());
     assert_eq!(first, std::thread::spawn(run_again(parts.clone(), grasp)).join().unwrap());

@@ -101,13 +101,31 @@ pub(crate) struct TryArguments {
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
     /// Where the middle of the finger tips is when they close, metres
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, required_unless_present = "grasp")]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        required_unless_present = "grasp"
+    )]
     pub tip: Option<Vec<f64>>,
     /// Approach direction
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, default_value = "0,0,-1")]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        default_value = "0,0,-1"
+    )]
     pub approach: Vec<f64>,
     /// Closing direction
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, default_value = "1,0,0")]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        default_value = "1,0,0"
+    )]
     pub closing: Vec<f64>,
     /// Distance of the pads before they close, metres (default: as far as they go)
     #[arg(long, value_name = "M")]

@@ -26,7 +26,8 @@ const PICTURES: u64 = 2;
 
 pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
     let (gripper, trial) = physics(&a.physics)?;
-    let mut options = AttemptOptions { any_orientation: a.any_orientation, trial, ..AttemptOptions::default() };
+    let mut options =
+        AttemptOptions { any_orientation: a.any_orientation, trial, ..AttemptOptions::default() };
     if a.no_noise {
         options.sensor = None;
     }
@@ -263,8 +264,9 @@ fn named_objects(a: &MeasureArguments) -> Result<Vec<(String, String, Mesh)>> {
             .collect();
     };
     let text = std::fs::read_to_string(list).with_context(|| list.display().to_string())?;
-    let listed: Vec<Listed> = serde_json::from_str(&text)
-        .with_context(|| format!("{}: expected a list of objects with class, mesh and unit", list.display()))?;
+    let listed: Vec<Listed> = serde_json::from_str(&text).with_context(|| {
+        format!("{}: expected a list of objects with class, mesh and unit", list.display())
+    })?;
     if listed.is_empty() {
         bail!("{}: the list is empty: name at least one object", list.display());
     }
@@ -289,8 +291,7 @@ fn file_name(name: &str) -> String {
 fn picture(path: &Path, gripper: &Gripper, result: &Attempt) -> Result<()> {
     let (Some(view), Some(best)) = (&result.view, result.proposals.first()) else { return Ok(()) };
     let color = if result.ending.is_success() { [60, 220, 80] } else { [235, 70, 60] };
-    let drawn =
-        [DrawnGrasp { camera_from_gripper: best.camera_from_gripper, opening: best.opening, color }];
+    let drawn = [DrawnGrasp { camera_from_gripper: best.camera_from_gripper, opening: best.opening, color }];
     let background = overlay::depth_picture(&view.depth);
     let image = draw_grasps(&background, Some(&view.depth), &view.camera, gripper, &drawn)?;
     Ok(write_rgb(path, &image)?)

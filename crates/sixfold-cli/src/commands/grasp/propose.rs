@@ -37,9 +37,9 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let depth = undistort_depth(&depth, &camera)?;
     let rgb = match &a.rgb {
         None => None,
-        Some(path) => Some(
-            undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?,
-        ),
+        Some(path) => {
+            Some(undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?)
+        }
     };
     let camera = camera.without_distortion();
     let began = std::time::Instant::now();

@@ -30,8 +30,8 @@ pub(super) fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
 pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     let (gripper, options) = physics(&a.physics)?;
     let object = objects::find(&a.object, a.unit, &a.store)?;
-    let parts = ConvexParts::of_mesh(&object.mesh, &PartsOptions::default())
-        .with_context(|| a.object.clone())?;
+    let parts =
+        ConvexParts::of_mesh(&object.mesh, &PartsOptions::default()).with_context(|| a.object.clone())?;
     let (world_from_object, world_from_gripper, opening) = match &a.grasp {
         Some(path) => read_grasp(path)?,
         None => {
@@ -47,7 +47,11 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
                 &three("--closing", &a.closing)?,
             )
             .ok_or_else(|| {
-                anyhow!("--approach and --closing: found {:?} and {:?}, expected two different directions", a.approach, a.closing)
+                anyhow!(
+                    "--approach and --closing: found {:?} and {:?}, expected two different directions",
+                    a.approach,
+                    a.closing
+                )
             })?;
             (rest, pose, a.opening.unwrap_or(gripper.max_opening))
         }
