@@ -4,6 +4,7 @@ mod bad_input;
 mod dataset;
 mod detect;
 mod eval;
+mod grasp;
 mod image;
 mod objects;
 mod pix2pose;

@@ -1,0 +1,86 @@
+//! `sixfold grasp`.
+
+use std::fs;
+
+use sixfold_bop::write_mask;
+use sixfold_geometry::Mask;
+use sixfold_render::render_depth;
+
+use crate::support::*;
+
+const VIEW: &str = "grasp propose --depth depth.png --camera camera.json";
+
+/// An object on a table, with its mask and an empty one.
+fn folder() -> OneImage {
+    let case = OneImage::new();
+    let alone = render_depth(&part(), &case.truth, &camera());
+    write_mask(&case.path().join("mask.png"), &alone.map(|&z| z > 0.0)).unwrap();
+    write_mask(&case.path().join("nothing.png"), &Mask::filled(WIDTH, HEIGHT, false)).unwrap();
+    case
+}
+
+#[test]
+fn grasps_are_proposed_with_and_without_a_mask_and_drawn() {
+    let case = folder();
+    for mask in ["", " --mask mask.png"] {
+        let run = sixfold(case.path(), &format!("{VIEW}{mask} --out out --json")).expect(0);
+        let found = run.json();
+        let grasps = found["grasps"].as_array().unwrap();
+        assert!(!grasps.is_empty() && grasps.len() <= 5);
+        assert!(grasps[0]["quality"].as_f64().unwrap() > 0.1);
+        assert!(grasps[0]["opening"].as_f64().unwrap() <= 0.14);
+        assert!(found["table"]["offset"].is_number());
+        assert!(fs::metadata(case.path().join("out/overlay.png")).unwrap().len() > 1000);
+        assert!(case.path().join("out/grasps.json").exists());
+    }
+}
+
+#[test]
+fn an_object_too_large_for_the_gripper_gives_exit_status_1() {
+    let case = folder();
+    let tiny = r#"{"kind": "parallel-jaws", "name": "tiny", "max_opening": 0.006, "finger_length": 0.02,
+        "finger_width": 0.01, "finger_thickness": 0.005, "palm_width": 0.03, "palm_depth": 0.03, "palm_height": 0.05,
+        "force": 5, "friction": 0.5}"#;
+    fs::write(case.path().join("tiny.json"), tiny).unwrap();
+    let run = sixfold(case.path(), &format!("{VIEW} --gripper tiny.json")).expect(1);
+    assert!(run.stdout.contains("no grasp found for gripper tiny"), "{}", run.stdout);
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let case = folder();
+    fails(case.path(), &format!("{VIEW} --mask nothing.png"), &["nothing.png", "mask is empty"]);
+    fails(case.path(), &format!("{VIEW} --gripper claw"), &["claw", "jaws-140"]);
+    fs::write(case.path().join("bad.json"), r#"{"kind": "parallel-jaws", "name": "a", "max_opening": 140}"#)
+        .unwrap();
+    fails(case.path(), &format!("{VIEW} --gripper bad.json"), &["bad.json", "finger_length"]);
+    fails(case.path(), &format!("{VIEW} --depth-scale 100"), &["scale wrong by a factor of 1000"]);
+    fails(case.path(), "grasp try --object part.ply --unit mm --tip 0,0", &["--tip", "three finite numbers"]);
+    fails(
+        case.path(),
+        "grasp try --object part.ply --unit mm --tip 0,0,0.05 --mass 200",
+        &["mass", "0.001 to 20 kg"],
+    );
+}
+
+#[test]
+fn a_grasp_is_tried_and_the_planner_is_measured() {
+    let case = folder();
+    let run = sixfold(
+        case.path(),
+        "grasp try --object part.ply --unit mm --tip 0.0,0.0,0.01 --closing 0,1,0 --json",
+    );
+    assert!(run.code == 0 || run.code == 1, "{}", run.stderr);
+    assert_eq!(run.json()["report"]["outcome"] == "held", run.code == 0);
+    let beside = "grasp try --object part.ply --unit mm --tip 0.3,0,0.05";
+    assert!(sixfold(case.path(), beside).expect(1).stdout.contains("closed on nothing"));
+    let measure = "grasp measure --object part.ply --unit mm --trials 2 --out out --json";
+    let first = sixfold(case.path(), measure).expect(0).json();
+    assert_eq!(first["classes"][0]["trials"], 2);
+    assert!(case.path().join("out/trials.json").exists());
+    let again = sixfold(case.path(), &format!("--threads 1 {measure}")).expect(0).json();
+    for number in 0..2 {
+        let trial = |json: &serde_json::Value| json["objects"][0]["trials"][number]["report"].clone();
+        assert_eq!(trial(&first), trial(&again));
+    }
+}
