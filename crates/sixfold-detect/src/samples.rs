@@ -14,7 +14,7 @@ use sixfold_augment::{
     AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream,
     uniform,
 };
-use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3, sphere_directions};
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch, randomly_colored};
 
@@ -560,7 +560,7 @@ impl Prepared {
             .unwrap_or([4.0 * diameter, 12.0 * diameter])
             .map(|d| d.max(diameter));
         let (low, high) = mesh.bounding_box();
-        let extremes = extremes(&mesh);
+        let extremes = mesh.extremes(200);
         let textured = mesh.texture().is_some() && mesh.texcoords().is_some();
         let mesh = if mesh.faces().len() > FACES && !textured { simplify(&mesh, FACES) } else { mesh };
         // Normals looked up per sample would be computed anew every time.
@@ -568,20 +568,6 @@ impl Prepared {
         let mesh = mesh.clone().with_normals(normals).unwrap_or(mesh);
         Ok(Prepared { mesh, colored, extremes, centre: (low + high) * 0.5, poses, distance, cutouts })
     }
-}
-
-/// Vertices that are outermost in some direction.
-fn extremes(mesh: &Mesh) -> Vec<Vec3> {
-    let vertices = mesh.vertices();
-    let mut chosen: Vec<usize> = sphere_directions(200)
-        .iter()
-        .filter_map(|d| {
-            (0..vertices.len()).max_by(|&a, &b| d.dot(&vertices[a]).total_cmp(&d.dot(&vertices[b])))
-        })
-        .collect();
-    chosen.sort_unstable();
-    chosen.dedup();
-    chosen.into_iter().map(|i| vertices[i]).collect()
 }
 
 impl std::fmt::Debug for SceneSource {

@@ -9,6 +9,7 @@
 
 mod camera;
 mod cloud;
+mod depth_check;
 mod icp;
 mod image;
 mod kabsch;
@@ -22,6 +23,7 @@ mod undistort;
 
 pub use camera::{BrownConrady, Camera, CameraError};
 pub use cloud::{PointCloud, sphere_directions};
+pub use depth_check::{DepthImageError, usable_depth};
 pub use icp::{
     CorrespondenceSource, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, icp,
 };

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 
 use sixfold_geometry::{
-    Camera, CameraError, DepthImage, Image, Mask, NormalOptions, Plane, PlaneOptions, PointCloud, Rect, Vec2,
-    Vec3, dominant_plane, inpaint_depth, normals_from_depth,
+    Camera, CameraError, DepthImage, DepthImageError, Image, Mask, NormalOptions, Plane, PlaneOptions,
+    PointCloud, Rect, Vec2, Vec3, dominant_plane, inpaint_depth, normals_from_depth, usable_depth,
 };
 use thiserror::Error;
 
@@ -29,24 +29,9 @@ pub enum ViewError {
         /// Height of the depth image.
         height: usize,
     },
-    /// No pixel has depth.
-    #[error(
-        "the depth image has no valid pixel (all {pixels} are zero or not finite): check the file and its depth scale"
-    )]
-    NoDepth {
-        /// Pixels in the image.
-        pixels: usize,
-    },
-    /// All depth lies where no tabletop object can be.
-    #[error(
-        "the depth lies between {nearest:.4} m and {farthest:.4} m, outside 0.05 m to 20 m: is the depth scale wrong by a factor of 1000?"
-    )]
-    Scale {
-        /// Smallest valid depth in metres.
-        nearest: f32,
-        /// Largest valid depth in metres.
-        farthest: f32,
-    },
+    /// The depth image holds nothing that could be the scene.
+    #[error(transparent)]
+    Depth(#[from] DepthImageError),
     /// There is no plane that could be a table.
     #[error(
         "no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object"
@@ -323,15 +308,7 @@ fn footprint(
 fn checked(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Result<DepthImage, ViewError> {
     camera.check()?;
     camera.check_image(depth.width(), depth.height())?;
-    let depth = depth.map(|&z| if z > 0.0 && z.is_finite() { z } else { 0.0 });
-    let valid = depth.as_slice().iter().copied().filter(|&z| z > 0.0);
-    let (nearest, farthest) = valid.fold((f32::INFINITY, 0f32), |(a, b), z| (a.min(z), b.max(z)));
-    if farthest == 0.0 {
-        return Err(ViewError::NoDepth { pixels: depth.as_slice().len() });
-    }
-    if farthest < 0.05 || nearest > 20.0 {
-        return Err(ViewError::Scale { nearest, farthest });
-    }
+    let depth = usable_depth(depth)?;
     Ok(depth.map(|&z| if f64::from(z) <= options.max_depth { z } else { 0.0 }))
 }
 

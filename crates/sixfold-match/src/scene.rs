@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 use sixfold_geometry::{
-    Camera, CameraError, DepthImage, Image, Mask, NormalImage, NormalOptions, Plane, PlaneOptions,
-    PointCloud, Vec3, dominant_plane, inpaint_depth, normals_from_depth,
+    Camera, CameraError, DepthImage, DepthImageError, Image, Mask, NormalImage, NormalOptions, Plane,
+    PlaneOptions, PointCloud, Vec3, dominant_plane, inpaint_depth, normals_from_depth, usable_depth,
 };
 use thiserror::Error;
 
@@ -26,24 +26,9 @@ pub enum SceneError {
         /// Height of the depth image.
         height: usize,
     },
-    /// No pixel has depth.
-    #[error(
-        "the depth image has no valid pixel (all {pixels} are zero or not finite): check the file and its depth scale"
-    )]
-    NoDepth {
-        /// Pixels in the image.
-        pixels: usize,
-    },
-    /// All depth lies where no tabletop object can be.
-    #[error(
-        "the depth lies between {nearest:.4} m and {farthest:.4} m, outside 0.05 m to 20 m: is the depth scale wrong by a factor of 1000?"
-    )]
-    Scale {
-        /// Smallest valid depth in metres.
-        nearest: f32,
-        /// Largest valid depth in metres.
-        farthest: f32,
-    },
+    /// The depth image holds nothing that could be the scene.
+    #[error(transparent)]
+    Depth(#[from] DepthImageError),
 }
 
 /// How a depth image is prepared.
@@ -117,15 +102,7 @@ impl Scene {
                 height: depth.height(),
             });
         }
-        let depth = depth.map(|&z| if z > 0.0 && z.is_finite() { z } else { 0.0 });
-        let valid = depth.as_slice().iter().copied().filter(|&z| z > 0.0);
-        let (nearest, farthest) = valid.fold((f32::INFINITY, 0f32), |(a, b), z| (a.min(z), b.max(z)));
-        if farthest == 0.0 {
-            return Err(SceneError::NoDepth { pixels: depth.as_slice().len() });
-        }
-        if farthest < 0.05 || nearest > 20.0 {
-            return Err(SceneError::Scale { nearest, farthest });
-        }
+        let depth = usable_depth(depth)?;
         let filled = inpaint_depth(&depth, options.inpaint_rounds);
         let mut normals = normals_from_depth(&filled, camera, &options.normals);
         for (n, z) in normals.as_mut_slice().iter_mut().zip(depth.as_slice()) {

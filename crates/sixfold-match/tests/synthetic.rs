@@ -1,6 +1,6 @@
 //! The whole matching on rendered scenes, where the truth is known exactly.
 
-use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec3};
+use sixfold_geometry::{Camera, DepthImage, DepthImageError, Mask, Pose, Vec3};
 use sixfold_match::clustering::{ClusterOptions, cluster};
 use sixfold_match::voting::{Hypothesis, VotingOptions, vote};
 use sixfold_match::{
@@ -271,9 +271,12 @@ fn unusable_input_is_named() {
     let empty = DepthImage::filled(400, 300, 0.0);
     let new =
         |depth: &DepthImage, mask: Option<&Mask>| Scene::new(depth, &camera, mask, &SceneOptions::default());
-    assert!(matches!(new(&empty, None), Err(SceneError::NoDepth { pixels: 120_000 })));
+    assert!(matches!(
+        new(&empty, None),
+        Err(SceneError::Depth(DepthImageError::NoDepth { pixels: 120_000 }))
+    ));
     let nan = DepthImage::filled(400, 300, f32::NAN);
-    assert!(matches!(new(&nan, None), Err(SceneError::NoDepth { .. })));
+    assert!(matches!(new(&nan, None), Err(SceneError::Depth(DepthImageError::NoDepth { .. }))));
     let millimetres = DepthImage::filled(400, 300, 700.0);
     let message = new(&millimetres, None).unwrap_err().to_string();
     assert!(message.contains("factor of 1000"), "{message}");

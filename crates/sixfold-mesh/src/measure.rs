@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{Pose, Vec3, sphere_directions};
 
 use crate::Mesh;
 
@@ -11,6 +11,21 @@ impl Mesh {
     pub fn bounding_box(&self) -> (Vec3, Vec3) {
         let first = self.vertices()[0];
         self.vertices().iter().fold((first, first), |(low, high), v| (low.inf(v), high.sup(v)))
+    }
+
+    /// The vertices that are outermost in one of `directions` directions spread over the sphere, in metres: enough to find
+    /// the object's box in an image.
+    pub fn extremes(&self, directions: usize) -> Vec<Vec3> {
+        let vertices = self.vertices();
+        let mut outermost: Vec<usize> = sphere_directions(directions)
+            .iter()
+            .filter_map(|d| {
+                (0..vertices.len()).max_by(|&a, &b| d.dot(&vertices[a]).total_cmp(&d.dot(&vertices[b])))
+            })
+            .collect();
+        outermost.sort_unstable();
+        outermost.dedup();
+        outermost.into_iter().map(|i| vertices[i]).collect()
     }
 
     /// The corners of a face, in metres.

@@ -141,7 +141,7 @@ fn same(a: &Rect, b: &Rect) -> bool {
     near(a.width, b.width) && near(a.height, b.height) && apart < 0.02 * b.width.max(b.height).max(10.0)
 }
 
-/// Fewer photographs of an object say nothing of its distance.
+/// Fewer photographs say nothing of the shift, and fewer of an object nothing of its distance.
 const LEAST_PHOTOGRAPHS: usize = 5;
 /// Poses turned further from the truth than this are wrong, not off.
 const SAME_ROTATION: f64 = 0.26;
@@ -161,8 +161,8 @@ pub fn measure_corrections(
     mut progress: impl FnMut(),
 ) -> Result<BTreeMap<u32, Correction>, EstimateError> {
     let options = AlignOptions { correct: false, ..AlignOptions::default() };
-    let mut shifts: [Vec<f64>; 2] = [vec![], vec![]];
-    let mut depths: BTreeMap<u32, Vec<f64>> = BTreeMap::new();
+    let mut shifts = Vec::new();
+    let mut depths: BTreeMap<u32, Vec<f64>> = objects.keys().map(|id| (*id, Vec::new())).collect();
     for photograph in photographs {
         progress();
         let id = photograph.object_id();
@@ -184,12 +184,21 @@ pub fn measure_corrections(
         }
         let (here, there) = (camera.project(&found.translation()), camera.project(&truth.translation()));
         if let (Some(here), Some(there)) = (here, there) {
-            shifts[0].push(here.x - there.x);
-            shifts[1].push(here.y - there.y);
+            shifts.push(here - there);
         }
         depths.entry(id).or_default().push(found.translation().z / truth.translation().z - 1.0);
     }
-    let shift = shifts.map(|mut values| median(&mut values));
+    Ok(corrections(&shifts, depths))
+}
+
+/// What is known from the `shifts` of all photographs (pixels) and the relative errors of every object's distance.
+fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32, Correction> {
+    let shift = if shifts.len() < LEAST_PHOTOGRAPHS {
+        [0.0; 2]
+    } else {
+        [0, 1].map(|axis| median(&mut shifts.iter().map(|s| s[axis]).collect::<Vec<_>>()))
+    };
+    let ids: Vec<u32> = depths.keys().copied().collect();
     // Median, and the square of its standard error.
     let measured: BTreeMap<u32, (f64, f64)> = depths
         .into_iter()
@@ -205,14 +214,14 @@ pub fn measure_corrections(
     let scatter = measured.values().map(|(m, _)| m * m).sum::<f64>() / count;
     let noise = measured.values().map(|(_, e)| e).sum::<f64>() / count;
     let between = (scatter - noise).max(0.0);
-    let correction = |id: &u32| {
-        let depth = measured.get(id).map_or(0.0, |(middle, error)| {
+    let correction = |id: u32| {
+        let depth = measured.get(&id).map_or(0.0, |(middle, error)| {
             let total = between + error;
             if total > 0.0 { middle * between / total } else { 0.0 }
         });
         Correction { shift, depth }
     };
-    Ok(objects.keys().map(|id| (*id, correction(id))).collect())
+    ids.into_iter().map(|id| (id, correction(id))).collect()
 }
 
 /// The middle value, 0 of none.
@@ -245,6 +254,30 @@ mod tests {
         // Behind the camera nothing can be said.
         let behind = Pose::from_translation(Vec3::new(0.0, 0.0, -1.0));
         assert_eq!(correction.apply(&camera, &behind), behind);
+    }
+
+    #[test]
+    fn distances_count_as_far_as_they_stand_out_of_their_scatter() {
+        let shifts: Vec<Vec2> = [0.9, 1.0, 1.1, 1.2, 30.0].map(|x| Vec2::new(x, -x)).to_vec();
+        let around = |middle: f64, scatter: f64| -> Vec<f64> {
+            (-4..=4).map(|i| middle + 0.25 * scatter * f64::from(i)).collect()
+        };
+        let known = BTreeMap::from([
+            (1, around(0.02, 0.001)),
+            (2, around(0.02, 0.06)),
+            (3, vec![0.5; LEAST_PHOTOGRAPHS - 1]),
+        ]);
+        let found = corrections(&shifts, known.clone());
+        // The outlier is outvoted, and the shift is the same for all.
+        assert!(found.values().all(|c| c.shift == [1.1, -1.1]), "{found:?}");
+        // A sure error is taken out whole, an unsure one in part, one seen on too few photographs not at all.
+        assert!((0.0199..0.02).contains(&found[&1].depth), "{found:?}");
+        assert!((0.001..0.015).contains(&found[&2].depth), "{found:?}");
+        assert_eq!(found[&3].depth, 0.0);
+        // Too few photographs say nothing of the shift either.
+        let few = corrections(&shifts[..LEAST_PHOTOGRAPHS - 1], known);
+        assert!(few.values().all(|c| c.shift == [0.0; 2]), "{few:?}");
+        assert_eq!(few[&1].depth, found[&1].depth);
     }
 
     #[test]

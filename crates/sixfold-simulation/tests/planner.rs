@@ -116,7 +116,7 @@ fn what_shows_no_object_is_refused_with_a_reason() {
     assert!(matches!(refused(depth, &Mask::filled(10, 10, true)), ViewError::MaskSize { .. }));
     assert!(matches!(
         refused(&DepthImage::filled(width, height, 0.0), &full(true)),
-        ViewError::NoDepth { .. }
+        ViewError::Depth(sixfold_geometry::DepthImageError::NoDepth { .. })
     ));
     let thousand = depth.map(|z| z * 1000.0);
     assert!(refused(&thousand, &full(true)).to_string().contains("factor of 1000"));

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use rand::RngExt;
 use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, stream, uniform};
-use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3, sphere_directions};
+use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, simplify};
 use sixfold_render::BoundingBoxScale;
 
@@ -325,7 +325,7 @@ impl Prepared {
         let small = small.clone().with_normals(normals).unwrap_or(small);
         Ok(Prepared {
             id,
-            extremes: extremes(&mesh),
+            extremes: mesh.extremes(300),
             centre: (low + high) * 0.5,
             mesh: small,
             textured: has_texture.then_some(mesh),
@@ -365,18 +365,4 @@ impl std::fmt::Debug for SampleSource {
             .field("options", &self.options)
             .finish_non_exhaustive()
     }
-}
-
-/// Vertices that are outermost in some direction.
-fn extremes(mesh: &Mesh) -> Vec<Vec3> {
-    let vertices = mesh.vertices();
-    let mut chosen: Vec<usize> = sphere_directions(300)
-        .iter()
-        .filter_map(|d| {
-            (0..vertices.len()).max_by(|&a, &b| d.dot(&vertices[a]).total_cmp(&d.dot(&vertices[b])))
-        })
-        .collect();
-    chosen.sort_unstable();
-    chosen.dedup();
-    chosen.into_iter().map(|i| vertices[i]).collect()
 }
