@@ -1,7 +1,8 @@
 """Quickstart: from a mesh and an image to poses, with a picture of every step.
 
     pip install ./python matplotlib
-    python python/examples/quickstart.py [--data data/demo] [--weights weights/pix2pose-lmo.safetensors] [--out out]
+    python python/examples/quickstart.py [--data data/demo] [--weights weights/pix2pose-lmo.safetensors]
+        [--detector weights/detector-lmo.safetensors] [--out out]
 
 Reads one real frame of LM-O that comes with the repository and writes OUT/quickstart.png. Each part stands for itself;
 the lines starting with `# %%` make cells in an editor that knows them.
@@ -27,6 +28,7 @@ parser.add_argument(
     "--data", type=pathlib.Path, default=ROOT / "data/demo", help="a BOP dataset (default: %(default)s)"
 )
 parser.add_argument("--weights", type=pathlib.Path, default=ROOT / "weights/pix2pose-lmo.safetensors")
+parser.add_argument("--detector", type=pathlib.Path, default=ROOT / "weights/detector-lmo.safetensors")
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for the picture")
 arguments = parser.parse_args()
 COLORS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#d55e00", "#cc79a7", "#0072b2", "#a06e3c"]
@@ -117,28 +119,23 @@ for color, (obj_id, pose) in zip(COLORS, from_depth.items()):
     outline(panels[1, 0], meshes[obj_id], pose, color, obj_id)
 panels[1, 0].set_title("poses from depth alone (point pair features)")
 
-# %% Poses from colour alone: a trained network, in boxes
+# %% Poses from colour alone: a detector says where the objects are, a second network how they are turned
 from_colour = {}
 panels[1, 1].imshow(rgb)
-if arguments.weights.exists():
+if arguments.weights.exists() and arguments.detector.exists():
+    detector = sixfold.Detector.load(arguments.detector)
     network = sixfold.Pix2Pose.load(arguments.weights, camera=camera, meshes=meshes)
-    boxes, ids = [], []
-    for known in network.objects:
-        mask = known["id"] in truth and sixfold.render_depth(meshes[known["id"]], truth[known["id"]], camera) > 0
-        if np.any(mask):
-            rows, columns = np.nonzero(mask)
-            boxes.append([columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1])
-            ids.append(known["id"])
     begin = time.perf_counter()
-    for found in network(rgb, boxes, ids):
+    detected = detector(rgb, per_object=1)
+    for found in network(rgb, [d.bbox for d in detected], [d.object_id for d in detected]):
         if found is not None:
             from_colour[found.object_id] = found.camera_from_object
-    print(f"colour alone: {len(from_colour)} of {len(boxes)} boxes in {time.perf_counter() - begin:.1f} s")
+    print(f"colour alone: {len(from_colour)} of {len(detected)} detected in {time.perf_counter() - begin:.1f} s")
     for color, (obj_id, pose) in zip(COLORS, from_colour.items()):
         outline(panels[1, 1], meshes[obj_id], pose, color, obj_id)
 else:
-    print(f"colour alone: left out, {arguments.weights} is not there")
-panels[1, 1].set_title("poses from colour alone (Pix2Pose), boxes given")
+    print(f"colour alone: left out, {arguments.weights} or {arguments.detector} is not there")
+panels[1, 1].set_title("poses from colour alone (detector and Pix2Pose)")
 
 # %% Errors: below a tenth of the diameter a pose counts as right
 labels = sorted(truth)

@@ -12,6 +12,8 @@ mod arrays;
 mod bop;
 mod camera;
 mod coco;
+mod detector;
+mod grasp;
 mod guard;
 mod mesh;
 mod metrics;
@@ -48,6 +50,10 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<scene::PpfModel>()?;
     module.add_class::<scene::PpfScene>()?;
     module.add_class::<scene::PpfEstimate>()?;
+    module.add_class::<grasp::PyGripper>()?;
+    module.add_class::<grasp::PyGrasp>()?;
+    module.add_class::<detector::Detector>()?;
+    module.add_class::<detector::DetectedObject>()?;
     module.add_class::<pix2pose::Pix2Pose>()?;
     module.add_class::<pix2pose::Pix2PosePose>()?;
     module.add_function(wrap_pyfunction!(mesh::_mesh_of, module)?)?;
@@ -75,6 +81,9 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(scene::fit_plane, module)?)?;
     module.add_function(wrap_pyfunction!(scene::sphere_directions, module)?)?;
     module.add_function(wrap_pyfunction!(scene::estimate_ppf, module)?)?;
+    module.add_function(wrap_pyfunction!(grasp::find_objects, module)?)?;
+    module.add_function(wrap_pyfunction!(grasp::propose_grasps, module)?)?;
+    module.add_function(wrap_pyfunction!(grasp::draw_grasps, module)?)?;
     for (name, register) in [
         ("metrics", metrics::register as fn(&Bound<'_, PyModule>) -> PyResult<()>),
         ("bop", bop::register),

@@ -8,21 +8,19 @@ use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyType};
-use sixfold_geometry::{Pose, Rect};
+use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
+use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found, estimate};
 use sixfold_pix2pose::model::{ModelError, Pix2PoseModel};
-use sixfold_pix2pose::refine::{RefineOptions, refine};
+use sixfold_pix2pose::refine::outline_mesh;
 
 use crate::arrays::{self, about, bad, positive, seed};
 use crate::camera::PyCamera;
 use crate::guard::{interruptible, os_error};
 use crate::mesh::PyMesh;
-
-/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
-const SAME_BOX: f64 = 0.05;
 
 fn model_error(error: ModelError) -> PyErr {
     match &error {
@@ -43,7 +41,7 @@ pub(crate) struct Pix2PosePose {
     /// Correspondences that fit over the object's pixels, 0 to 1.
     #[pyo3(get)]
     score: f64,
-    /// Whether the mesh's outline was aligned with the image.
+    /// Whether enough of the mesh's outline was found in the image to align it.
     #[pyo3(get)]
     refined: bool,
     /// Whether the pose was aligned with depth.
@@ -135,7 +133,14 @@ pub(crate) struct Pix2Pose {
     meshes: Meshes,
 }
 
-type Meshes = BTreeMap<u32, Arc<Mesh>>;
+type Meshes = BTreeMap<u32, ObjectMesh>;
+
+/// An object's mesh, whole and with no more faces than its outline needs.
+#[derive(Clone)]
+struct ObjectMesh {
+    whole: Arc<Mesh>,
+    outline: Arc<Mesh>,
+}
 
 fn meshes_of(model: &Pix2PoseModel, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
     let mut out = BTreeMap::new();
@@ -143,32 +148,39 @@ fn meshes_of(model: &Pix2PoseModel, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -
         let (_, entry) =
             model.object(id).map_err(|error| PyValueError::new_err(format!("meshes: {error}")))?;
         let mesh = mesh.get().mesh.clone();
-        let scale = entry.scale();
-        let (low, high) = mesh.bounding_box();
-        let off = (low - (scale.centre - scale.half_size))
-            .amax()
-            .max((high - (scale.centre + scale.half_size)).amax());
-        if off > SAME_BOX * entry.diameter {
-            let size = 1000.0 * (high - low);
-            let own = 2000.0 * scale.half_size;
-            return Err(bad(
-                "meshes",
-                format!(
-                    "for object {id} a box of {:.1} x {:.1} x {:.1} mm as in training",
-                    own.x, own.y, own.z
-                ),
-                format!(
-                    "{:.1} x {:.1} x {:.1} mm, corners off by {:.1} mm (another object, unit or origin?)",
-                    size.x,
-                    size.y,
-                    size.z,
-                    1000.0 * off
-                ),
-            ));
-        }
-        out.insert(id, mesh);
+        let named = |error| PyValueError::new_err(format!("meshes: for object {id}: {error}"));
+        entry.check_mesh(&mesh).map_err(named)?;
+        let outline = Arc::new(outline_mesh(&mesh));
+        out.insert(id, ObjectMesh { whole: mesh, outline });
     }
     Ok(out)
+}
+
+/// One box: with the outline aligned where there is a mesh and it is wanted, as PnP left it elsewhere.
+fn look_into(
+    (model, image, camera): (&Pix2PoseModel, &RgbImage, &Camera),
+    object_id: u32,
+    region: &Rect,
+    mesh: Option<&ObjectMesh>,
+    refine: bool,
+    options: &AlignOptions,
+) -> Result<Option<Posed>, EstimateError> {
+    if let (Some(mesh), true) = (mesh, refine) {
+        let aligned = estimate_aligned(model, image, camera, object_id, region, &mesh.outline, options)?;
+        return Ok(aligned.map(|a| Posed {
+            object_id,
+            camera_from_object: a.camera_from_object,
+            refined: a.improved,
+            aligned: false,
+            found: a.found,
+        }));
+    }
+    let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
+        return Ok(None);
+    };
+    let Some(best) = found.hypotheses.first() else { return Ok(None) };
+    let camera_from_object = best.camera_from_object;
+    Ok(Some(Posed { object_id, camera_from_object, refined: false, aligned: false, found }))
 }
 
 #[pymethods]
@@ -211,12 +223,14 @@ impl Pix2Pose {
     /// rgb (H, W, 3) uint8, without lens distortion; boxes (N, 4) x, y, width, height in pixels; object_ids (N,), not
     /// needed for a model of one object; camera, meshes: in place of those of `load`; depth (H, W) metres: poses of
     /// objects with a mesh are aligned with it; thresholds on the expected error in place of the model's; two_stages=False
-    /// takes the poses of the first pass; refine=False leaves the outline alone. The same input and seed give the same
-    /// result. Ctrl-C is heard.
+    /// takes the poses of the first pass; refine=False leaves the outline alone; looks: most looks at an object with a
+    /// mesh, each but the first into the box of the pose before, which helps where boxes are poor; correct=False keeps what
+    /// aligned poses were off by on the photographs of the training. The same input and seed give the same result. Ctrl-C
+    /// is heard.
     ///
     /// Raises ValueError for an unknown object, a box without area or outside the image, an image of another size than the
     /// camera's.
-    #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, crop_factor=1.5, seed=0))]
+    #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, looks=1, correct=true, crop_factor=1.5, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn __call__(
         &self,
@@ -230,6 +244,8 @@ impl Pix2Pose {
         thresholds: Option<&Bound<'_, PyAny>>,
         two_stages: bool,
         refine: bool,
+        looks: i64,
+        correct: bool,
         crop_factor: f64,
         seed: i64,
     ) -> PyResult<Vec<Option<Pix2PosePose>>> {
@@ -277,42 +293,31 @@ impl Pix2Pose {
             seed: self::seed(seed)?,
             ..EstimateOptions::default()
         };
+        let options = AlignOptions {
+            estimate: options,
+            looks: arrays::whole("looks", looks, 1)?,
+            correct,
+            ..AlignOptions::default()
+        };
         let model = self.model.clone();
         let found = interruptible(py, move |stop| {
             let scene = depth.as_ref().map(|d| DepthScene::new(d, &camera));
             let mut out: Vec<Option<Posed>> = Vec::with_capacity(boxes.len());
             for (region, object_id) in boxes.iter().zip(ids) {
                 stop.check();
-                let Some(found) = estimate(&model, &image, &camera, object_id, region, &options)? else {
+                let mesh = meshes.get(&object_id);
+                let look = (model.as_ref(), &image, &camera);
+                let Some(mut posed) = look_into(look, object_id, region, mesh, refine, &options)? else {
                     out.push(None);
                     continue;
                 };
-                let Some(best) = found.hypotheses.first() else {
-                    out.push(None);
-                    continue;
-                };
-                let mut posed = Posed {
-                    object_id,
-                    camera_from_object: best.camera_from_object,
-                    refined: false,
-                    aligned: false,
-                    found,
-                };
-                if let Some(mesh) = meshes.get(&object_id) {
-                    if refine {
-                        let aligned =
-                            self::refine(&image, &camera, mesh, &posed.found, &RefineOptions::default());
+                if let (Some(mesh), Some(scene)) = (mesh, &scene) {
+                    let diameter = model.object(object_id).map(|(_, o)| o.diameter)?;
+                    // Too little depth on the object leaves the pose that colour gave.
+                    let start = posed.camera_from_object;
+                    if let Ok(aligned) = scene.align(&mesh.whole, diameter, &start, &posed.found) {
                         posed.camera_from_object = aligned.camera_from_object;
-                        posed.refined = aligned.improved;
-                    }
-                    if let Some(scene) = &scene {
-                        let diameter = model.object(object_id).map(|(_, o)| o.diameter)?;
-                        // Too little depth on the object leaves the pose that colour gave.
-                        let start = posed.camera_from_object;
-                        if let Ok(aligned) = scene.align(mesh, diameter, &start, &posed.found) {
-                            posed.camera_from_object = aligned.camera_from_object;
-                            posed.aligned = true;
-                        }
+                        posed.aligned = true;
                     }
                 }
                 out.push(Some(posed));

@@ -45,3 +45,11 @@ def weights():
     if not file.is_file():
         pytest.skip("the repository's weights are not at hand")
     return file
+
+
+@pytest.fixture(scope="session")
+def detector_weights():
+    file = ROOT / "weights/detector-lmo.safetensors"
+    if not file.is_file():
+        pytest.skip("the repository's weights are not at hand")
+    return file

@@ -112,6 +112,9 @@ pub(crate) struct DemoArguments {
     /// Weights for poses from colour (default: weights/pix2pose-lmo.safetensors of this repository)
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: Option<PathBuf>,
+    /// Weights of the detector (default: weights/detector-lmo.safetensors of this repository)
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub detector: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArguments,
 }
@@ -145,6 +148,10 @@ pub(crate) struct EstimateArguments {
     /// Leave out the last step of --method pix2pose, which aligns the rendered mesh with the image
     #[arg(long)]
     pub no_refine: bool,
+    /// Most looks of --method pix2pose at an object: each but the first is into the box of the pose before, which helps where
+    /// boxes are poor and takes as long again (default: 1)
+    #[arg(long, value_name = "N")]
+    pub looks: Option<NonZeroUsize>,
     /// Which of the model's objects --method pix2pose looks for in one image (default: its only one)
     #[arg(long, value_name = "ID", conflicts_with = "dataset")]
     pub object_id: Option<u32>,
@@ -193,6 +200,9 @@ pub(crate) struct EstimateArguments {
     /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
     #[arg(long, value_name = "FILE", requires = "dataset")]
     pub targets: Option<PathBuf>,
+    /// Leave out these frames of the dataset, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub except: Option<PathBuf>,
     /// Where the objects are: gt for the ground truth's boxes, detect for those of --detector, or a file of COCO
     /// detections (default: detect with --detector, else anywhere)
     #[arg(long, value_name = "gt|detect|FILE", requires = "dataset")]
@@ -247,8 +257,8 @@ pub(crate) struct EvalArguments {
     /// COCO detections to score by box AP (and mask AP where they have masks)
     #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
     pub detections: Option<PathBuf>,
-    /// With --detections: leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
-    #[arg(long, value_name = "FILE", requires = "detections")]
+    /// Leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE")]
     pub except: Option<PathBuf>,
     /// With --detections: score from which on detections count for recall and false detections, 0 to 1
     #[arg(long, value_name = "SCORE", default_value = "0.4")]
@@ -639,9 +649,9 @@ pub(crate) struct ReproducePix2PoseArguments {
     /// Folder for the table, its JSON, and the rows done so far
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Also with the boxes of this file of COCO detections
+    /// Also with the boxes of these files of COCO detections; may be given several times
     #[arg(long, value_name = "FILE.json")]
-    pub detections: Option<PathBuf>,
+    pub detections: Vec<PathBuf>,
     /// Score these published results (BOP's CSV) on the same targets, for comparison
     #[arg(long, value_name = "FILE.csv")]
     pub published: Option<PathBuf>,

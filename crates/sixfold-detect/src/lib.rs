@@ -7,5 +7,6 @@ pub mod loss;
 pub mod model;
 pub mod network;
 pub mod samples;
+mod solids;
 pub mod targets;
 pub mod training;

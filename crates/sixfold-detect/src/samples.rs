@@ -8,6 +8,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::solids::{random_solid, random_turn};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sixfold_augment::{
@@ -22,6 +23,9 @@ use crate::targets::{Annotation, IGNORED, Instance};
 
 /// Objects with fewer visible pixels in a training image are not learnt.
 const LEAST_PIXELS: usize = 64;
+/// Photographs whose colours are kept of each object, and how many colours of each.
+const PALETTE_PICTURES: usize = 6;
+const PALETTE_COLORS: usize = 40;
 /// Meshes with more faces are simplified.
 const FACES: usize = 5000;
 /// The camera of renders where there are no photographs.
@@ -47,8 +51,10 @@ pub struct SceneOptions {
     pub most_added: u32,
     /// Share of renders among pasted objects that have photographs, 0..1.
     pub render_share: f32,
-    /// Most distractors: shapes, and outlines of objects filled with something else.
+    /// Most distractors: solids, shapes, and outlines of objects filled with something else.
     pub most_distractors: u32,
+    /// Share of solids among them, 0..1.
+    pub solid_share: f32,
     /// Objects of which a smaller part is visible than this share are not learnt.
     pub least_visible: f32,
     /// Chance that a rendered object has random colours.
@@ -68,7 +74,8 @@ impl Default for SceneOptions {
             most_pasted: 7,
             most_added: 3,
             render_share: 0.4,
-            most_distractors: 3,
+            most_distractors: 5,
+            solid_share: 0.6,
             least_visible: 0.15,
             random_color_chance: 0.0,
             near_real_share: 0.6,
@@ -154,6 +161,8 @@ pub struct SceneSource {
     camera: Camera,
     options: SceneOptions,
     poses: SampleOptions,
+    /// Colours of the objects.
+    palette: Vec<[u8; 3]>,
 }
 
 /// An image in the making.
@@ -234,7 +243,8 @@ impl SceneSource {
             view_turn: options.rotation,
             ..SampleOptions::default()
         };
-        Ok(SceneSource { objects: prepared, photographs, backgrounds, camera, options, poses })
+        let palette = prepared.iter().flat_map(Prepared::palette).collect();
+        Ok(SceneSource { objects: prepared, photographs, backgrounds, camera, options, poses, palette })
     }
 
     /// The options.
@@ -258,7 +268,7 @@ impl SceneSource {
             for _ in 0..random.random_range(0..=options.most_added) {
                 self.paste_object(&mut canvas, random);
             }
-            if random.random::<f32>() < 0.5 {
+            for _ in 0..random.random_range(0..=2) {
                 self.distract(&mut canvas, random);
             }
             canvas
@@ -271,7 +281,7 @@ impl SceneSource {
             if !empty {
                 for _ in 0..random.random_range(1..=options.most_pasted.max(1)) {
                     self.paste_object(&mut canvas, random);
-                    if random.random::<f32>() < 0.15 {
+                    if random.random::<f32>() < 0.25 {
                         self.distract(&mut canvas, random);
                     }
                 }
@@ -423,10 +433,17 @@ impl SceneSource {
         Some((patch, cover))
     }
 
-    /// Something that is no object to be found: a shape, or the outline of an object filled with something else.
+    /// Something that is no object to be found: a solid, a shape, or the outline of an object filled with something else.
     fn distract(&self, canvas: &mut Canvas, random: &mut Random) {
         let side = self.options.size;
         let longest = uniform(random, [0.06, 0.5]) * side as f32;
+        let feather = uniform(random, [0.4, 1.2]);
+        if random.random::<f32>() < self.options.solid_share {
+            let (patch, cover) = self.solid(longest, random);
+            let corner = self.corner(&patch, random);
+            canvas.paste(&patch, &cover, corner, feather, 0);
+            return;
+        }
         let outline = random.random::<f32>() < 0.5;
         let object = &self.objects[random.random_range(0..self.objects.len())];
         let cover = match object.cutouts.get(random.random_range(0..object.cutouts.len().max(1))) {
@@ -446,8 +463,31 @@ impl SceneSource {
             _ => self.backgrounds.patch(cover.width, cover.height, random),
         };
         let corner = self.corner(&patch, random);
-        let feather = uniform(random, [0.4, 1.2]);
         canvas.paste(&patch, &cover, corner, feather, 0);
+    }
+
+    /// A solid whose longest side is at most `longest` pixels long, from anywhere.
+    fn solid(&self, longest: f32, random: &mut Random) -> (Patch, Coverage) {
+        let mesh = random_solid(&self.backgrounds, &self.palette, random);
+        let distance = f64::from(uniform(random, [4.0, 10.0]));
+        let turn = random_turn(random);
+        let pose = Pose::new(turn.rotation(), Vec3::new(0.0, 0.0, distance));
+        // A cube of side 1 fits into a ball of diameter 1.74; it is nearer than its middle.
+        let size = (1.9 * longest).ceil().max(8.0) as usize;
+        let focal = f64::from(longest) * (distance - 0.87);
+        let middle = 0.5 * (size as f64 - 1.0);
+        let camera = Camera {
+            fx: focal,
+            fy: focal,
+            cx: middle,
+            cy: middle,
+            width: size,
+            height: size,
+            distortion: None,
+        };
+        let (mut patch, cover) = color_patch(&mesh, &camera, &pose, random);
+        self.poses.render_color.apply(&mut patch, random);
+        (patch, cover)
     }
 
     /// What is visible in the end.
@@ -568,6 +608,23 @@ impl Prepared {
         let mesh = mesh.clone().with_normals(normals).unwrap_or(mesh);
         Ok(Prepared { mesh, colored, extremes, centre: (low + high) * 0.5, poses, distance, cutouts })
     }
+
+    /// A few of its colours: as photographed, else those of its mesh.
+    fn palette(&self) -> Vec<[u8; 3]> {
+        let mut colors = vec![];
+        for (cutout, longest) in self.cutouts.iter().take(PALETTE_PICTURES) {
+            let (patch, cover) = draw(cutout, longest.min(64.0), 0.0);
+            let pixels = patch.width * patch.height;
+            let inside: Vec<usize> = (0..pixels).filter(|i| cover.data[*i] > 0.9).collect();
+            colors.extend(inside.iter().step_by((inside.len() / PALETTE_COLORS).max(1)).map(|i| {
+                std::array::from_fn(|c| (255.0 * patch.data[c * pixels + i]).round().clamp(0.0, 255.0) as u8)
+            }));
+        }
+        if let (true, Some(of_mesh)) = (colors.is_empty(), self.mesh.colors()) {
+            colors.extend(of_mesh.iter().step_by((of_mesh.len() / PALETTE_COLORS).max(1)));
+        }
+        colors
+    }
 }
 
 impl std::fmt::Debug for SceneSource {
@@ -594,6 +651,7 @@ impl SceneOptions {
             ("photograph_share", self.photograph_share),
             ("empty_share", self.empty_share),
             ("render_share", self.render_share),
+            ("solid_share", self.solid_share),
             ("least_visible", self.least_visible),
             ("random_color_chance", self.random_color_chance),
             ("near_real_share", self.near_real_share),

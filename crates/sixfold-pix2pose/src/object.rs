@@ -24,6 +24,33 @@ pub struct ObjectEntry {
     pub correction: Correction,
 }
 
+/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
+const SAME_BOX: f64 = 0.05;
+
+/// A mesh that is not the one of the training.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error(
+    "its box measures {} mm, that of object {object_id} in the model {} mm, and corners differ by {:.1} mm: another object, \
+     unit or origin? Give the mesh that the model was trained on",
+    millimetres(found),
+    millimetres(expected),
+    1000.0 * off
+)]
+pub struct OtherMesh {
+    /// The object it was to be.
+    pub object_id: u32,
+    /// Sides of the box in the training, metres.
+    pub expected: [f64; 3],
+    /// Sides of the mesh's box, metres.
+    pub found: [f64; 3],
+    /// Largest difference of a corner's coordinate, metres.
+    pub off: f64,
+}
+
+fn millimetres(sides: &[f64; 3]) -> String {
+    sides.map(|side| format!("{:.1}", 1000.0 * side)).join(" x ")
+}
+
 impl ObjectEntry {
     /// The entry of an object with the thresholds of the BOP entries (section 3.4.4).
     pub fn new(id: u32, info: &ModelInfo, scale: &BoundingBoxScale) -> Self {
@@ -35,6 +62,23 @@ impl ObjectEntry {
             thresholds: BOP_THRESHOLDS.to_vec(),
             correction: Correction::default(),
         }
+    }
+
+    /// An error unless the mesh is the object's: of the same size and place in its frame.
+    ///
+    /// # Errors
+    /// [`OtherMesh`].
+    pub fn check_mesh(&self, mesh: &Mesh) -> Result<(), OtherMesh> {
+        let scale = self.scale();
+        let (low, high) = mesh.bounding_box();
+        let low_off = low - (scale.centre - scale.half_size);
+        let high_off = high - (scale.centre + scale.half_size);
+        let off = low_off.amax().max(high_off.amax());
+        if off <= SAME_BOX * self.diameter {
+            return Ok(());
+        }
+        let expected = (2.0 * scale.half_size).into();
+        Err(OtherMesh { object_id: self.id, expected, found: (high - low).into(), off })
     }
 
     /// How coordinates are normalised.
@@ -110,6 +154,21 @@ pub fn symmetry_deviation(mesh: &Mesh, object_from_object: &Pose) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_mesh_of_another_size_or_place_is_refused() {
+        let corners = [Vec3::new(0.0, 0.0, 0.0), Vec3::new(0.2, 0.0, 0.0), Vec3::new(0.0, 0.1, 0.05)];
+        let mesh = Mesh::new(corners.to_vec(), vec![[0, 1, 2]]).unwrap();
+        let info = ModelInfo::of_mesh(&mesh);
+        let (low, high) = mesh.bounding_box();
+        let entry = ObjectEntry::new(7, &info, &BoundingBoxScale::of_corners(&low, &high));
+        assert_eq!(entry.check_mesh(&mesh), Ok(()));
+        assert_eq!(entry.check_mesh(&mesh.scaled(1.02)), Ok(()));
+        let error = entry.check_mesh(&mesh.scaled(1000.0)).unwrap_err().to_string();
+        assert!(error.contains("object 7") && error.contains("200.0 x 100.0 x 50.0 mm"), "{error}");
+        let moved = mesh.transformed(&Pose::from_translation(Vec3::new(0.0, 0.03, 0.0)));
+        assert!((entry.check_mesh(&moved).unwrap_err().off - 0.03).abs() < 1e-9);
+    }
 
     #[test]
     fn a_quarter_turn_of_a_box_with_unequal_sides_is_applied_in_metres() {

@@ -10,6 +10,7 @@ use sixfold_bop::{
 };
 use sixfold_geometry::Rect;
 use sixfold_mesh::Mesh;
+use sixfold_nn::weights::ModelCard;
 
 use super::detect::Detector;
 
@@ -49,6 +50,14 @@ impl Boxes {
             }
         }
         Ok((Boxes::Detections(read.detections), skipped))
+    }
+
+    /// The card of the detector, if there is one.
+    pub fn detector_card(&self) -> Option<&ModelCard> {
+        match self {
+            Boxes::Detector(detector, _) => Some(detector.model().card()),
+            _ => None,
+        }
     }
 
     /// Boxes of a target with their scores: detections best first, as many as there are instances, or the ground

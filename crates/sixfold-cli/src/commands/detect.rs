@@ -11,6 +11,7 @@ use sixfold_detect::detect::{DetectOptions, Detected};
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
 
+use super::frames::excepted;
 use crate::Outcome;
 use crate::arguments::DetectArguments;
 use crate::output::{report, write_atomically};
@@ -244,10 +245,8 @@ fn images(a: &DetectArguments, dataset: &BopDataset) -> Result<Vec<(u32, u32)>> 
             images.extend(dataset.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
         }
     }
-    if let Some(file) = &a.except {
-        for t in dataset.targets(Some(file))? {
-            images.remove(&(t.scene_id, t.im_id));
-        }
+    for image in excepted(dataset, a.except.as_deref())? {
+        images.remove(&image);
     }
     Ok(images.into_iter().collect())
 }

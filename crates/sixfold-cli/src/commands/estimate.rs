@@ -20,9 +20,9 @@ use crate::progress::{Progress, check_interrupt};
 const SURE_ENOUGH: f64 = 0.25;
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
-    if a.weights.is_some() || a.object_id.is_some() || a.icp || a.detector.is_some() {
+    if a.weights.is_some() || a.object_id.is_some() || a.icp || a.detector.is_some() || a.looks.is_some() {
         bail!(
-            "--weights, --object-id, --icp and, for one image, --detector belong to --method pix2pose; point pair features \
+            "--weights, --object-id, --icp, --looks and, for one image, --detector belong to --method pix2pose; point pair features \
              need none of them"
         );
     }

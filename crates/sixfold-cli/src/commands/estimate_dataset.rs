@@ -15,6 +15,7 @@ use sixfold_pix2pose::estimate::EstimateError;
 
 use super::boxes::Boxes;
 use super::estimate::{box_mask, estimate_options, scene_options};
+use super::frames::excepted;
 use super::pix2pose::Pix2Pose;
 use crate::Outcome;
 use crate::arguments::{EstimateArguments, Method};
@@ -30,11 +31,16 @@ struct RunRecord {
     method: String,
     weights: Option<String>,
     refine: bool,
+    /// Of Pix2Pose only.
+    #[serde(default)]
+    looks: Option<usize>,
     #[serde(default)]
     icp: bool,
     dataset: String,
     split: String,
     targets: Option<String>,
+    #[serde(default)]
+    except: Option<String>,
     boxes: Option<String>,
     #[serde(default)]
     detector: Option<String>,
@@ -76,7 +82,10 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         bail!("--out: found {}, expected a file that ends in .csv", out.display());
     }
     let dataset = BopDataset::open(root, &a.split)?;
-    let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
+    let mut targets = dataset.targets(a.targets.as_deref())?;
+    let left_out = excepted(&dataset, a.except.as_deref())?;
+    targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
+    let targets = dataset.object_targets(&targets)?;
     let mut skipped: Vec<String> = vec![];
     let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
     let boxes = match (a.boxes.as_deref(), &a.detector) {
@@ -99,8 +108,10 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             )
         }
         Method::Pix2pose => Some(Pix2Pose::new(a)?),
-        Method::Ppf if a.weights.is_some() || a.icp => {
-            bail!("--weights and --icp belong to --method pix2pose; point pair features need neither")
+        Method::Ppf if a.weights.is_some() || a.icp || a.looks.is_some() => {
+            bail!(
+                "--weights, --icp and --looks belong to --method pix2pose; point pair features need none of them"
+            )
         }
         Method::Ppf => None,
     };
@@ -114,10 +125,12 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         method: a.method.name().into(),
         weights: a.weights.as_ref().map(|w| w.display().to_string()),
         refine: a.refines(),
+        looks: pix2pose.as_ref().map(Pix2Pose::looks),
         icp: a.icp,
         dataset: root.display().to_string(),
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
+        except: a.except.as_ref().map(|t| t.display().to_string()),
         boxes: a.boxes.clone(),
         detector: a.detector.as_ref().map(|w| w.display().to_string()),
         min_score: a.min_score,

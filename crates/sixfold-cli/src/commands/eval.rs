@@ -10,6 +10,7 @@ use sixfold_bop::{
     read_detections, read_results, read_results_lenient, write_recall_curves,
 };
 
+use super::frames::excepted;
 use crate::Outcome;
 use crate::arguments::EvalArguments;
 use crate::output::report;
@@ -41,7 +42,9 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
             row.expected
         );
     }
-    let targets = dataset.targets(a.targets.as_deref())?;
+    let mut targets = dataset.targets(a.targets.as_deref())?;
+    let left_out = excepted(&dataset, a.except.as_deref())?;
+    targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
     let options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::default() };
     let progress = std::sync::Mutex::new(None);
     let localisation = evaluate(&dataset, &estimates, &targets, &options, &|p| {
@@ -181,10 +184,8 @@ fn coco_truth(a: &EvalArguments, dataset: &BopDataset) -> Result<VisibleTruth> {
             }
         }
     }
-    if let Some(file) = &a.except {
-        for t in dataset.targets(Some(file))? {
-            images.remove(&(t.scene_id, t.im_id));
-        }
+    for image in excepted(dataset, a.except.as_deref())? {
+        images.remove(&image);
     }
     let mut files = vec![];
     for scene_id in dataset.scene_ids() {

@@ -8,6 +8,7 @@ use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::Rect;
 use sixfold_mesh::ModelInfo;
+use sixfold_nn::weights::{ModelCard, read_card};
 use sixfold_pix2pose::samples::{RealCrop, TrainingObject, read_real_crops};
 use sixfold_render::BoundingBoxScale;
 
@@ -149,8 +150,28 @@ pub(super) fn backgrounds(
     Ok(backgrounds.with_procedural_share(share))
 }
 
+/// What a card says of the weights that a training began with: how they came about, and theirs in turn.
+pub(super) fn continued_from(init: Option<&Path>) -> Result<serde_json::Value> {
+    let Some(file) = init else { return Ok(serde_json::Value::Null) };
+    let card = read_card(file)?;
+    Ok(serde_json::json!({
+        "file": file.display().to_string(),
+        "command": card.command,
+        "data": card.data,
+        "steps": card.steps,
+        "seed": card.seed,
+        "continued_from": card.extra["continued_from"],
+    }))
+}
+
 /// What the user typed, for the card.
 pub(super) fn command_line() -> String {
-    let words = std::env::args().skip(1);
+    let words = std::env::args().skip(1).filter(|word| word != "--export");
     std::iter::once("sixfold".to_string()).chain(words).collect::<Vec<_>>().join(" ")
+}
+
+/// Whether a model's card names a frame (`scene/image`) among those of its training.
+pub(crate) fn was_trained_on(card: &ModelCard, scene_id: u32, im_id: u32) -> bool {
+    let name = format!("{scene_id}/{im_id}");
+    card.data.split(|c: char| !(c.is_ascii_digit() || c == '/')).any(|word| word == name)
 }

@@ -3,12 +3,12 @@
 pub(crate) mod boxes;
 pub(crate) mod completions;
 pub(crate) mod demo;
-pub(crate) mod demo_rgb;
 pub(crate) mod detect;
 pub(crate) mod estimate;
 pub(crate) mod estimate_dataset;
 pub(crate) mod estimate_rgb;
 pub(crate) mod eval;
+pub(crate) mod frames;
 pub(crate) mod grasp;
 pub(crate) mod material;
 pub(crate) mod object;

@@ -1,10 +1,11 @@
 //! Pix2Pose as the commands use it: model, options, refinement and alignment with depth in one.
 
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
@@ -36,9 +37,6 @@ pub(crate) struct Pix2PosePose {
     pub found: Found,
 }
 
-/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
-const SAME_BOX: f64 = 0.05;
-
 impl Pix2Pose {
     pub fn new(a: &EstimateArguments) -> Result<Pix2Pose> {
         let weights = a.weights.as_deref().ok_or_else(|| {
@@ -48,7 +46,10 @@ impl Pix2Pose {
         })?;
         let pix2pose = Pix2Pose::load(weights)?;
         let estimate = EstimateOptions { seed: a.seed, ..EstimateOptions::default() };
-        Ok(pix2pose.varied(AlignOptions { estimate, ..AlignOptions::default() }, a.refines()))
+        let options = AlignOptions { estimate, ..AlignOptions::default() };
+        let looks = a.looks.map_or(options.looks, NonZeroUsize::get);
+        let options = AlignOptions { looks, ..options };
+        Ok(pix2pose.varied(options, a.refines()))
     }
 
     /// The model of a weight file with the default options.
@@ -62,15 +63,13 @@ impl Pix2Pose {
         Pix2Pose { model: self.model.clone(), options, aligns, outlines: self.outlines.clone() }
     }
 
-    pub fn model(&self) -> &Pix2PoseModel {
-        &self.model
+    /// Most looks at an object.
+    pub fn looks(&self) -> usize {
+        self.options.looks
     }
 
-    /// Whether the model's card names a frame (`scene/image`) among those of its training.
-    pub fn was_trained_on(&self, scene_id: u32, im_id: u32) -> bool {
-        let name = format!("{scene_id}/{im_id}");
-        let card = &self.model.card().data;
-        card.split(|c: char| !(c.is_ascii_digit() || c == '/')).any(|word| word == name)
+    pub fn model(&self) -> &Pix2PoseModel {
+        &self.model
     }
 
     /// What the model knows of an object; without an id, of its only one.
@@ -87,27 +86,7 @@ impl Pix2Pose {
 
     /// An error unless the mesh is that of the model's object `id`: same place and size in its frame.
     pub fn check_mesh(&self, id: u32, mesh: &Mesh, name: &str) -> Result<()> {
-        let entry = self.entry(Some(id))?;
-        let scale = entry.scale();
-        let (low, high) = mesh.bounding_box();
-        let off = (low - (scale.centre - scale.half_size))
-            .amax()
-            .max((high - (scale.centre + scale.half_size)).amax());
-        if off > SAME_BOX * entry.diameter {
-            let size = high - low;
-            let expected = 2.0 * scale.half_size;
-            bail!(
-                "{name}: its box measures {:.1} x {:.1} x {:.1} mm, that of object {id} in the model {:.1} x {:.1} x {:.1} mm, \
-                 and corners differ by {:.1} mm: another object, unit or origin? Give the mesh that the model was trained on",
-                1000.0 * size.x,
-                1000.0 * size.y,
-                1000.0 * size.z,
-                1000.0 * expected.x,
-                1000.0 * expected.y,
-                1000.0 * expected.z,
-                1000.0 * off
-            );
-        }
+        self.entry(Some(id))?.check_mesh(mesh).with_context(|| name.to_owned())?;
         Ok(())
     }
 

@@ -19,7 +19,7 @@ use sixfold_pix2pose::refine::outline_mesh;
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
 use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 
-use super::material::{Material, backgrounds, command_line, material};
+use super::material::{Material, backgrounds, command_line, continued_from, material};
 use super::train_detector::train_detector;
 use crate::Outcome;
 use crate::arguments::{NetworkKind, TrainArguments, TrainCommand, TrainPix2PoseArguments};
@@ -138,7 +138,8 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     card.data = description;
     card.seed = options.seed;
     card.command = command_line();
-    card.extra = serde_json::json!({ "training": options });
+    card.extra =
+        serde_json::json!({ "training": options, "continued_from": continued_from(a.init.as_deref())? });
     let dissertation = AdversarialOptions {
         steps: a.steps.unwrap_or(25_000),
         batch: a.per_object.unwrap_or(50),

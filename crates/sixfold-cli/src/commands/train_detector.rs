@@ -12,7 +12,7 @@ use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use sixfold_pix2pose::samples::read_real_crops;
 
-use super::material::{command_line, material, plain_backgrounds};
+use super::material::{command_line, continued_from, material, plain_backgrounds};
 use super::train::Summary;
 use crate::arguments::{DetectorKind, TrainDetectorArguments};
 use crate::progress::{Progress, interrupted};
@@ -69,7 +69,8 @@ pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary> {
     card.data = material.description;
     card.seed = a.seed;
     card.command = command_line();
-    card.extra = serde_json::json!({ "training": options });
+    card.extra =
+        serde_json::json!({ "training": options, "continued_from": continued_from(a.init.as_deref())? });
     let usage = DetectorUse { longest_side: a.longest_side, threshold: a.threshold };
     let classes: Vec<ClassEntry> = ids.iter().map(|id| ClassEntry { id: *id }).collect();
     let path = a.out.join("model.safetensors");

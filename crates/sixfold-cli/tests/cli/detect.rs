@@ -28,9 +28,18 @@ fn a_detector_is_trained_and_used() {
     assert!(card.contains("7/0 7/4 7/11"), "{card}");
     // Nothing is left to do: the same again; other options need another folder.
     let model = std::fs::read(tiny.path().join(WEIGHTS)).unwrap();
-    sixfold(tiny.path(), &format!("{TRAIN} --steps 120 --export")).expect(0);
-    assert!(!model.is_empty());
+    sixfold(tiny.path(), &format!("{TRAIN} --steps 120 --export --json")).expect(0);
+    assert!(std::fs::read(tiny.path().join(WEIGHTS)).unwrap() == model);
     fails(tiny.path(), &format!("{TRAIN} --steps 121"), &["steps was 120, is 121", "another folder"]);
+
+    // Going on from weights, whose origin the card keeps.
+    let further = TRAIN.replace("--out detector", &format!("--out further --init {WEIGHTS} --steps 1"));
+    sixfold(tiny.path(), &further).expect(0);
+    let card = std::fs::read_to_string(tiny.path().join("further/model.md")).unwrap();
+    assert!(
+        card.contains("continued_from") && card.contains(&format!("sixfold {TRAIN} --steps 120")),
+        "{card}"
+    );
 
     // One image: the object, its box, its mask, a picture.
     let rgb = "--rgb tiny/test/000007/rgb/000004.png";

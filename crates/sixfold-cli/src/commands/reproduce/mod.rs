@@ -21,6 +21,7 @@ use sixfold_pix2pose::estimate::Quirks;
 
 use self::row::{Row, Setting};
 use super::boxes::Boxes;
+use super::material::was_trained_on;
 use super::pix2pose::Pix2Pose;
 use crate::Outcome;
 use crate::arguments::{ReproduceArguments, ReproduceCommand, ReproducePix2PoseArguments};
@@ -44,7 +45,6 @@ struct Inputs {
     weights_hash: String,
     /// Frames left out, `scene/image`.
     trained_on: Vec<String>,
-    detections: Option<String>,
     published: Option<String>,
     quick: bool,
     seed: u64,
@@ -67,8 +67,17 @@ struct Bench {
     meshes: BTreeMap<u32, Mesh>,
     /// Visible ground-truth boxes by scene, image and object.
     truth: Regions,
-    detections: Option<Regions>,
+    detections: Vec<Detections>,
     seed: u64,
+}
+
+/// A file of detections.
+struct Detections {
+    /// The file's name without its ending.
+    name: String,
+    /// FNV-1a of the file: another file's rows are others.
+    hash: u64,
+    regions: Regions,
 }
 
 /// Boxes and their scores by scene, image and object.
@@ -114,7 +123,6 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
             fnv(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
         ),
         trained_on: trained_on.iter().map(|(scene, image)| format!("{scene}/{image}")).collect(),
-        detections: a.detections.as_ref().map(|f| f.display().to_string()),
         published: a.published.as_ref().map(|f| f.display().to_string()),
         quick: a.quick,
         seed: a.seed,
@@ -122,7 +130,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
     same_inputs(&a.out, &inputs)?;
     let bench = Bench::new(a, dataset, targets, &pix2pose)?;
     let mut rows = vec![];
-    for setting in settings(a) {
+    for setting in settings(&bench) {
         check_interrupt("the rows done so far are kept; run the same command again to go on")?;
         let used = setting.of(&pix2pose, a.seed);
         rows.push(row::kept_or_made(&a.out, &setting.key, || bench.measure(&used, &setting, &a.out))?);
@@ -161,7 +169,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
 }
 
 /// The ways of using the model that are compared.
-fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
+fn settings(bench: &Bench) -> Vec<Setting> {
     let plain = Setting::plain;
     let mut all = vec![
         Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned (default)") },
@@ -213,16 +221,13 @@ fn settings(a: &ReproducePix2PoseArguments) -> Vec<Setting> {
         let title = format!("default, boxes moved and scaled by up to {percent} % of their size");
         all.push(Setting { refine: true, noise: Some(f64::from(percent) / 100.0), ..plain(key, &title) });
     }
-    if a.detections.is_some() {
-        all.push(Setting {
-            refine: true,
-            detections: true,
-            ..plain("detections", "default, boxes of the detections")
-        });
-        all.push(Setting {
-            detections: true,
-            ..plain("detections-no-refinement", "two stages, PnP, boxes of the detections")
-        });
+    for (number, d) in bench.detections.iter().enumerate() {
+        let key = format!("detections-{}-{:08x}", d.name, d.hash as u32);
+        let title = format!("default, boxes of {}", d.name);
+        all.push(Setting { refine: true, detections: Some(number), ..plain(&key, &title) });
+        let title = format!("two stages, PnP, boxes of {}", d.name);
+        let key = format!("{key}-no-refinement");
+        all.push(Setting { detections: Some(number), ..plain(&key, &title) });
     }
     all
 }
@@ -244,7 +249,7 @@ fn test_targets(
     }
     // The model's card says what it was trained on: scores on those frames would be worth nothing.
     let card = &pix2pose.model().card().data;
-    if let Some(t) = targets.iter().find(|t| pix2pose.was_trained_on(t.scene_id, t.im_id)) {
+    if let Some(t) = targets.iter().find(|t| was_trained_on(pix2pose.model().card(), t.scene_id, t.im_id)) {
         bail!(
             "{}: the model was trained on frame {}/{}, which {} does not list; give the frames of its training (its card says: {card})",
             a.weights.display(),
@@ -306,7 +311,7 @@ impl Bench {
             meshes.insert(id, dataset.model(id, Models::Rendering)?);
         }
         let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
-        Ok(Bench { dataset, targets, meshes, truth, detections: None, seed })
+        Ok(Bench { dataset, targets, meshes, truth, detections: vec![], seed })
     }
 
     fn new(
@@ -322,16 +327,20 @@ impl Bench {
             meshes.insert(id, mesh);
         }
         let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
-        let detections = match &a.detections {
-            None => None,
-            Some(file) => {
-                let (boxes, skipped) = Boxes::read(&dataset, file)?;
-                for s in skipped {
-                    eprintln!("skipped {s}");
-                }
-                Some(regions(&dataset, &targets, &meshes, &boxes)?)
+        let mut detections = vec![];
+        for file in &a.detections {
+            let (boxes, skipped) = Boxes::read(&dataset, file)?;
+            for s in skipped {
+                eprintln!("skipped {s}");
             }
-        };
+            let hash = fnv(&std::fs::read(file).with_context(|| file.display().to_string())?);
+            let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            detections.push(Detections {
+                name,
+                hash,
+                regions: regions(&dataset, &targets, &meshes, &boxes)?,
+            });
+        }
         Ok(Bench { dataset, targets, meshes, truth, detections, seed: a.seed })
     }
 }

@@ -13,7 +13,7 @@ use sixfold_geometry::Rect;
 use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::estimate::EstimateOptions;
 
-use super::Bench;
+use super::{Bench, Regions};
 use crate::commands::pix2pose::Pix2Pose;
 use crate::output::write_atomically;
 use crate::progress::{Progress, check_interrupt};
@@ -33,8 +33,8 @@ pub(super) struct Setting {
     pub correct: bool,
     /// Ground-truth boxes are moved and scaled by up to this share of their size.
     pub noise: Option<f64>,
-    /// Boxes of the file of detections instead of the ground truth's.
-    pub detections: bool,
+    /// Boxes of this file of detections instead of the ground truth's.
+    pub detections: Option<usize>,
 }
 
 /// A row as it is kept.
@@ -44,12 +44,24 @@ pub(super) struct Row {
     pub title: String,
     pub boxes: String,
     pub scores: Scores,
+    /// Of detections: how good their boxes are.
+    #[serde(default)]
+    pub detection: Option<RightBoxes>,
     /// Boxes looked into.
     pub regions: usize,
     /// Poses found in them.
     pub found: usize,
     /// Per box: crops, both stages, PnP and, where it is done, refinement.
     pub milliseconds: Option<Times>,
+}
+
+/// Detections as table 3.9 of the dissertation judges them.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(super) struct RightBoxes {
+    /// Share of the targets whose best box overlaps the visible ground truth's by more than half.
+    pub share: f64,
+    /// ADD(-S) below a tenth of the diameter over these targets alone.
+    pub add_s: Option<f64>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -106,7 +118,7 @@ impl Setting {
             looks: AlignOptions::default().looks,
             correct: true,
             noise: None,
-            detections: false,
+            detections: None,
         }
     }
 
@@ -125,8 +137,8 @@ impl Setting {
 impl Bench {
     /// Estimates all targets in one way, keeps the poses and scores them.
     pub(super) fn measure(&self, pix2pose: &Pix2Pose, setting: &Setting, folder: &Path) -> Result<Row> {
-        let boxes = if setting.detections { self.detections.as_ref() } else { Some(&self.truth) };
-        let boxes = boxes.ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
+        let detections = setting.detections.and_then(|number| self.detections.get(number));
+        let boxes = detections.map_or(&self.truth, |d| &d.regions);
         let mut images: BTreeMap<(u32, u32), Vec<&Target>> = BTreeMap::new();
         for t in &self.targets {
             images.entry((t.scene_id, t.im_id)).or_default().push(t);
@@ -191,12 +203,29 @@ impl Bench {
         let csv = folder.join("rows").join(format!("{}.csv", setting.key));
         std::fs::create_dir_all(folder.join("rows")).with_context(|| folder.display().to_string())?;
         write_results(&csv, &estimates)?;
-        let name = match (setting.detections, setting.noise) {
-            (true, _) => "detections".to_string(),
-            (false, None) => "ground truth".to_string(),
-            (false, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
+        let name = match (detections, setting.noise) {
+            (Some(d), _) => d.name.clone(),
+            (None, None) => "ground truth".to_string(),
+            (None, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
         };
-        self.scored(&setting.key, &setting.title, &name, &estimates, times, regions)
+        let mut row = self.scored(&setting.key, &setting.title, &name, &estimates, times, regions)?;
+        row.detection = detections.map(|d| self.right_boxes(&d.regions, &estimates)).transpose()?;
+        Ok(row)
+    }
+
+    /// How many targets were detected, and the poses of those alone.
+    fn right_boxes(&self, detected: &Regions, estimates: &[Estimate]) -> Result<RightBoxes> {
+        let overlaps = |t: &&Target| {
+            let Some(key) = t.object.map(|o| (t.scene_id, t.im_id, o.obj_id)) else { return false };
+            let best = detected.get(&key).and_then(|boxes| boxes.first());
+            let truth = self.truth.get(&key).map_or(&[][..], Vec::as_slice);
+            best.is_some_and(|(found, _)| truth.iter().any(|(b, _)| overlap(found, b) > RIGHT_BOX))
+        };
+        let right: Vec<Target> = self.targets.iter().filter(overlaps).copied().collect();
+        let share = right.len() as f64 / self.targets.len().max(1) as f64;
+        let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
+        let e = evaluate(&self.dataset, estimates, &right, &options, &|_| {})?;
+        Ok(RightBoxes { share, add_s: e.add_s_recall.get("mean").copied().flatten() })
     }
 
     /// A row of estimates.
@@ -244,11 +273,21 @@ impl Bench {
                     .then(|| each.iter().sum::<f64>() / each.len() as f64),
                 objects,
             },
+            detection: None,
             regions,
             found: e.estimates.saturating_sub(e.estimates_left_out),
             milliseconds,
         })
     }
+}
+
+/// Boxes that overlap more are right.
+const RIGHT_BOX: f64 = 0.5;
+
+/// Intersection over union.
+fn overlap(a: &Rect, b: &Rect) -> f64 {
+    let common = a.intersect(b).map_or(0.0, |r| r.width * r.height);
+    common / (a.width * a.height + b.width * b.height - common)
 }
 
 /// The box with centre and sides moved by up to `share` of its sides; a box and a seed always give the same.
@@ -269,6 +308,14 @@ fn moved(region: &Rect, share: f64, seed: [u64; 5]) -> Rect {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn overlap_is_intersection_over_union() {
+        let of = |x: f64, width: f64| Rect { x, y: 0.0, width, height: 10.0 };
+        assert_eq!(overlap(&of(0.0, 10.0), &of(0.0, 10.0)), 1.0);
+        assert!((overlap(&of(0.0, 10.0), &of(5.0, 10.0)) - 1.0 / 3.0).abs() < 1e-12);
+        assert_eq!(overlap(&of(0.0, 10.0), &of(20.0, 10.0)), 0.0);
+    }
 
     #[test]
     fn noise_is_bounded_repeatable_and_different_for_every_box() {

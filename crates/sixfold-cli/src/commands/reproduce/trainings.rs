@@ -121,7 +121,7 @@ impl Bench {
                 .map(|(id, m)| (*id, m.clone()))
                 .collect(),
             truth: mine(&self.truth),
-            detections: None,
+            detections: vec![],
             seed: self.seed,
         }
     }

@@ -1,4 +1,5 @@
-//! The demo's second half: poses from colour alone in the boxes of the ground truth, beside those from depth.
+//! The demo's second half: poses from colour alone, beside those from depth. A detector says where the objects are; without
+//! its weights the ground truth does.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,9 +9,10 @@ use anyhow::{Result, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Target, write_rgb};
 
-use super::boxes::Boxes;
-use super::demo::{Known, add_s, found_upwards};
-use super::pix2pose::Pix2Pose;
+use super::super::boxes::Boxes;
+use super::super::material::was_trained_on;
+use super::super::pix2pose::Pix2Pose;
+use super::samples::{Known, add_s, found_upwards};
 use crate::arguments::DemoArguments;
 use crate::overlay::{self, Drawn};
 use crate::progress::{Progress, check_interrupt};
@@ -29,6 +31,8 @@ pub(super) struct Row {
 #[derive(Serialize)]
 pub(super) struct Colour {
     pub weights: Option<PathBuf>,
+    /// Weights of the detector; without them boxes are the ground truth's.
+    pub detector: Option<PathBuf>,
     pub poses: Vec<Row>,
     pub correct: usize,
     /// Targets in colour images that were looked for.
@@ -40,6 +44,8 @@ pub(super) struct Colour {
 
 /// Weights of the sample objects, relative to the repository.
 const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
+/// The detector of the sample objects.
+const DETECTOR: &str = "weights/detector-lmo.safetensors";
 
 pub(super) fn run(
     a: &DemoArguments,
@@ -49,6 +55,7 @@ pub(super) fn run(
 ) -> Result<Colour> {
     let none = |weights: Option<PathBuf>, reason: String| Colour {
         weights,
+        detector: None,
         poses: vec![],
         correct: 0,
         targets: 0,
@@ -84,8 +91,14 @@ fn with_model(
             pix2pose.check_mesh(*id, &k.object.mesh, &format!("model {id}"))?;
         }
     }
+    let detector = a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR)));
+    let boxes = match &detector {
+        Some(file) => Boxes::of_detector(file, known.keys().copied())?,
+        None => Boxes::GroundTruth,
+    };
     let mut colour = Colour {
         weights: Some(weights.to_owned()),
+        detector,
         poses: vec![],
         correct: 0,
         targets: 0,
@@ -98,8 +111,11 @@ fn with_model(
         for im_id in scene.image_ids() {
             check_interrupt("run it again")?;
             let Some(image) = scene.rgb(im_id)? else { continue };
-            if pix2pose.was_trained_on(scene_id, im_id) {
-                bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", weights.display());
+            let detector = boxes.detector_card().zip(colour.detector.as_deref());
+            for (card, file) in [(pix2pose.model().card(), weights)].into_iter().chain(detector) {
+                if was_trained_on(card, scene_id, im_id) {
+                    bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", file.display());
+                }
             }
             let camera = scene.camera(im_id)?;
             let mut drawn = vec![];
@@ -107,8 +123,7 @@ fn with_model(
                 let Some((o, k)) = t.object.and_then(|o| Some((o, known.get(&o.obj_id)?))) else { continue };
                 colour.targets += 1;
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
-                let regions = Boxes::GroundTruth
-                    .of_target(&scene, t, &o, |id| known.get(&id).map(|k| &k.object.mesh))?;
+                let regions = boxes.of_target(&scene, t, &o, |id| known.get(&id).map(|k| &k.object.mesh))?;
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
                 let (Some((region, _)), Some(truth)) = (regions.first(), truth) else { continue };
                 let start = Instant::now();
@@ -151,9 +166,11 @@ pub(super) fn print_table(colour: &Colour, of_depth: impl Fn(&str, u32) -> Optio
         println!("\nPoses from colour alone (Pix2Pose): none: {reason}");
         return;
     }
-    println!(
-        "\nPoses from colour alone (Pix2Pose), in the boxes of the ground truth; last column: the errors from depth above"
-    );
+    let boxes = match colour.detector {
+        Some(_) => "in the boxes that the detector finds",
+        None => "in the boxes of the ground truth",
+    };
+    println!("\nPoses from colour alone (Pix2Pose), {boxes}; last column: the errors from depth above");
     println!(
         "{:>10} {:>7} {:>12} {:>10} {:>11} {:>8} {:>11}",
         "image", "object", "error (mm)", "of diam.", "confidence", "seconds", "from depth"

@@ -1,23 +1,22 @@
-//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures.
+//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures. Here poses from depth and the
+//! report; `colour.rs` adds poses from colour, `samples.rs` is what both know of the samples.
+
+mod colour;
+mod samples;
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::{
-    BopDataset, EvalOptions, Evaluation, GroundTruth, ModelPoints, Models, evaluate, write_recall_curves,
-    write_rgb,
-};
-use sixfold_geometry::Pose;
+use sixfold_bop::{BopDataset, EvalOptions, Evaluation, evaluate, write_recall_curves, write_rgb};
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
-use sixfold_mesh::ModelInfo;
 
-use super::demo_rgb::{self, Colour};
+use self::colour::Colour;
+use self::samples::{Known, add_s, sample_folder};
 use crate::Outcome;
 use crate::arguments::DemoArguments;
-use crate::objects::Object;
 use crate::output::report;
 use crate::overlay::{self, Drawn};
 use crate::progress::{Progress, check_interrupt};
@@ -47,46 +46,11 @@ struct Whole {
     colour: Colour,
 }
 
-/// An object of the samples, described for point pair features.
-pub(super) struct Known {
-    pub object: Object,
-    model: sixfold_match::ObjectModel,
-    points: ModelPoints,
-}
-
-/// A file or folder of the repository, found from where the program was started or built.
-pub(super) fn found_upwards(name: &Path) -> Option<PathBuf> {
-    let here = std::env::current_dir().unwrap_or_default();
-    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists())
-}
-
-/// The samples: given, or found.
-fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
-    match given.map(Path::to_owned).or_else(|| found_upwards(Path::new("data/demo"))) {
-        Some(folder) => Ok(folder),
-        None => bail!(
-            "the sample data (folder data/demo of the repository) is not here: run inside the repository or give --data DIR"
-        ),
-    }
-}
-
-/// ADD, or ADI for symmetric objects, in metres.
-pub(super) fn add_s(known: &Known, camera_from_object: Pose, truth: &GroundTruth) -> f64 {
-    let estimated = sixfold_bop::Placement::from(camera_from_object);
-    if known.object.info.is_symmetric() {
-        sixfold_bop::adi(&known.points, estimated, truth.placement())
-    } else {
-        sixfold_bop::add(&known.points, estimated, truth.placement())
-    }
-}
-
 pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let start = Instant::now();
     let folder = sample_folder(a.data.as_deref())?;
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
-    let infos = dataset.models_info(Models::Rendering)?;
     let mut known: BTreeMap<u32, Known> = BTreeMap::new();
     let mut progress = Progress::new("poses", targets.len());
     let mut rows = vec![];
@@ -104,15 +68,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 let Some(o) = t.object else { continue };
                 let began = Instant::now();
                 if let std::collections::btree_map::Entry::Vacant(place) = known.entry(o.obj_id) {
-                    let mesh = dataset.model(o.obj_id, Models::Rendering)?;
-                    let points = ModelPoints::new(mesh.vertices())
-                        .ok_or_else(|| anyhow!("object {}: the model has no vertices", o.obj_id))?;
-                    let info = infos.as_ref().and_then(|i| i.0.get(&o.obj_id)).cloned();
-                    let info = info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-                    let description = a.out.join(format!("objects/{:06}.sixfold-ppf", o.obj_id));
-                    let object = Object { name: o.obj_id.to_string(), mesh, info, description };
-                    let model = object.ppf_model()?;
-                    place.insert(Known { object, model, points });
+                    place.insert(Known::new(&dataset, o.obj_id, &a.out.join("objects"))?);
                 }
                 let Some(k) = known.get(&o.obj_id) else { continue };
                 let estimates = estimate(&prepared, &k.model, &EstimateOptions::default());
@@ -163,7 +119,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let curves = a.out.join("recall.png");
     write_recall_curves(&curves, &evaluation)?;
     pictures.push(curves);
-    let colour = demo_rgb::run(a, &dataset, &targets, &known)?;
+    let colour = colour::run(a, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
     let whole = Whole {
         poses: rows,
@@ -201,7 +157,7 @@ fn print_table(whole: &Whole) {
     println!();
     super::eval::print_evaluation(&whole.evaluation);
     println!("\n{} of {} poses within 10 % of the diameter", whole.correct, whole.targets);
-    demo_rgb::print_table(&whole.colour, |image, object| {
+    colour::print_table(&whole.colour, |image, object| {
         whole.poses.iter().find(|r| r.image == image && r.object == object).map(|r| r.add_s_of_diameter)
     });
     println!("\n{:.1} s in all. Pictures:", whole.seconds);

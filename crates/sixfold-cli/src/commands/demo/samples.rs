@@ -1,0 +1,60 @@
+//! The samples: where they are, and what is known of their objects.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, anyhow, bail};
+use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models, Placement, adi};
+use sixfold_geometry::Pose;
+use sixfold_match::ObjectModel;
+use sixfold_mesh::ModelInfo;
+
+use crate::objects::Object;
+
+/// An object of the samples, described for point pair features.
+pub(super) struct Known {
+    pub object: Object,
+    pub model: ObjectModel,
+    points: ModelPoints,
+}
+
+impl Known {
+    /// Object `id`; its description is kept in `folder`.
+    pub fn new(dataset: &BopDataset, id: u32, folder: &Path) -> Result<Known> {
+        let mesh = dataset.model(id, Models::Rendering)?;
+        let points = ModelPoints::new(mesh.vertices())
+            .ok_or_else(|| anyhow!("object {id}: the model has no vertices"))?;
+        let info = dataset.models_info(Models::Rendering)?.and_then(|infos| infos.0.get(&id).cloned());
+        let info = info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
+        let description = folder.join(format!("{id:06}.sixfold-ppf"));
+        let object = Object { name: id.to_string(), mesh, info, description };
+        let model = object.ppf_model()?;
+        Ok(Known { object, model, points })
+    }
+}
+
+/// A file or folder of the repository, found from where the program was started or built.
+pub(super) fn found_upwards(name: &Path) -> Option<PathBuf> {
+    let here = std::env::current_dir().unwrap_or_default();
+    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists())
+}
+
+/// The samples: given, or found.
+pub(super) fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
+    match given.map(Path::to_owned).or_else(|| found_upwards(Path::new("data/demo"))) {
+        Some(folder) => Ok(folder),
+        None => bail!(
+            "the sample data (folder data/demo of the repository) is not here: run inside the repository or give --data DIR"
+        ),
+    }
+}
+
+/// ADD, or ADI for symmetric objects, in metres.
+pub(super) fn add_s(known: &Known, camera_from_object: Pose, truth: &GroundTruth) -> f64 {
+    let estimated = Placement::from(camera_from_object);
+    if known.object.info.is_symmetric() {
+        adi(&known.points, estimated, truth.placement())
+    } else {
+        sixfold_bop::add(&known.points, estimated, truth.placement())
+    }
+}

@@ -1,0 +1,155 @@
+//! `Detector`: boxes and masks of known objects in an image.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyType;
+use sixfold_detect::detect::DetectOptions;
+use sixfold_detect::model::{DetectorModel, ModelError};
+use sixfold_nn::weights::WeightsError;
+
+use crate::arrays::{self, about, bad, whole};
+use crate::guard::{interruptible, os_error};
+
+fn model_error(error: ModelError) -> PyErr {
+    match &error {
+        ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// An object that a detector found.
+#[pyclass(name = "DetectedObject", module = "sixfold", frozen)]
+pub(crate) struct DetectedObject {
+    /// The object.
+    #[pyo3(get)]
+    object_id: u32,
+    /// Confidence, 0 to 1: the expected overlap of the box with the object's.
+    #[pyo3(get)]
+    score: f32,
+    /// Box of the visible part, (4,) float64: x, y, width, height in pixels.
+    #[pyo3(get)]
+    bbox: Py<PyArray1<f64>>,
+    /// Visible part, (H, W) bool, or None without masks.
+    #[pyo3(get)]
+    mask: Option<Py<PyArray2<bool>>>,
+}
+
+#[pymethods]
+impl DetectedObject {
+    fn __repr__(&self) -> String {
+        format!("<DetectedObject: object {}, score {:.3}>", self.object_id, self.score)
+    }
+}
+
+/// A trained detector: where known objects are, from colour alone. Made by `load`; its boxes are what `Pix2Pose` asks for.
+///
+/// >>> detector = Detector.load("weights/detector-lmo.safetensors")  # doctest: +SKIP
+/// >>> found = detector(rgb)  # doctest: +SKIP
+/// >>> poses = pix2pose(rgb, [d.bbox for d in found], [d.object_id for d in found])  # doctest: +SKIP
+#[pyclass(name = "Detector", module = "sixfold", frozen)]
+pub(crate) struct Detector {
+    model: Arc<DetectorModel>,
+}
+
+#[pymethods]
+impl Detector {
+    /// Reads a weight file (.safetensors) that `sixfold train detector` wrote.
+    ///
+    /// Raises OSError when the file cannot be read, ValueError when it is no such model.
+    #[classmethod]
+    fn load(_class: &Bound<'_, PyType>, py: Python<'_>, path: PathBuf) -> PyResult<Self> {
+        let model = interruptible(py, move |_| DetectorModel::load(&path))?.map_err(model_error)?;
+        Ok(Detector { model: Arc::new(model) })
+    }
+
+    /// Ids of the objects that it knows.
+    #[getter]
+    fn object_ids(&self) -> Vec<u32> {
+        self.model.classes().iter().map(|class| class.id).collect()
+    }
+
+    /// Detections with a lower score are left out unless a call says otherwise.
+    #[getter]
+    fn threshold(&self) -> f32 {
+        self.model.usage().threshold
+    }
+
+    /// The model's card: what it was trained on, how, with which scores.
+    #[getter]
+    fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        crate::bop::json_to_python(py, self.model.card())
+    }
+
+    /// Looks for the detector's objects in an image: a list of DetectedObject, best first.
+    ///
+    /// rgb (H, W, 3) uint8, of any size, larger ones are reduced; object_ids: only these; threshold on the score in place of
+    /// the model's; overlap: of two boxes of an object that overlap more (intersection over union) the worse one is left
+    /// out; at most per_object detections of an object and max_detections in all; masks=False leaves the masks out. Ctrl-C
+    /// is heard.
+    ///
+    /// Raises ValueError for an unknown object, an option out of its range, an image without pixels.
+    #[pyo3(signature = (rgb, *, object_ids=None, threshold=None, overlap=0.5, per_object=100, max_detections=100, masks=true))]
+    #[allow(clippy::too_many_arguments)]
+    fn __call__(
+        &self,
+        py: Python<'_>,
+        rgb: &Bound<'_, PyAny>,
+        object_ids: Option<&Bound<'_, PyAny>>,
+        threshold: Option<f64>,
+        overlap: f64,
+        per_object: i64,
+        max_detections: i64,
+        masks: bool,
+    ) -> PyResult<Vec<DetectedObject>> {
+        let image = arrays::rgb("rgb", rgb)?;
+        let wanted = object_ids.map(|ids| arrays::ids("object_ids", ids)).transpose()?;
+        for id in wanted.iter().flatten() {
+            self.model.check_object(*id).map_err(about("object_ids"))?;
+        }
+        let options = DetectOptions {
+            threshold: share("threshold", threshold.unwrap_or(f64::from(self.threshold())))?,
+            overlap: share("overlap", overlap)?,
+            per_class: whole("per_object", per_object, 1)?,
+            most: whole("max_detections", max_detections, 1)?,
+            masks,
+        };
+        let model = self.model.clone();
+        let found = interruptible(py, move |_| model.detect(&image, &options))?.map_err(about("rgb"))?;
+        let mut out = Vec::with_capacity(found.len());
+        for d in found {
+            let object_id = self.model.id_of(d.class);
+            if wanted.as_ref().is_some_and(|ids| !ids.contains(&object_id)) {
+                continue;
+            }
+            let b = d.bbox;
+            out.push(DetectedObject {
+                object_id,
+                score: d.score,
+                bbox: PyArray1::from_vec(py, vec![b.x, b.y, b.width, b.height]).unbind(),
+                mask: d
+                    .mask
+                    .map(|mask| Ok::<_, PyErr>(arrays::from_image(py, mask)?.unbind()))
+                    .transpose()?,
+            });
+        }
+        Ok(out)
+    }
+
+    fn __repr__(&self) -> String {
+        let ids: Vec<String> = self.object_ids().iter().map(u32::to_string).collect();
+        format!("<Detector: objects {}>", ids.join(", "))
+    }
+}
+
+/// 0 to 1.
+fn share(argument: &str, value: f64) -> PyResult<f32> {
+    if (0.0..=1.0).contains(&value) {
+        Ok(value as f32)
+    } else {
+        Err(bad(argument, "a number from 0 to 1", value.to_string()))
+    }
+}
