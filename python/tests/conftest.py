@@ -30,26 +30,25 @@ def pose():
     return posed((0.02, -0.03, 0.7), (0.6, -0.4, 0.3))
 
 
+def at_hand(name, what):
+    """A file or folder of the repository; without it the test is skipped."""
+    path = ROOT / name
+    if not path.exists():
+        pytest.skip(f"the repository's {what} are not at hand")
+    return path
+
+
 @pytest.fixture(scope="session")
 def demo():
     """The sample dataset of the repository."""
-    folder = ROOT / "data/demo"
-    if not folder.is_dir():
-        pytest.skip("the repository's sample data is not at hand")
-    return folder
+    return at_hand("data/demo", "sample data")
 
 
 @pytest.fixture(scope="session")
 def weights():
-    file = ROOT / "weights/pix2pose-lmo.safetensors"
-    if not file.is_file():
-        pytest.skip("the repository's weights are not at hand")
-    return file
+    return at_hand("weights/pix2pose-lmo.safetensors", "weights")
 
 
 @pytest.fixture(scope="session")
 def detector_weights():
-    file = ROOT / "weights/detector-lmo.safetensors"
-    if not file.is_file():
-        pytest.skip("the repository's weights are not at hand")
-    return file
+    return at_hand("weights/detector-lmo.safetensors", "weights")
