@@ -452,9 +452,9 @@ pub(crate) struct DetectArguments {
     /// Trained detector: a file that `sixfold train detector` wrote
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: PathBuf,
-    /// Colour image: PNG or JPEG of any size, grey or colour
-    #[arg(long, value_name = "FILE", required_unless_present = "dataset", conflicts_with = "dataset")]
-    pub rgb: Option<PathBuf>,
+    /// Colour images: PNG or JPEG of any size, grey or colour
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]
+    pub rgb: Vec<PathBuf>,
     /// BOP dataset folder: detect in the images of its targets
     #[arg(long, value_name = "DIR", requires = "out")]
     pub dataset: Option<PathBuf>,
@@ -467,7 +467,7 @@ pub(crate) struct DetectArguments {
     /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE", requires = "dataset")]
     pub except: Option<PathBuf>,
-    /// Result: a JSON file of COCO detections for a dataset, a folder for one image
+    /// Result: a JSON file of COCO detections for a dataset, a folder for images
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Folder for overlay pictures of a dataset's images

@@ -1,4 +1,4 @@
-//! `sixfold detect`: boxes and masks of a detector's objects, in one image or in all of a dataset.
+//! `sixfold detect`: boxes and masks of a detector's objects, in images or in all of a dataset.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -72,6 +72,36 @@ struct Found {
     mask_pixels: Option<u64>,
 }
 
+impl Found {
+    /// `None` for a detection without a box, which a detector does not give.
+    fn new(d: &Detection) -> Option<Found> {
+        let b = d.bbox?;
+        Some(Found {
+            object_id: d.category_id,
+            score: d.score,
+            bbox: [b.x, b.y, b.width, b.height],
+            mask_pixels: d.segmentation.as_ref().map(Rle::area),
+        })
+    }
+}
+
+#[derive(Serialize)]
+struct Many {
+    images: Vec<OneOfMany>,
+    detections: usize,
+    detections_per_image: Option<f64>,
+    skipped: Vec<String>,
+}
+
+#[derive(Serialize)]
+struct OneOfMany {
+    /// Its place, from 1.
+    image: u32,
+    file: PathBuf,
+    detections: Vec<Found>,
+    seconds: f64,
+}
+
 #[derive(Serialize)]
 struct Whole {
     detections: Vec<Found>,
@@ -107,10 +137,11 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     };
     options.check().map_err(|message| anyhow!(message))?;
     let detector = Detector { model, options };
-    match (&a.dataset, &a.rgb) {
+    match (&a.dataset, &a.rgb[..]) {
         (Some(root), _) => in_dataset(a, &detector, root),
-        (None, Some(file)) => in_image(a, &detector, file),
-        (None, None) => bail!("give --rgb FILE or --dataset DIR"),
+        (None, [file]) => in_image(a, &detector, file),
+        (None, []) => bail!("give --rgb FILE or --dataset DIR"),
+        (None, files) => in_images(a, &detector, files),
     }
 }
 
@@ -134,18 +165,7 @@ fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Out
         write_detections(&path, &found)?;
         json = Some(path);
     }
-    let detections = found
-        .iter()
-        .filter_map(|d| {
-            let b = d.bbox?;
-            Some(Found {
-                object_id: d.category_id,
-                score: d.score,
-                bbox: [b.x, b.y, b.width, b.height],
-                mask_pixels: d.segmentation.as_ref().map(Rle::area),
-            })
-        })
-        .collect();
+    let detections = found.iter().filter_map(Found::new).collect();
     let whole = Whole { detections, seconds, file: json, overlay };
     if let Some(folder) = &a.out {
         write_atomically(&folder.join("result.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
@@ -166,6 +186,63 @@ fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Out
         }
     })?;
     Ok(if whole.detections.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+/// Several images that belong to no dataset; in `detections.json` their ids are their places, from 1.
+fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Result<Outcome> {
+    let mut progress = Progress::new("images", files.len());
+    let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
+    for (number, file) in (1..).zip(files) {
+        check_interrupt("nothing was written")?;
+        let found = read_rgb(file).map_err(anyhow::Error::from).and_then(|image| {
+            let start = Instant::now();
+            let mut found = detector.detections(&image, 0, number)?;
+            let seconds = start.elapsed().as_secs_f64();
+            found.retain(|d| wanted(a, d.category_id));
+            if let Some(folder) = &a.out {
+                let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+                let path = folder.join(format!("overlays/{number:06}_{stem}.png"));
+                write_rgb(&path, &picture(&image, &found))?;
+            }
+            Ok((found, seconds))
+        });
+        match found {
+            Ok((found, seconds)) => {
+                let detections = found.iter().filter_map(Found::new).collect();
+                images.push(OneOfMany { image: number, file: file.clone(), detections, seconds });
+                all.extend(found);
+            }
+            Err(error) => skipped.push(format!("{}: {}", file.display(), crate::describe(&error))),
+        }
+        progress.step(file.display().to_string());
+    }
+    progress.finish();
+    for s in &skipped {
+        eprintln!("skipped {s}");
+    }
+    if let Some(folder) = &a.out {
+        write_detections(&folder.join("detections.json"), &all)?;
+    }
+    let per_image = (!images.is_empty()).then(|| all.len() as f64 / images.len() as f64);
+    let many = Many { images, detections: all.len(), detections_per_image: per_image, skipped };
+    report(&a.json, &many, || {
+        println!("{:>8} {:>8} {:>10}  file", "image", "objects", "best score");
+        for i in &many.images {
+            let best = i.detections.first().map_or("-".to_string(), |d| format!("{:.3}", d.score));
+            println!("{:>8} {:>8} {best:>10}  {}", i.image, i.detections.len(), i.file.display());
+        }
+        println!("{} detections in {} images", many.detections, many.images.len());
+        if let Some(folder) = &a.out {
+            println!("detections.json and overlays are in {}", folder.display());
+        }
+    })?;
+    Ok(if !many.skipped.is_empty() {
+        Outcome::Incomplete
+    } else if many.detections == 0 {
+        Outcome::NothingFound
+    } else {
+        Outcome::Found
+    })
 }
 
 fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<Outcome> {

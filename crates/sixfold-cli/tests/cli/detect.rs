@@ -57,6 +57,16 @@ fn a_detector_is_trained_and_used() {
     // Nobody is that sure.
     sixfold(tiny.path(), &detect(&format!("{rgb} --threshold 1"))).expect(1);
 
+    // Several files.
+    let several = "--rgb tiny/test/000007/rgb/000000.png tiny/test/000007/rgb/000011.png";
+    let options = "--threshold 0.05 --per-object 1 --out several --json";
+    let json = sixfold(tiny.path(), &detect(&format!("{several} {options}"))).expect(0).json();
+    assert_eq!((&json["images"][1]["image"], &json["detections"]), (&2.into(), &2.into()));
+    assert_eq!(json_of(&tiny.path().join("several/detections.json"))[1]["image_id"], 2);
+    assert!(image::open(tiny.path().join("several/overlays/000002_000011.png")).is_ok());
+    let run = sixfold(tiny.path(), &detect(&format!("{several} nothing.png {options}")));
+    assert!(run.expect(2).stderr.contains("skipped nothing.png"));
+
     // All images, and their scores.
     let all = detect("--dataset tiny --out found.json --overlays pictures --json");
     let json = sixfold(tiny.path(), &all).expect(0).json();
