@@ -126,7 +126,7 @@ if arguments.weights.exists() and arguments.detector.exists():
     detector = sixfold.Detector.load(arguments.detector)
     network = sixfold.Pix2Pose.load(arguments.weights, camera=camera, meshes=meshes)
     begin = time.perf_counter()
-    detected = detector(rgb, per_object=1)
+    detected = detector(rgb, threshold=0.3, per_object=1)  # each object is there once, so unsure boxes are worth a look
     for found in network(rgb, [d.bbox for d in detected], [d.object_id for d in detected]):
         if found is not None:
             from_colour[found.object_id] = found.camera_from_object

@@ -36,7 +36,7 @@ def overlap(a, b):
 
 
 def test_finds_what_is_there(detector, rgb, boxes):
-    found = detector(rgb)
+    found = detector(rgb, threshold=0.3)
     assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
     best = {}
     for d in found:
@@ -55,7 +55,7 @@ def test_poses_in_its_boxes(detector, rgb, demo, weights):
     dataset = bop.Dataset(demo)
     meshes = {i: dataset.model(i) for i in detector.object_ids}
     pix2pose = sixfold.Pix2Pose.load(weights, camera=dataset.camera(2, 3), meshes=meshes)
-    found = detector(rgb, per_object=1)
+    found = detector(rgb, threshold=0.3, per_object=1)
     poses = pix2pose(rgb, [d.bbox for d in found], [d.object_id for d in found])
     truth = {g["obj_id"]: g["camera_from_object"] for g in dataset.ground_truth(2, 3)}
     near = [
@@ -74,7 +74,7 @@ def test_options(detector, rgb):
     assert all(d.mask is None for d in everything) and len(everything) > len(detector(rgb))
     assert all(d.score >= 0.7 for d in detector(rgb, threshold=0.7))
     assert len(detector(rgb, threshold=0, max_detections=3)) == 3
-    only = detector(rgb, object_ids=[8], per_object=1)
+    only = detector(rgb, object_ids=[8], threshold=0.3, per_object=1)
     assert [d.object_id for d in only] == [8]
     again = detector(np.asfortranarray(rgb), threshold=0.02, masks=False)
     assert [tuple(d.bbox) for d in again] == [tuple(d.bbox) for d in everything]

@@ -6,6 +6,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
+use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2, Vec3, undistort_depth, undistort_rgb};
 use sixfold_mesh::Mesh;
@@ -204,11 +205,16 @@ fn print_table(whole: &Whole, folder: Option<&Path>) {
     }
 }
 
+/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
+const ASKED_FOR: f32 = 0.4;
+
 /// Where a detector sees the object best, if at all.
 fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Rect>> {
     let model = DetectorModel::load(weights)?;
     model.check_object(id).with_context(|| weights.display().to_string())?;
-    let found = model.detect(image, &model.options())?;
+    let options = model.options();
+    let options = DetectOptions { threshold: options.threshold.min(ASKED_FOR), ..options };
+    let found = model.detect(image, &options)?;
     Ok(detect::best(&found, &model, id).map(|d| d.bbox))
 }
 
