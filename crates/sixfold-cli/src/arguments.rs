@@ -311,6 +311,10 @@ pub(crate) struct RenderArguments {
 pub(crate) enum Sensor {
     /// Noise, quantisation and losses of a Kinect-class camera (Nguyen et al. 2012)
     Kinect,
+    /// The same with the projector's shadow and the growth of the noise with the surface's angle
+    Xtion,
+    /// An active stereo camera of the RealSense D400 class
+    Realsense,
     /// No noise
     Ideal,
 }
@@ -332,6 +336,9 @@ pub(crate) struct SimulateArguments {
     /// Copy the colour images too
     #[arg(long)]
     pub rgb: bool,
+    /// Folder for pictures of ideal and simulated depth side by side
+    #[arg(long, value_name = "DIR")]
+    pub pictures: Option<PathBuf>,
     /// Simulate only these image ids
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub images: Vec<u32>,

@@ -38,6 +38,24 @@ pub(crate) fn depth_picture(depth: &DepthImage) -> RgbImage {
     })
 }
 
+/// Two depth images as one picture, left and right in the same shades.
+pub(crate) fn side_by_side(left: &DepthImage, right: &DepthImage) -> RgbImage {
+    let gap = 4;
+    let start = left.width() + gap;
+    let (width, height) = (start + right.width(), left.height().max(right.height()));
+    let both = DepthImage::from_fn(width, height, |x, y| match x.checked_sub(start) {
+        Some(x) => right.get(x, y).copied().unwrap_or(0.0),
+        None => left.get(x, y).copied().unwrap_or(0.0),
+    });
+    let mut picture = depth_picture(&both);
+    for y in 0..height {
+        for x in left.width()..start {
+            picture[(x, y)] = [255; 3];
+        }
+    }
+    picture
+}
+
 /// One pose to be drawn.
 pub(crate) struct Drawn<'a> {
     pub mesh: &'a Mesh,

@@ -154,6 +154,11 @@ impl Scene {
         &self.normals
     }
 
+    /// Distance in pixels to the nearest depth edge or hole, at most 255.
+    pub fn edge_distance(&self) -> &Image<u8> {
+        &self.edge_distance
+    }
+
     /// The camera.
     pub fn camera(&self) -> &Camera {
         &self.camera

@@ -10,10 +10,11 @@ mod outputs;
 mod raster;
 mod sensor;
 mod shade;
+mod shadow;
 mod table;
 
 pub use outputs::{BoundingBoxScale, Surface};
 pub use raster::{Canvas, Culling, Frame, RenderOptions, SceneObject, render_depth};
-pub use sensor::{DepthSensor, simulate_depth};
+pub use sensor::{DepthSensor, Draws, simulate_depth};
 pub use shade::{Light, Material, shade};
 pub use table::{plane_mesh, support_plane};

@@ -6,7 +6,8 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde_json::json;
 use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
+    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_rgb,
+    write_targets,
 };
 use sixfold_geometry::Pose;
 use sixfold_mesh::Mesh;
@@ -17,6 +18,7 @@ use sixfold_render::{
 use crate::Outcome;
 use crate::arguments::{Sensor, SimulateArguments};
 use crate::output::report;
+use crate::overlay;
 use crate::progress::{Progress, check_interrupt};
 
 /// Width of the simulated table in metres.
@@ -63,13 +65,21 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             let mut frame = Frame::new(&camera);
             frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
             let ideal = frame.depth();
-            let depth = match a.sensor {
-                Sensor::Ideal => ideal,
-                Sensor::Kinect => {
-                    let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
-                    simulate_depth(&ideal, &frame.normals(&objects), &DepthSensor::kinect(), seed)
-                }
+            let sensor = match a.sensor {
+                Sensor::Ideal => None,
+                Sensor::Kinect => Some(DepthSensor::kinect()),
+                Sensor::Xtion => Some(DepthSensor::xtion()),
+                Sensor::Realsense => Some(DepthSensor::realsense()),
             };
+            let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
+            let depth = match &sensor {
+                None => ideal.clone(),
+                Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), sensor, seed),
+            };
+            if let Some(folder) = &a.pictures {
+                let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
+                write_rgb(&path, &overlay::side_by_side(&ideal, &depth))?;
+            }
             let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
             let rgb = if a.rgb { scene.rgb(im_id)? } else { None };

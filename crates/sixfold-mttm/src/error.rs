@@ -1,0 +1,106 @@
+//! What can be wrong with templates and with files of them.
+
+use std::io;
+use std::path::PathBuf;
+
+use sixfold_geometry::CameraError;
+use thiserror::Error;
+
+/// Why there are no templates.
+#[derive(Debug, Error, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum TemplateError {
+    /// There is nothing to render.
+    #[error("the mesh has {faces} faces, templates need a surface: give a mesh, not a point cloud")]
+    NoSurface {
+        /// Faces found.
+        faces: usize,
+    },
+    /// The camera belongs to another image.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The mask belongs to another image.
+    #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}")]
+    MaskSize {
+        /// Width of the mask.
+        found_width: usize,
+        /// Height of the mask.
+        found_height: usize,
+        /// Width of the depth image.
+        width: usize,
+        /// Height of the depth image.
+        height: usize,
+    },
+    /// Too little of the object is measured.
+    #[error(
+        "only {found} of the mask's {pixels} pixels have depth, at least {needed} are needed: is it the mask of this image, and is the depth there?"
+    )]
+    TooLittleDepth {
+        /// Pixels of the mask with depth.
+        found: usize,
+        /// Pixels of the mask.
+        pixels: usize,
+        /// Pixels needed.
+        needed: usize,
+    },
+    /// What the mask shows has a size that no tabletop object has.
+    #[error(
+        "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"
+    )]
+    Size {
+        /// Largest extent in metres.
+        found: f64,
+        /// Smallest extent that is taken.
+        low: f64,
+        /// Largest extent that is taken.
+        high: f64,
+    },
+    /// No view was given.
+    #[error("no view of the object was given")]
+    NoViews,
+    /// Some views say where the object is and some do not.
+    #[error("view {view} has {found} pose, the first view {first}: poses for all views or for none")]
+    MixedPoses {
+        /// Number of the view.
+        view: usize,
+        /// "a" or "no".
+        found: &'static str,
+        /// "has one" or "has none".
+        first: &'static str,
+    },
+}
+
+/// Why a file of templates cannot be used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    /// The file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// Not a file of templates, or damaged.
+    #[error("{}: {what}; make the templates anew", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: &'static str,
+    },
+    /// Of another version.
+    #[error(
+        "{}: written by another version of sixfold: found format {found}, expected {expected}; make the templates anew",
+        path.display()
+    )]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// Format found.
+        found: u32,
+        /// Format expected.
+        expected: u32,
+    },
+}

@@ -1,0 +1,358 @@
+//! From a prepared scene and an object's templates to poses: sample regions, match, mask, merge, match again, align, verify
+//! (dissertation, sections 5.2.4 and 5.2.5).
+
+use std::time::Instant;
+
+use rayon::prelude::*;
+use serde::Serialize;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_match::estimate::{EstimateOptions as VerifyOptions, verify};
+use sixfold_match::voting::Hypothesis as Candidate;
+use sixfold_match::{ObjectModel, Scene, VerificationOptions, VerificationScore};
+
+use crate::align::{align, camera_from_view};
+use crate::judge::{Surface, judge};
+use crate::mask::{Pixels, common, template_mask};
+use crate::matching::{MatchOptions, Matcher};
+use crate::roi::{ProposalOptions, Roi, propose};
+use crate::template::ObjectTemplates;
+
+/// How objects are searched.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EstimateOptions {
+    /// Where regions are sampled.
+    pub proposals: ProposalOptions,
+    /// Regions of the first matching that are aligned and get a mask.
+    pub masked: usize,
+    /// Regions left after merging.
+    pub regions: usize,
+    /// Pose hypotheses of a region (dissertation: 5).
+    pub hypotheses: usize,
+    /// Hypotheses that are refined and verified with the mesh, where there is one.
+    pub verified: usize,
+    /// Lay matched templates on the scene's surface; otherwise a pose is that of the nearest template, as it was matched.
+    pub align: bool,
+    /// Thresholds of the scores.
+    pub verification: VerificationOptions,
+    /// Most instances.
+    pub max_instances: usize,
+    /// Estimates with a lower confidence are not returned.
+    pub min_score: f64,
+}
+
+impl Default for EstimateOptions {
+    fn default() -> Self {
+        EstimateOptions {
+            proposals: ProposalOptions::default(),
+            masked: 60,
+            regions: 10,
+            hypotheses: 5,
+            verified: 16,
+            align: true,
+            verification: VerificationOptions::default(),
+            max_instances: 1,
+            min_score: 0.05,
+        }
+    }
+}
+
+/// An object ready to be searched: its templates prepared, and its mesh, if there is one.
+#[derive(Debug, Clone)]
+pub struct KnownObject {
+    templates: ObjectTemplates,
+    matcher: Matcher,
+    surfaces: Vec<Surface>,
+    model: Option<ObjectModel>,
+}
+
+/// Points of a template that ICP uses.
+const ICP_POINTS: usize = 160;
+
+impl KnownObject {
+    /// Prepares templates; `model` is what verification draws, `None` to judge by the templates alone.
+    pub fn new(templates: ObjectTemplates, model: Option<ObjectModel>) -> KnownObject {
+        let matcher = Matcher::new(&templates, &MatchOptions::default());
+        let surfaces =
+            templates.templates.par_iter().map(|t| Surface::new(t, templates.size, ICP_POINTS)).collect();
+        KnownObject { templates, matcher, surfaces, model }
+    }
+
+    /// The templates.
+    pub fn templates(&self) -> &ObjectTemplates {
+        &self.templates
+    }
+
+    /// The same object without its mesh.
+    pub fn without_mesh(mut self) -> KnownObject {
+        self.model = None;
+        self
+    }
+}
+
+/// A pose with what speaks for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// The pose. Templates cut out of depth images without poses give that of the matched template's own frame.
+    pub camera_from_object: Pose,
+    /// What decides between estimates, 0 to 1.
+    pub confidence: f64,
+    /// What the verification says, by the mesh or the template.
+    pub score: VerificationScore,
+    /// The matched template.
+    pub template: usize,
+    /// Pixels of the object by the matched template, before any refinement with a mesh.
+    pub mask: Pixels,
+}
+
+/// Where the time went, in seconds, and how much there was to do.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Stages {
+    /// Sampling and first matching.
+    pub matching: f64,
+    /// Masks and their merging.
+    pub masks: f64,
+    /// Second matching and alignment.
+    pub rematching: f64,
+    /// Verification.
+    pub verification: f64,
+    /// Regions sampled.
+    pub sampled: usize,
+    /// Regions left after merging.
+    pub regions: usize,
+}
+
+impl Stages {
+    /// Seconds until there are hypotheses: all but the verification.
+    pub fn hypotheses(&self) -> f64 {
+        self.matching + self.masks + self.rematching
+    }
+}
+
+/// A template somewhere in the scene.
+#[derive(Debug, Clone)]
+struct Placed {
+    template: usize,
+    camera_from_view: Pose,
+    score: VerificationScore,
+    /// What decides: agreement of the surface, and of the match it came from.
+    support: f64,
+}
+
+/// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives the same output at
+/// any number of threads.
+pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) -> (Vec<Estimate>, Stages) {
+    let mut stages = Stages::default();
+    let mut clock = Instant::now();
+    let mut lap = || {
+        let seconds = clock.elapsed().as_secs_f64();
+        clock = Instant::now();
+        seconds
+    };
+    let placed = first_matching(scene, object, options, &mut stages);
+    stages.matching = lap();
+    let regions = merge(scene, object, &placed, options);
+    stages.regions = regions.len();
+    stages.masks = lap();
+    let hypotheses: Vec<Vec<Placed>> =
+        regions.par_iter().map(|(seed, mask)| second_matching(scene, object, seed, mask, options)).collect();
+    let mut hypotheses = hypotheses.concat();
+    // A stable sort: equal ones stay in the order of their regions.
+    hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
+    stages.rematching = lap();
+    let estimates = judge_all(scene, object, &hypotheses, options);
+    stages.verification = lap();
+    (estimates, stages)
+}
+
+/// Samples regions, matches them, and lays the best matches on the scene.
+fn first_matching(
+    scene: &Scene,
+    object: &KnownObject,
+    options: &EstimateOptions,
+    stages: &mut Stages,
+) -> Vec<Placed> {
+    let size = object.templates.size;
+    let rois = propose(scene, object.templates.diameter, &options.proposals);
+    stages.sampled = rois.len();
+    let matches = object.matcher.best(rois.len(), |i| rois[i].cells(scene, size, |_| true));
+    let mut order: Vec<usize> = (0..rois.len()).filter(|&i| matches[i].score > 0.0).collect();
+    order.sort_by(|&a, &b| matches[b].score.total_cmp(&matches[a].score).then(a.cmp(&b)));
+    // Of neighbours the best one.
+    let apart = 0.15 * object.templates.diameter;
+    let mut chosen: Vec<usize> = vec![];
+    for i in order {
+        if chosen.len() >= options.masked {
+            break;
+        }
+        if chosen.iter().all(|&k| (rois[k].centre - rois[i].centre).norm() > apart) {
+            chosen.push(i);
+        }
+    }
+    chosen.par_iter().map(|&i| place(scene, object, &rois[i], matches[i], options)).collect()
+}
+
+/// Lays a matched template on the scene.
+fn place(
+    scene: &Scene,
+    object: &KnownObject,
+    roi: &Roi,
+    matched: crate::matching::Match,
+    options: &EstimateOptions,
+) -> Placed {
+    let entry = object.matcher.entries()[matched.entry];
+    let surface = &object.surfaces[entry.template];
+    let mut pose = camera_from_view(&roi.camera_from_roi(), entry.turn);
+    if options.align {
+        pose = align(scene, &surface.sparse, &pose, object.matcher.tolerance());
+    }
+    let threshold = options.verification.threshold_for(object.templates.diameter);
+    let score = judge(scene, surface, &pose, threshold, &options.verification);
+    let support = score.ranking() * f64::from(matched.score).max(0.0).sqrt();
+    Placed { template: entry.template, camera_from_view: pose, score, support }
+}
+
+/// Masks on every so many-th pixel while regions are merged.
+const STRIDE: usize = 2;
+
+/// The masks of the placed templates, without those that overlap a better one by more than half.
+fn merge(
+    scene: &Scene,
+    object: &KnownObject,
+    placed: &[Placed],
+    options: &EstimateOptions,
+) -> Vec<(Placed, Pixels)> {
+    let tolerance = object.matcher.tolerance();
+    let masks: Vec<Pixels> = placed
+        .par_iter()
+        .map(|p| {
+            let template = &object.templates.templates[p.template];
+            template_mask(scene, template, object.templates.size, &p.camera_from_view, tolerance, STRIDE)
+        })
+        .collect();
+    let mut order: Vec<usize> = (0..placed.len()).collect();
+    order.sort_by(|&a, &b| placed[b].support.total_cmp(&placed[a].support).then(a.cmp(&b)));
+    let mut regions: Vec<(Placed, Pixels)> = vec![];
+    for i in order {
+        if regions.len() >= options.regions {
+            break;
+        }
+        let mask = &masks[i];
+        let overlaps = |other: &Pixels| 2 * common(mask, other) > mask.len().min(other.len());
+        if mask.len() >= 20 && !regions.iter().any(|(_, other)| overlaps(other)) {
+            regions.push((placed[i].clone(), mask.clone()));
+        }
+    }
+    regions
+}
+
+/// Matches a region again, centred where its template says and without its background, and lays the nearest templates
+/// that differ on the scene.
+fn second_matching(
+    scene: &Scene,
+    object: &KnownObject,
+    seed: &Placed,
+    mask: &Pixels,
+    options: &EstimateOptions,
+) -> Vec<Placed> {
+    let (width, height) = scene.depth().size();
+    let (columns, rows) = (width.div_ceil(STRIDE), height.div_ceil(STRIDE));
+    let mut inside = vec![false; columns * rows];
+    for &p in mask {
+        let (x, y) = (p as usize % width / STRIDE, p as usize / width / STRIDE);
+        // A little more than the mask: templates that differ reach further.
+        for v in y.saturating_sub(2)..=(y + 2).min(rows - 1) {
+            for u in x.saturating_sub(2)..=(x + 2).min(columns - 1) {
+                inside[v * columns + u] = true;
+            }
+        }
+    }
+    let seen = |pixel: usize| inside[pixel / width / STRIDE * columns + pixel % width / STRIDE];
+    let centre = seed.camera_from_view.translation();
+    let shift = 0.07 * object.templates.diameter;
+    let shifts = [
+        Vec3::zeros(),
+        Vec3::x() * shift,
+        Vec3::x() * -shift,
+        Vec3::y() * shift,
+        Vec3::y() * -shift,
+        Vec3::z() * shift,
+        Vec3::z() * -shift,
+    ];
+    let rois = shifts.map(|s| Roi { centre: centre + s });
+    let cells: Vec<_> = rois.iter().map(|r| r.cells(scene, object.templates.size, seen)).collect();
+    let mut found = vec![seed.clone()];
+    for (matched, region) in object.matcher.ranked(&cells).into_iter().take(40 * options.hypotheses) {
+        if found.len() > options.hypotheses {
+            break;
+        }
+        let entry = object.matcher.entries()[matched.entry];
+        let start = camera_from_view(&rois[region].camera_from_roi(), entry.turn);
+        // Views without poses have frames of their own: only the view itself can be compared.
+        let object_pose = |p: &Pose, t: usize| *p * object.templates.templates[t].view_from_object;
+        let new = object_pose(&start, entry.template);
+        let same = found.iter().any(|f| {
+            object_pose(&f.camera_from_view, f.template).rotation_angle_to(&new) < 0.3
+                && (object.templates.source != crate::Source::Depth || f.template == entry.template)
+        });
+        if !same {
+            found.push(place(scene, object, &rois[region], matched, options));
+        }
+    }
+    found
+}
+
+/// The last word, by the mesh where there is one, and no two estimates of the same pixels.
+fn judge_all(
+    scene: &Scene,
+    object: &KnownObject,
+    hypotheses: &[Placed],
+    options: &EstimateOptions,
+) -> Vec<Estimate> {
+    let templates = &object.templates;
+    let threshold = options.verification.threshold_for(templates.diameter);
+    let most = options.verified.max(2 * options.max_instances);
+    let kept: Vec<&Placed> = hypotheses.iter().take(most).collect();
+    let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
+    let mut judged: Vec<(Pose, f64, VerificationScore, usize)> = match &object.model {
+        None => kept.iter().enumerate().map(|(i, p)| (pose_of(p), p.support, p.score, i)).collect(),
+        Some(model) => {
+            let verify_options = VerifyOptions {
+                verification: options.verification,
+                vote_power: 0.0,
+                ..VerifyOptions::default()
+            };
+            kept.par_iter()
+                .enumerate()
+                .filter_map(|(i, p)| {
+                    let candidate = Candidate { camera_from_object: pose_of(p), votes: 1.0 };
+                    let e = verify(scene, model, &[candidate], threshold, &verify_options).pop()?;
+                    // Two witnesses: the drawn mesh, and the template it came from.
+                    let confidence = e.score.ranking() * p.support.clamp(0.0, 1.0).powf(0.2);
+                    Some((e.camera_from_object, confidence, e.score, i))
+                })
+                .collect()
+        }
+    };
+    judged.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.3.cmp(&b.3)));
+    let mut estimates: Vec<Estimate> = vec![];
+    for (camera_from_object, confidence, score, i) in judged {
+        if estimates.len() >= options.max_instances || confidence < options.min_score {
+            break;
+        }
+        let template = kept[i].template;
+        let mask = template_mask(
+            scene,
+            &templates.templates[template],
+            templates.size,
+            &kept[i].camera_from_view,
+            object.matcher.tolerance(),
+            1,
+        );
+        let shared = |other: &Estimate| 10 * common(&mask, &other.mask) > 3 * mask.len();
+        if mask.is_empty() || estimates.iter().any(shared) {
+            continue;
+        }
+        estimates.push(Estimate { camera_from_object, confidence, score, template, mask });
+    }
+    estimates
+}

@@ -1,0 +1,112 @@
+//! Templates drawn from a mesh.
+
+use rayon::prelude::*;
+use sixfold_geometry::{Pose, Vec2, Vec3};
+use sixfold_mesh::{Mesh, simplify};
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+use crate::error::TemplateError;
+use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
+use crate::views::{view_directions, view_rotation};
+
+/// More faces than this are finer than a template's pixels.
+const MOST_FACES: usize = 12_000;
+
+impl ObjectTemplates {
+    /// Draws `mesh` (metres) from all sides that the options ask for.
+    ///
+    /// # Errors
+    /// [`TemplateError::NoSurface`].
+    pub fn from_mesh(mesh: &Mesh, options: &TemplateOptions) -> Result<ObjectTemplates, TemplateError> {
+        if mesh.faces().is_empty() {
+            return Err(TemplateError::NoSurface { faces: 0 });
+        }
+        let diameter = mesh.diameter();
+        let size = options.margin * diameter;
+        let simple;
+        let mesh = if mesh.faces().len() > MOST_FACES {
+            simple = simplify(mesh, MOST_FACES);
+            &simple
+        } else {
+            mesh
+        };
+        let templates: Vec<Template> = view_directions(options.coverage)
+            .par_iter()
+            .filter_map(|direction| draw(mesh, direction, size, options.distance))
+            .collect();
+        if templates.is_empty() {
+            return Err(TemplateError::NoSurface { faces: mesh.faces().len() });
+        }
+        Ok(ObjectTemplates { diameter, size, options: *options, source: Source::Mesh, templates })
+    }
+}
+
+/// One view; `None` when nothing of the mesh is seen from there (a sheet seen edge-on).
+fn draw(mesh: &Mesh, direction: &Vec3, size: f64, distance: f64) -> Option<Template> {
+    let camera = patch_camera(size, distance);
+    let mut frame = Frame::new(&camera);
+    let rotation = view_rotation(direction);
+    let (low, high) = mesh.bounding_box();
+    // The middle of the box on the axis at first, then the middle of what is seen.
+    let mut pose = Pose::new(rotation, Vec3::z() * distance - rotation * ((low + high) * 0.5));
+    for _ in 0..3 {
+        frame.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
+        let depth = frame.depth();
+        let pixels: Vec<[usize; 2]> =
+            (0..SIDE * SIDE).map(|i| [i % SIDE, i / SIDE]).filter(|&[x, y]| depth[(x, y)] > 0.0).collect();
+        let [x, y] = middle_pixel(&pixels)?;
+        let seen = camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(depth[(x, y)]));
+        pose = pose.with_translation(pose.translation() + Vec3::z() * distance - seen);
+    }
+    frame.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
+    let depth = frame.depth();
+    let stored =
+        depth.as_slice().iter().map(|&z| if z > 0.0 { Template::stored(f64::from(z) - distance) } else { 0 });
+    Some(Template {
+        view_from_object: pose.with_translation(pose.translation() - Vec3::z() * distance),
+        distance,
+        depth: stored.collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A box of 6 x 8 x 10 cm, corner at the origin.
+    fn brick() -> Mesh {
+        const QUADS: [[u32; 4]; 6] =
+            [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let size = [0.06, 0.08, 0.10];
+        let vertices =
+            (0..8).map(|i| Vec3::from_fn(|k, _| if i >> k & 1 == 1 { size[k] } else { 0.0 })).collect();
+        let faces = QUADS.iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect();
+        Mesh::new(vertices, faces).unwrap()
+    }
+
+    #[test]
+    fn every_point_of_a_template_lies_on_the_mesh() {
+        let templates = ObjectTemplates::from_mesh(&brick(), &TemplateOptions::default()).unwrap();
+        assert_eq!(templates.templates.len(), 301);
+        for t in templates.templates.iter().step_by(17) {
+            let (cloud, _) = t.cloud(templates.size);
+            assert!(cloud.len() > 200, "{}", cloud.len());
+            let object_from_view = t.view_from_object.inverse();
+            for p in &cloud.points {
+                let p = object_from_view.transform_point(p);
+                let off = |v: f64, top: f64| v.abs().min((v - top).abs());
+                let surface = off(p.x, 0.06).min(off(p.y, 0.08)).min(off(p.z, 0.10));
+                assert!(surface < 2e-4, "{p:?}");
+            }
+            // The reference point is seen and lies in the middle of the patch.
+            assert!(t.relative_depth(SIDE / 2, SIDE / 2).is_some_and(|z| z.abs() < 0.01));
+        }
+    }
+
+    #[test]
+    fn a_point_cloud_is_refused() {
+        let points = Mesh::new(vec![Vec3::zeros(), Vec3::x(), Vec3::y()], vec![]).unwrap();
+        let error = ObjectTemplates::from_mesh(&points, &TemplateOptions::default()).unwrap_err();
+        assert_eq!(error, TemplateError::NoSurface { faces: 0 });
+    }
+}

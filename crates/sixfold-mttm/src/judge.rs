@@ -1,0 +1,104 @@
+//! Judging a pose without a mesh: the scores of the dissertation's section 5.2.5, computed with the template that was
+//! matched in place of a rendering (what its section 5.4 leaves for the future).
+
+use sixfold_geometry::{PointCloud, Pose};
+use sixfold_match::{Scene, VerificationOptions, VerificationScore};
+
+use crate::template::{SIDE, Template};
+
+/// What a template shows, for alignment and judgement.
+#[derive(Debug, Clone)]
+pub struct Surface {
+    /// Some of the points with normals, for ICP.
+    pub sparse: PointCloud,
+    /// All points with normals.
+    pub dense: PointCloud,
+    /// Which of them lie on the outline.
+    pub outline: Vec<bool>,
+}
+
+impl Surface {
+    /// Prepares a template of a patch of `size` metres; `sparse` points for ICP.
+    pub fn new(template: &Template, size: f64, sparse: usize) -> Surface {
+        let (dense, pixels) = template.cloud(size);
+        let empty = |x: usize, y: usize| template.depth[y * SIDE + x] == 0;
+        let outline = pixels
+            .iter()
+            .map(|&[x, y]| {
+                x == 0
+                    || y == 0
+                    || x + 1 == SIDE
+                    || y + 1 == SIDE
+                    || empty(x - 1, y)
+                    || empty(x + 1, y)
+                    || empty(x, y - 1)
+                    || empty(x, y + 1)
+            })
+            .collect();
+        let stride = ((dense.len() as f64 / sparse.max(1) as f64).sqrt().round() as usize).max(1);
+        let mut few = PointCloud::default();
+        for (i, &[x, y]) in pixels.iter().enumerate() {
+            // Grazing surface slides out of its pixel.
+            if x % stride == 0 && y % stride == 0 && dense.normals[i].z < -0.15 {
+                few.points.push(dense.points[i]);
+                few.normals.push(dense.normals[i]);
+            }
+        }
+        Surface { sparse: few, dense, outline }
+    }
+}
+
+/// Scores a template at a pose. `threshold` is the depth inlier threshold in metres.
+pub fn judge(
+    scene: &Scene,
+    surface: &Surface,
+    camera_from_view: &Pose,
+    threshold: f64,
+    options: &VerificationOptions,
+) -> VerificationScore {
+    let camera = scene.camera();
+    let (width, height) = (camera.width as f64, camera.height as f64);
+    let cosine = options.normal_angle.cos();
+    let mut score = VerificationScore::default();
+    let (mut with_normal, mut good_normals, mut contour, mut on_edge) = (0usize, 0usize, 0usize, 0usize);
+    for (i, p) in surface.dense.points.iter().enumerate() {
+        let p = camera_from_view.transform_point(p);
+        score.rendered += 1;
+        let Some(pixel) = camera.project(&p) else { continue };
+        let (x, y) = (pixel.x.round(), pixel.y.round());
+        if !(x >= 0.0 && y >= 0.0 && x < width && y < height) {
+            continue;
+        }
+        let at = (x as usize, y as usize);
+        let measured = f64::from(scene.depth()[at]);
+        let n = camera_from_view.transform_direction(&surface.dense.normals[i]);
+        // As in the screening of point pair features: grazing surface may miss by more in depth.
+        let slope = (-n.dot(&p) / p.norm()).clamp(0.3, 1.0);
+        let off = (measured - p.z) * slope;
+        let hidden = measured > 0.0 && off < -threshold;
+        if hidden {
+            score.occluded += 1;
+        } else if measured > 0.0 && off > threshold {
+            score.outliers += 1;
+        } else if measured > 0.0 {
+            score.inliers += 1;
+            let m = scene.normals()[at];
+            if m != [0.0; 3] {
+                with_normal += 1;
+                let agreement = n.x * f64::from(m[0]) + n.y * f64::from(m[1]) + n.z * f64::from(m[2]);
+                good_normals += usize::from(agreement > cosine);
+            }
+        }
+        if surface.outline[i] && !hidden {
+            contour += 1;
+            on_edge += usize::from(scene.edge_distance()[at] <= options.boundary_distance);
+        }
+    }
+    let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+    score.depth =
+        (1.0 - share(score.outliers, score.rendered)) * share(score.inliers, score.rendered - score.occluded);
+    score.boundary = share(on_edge, contour);
+    score.normals = share(good_normals, with_normal);
+    score.total = score.depth * score.boundary * score.normals;
+    score
+}

@@ -1,0 +1,30 @@
+//! Objects never trained on, found in depth images by their templates: what chapter 5 of the dissertation is about.
+//!
+//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh ([`from_mesh`])
+//! or cut out of real depth images ([`from_depth`]). Adding an object is all there is to do: nothing is trained.
+//! In a scene, patches around sampled pixels ([`roi`]) are matched with all templates ([`matching`]), the best ones get
+//! masks ([`mask`]), masks of one object are merged, matched again without their background, and the nearest
+//! templates become poses by their geometry ([`align`]); [`mod@estimate`] puts it together, and [`judge`] says how well a pose
+//! agrees with the image when there is no mesh.
+
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+pub mod align;
+mod error;
+pub mod estimate;
+pub mod from_depth;
+pub mod from_mesh;
+pub mod judge;
+pub mod mask;
+pub mod matching;
+pub mod roi;
+mod store;
+mod template;
+mod views;
+
+pub use error::{StoreError, TemplateError};
+pub use estimate::{Estimate, EstimateOptions, KnownObject, Stages, estimate};
+pub use from_depth::DepthView;
+pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
+pub use views::{Coverage, view_directions, view_rotation};

@@ -1,0 +1,237 @@
+//! The hand-made descriptor: all templates of an object against a region of the scene, exactly.
+//!
+//! A template is some points of its surface, each in a cell of the region, with depth and normal. A cell agrees when its depth is
+//! near the template's and its normal looks the same way; it contradicts when the scene lies further away (one would see
+//! through the object), and says nothing when the scene lies in front (hidden) or nothing was measured. In contrast
+//! to a distance between descriptors of whole regions, what surrounds the object plays no part, and what hides it little.
+//! Sixteen regions are compared at a time, a number of each in one vector of the processor.
+
+use rayon::prelude::*;
+use sixfold_geometry::Vec3;
+
+use crate::roi::{Cell, GRID, UNKNOWN};
+use crate::template::{ObjectTemplates, SIDE, Template};
+
+/// Regions compared at a time.
+pub const LANES: usize = 16;
+/// Points of a template that are compared.
+const POINTS: usize = 64;
+
+/// How agreement is counted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatchOptions {
+    /// Depths agree within this share of the diameter.
+    pub depth: f64,
+    /// Smallest and largest tolerance, metres.
+    pub limits: (f64, f64),
+    /// Weight of what is hidden or not measured, next to what is seen: a template of which little is seen is a worse bet.
+    pub hidden: f32,
+}
+
+impl Default for MatchOptions {
+    fn default() -> Self {
+        MatchOptions { depth: 0.14, limits: (0.012, 0.03), hidden: 0.25 }
+    }
+}
+
+/// A view at a turn in the image plane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Entry {
+    /// Number of the template.
+    pub template: usize,
+    /// Turn in the image plane, radians: ROI from view.
+    pub turn: f64,
+}
+
+/// A match: how well (0 to 1) and with what.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Agreement.
+    pub score: f32,
+    /// Number of the entry in [`Matcher::entries`].
+    pub entry: usize,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Point {
+    cell: u32,
+    depth: f32,
+    normal: [f32; 3],
+}
+
+/// Templates made ready to be compared.
+#[derive(Debug, Clone)]
+pub struct Matcher {
+    entries: Vec<Entry>,
+    /// Points of all entries in turn, and where each entry's begin.
+    points: Vec<Point>,
+    starts: Vec<usize>,
+    tolerance: f32,
+    hidden: f32,
+}
+
+/// Regions side by side: for every cell, each of its four numbers of all regions together.
+type Block = Vec<[[f32; LANES]; 4]>;
+
+impl Matcher {
+    /// Makes the templates ready, each at all of its turns.
+    pub fn new(object: &ObjectTemplates, options: &MatchOptions) -> Matcher {
+        let turns = object.turns();
+        let per_template: Vec<Vec<(Entry, Vec<Point>)>> = object
+            .templates
+            .par_iter()
+            .enumerate()
+            .map(|(number, template)| {
+                let chosen = chosen_points(template, object.size);
+                turns
+                    .iter()
+                    .map(|&turn| (Entry { template: number, turn }, turned(&chosen, turn)))
+                    .filter(|(_, points)| points.len() >= POINTS / 4)
+                    .collect()
+            })
+            .collect();
+        let tolerance = (options.depth * object.diameter).clamp(options.limits.0, options.limits.1) as f32;
+        let mut matcher =
+            Matcher { entries: vec![], points: vec![], starts: vec![0], tolerance, hidden: options.hidden };
+        for (entry, mut points) in per_template.into_iter().flatten() {
+            matcher.entries.push(entry);
+            matcher.points.append(&mut points);
+            matcher.starts.push(matcher.points.len());
+        }
+        matcher
+    }
+
+    /// The views with their turns.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The tolerance of depths, metres.
+    pub fn tolerance(&self) -> f64 {
+        f64::from(self.tolerance)
+    }
+
+    /// The best entry for every region, given by their cells.
+    pub fn best<'a>(&self, count: usize, cells: impl Fn(usize) -> Vec<Cell> + Sync + 'a) -> Vec<Match> {
+        let blocks: Vec<Vec<Match>> = (0..count.div_ceil(LANES))
+            .into_par_iter()
+            .map(|b| {
+                let range = b * LANES..((b + 1) * LANES).min(count);
+                let block = side_by_side(range.clone().map(&cells));
+                let mut best = [Match { score: 0.0, entry: 0 }; LANES];
+                for entry in 0..self.entries.len() {
+                    let scores = self.compare(&block, entry);
+                    for (best, score) in best.iter_mut().zip(scores) {
+                        if score > best.score {
+                            *best = Match { score, entry };
+                        }
+                    }
+                }
+                best[..range.len()].to_vec()
+            })
+            .collect();
+        blocks.concat()
+    }
+
+    /// All entries against a few regions (at most [`LANES`]) that show the same thing from slightly shifted centres: each entry's
+    /// best score over the regions and which of them it was, best first.
+    pub fn ranked(&self, regions: &[Vec<Cell>]) -> Vec<(Match, usize)> {
+        let block = side_by_side(regions.iter().take(LANES).cloned());
+        let mut ranked: Vec<(Match, usize)> = (0..self.entries.len())
+            .map(|entry| {
+                let scores = self.compare(&block, entry);
+                let best = (0..regions.len().min(LANES))
+                    .max_by(|&a, &b| scores[a].total_cmp(&scores[b]).then(b.cmp(&a)))
+                    .unwrap_or(0);
+                (Match { score: scores[best], entry }, best)
+            })
+            .collect();
+        ranked.sort_by(|a, b| b.0.score.total_cmp(&a.0.score).then(a.0.entry.cmp(&b.0.entry)));
+        ranked
+    }
+
+    /// Agreement of an entry with the regions of a block.
+    fn compare(&self, block: &Block, entry: usize) -> [f32; LANES] {
+        let points = &self.points[self.starts[entry]..self.starts[entry + 1]];
+        let (tolerance, inverse) = (self.tolerance, 1.0 / self.tolerance);
+        let (mut good, mut behind, mut hidden) = ([0f32; LANES], [0f32; LANES], [0f32; LANES]);
+        for p in points {
+            let [depth, nx, ny, nz] = &block[p.cell as usize];
+            for l in 0..LANES {
+                let off = depth[l] - p.depth;
+                let cosine = nx[l] * p.normal[0] + ny[l] * p.normal[1] + nz[l] * p.normal[2];
+                let near = 1.0 - off.abs() * inverse;
+                let near = if near > 0.0 { near } else { 0.0 };
+                let facing = if cosine > 0.0 { cosine } else { 0.0 };
+                // Depth alone counts a little: normals at edges are not to be trusted.
+                good[l] += near * (0.2 + 0.8 * facing * facing);
+                behind[l] += if off > tolerance { 1.0 } else { 0.0 };
+                hidden[l] += if off < -tolerance { 1.0 } else { 0.0 };
+            }
+        }
+        let all = points.len() as f32;
+        std::array::from_fn(|l| good[l] / (all - (1.0 - self.hidden) * hidden[l]) * (1.0 - behind[l] / all))
+    }
+}
+
+fn side_by_side(regions: impl Iterator<Item = Vec<Cell>>) -> Block {
+    let mut block: Block = vec![UNKNOWN.map(|v| [v; LANES]); GRID * GRID];
+    for (lane, cells) in regions.enumerate() {
+        for (place, cell) in block.iter_mut().zip(cells) {
+            for (numbers, value) in place.iter_mut().zip(cell) {
+                numbers[lane] = value;
+            }
+        }
+    }
+    block
+}
+
+/// A point of a template with its place in the patch (pixels from the middle).
+struct Chosen {
+    place: [f64; 2],
+    depth: f64,
+    normal: Vec3,
+}
+
+/// Points evenly over what a template shows.
+fn chosen_points(template: &Template, size: f64) -> Vec<Chosen> {
+    let (cloud, pixels) = template.cloud(size);
+    let centre = (SIDE as f64 - 1.0) / 2.0;
+    // Every so many pixels of a row, rows alternately shifted, as many as give about the wanted number.
+    let spacing = (cloud.len() as f64 / POINTS as f64).sqrt().max(1.0);
+    let mut taken = std::collections::BTreeSet::new();
+    let mut chosen = vec![];
+    for (i, &[x, y]) in pixels.iter().enumerate() {
+        let row = (y as f64 / spacing) as usize;
+        let column = (x as f64 / spacing + if row % 2 == 0 { 0.0 } else { 0.5 }) as usize;
+        if taken.insert((row, column)) {
+            chosen.push(Chosen {
+                place: [x as f64 - centre, y as f64 - centre],
+                depth: cloud.points[i].z,
+                normal: cloud.normals[i],
+            });
+        }
+    }
+    chosen
+}
+
+fn turned(chosen: &[Chosen], turn: f64) -> Vec<Point> {
+    let (sin, cos) = turn.sin_cos();
+    let scale = GRID as f64 / SIDE as f64;
+    chosen
+        .iter()
+        .filter_map(|c| {
+            let [x, y] = c.place;
+            let (u, v) = (cos * x - sin * y, sin * x + cos * y);
+            let column = (u * scale + 0.5 * GRID as f64).floor();
+            let row = (v * scale + 0.5 * GRID as f64).floor();
+            let inside = |k: f64| (0.0..GRID as f64).contains(&k);
+            let n = c.normal;
+            (inside(column) && inside(row)).then(|| Point {
+                cell: (row as usize * GRID + column as usize) as u32,
+                depth: c.depth as f32,
+                normal: [(cos * n.x - sin * n.y) as f32, (sin * n.x + cos * n.y) as f32, n.z as f32],
+            })
+        })
+        .collect()
+}

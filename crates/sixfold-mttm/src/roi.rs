@@ -1,0 +1,149 @@
+//! Regions of interest: squares of a fixed metric size around points of the scene, seen as a camera that looks straight at
+//! them would see them (dissertation, section 5.2.4).
+//!
+//! The *ROI frame* has its origin at the centre and its z axis along the ray through it, so that a template matches wherever
+//! in the image its object stands.
+
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Pose, Vec2, Vec3};
+use sixfold_match::Scene;
+
+/// Cells along a side of a region.
+pub const GRID: usize = 20;
+
+/// A region: its centre in the camera frame (metres) need not lie on a measured point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Roi {
+    /// Centre in the camera frame, metres.
+    pub centre: Vec3,
+}
+
+/// What one cell of a region shows: depth along the region's axis relative to its centre (metres) and the normal in the
+/// region's frame.
+pub type Cell = [f32; 4];
+
+/// A cell in which nothing was measured, or which is not looked at: like something far in front, it neither agrees nor
+/// contradicts.
+pub const UNKNOWN: Cell = [-1e6, 0.0, 0.0, 0.0];
+
+/// The rotation camera from ROI: z to the ray through `point`, with as little turn as possible.
+pub fn ray_rotation(point: &Vec3) -> UnitQuaternion<f64> {
+    UnitQuaternion::rotation_between(&Vec3::z(), point).unwrap_or_else(UnitQuaternion::identity)
+}
+
+impl Roi {
+    /// From the region's frame to the camera's.
+    pub fn camera_from_roi(&self) -> Pose {
+        Pose::new(ray_rotation(&self.centre), self.centre)
+    }
+
+    /// The cells, row by row. `size` is the region's side in metres; pixels (numbers in the image) that `seen` refuses are
+    /// unknown.
+    pub fn cells(&self, scene: &Scene, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
+        let camera = scene.camera();
+        let rotation = ray_rotation(&self.centre);
+        let (axis, back) = (self.centre.normalize(), rotation.inverse().to_rotation_matrix().cast::<f32>());
+        let distance = self.centre.norm();
+        let (right, down) = (rotation * Vec3::x(), rotation * Vec3::y());
+        let step = size / GRID as f64;
+        let first = -0.5 * (GRID as f64 - 1.0);
+        (0..GRID * GRID)
+            .map(|i| {
+                let (u, v) = (first + (i % GRID) as f64, first + (i / GRID) as f64);
+                let point = self.centre + right * (u * step) + down * (v * step);
+                let Some(pixel) = camera.project(&point) else { return UNKNOWN };
+                let (x, y) = (pixel.x.round(), pixel.y.round());
+                if !(x >= 0.0 && y >= 0.0 && x < camera.width as f64 && y < camera.height as f64) {
+                    return UNKNOWN;
+                }
+                let (x, y) = (x as usize, y as usize);
+                let (z, n) = (scene.depth()[(x, y)], scene.normals()[(x, y)]);
+                if z <= 0.0 || !seen(y * camera.width + x) {
+                    return UNKNOWN;
+                }
+                let p = camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(z));
+                let n = back * sixfold_geometry::nalgebra::Vector3::from(n);
+                [(axis.dot(&p) - distance) as f32, n.x, n.y, n.z]
+            })
+            .collect()
+    }
+}
+
+/// How regions are sampled.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProposalOptions {
+    /// Distance between centres as a share of the object's diameter (the dissertation takes 20 pixels for all objects).
+    pub step: f64,
+    /// Depths further apart than this share of the diameter are told apart.
+    pub layer: f64,
+    /// Most regions; beyond it the step grows.
+    pub most: usize,
+}
+
+impl Default for ProposalOptions {
+    fn default() -> Self {
+        ProposalOptions { step: 0.14, layer: 0.15, most: 3000 }
+    }
+}
+
+/// Regions whose centres lie on a grid of the image, wherever something off the table is near. An object's middle may be hidden
+/// by another thing: each place has a centre for every depth that occurs around it, not only for the one seen there.
+pub fn propose(scene: &Scene, diameter: f64, options: &ProposalOptions) -> Vec<Roi> {
+    let camera = scene.camera();
+    let focal = 0.5 * (camera.fx + camera.fy);
+    let mut depths: Vec<f64> = scene.cloud().points.iter().map(|p| p.z).collect();
+    if depths.is_empty() {
+        return vec![];
+    }
+    let middle = depths.len() / 2;
+    let typical = *depths.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let mut step = (options.step * diameter * focal / typical).max(3.0);
+    loop {
+        let rois = sample(scene, step, options.layer * diameter);
+        if rois.len() <= options.most {
+            return rois;
+        }
+        step *= (rois.len() as f64 / options.most as f64).sqrt().max(1.05);
+    }
+}
+
+fn sample(scene: &Scene, step: f64, layer: f64) -> Vec<Roi> {
+    let camera = scene.camera();
+    let columns = (camera.width as f64 / step).ceil() as usize;
+    let rows = (camera.height as f64 / step).ceil() as usize;
+    // Distances along the rays of the points in every cell.
+    let mut cells: Vec<Vec<f64>> = vec![vec![]; columns * rows];
+    for p in &scene.cloud().points {
+        if let Some(pixel) = camera.project(p) {
+            let (i, j) = ((pixel.x / step).max(0.0) as usize, (pixel.y / step).max(0.0) as usize);
+            if i < columns && j < rows {
+                cells[j * columns + i].push(p.norm());
+            }
+        }
+    }
+    let mut rois = vec![];
+    for j in 0..rows {
+        for i in 0..columns {
+            let mut near: Vec<f64> = vec![];
+            for v in j.saturating_sub(1)..=(j + 1).min(rows - 1) {
+                for u in i.saturating_sub(1)..=(i + 1).min(columns - 1) {
+                    near.extend(&cells[v * columns + u]);
+                }
+            }
+            near.sort_by(f64::total_cmp);
+            let pixel = Vec2::new((i as f64 + 0.5) * step - 0.5, (j as f64 + 0.5) * step - 0.5);
+            let ray = camera.unproject(&pixel, 1.0).normalize();
+            // Layers: runs of distances none of which is further from the first than `layer`.
+            let mut start = 0;
+            for end in 1..=near.len() {
+                if end == near.len() || near[end] - near[start] > layer {
+                    if end - start >= 4 {
+                        rois.push(Roi { centre: ray * near[(start + end) / 2] });
+                    }
+                    start = end;
+                }
+            }
+        }
+    }
+    rois
+}

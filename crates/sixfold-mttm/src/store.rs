@@ -1,0 +1,239 @@
+//! Templates on disk: one file an object, little-endian: magic, format version, a hash of what they were made from, the
+//! numbers, and a checksum over all before it.
+//!
+//! A file is written beside its place, flushed to the disk and then moved there: a reader, a crash or a power cut never leaves
+//! half a file, and the old one stays until the new one is whole.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+
+use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::{Pose, Vec3};
+
+use crate::error::StoreError;
+use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
+use crate::views::Coverage;
+
+const MAGIC: &[u8; 8] = b"SIXFTPL\0";
+const VERSION: u32 = 1;
+const NUMBERS_PER_TEMPLATE: usize = 8;
+const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
+const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 4 * 8 + 4;
+
+/// FNV-1a (Fowler, Noll, Vo).
+fn checksum(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+impl ObjectTemplates {
+    /// The file's bytes: the same templates, the same bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut out = Vec::with_capacity(HEAD_BYTES + self.templates.len() * TEMPLATE_BYTES + 8);
+        out.extend_from_slice(MAGIC);
+        out.extend_from_slice(&VERSION.to_le_bytes());
+        out.push(match self.source {
+            Source::Mesh => 0,
+            Source::PosedDepth => 1,
+            Source::Depth => 2,
+        });
+        out.push(match self.options.coverage {
+            Coverage::Above => 0,
+            Coverage::Around => 1,
+        });
+        out.extend_from_slice(&(SIDE as u16).to_le_bytes());
+        for number in [self.diameter, self.size, self.options.margin, self.options.distance] {
+            out.extend_from_slice(&number.to_le_bytes());
+        }
+        out.extend_from_slice(&(self.templates.len() as u32).to_le_bytes());
+        for t in &self.templates {
+            let (q, p) = (t.view_from_object.rotation(), t.view_from_object.translation());
+            for number in [t.distance, q.w, q.i, q.j, q.k, p.x, p.y, p.z] {
+                out.extend_from_slice(&number.to_le_bytes());
+            }
+            t.depth.iter().for_each(|z| out.extend_from_slice(&z.to_le_bytes()));
+        }
+        let sum = checksum(&out);
+        out.extend_from_slice(&sum.to_le_bytes());
+        out
+    }
+
+    /// Writes the file; what was there before stays until the new one is whole and on the disk.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn write(&self, path: &Path) -> Result<(), StoreError> {
+        let error = |source| StoreError::Io { path: path.to_path_buf(), source };
+        let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
+        let written = (|| -> io::Result<()> {
+            let mut file = File::create(&temporary)?;
+            file.write_all(&self.to_bytes())?;
+            file.sync_all()?;
+            drop(file);
+            std::fs::rename(&temporary, path)?;
+            // The new name must be on the disk as well. Not every system lets a folder be opened.
+            if let Some(Ok(folder)) = path.parent().map(File::open) {
+                let _ = folder.sync_all();
+            }
+            Ok(())
+        })();
+        if written.is_err() {
+            let _ = std::fs::remove_file(&temporary);
+        }
+        written.map_err(error)
+    }
+
+    /// Reads a file that [`ObjectTemplates::write`] wrote.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn read(path: &Path) -> Result<ObjectTemplates, StoreError> {
+        let bytes =
+            std::fs::read(path).map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+        ObjectTemplates::parse(&bytes, path)
+    }
+
+    /// Reads the bytes of a file; `path` is for messages.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`], [`StoreError::Version`].
+    pub fn parse(bytes: &[u8], path: &Path) -> Result<ObjectTemplates, StoreError> {
+        let damaged = |what| StoreError::Damaged { path: path.to_path_buf(), what };
+        if bytes.len() < 8 || &bytes[..8] != MAGIC {
+            return Err(damaged("not a file of templates"));
+        }
+        let mut reader = Reader(&bytes[8..]);
+        let version = reader.u32().ok_or_else(|| damaged("cut off"))?;
+        if version != VERSION {
+            return Err(StoreError::Version { path: path.to_path_buf(), found: version, expected: VERSION });
+        }
+        if bytes.len() < HEAD_BYTES + 8 {
+            return Err(damaged("cut off"));
+        }
+        let (body, sum) = bytes.split_at(bytes.len() - 8);
+        if checksum(body).to_le_bytes() != sum {
+            return Err(damaged("the checksum does not match: damaged or cut off"));
+        }
+        reader = Reader(&body[12..]);
+        reader.templates().ok_or_else(|| damaged("its parts do not fit together"))
+    }
+}
+
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (head, tail) = self.0.split_first_chunk::<N>()?;
+        self.0 = tail;
+        Some(*head)
+    }
+
+    fn u32(&mut self) -> Option<u32> {
+        self.take().map(u32::from_le_bytes)
+    }
+
+    fn number(&mut self) -> Option<f64> {
+        self.take().map(f64::from_le_bytes).filter(|v| v.is_finite())
+    }
+
+    fn templates(&mut self) -> Option<ObjectTemplates> {
+        let [source, coverage] = self.take()?;
+        let source = [Source::Mesh, Source::PosedDepth, Source::Depth].get(usize::from(source)).copied()?;
+        let coverage = [Coverage::Above, Coverage::Around].get(usize::from(coverage)).copied()?;
+        if usize::from(u16::from_le_bytes(self.take()?)) != SIDE {
+            return None;
+        }
+        let [diameter, size] = [self.number()?, self.number()?];
+        let options = TemplateOptions { coverage, margin: self.number()?, distance: self.number()? };
+        let count = self.u32()? as usize;
+        // Exactly what is left, before anything is allocated.
+        if !(diameter > 0.0 && size > 0.0)
+            || count == 0
+            || self.0.len() != count.checked_mul(TEMPLATE_BYTES)?
+        {
+            return None;
+        }
+        let templates = (0..count).map(|_| self.template()).collect::<Option<Vec<_>>>()?;
+        Some(ObjectTemplates { diameter, size, options, source, templates })
+    }
+
+    fn template(&mut self) -> Option<Template> {
+        let distance = self.number().filter(|d| *d > 0.0)?;
+        let q = Quaternion::new(self.number()?, self.number()?, self.number()?, self.number()?);
+        if (q.norm() - 1.0).abs() > 1e-6 {
+            return None;
+        }
+        let rotation = UnitQuaternion::new_unchecked(q);
+        let translation = Vec3::new(self.number()?, self.number()?, self.number()?);
+        let depth =
+            (0..SIDE * SIDE).map(|_| self.take().map(u16::from_le_bytes)).collect::<Option<Vec<_>>>()?;
+        Some(Template { view_from_object: Pose::new(rotation, translation), distance, depth })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn templates() -> ObjectTemplates {
+        let template = |k: u16| Template {
+            view_from_object: Pose::exp(&[0.01, 0.02, f64::from(k) * 0.01, 0.3, f64::from(k), 0.1].into()),
+            distance: 0.8,
+            depth: (0..SIDE * SIDE)
+                .map(|i| if i % 3 == 0 { 0 } else { 32_000 + k + i as u16 % 50 })
+                .collect(),
+        };
+        ObjectTemplates {
+            diameter: 0.12,
+            size: 0.132,
+            options: TemplateOptions::default(),
+            source: Source::Mesh,
+            templates: (0..3).map(template).collect(),
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("templates.bin");
+        let written = templates();
+        written.write(&path).unwrap();
+        assert_eq!(ObjectTemplates::read(&path).unwrap(), written);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        // A process killed while writing leaves its own unfinished file; the old one is whole.
+        std::fs::write(path.with_extension("1.tmp"), &written.to_bytes()[..1000]).unwrap();
+        assert_eq!(ObjectTemplates::read(&path).unwrap(), written);
+    }
+
+    #[test]
+    fn damage_is_noticed_wherever_it_is() {
+        let path = Path::new("templates.bin");
+        let bytes = templates().to_bytes();
+        for place in (0..bytes.len()).step_by(211) {
+            let mut bad = bytes.clone();
+            bad[place] ^= 0x10;
+            assert!(ObjectTemplates::parse(&bad, path).is_err(), "byte {place}");
+        }
+        for length in (0..bytes.len()).step_by(997) {
+            assert!(ObjectTemplates::parse(&bytes[..length], path).is_err(), "cut at {length}");
+        }
+        let mut newer = bytes.clone();
+        newer[8] = 9;
+        let message = ObjectTemplates::parse(&newer, path).unwrap_err().to_string();
+        assert!(message.contains("found format 9, expected 1"), "{message}");
+    }
+
+    #[test]
+    fn a_count_that_asks_for_all_memory_is_refused() {
+        let mut bytes = templates().to_bytes();
+        let at = HEAD_BYTES - 4;
+        bytes[at..at + 4].copy_from_slice(&u32::MAX.to_le_bytes());
+        let end = bytes.len() - 8;
+        let sum = checksum(&bytes[..end]);
+        bytes[end..].copy_from_slice(&sum.to_le_bytes());
+        assert!(matches!(
+            ObjectTemplates::parse(&bytes, Path::new("t")).unwrap_err(),
+            StoreError::Damaged { .. }
+        ));
+    }
+}

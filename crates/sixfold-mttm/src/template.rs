@@ -1,0 +1,151 @@
+//! A template: what an object looks like from one side, as a small depth image around a point of its surface.
+//!
+//! The *view frame* has its origin at that reference point and its z axis along the ray through it. A patch spans a fixed metric
+//! size at the reference point's distance, so a template looks the same from any distance (dissertation, section 5.2.4:
+//! ROIs of fixed metric size).
+
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::{Camera, DepthImage, NormalOptions, PointCloud, Pose, Vec2, Vec3, normals_from_depth};
+
+use crate::views::Coverage;
+
+/// Pixels along a side of a template.
+pub const SIDE: usize = 64;
+/// Metres of a step of stored depth.
+const DEPTH_STEP: f64 = 1e-4;
+/// Stored depth of the reference point; 0 is "nothing seen".
+const DEPTH_ZERO: i32 = 32_768;
+/// Normals of scenes are taken over windows of about so many metres; those of templates over the same.
+const NORMAL_REACH: f64 = 0.008;
+
+/// How templates are made.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TemplateOptions {
+    /// From which sides a mesh is drawn.
+    pub coverage: Coverage,
+    /// Side of a patch as a share of the object's diameter (largest extent, where the object is known from depth images).
+    pub margin: f64,
+    /// Distance from which a mesh is drawn, metres.
+    pub distance: f64,
+}
+
+impl Default for TemplateOptions {
+    fn default() -> Self {
+        TemplateOptions { coverage: Coverage::Above, margin: 1.1, distance: 0.8 }
+    }
+}
+
+/// Where templates came from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Source {
+    /// Drawn from a mesh.
+    Mesh,
+    /// Cut out of depth images whose poses are known.
+    PosedDepth,
+    /// Cut out of depth images without poses: every view has an object frame of its own, parallel to its view frame, its
+    /// origin in the middle of what is seen.
+    Depth,
+}
+
+/// An object as one camera sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Template {
+    /// From the object's frame to the view frame.
+    pub view_from_object: Pose,
+    /// Distance of the reference point from the camera, metres.
+    pub distance: f64,
+    /// Depth relative to the reference point's, row by row, in steps of 0.1 mm from 32768 on; 0 where the object is
+    /// not seen.
+    pub depth: Vec<u16>,
+}
+
+/// All templates of an object.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ObjectTemplates {
+    /// Diameter of the object (largest extent seen, where it is known from depth images), metres.
+    pub diameter: f64,
+    /// Side of a patch at the reference point's distance, metres.
+    pub size: f64,
+    /// How they were made.
+    pub options: TemplateOptions,
+    /// What they were made from.
+    pub source: Source,
+    /// The views, without turns in the image plane: those are computed.
+    pub templates: Vec<Template>,
+}
+
+impl ObjectTemplates {
+    /// Turns in the image plane in which every view is matched, radians.
+    pub fn turns(&self) -> Vec<f64> {
+        match self.source {
+            Source::Mesh => self.options.coverage.turns(),
+            // A photographed view may be met with the camera held in any way, but seldom upside down.
+            Source::PosedDepth | Source::Depth => Coverage::Above.turns(),
+        }
+    }
+}
+
+impl Template {
+    /// The depth of a pixel relative to the reference point, metres.
+    pub fn relative_depth(&self, column: usize, row: usize) -> Option<f64> {
+        match self.depth[row * SIDE + column] {
+            0 => None,
+            stored => Some(f64::from(i32::from(stored) - DEPTH_ZERO) * DEPTH_STEP),
+        }
+    }
+
+    /// Relative depth as it is stored.
+    pub(crate) fn stored(relative: f64) -> u16 {
+        let steps = (relative / DEPTH_STEP).round() as i32 + DEPTH_ZERO;
+        steps.clamp(1, i32::from(u16::MAX)) as u16
+    }
+
+    /// The camera that saw the patch; the view frame lies `distance` in front of it.
+    pub fn camera(&self, size: f64) -> Camera {
+        patch_camera(size, self.distance)
+    }
+
+    /// The patch as a depth image of [`Template::camera`], metres.
+    pub fn depth_image(&self) -> DepthImage {
+        DepthImage::from_fn(SIDE, SIDE, |x, y| {
+            self.relative_depth(x, y).map_or(0.0, |z| (self.distance + z) as f32)
+        })
+    }
+
+    /// What is seen, in the view frame: points and normals of pixels with a normal, row by row, with their columns and rows.
+    pub fn cloud(&self, size: f64) -> (PointCloud, Vec<[usize; 2]>) {
+        let (camera, depth) = (self.camera(size), self.depth_image());
+        let radius = (NORMAL_REACH * SIDE as f64 / size).round().clamp(1.0, 4.0) as usize;
+        let normals = normals_from_depth(&depth, &camera, &NormalOptions { radius, ..Default::default() });
+        let (mut cloud, mut pixels) = (PointCloud::default(), vec![]);
+        for y in 0..SIDE {
+            for x in 0..SIDE {
+                let (z, n) = (depth[(x, y)], normals[(x, y)]);
+                if z > 0.0 && n != [0.0; 3] {
+                    let p = camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(z));
+                    cloud.points.push(p - Vec3::z() * self.distance);
+                    cloud.normals.push(Vec3::from(n.map(f64::from)));
+                    pixels.push([x, y]);
+                }
+            }
+        }
+        (cloud, pixels)
+    }
+}
+
+/// A camera of [`SIDE`] pixels whose image spans `size` metres at `distance`.
+pub(crate) fn patch_camera(size: f64, distance: f64) -> Camera {
+    let focal = SIDE as f64 * distance / size;
+    let centre = (SIDE as f64 - 1.0) / 2.0;
+    Camera { fx: focal, fy: focal, cx: centre, cy: centre, width: SIDE, height: SIDE, distortion: None }
+}
+
+/// The pixel of a mask nearest to its centroid.
+pub(crate) fn middle_pixel(pixels: &[[usize; 2]]) -> Option<[usize; 2]> {
+    let n = pixels.len() as f64;
+    let mean = |k: usize| pixels.iter().map(|p| p[k] as f64).sum::<f64>() / n;
+    let (x, y) = (mean(0), mean(1));
+    let off = |p: &[usize; 2]| (p[0] as f64 - x).powi(2) + (p[1] as f64 - y).powi(2);
+    pixels.iter().copied().min_by(|a, b| off(a).total_cmp(&off(b)))
+}
