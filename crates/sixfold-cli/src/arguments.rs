@@ -7,6 +7,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
 
 use crate::commands::grasp::arguments::GraspArguments;
+use crate::commands::mttm::arguments::{DepthViewArguments, ReproduceMttmArguments, TemplateViews};
 
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]
@@ -32,6 +33,7 @@ pub(crate) enum Command {
     #[command(after_help = "Examples:\n  \
         sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
         sixfold estimate --method pix2pose --weights model.safetensors --rgb c.png --camera camera.json --object mug.ply --unit mm --box 210,140,90,120 --out out\n  \
+        sixfold estimate --method mttm --depth d.png --camera camera.json --object mug --out out\n  \
         sixfold estimate --dataset lmo --split test --out results.csv\n  \
         sixfold estimate --method pix2pose --weights model.safetensors --dataset lmo --boxes gt --out results.csv")]
     Estimate(Box<EstimateArguments>),
@@ -125,6 +127,8 @@ pub(crate) enum Method {
     Ppf,
     /// Object coordinates from colour by a trained network, in boxes
     Pix2pose,
+    /// Templates in depth, from a mesh or from depth images of the object, no training
+    Mttm,
 }
 
 impl Method {
@@ -133,6 +137,7 @@ impl Method {
         match self {
             Method::Ppf => "ppf",
             Method::Pix2pose => "pix2pose",
+            Method::Mttm => "mttm",
         }
     }
 }
@@ -158,6 +163,9 @@ pub(crate) struct EstimateArguments {
     /// Align the poses of --method pix2pose with the depth image (ICP)
     #[arg(long)]
     pub icp: bool,
+    /// Judge the poses of --method mttm by its templates alone, as if there were no mesh
+    #[arg(long)]
+    pub templates_only: bool,
     /// Colour image: what pix2pose works on, else for the overlay
     #[arg(long, value_name = "FILE", requires = "camera")]
     pub rgb: Option<PathBuf>,
@@ -217,7 +225,7 @@ pub(crate) struct EstimateArguments {
     #[arg(long, value_name = "DIR", requires = "dataset")]
     pub overlays: Option<PathBuf>,
     /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image, 0.05 for a dataset, 0
-    /// with --method pix2pose)
+    /// with --method pix2pose, 0.45 for one image with --method mttm)
     #[arg(long, value_name = "SCORE")]
     pub min_score: Option<f64>,
     /// Match points on the table plane too
@@ -637,6 +645,11 @@ pub(crate) enum ReproduceCommand {
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
         Every row is kept; interrupted, it goes on when the same command is given again.")]
     Pix2pose(Box<ReproducePix2PoseArguments>),
+    /// Masks and poses of template matching per object, with its ablations, point pair features, and times
+    #[command(after_help = "Example:\n  \
+        sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
+        Every image is kept; interrupted, it goes on when the same command is given again.")]
+    Mttm(ReproduceMttmArguments),
 }
 
 #[derive(Debug, Args)]
@@ -695,16 +708,24 @@ pub(crate) struct ObjectArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ObjectCommand {
-    /// Store a mesh under a name
-    #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm --turns-about z")]
+    /// Store a mesh under a name, or an object seen in depth images
+    #[command(after_help = "Examples:\n  \
+        sixfold object add mug mug.ply --unit mm --turns-about z --templates\n  \
+        sixfold object add mug --depth d.png --mask mask.png --camera camera.json")]
     Add {
         /// Name: letters, digits, - and _
         name: String,
         /// Mesh file: PLY, OBJ, STL, glTF, GLB
-        mesh: PathBuf,
+        #[arg(required_unless_present = "depth")]
+        mesh: Option<PathBuf>,
         /// Unit of the mesh file: m, cm, mm, in
-        #[arg(long, value_name = "UNIT")]
-        unit: Unit,
+        #[arg(long, value_name = "UNIT", required_unless_present = "depth")]
+        unit: Option<Unit>,
+        /// Also make the mesh's templates for `estimate --method mttm`, from these sides
+        #[arg(long, value_enum, value_name = "VIEWS", num_args = 0..=1, default_missing_value = "above", conflicts_with = "depth")]
+        templates: Option<TemplateViews>,
+        #[command(flatten)]
+        views: DepthViewArguments,
         /// BOP models_info.json to take the symmetries from
         #[arg(long, value_name = "FILE", requires = "model_id")]
         models_info: Option<PathBuf>,

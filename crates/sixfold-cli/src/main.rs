@@ -53,6 +53,7 @@ fn main() -> ExitCode {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) if a.dataset.is_some() => commands::estimate_dataset::run(a),
         Command::Estimate(a) if a.method == Method::Pix2pose => commands::estimate_rgb::run(a),
+        Command::Estimate(a) if a.method == Method::Mttm => commands::mttm::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Detect(a) => commands::detect::run(a),
         Command::Eval(a) => commands::eval::run(a),

@@ -1,7 +1,8 @@
 //! Where objects come from: a mesh file, or the store of named objects.
 //!
 //! The store is a folder with one folder per object: `object.json` (format version, unit, symmetries, where it came from),
-//! `mesh.ply` (metres), and what methods learn about it (`ppf.bin`).
+//! `mesh.ply` (metres), and what methods learn about it (`ppf.bin`, `templates.bin`). An object added from depth images has
+//! templates and no mesh.
 
 use std::path::{Path, PathBuf};
 
@@ -10,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use sixfold_geometry::Pose;
 use sixfold_match::{ModelOptions, ObjectModel};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, read_mesh, write_ply};
+use sixfold_mttm::ObjectTemplates;
 
 /// Step at which a continuous symmetry is cut into poses when hypotheses are joined.
 const SYMMETRY_STEP: f64 = 0.05;
@@ -57,6 +59,9 @@ pub(crate) struct Record {
     pub diameter: f64,
     pub vertices: usize,
     pub faces: usize,
+    /// Known from depth images: there are templates and no mesh.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub without_mesh: bool,
     /// Transformations that map the object onto itself, as 4x4 matrices in metres, without the identity.
     pub symmetries_discrete: Vec<[[f64; 4]; 4]>,
     /// Axes about which the object may turn freely: direction, and a point on the axis in metres.
@@ -146,14 +151,31 @@ impl Store<'_> {
 
     pub fn load(&self, name: &str) -> Result<Object> {
         let record = self.record(name)?;
+        if record.without_mesh {
+            bail!(
+                "object {name} was added from depth images and has no mesh: only --method mttm can look for it"
+            );
+        }
         let place = self.place(name)?;
         let mesh = with_surface(name, read_mesh(place.join("mesh.ply"), Unit::Metre)?)?;
         let info = record.info(&mesh)?;
         Ok(Object { name: name.to_owned(), mesh, info, description: place.join("ppf.bin") })
     }
 
-    /// Stores a mesh: written beside first, then moved into place as a whole.
-    pub fn add(&self, name: &str, mesh: &Mesh, record: &Record, replace: bool) -> Result<()> {
+    /// Where an object's templates are.
+    pub fn templates_file(&self, name: &str) -> Result<PathBuf> {
+        Ok(self.place(name)?.join("templates.bin"))
+    }
+
+    /// Stores an object: written beside first, then moved into place as a whole.
+    pub fn add(
+        &self,
+        name: &str,
+        mesh: Option<&Mesh>,
+        templates: Option<&ObjectTemplates>,
+        record: &Record,
+        replace: bool,
+    ) -> Result<()> {
         let place = self.place(name)?;
         if place.exists() && !replace {
             bail!(
@@ -166,7 +188,12 @@ impl Store<'_> {
         let old = self.folder.join(format!(".{name}.{}.old", std::process::id()));
         let result = (|| -> Result<()> {
             std::fs::create_dir_all(&fresh)?;
-            write_ply(fresh.join("mesh.ply"), mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)?;
+            if let Some(mesh) = mesh {
+                write_ply(fresh.join("mesh.ply"), mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)?;
+            }
+            if let Some(templates) = templates {
+                templates.write(&fresh.join("templates.bin"))?;
+            }
             std::fs::write(fresh.join("object.json"), serde_json::to_string_pretty(record)?)?;
             if place.exists() {
                 std::fs::rename(&place, &old)?;
@@ -196,12 +223,29 @@ pub(crate) fn new_record(source: &Path, unit: Unit, mesh: &Mesh, info: &ModelInf
         diameter: mesh.diameter(),
         vertices: mesh.vertices().len(),
         faces: mesh.faces().len(),
+        without_mesh: false,
         symmetries_discrete: info.symmetries_discrete.iter().map(crate::output::pose_rows).collect(),
         symmetries_continuous: info
             .symmetries_continuous
             .iter()
             .map(|s| FreeAxis { axis: array(&s.axis), offset: array(&s.offset) })
             .collect(),
+    }
+}
+
+/// Makes the record of an object known from depth images.
+pub(crate) fn new_record_of_views(sources: &[PathBuf], templates: &ObjectTemplates) -> Record {
+    let names: Vec<String> = sources.iter().map(|s| s.display().to_string()).collect();
+    Record {
+        version: VERSION,
+        source: names.join(", "),
+        source_unit: Unit::Metre,
+        diameter: templates.diameter,
+        vertices: 0,
+        faces: 0,
+        without_mesh: true,
+        symmetries_discrete: vec![],
+        symmetries_continuous: vec![],
     }
 }
 

@@ -56,6 +56,15 @@ pub(crate) fn side_by_side(left: &DepthImage, right: &DepthImage) -> RgbImage {
     picture
 }
 
+/// Tints pixels (numbers `y * width + x`).
+pub(crate) fn tint(image: &mut RgbImage, pixels: &[u32], color: [u8; 3]) {
+    for &p in pixels {
+        if let Some(pixel) = image.as_mut_slice().get_mut(p as usize) {
+            *pixel = std::array::from_fn(|k| (0.5 * f32::from(pixel[k]) + 0.5 * f32::from(color[k])) as u8);
+        }
+    }
+}
+
 /// One pose to be drawn.
 pub(crate) struct Drawn<'a> {
     pub mesh: &'a Mesh,

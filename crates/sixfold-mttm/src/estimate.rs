@@ -22,7 +22,9 @@ use crate::template::ObjectTemplates;
 pub struct EstimateOptions {
     /// Where regions are sampled.
     pub proposals: ProposalOptions,
-    /// Regions of the first matching that are aligned and get a mask.
+    /// Regions of the first matching that are laid on the scene.
+    pub placed: usize,
+    /// Those of them that get a mask.
     pub masked: usize,
     /// Regions left after merging.
     pub regions: usize,
@@ -44,7 +46,8 @@ impl Default for EstimateOptions {
     fn default() -> Self {
         EstimateOptions {
             proposals: ProposalOptions::default(),
-            masked: 60,
+            placed: 160,
+            masked: 50,
             regions: 10,
             hypotheses: 5,
             verified: 16,
@@ -80,6 +83,11 @@ impl KnownObject {
     /// The templates.
     pub fn templates(&self) -> &ObjectTemplates {
         &self.templates
+    }
+
+    /// Whether poses are verified with a mesh.
+    pub fn has_mesh(&self) -> bool {
+        self.model.is_some()
     }
 
     /// The same object without its mesh.
@@ -181,7 +189,7 @@ fn first_matching(
     let apart = 0.15 * object.templates.diameter;
     let mut chosen: Vec<usize> = vec![];
     for i in order {
-        if chosen.len() >= options.masked {
+        if chosen.len() >= options.placed {
             break;
         }
         if chosen.iter().all(|&k| (rois[k].centre - rois[i].centre).norm() > apart) {
@@ -222,21 +230,22 @@ fn merge(
     options: &EstimateOptions,
 ) -> Vec<(Placed, Pixels)> {
     let tolerance = object.matcher.tolerance();
-    let masks: Vec<Pixels> = placed
+    let mut order: Vec<usize> = (0..placed.len()).collect();
+    order.sort_by(|&a, &b| placed[b].support.total_cmp(&placed[a].support).then(a.cmp(&b)));
+    order.truncate(options.masked);
+    let masks: Vec<Pixels> = order
         .par_iter()
-        .map(|p| {
+        .map(|&i| {
+            let p = &placed[i];
             let template = &object.templates.templates[p.template];
             template_mask(scene, template, object.templates.size, &p.camera_from_view, tolerance, STRIDE)
         })
         .collect();
-    let mut order: Vec<usize> = (0..placed.len()).collect();
-    order.sort_by(|&a, &b| placed[b].support.total_cmp(&placed[a].support).then(a.cmp(&b)));
     let mut regions: Vec<(Placed, Pixels)> = vec![];
-    for i in order {
+    for (&i, mask) in order.iter().zip(&masks) {
         if regions.len() >= options.regions {
             break;
         }
-        let mask = &masks[i];
         let overlaps = |other: &Pixels| 2 * common(mask, other) > mask.len().min(other.len());
         if mask.len() >= 20 && !regions.iter().any(|(_, other)| overlaps(other)) {
             regions.push((placed[i].clone(), mask.clone()));

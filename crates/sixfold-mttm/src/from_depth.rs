@@ -59,7 +59,7 @@ impl ObjectTemplates {
         let size = options.margin * extent;
         let templates = views.iter().zip(&points).map(|(view, seen)| cut(view, seen, size)).collect();
         let source = if posed { Source::PosedDepth } else { Source::Depth };
-        Ok(ObjectTemplates { diameter: extent, size, options: *options, source, templates })
+        Ok(ObjectTemplates { diameter: extent, size, options: *options, source, made_from: 0, templates })
     }
 }
 

@@ -1,11 +1,13 @@
 //! Templates drawn from a mesh.
 
+use std::path::Path;
+
 use rayon::prelude::*;
 use sixfold_geometry::{Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
-use crate::error::TemplateError;
+use crate::error::{StoreError, TemplateError};
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 use crate::views::{view_directions, view_rotation};
 
@@ -21,6 +23,7 @@ impl ObjectTemplates {
         if mesh.faces().is_empty() {
             return Err(TemplateError::NoSurface { faces: 0 });
         }
+        let made_from = fingerprint(mesh, options);
         let diameter = mesh.diameter();
         let size = options.margin * diameter;
         let simple;
@@ -37,8 +40,51 @@ impl ObjectTemplates {
         if templates.is_empty() {
             return Err(TemplateError::NoSurface { faces: mesh.faces().len() });
         }
-        Ok(ObjectTemplates { diameter, size, options: *options, source: Source::Mesh, templates })
+        Ok(ObjectTemplates { diameter, size, options: *options, source: Source::Mesh, made_from, templates })
     }
+
+    /// The templates of `mesh`, read from `path` when they are there and belong to this mesh and these options, otherwise
+    /// made and written there. The second value tells why a file that was there was not taken, or that the new one could
+    /// not be written.
+    ///
+    /// # Errors
+    /// [`TemplateError`] as [`ObjectTemplates::from_mesh`].
+    pub fn cached(
+        path: &Path,
+        mesh: &Mesh,
+        options: &TemplateOptions,
+    ) -> Result<(ObjectTemplates, Option<StoreError>), TemplateError> {
+        let mut note = None;
+        match ObjectTemplates::read(path) {
+            Ok(templates) if templates.made_from == fingerprint(mesh, options) => {
+                return Ok((templates, None));
+            }
+            Ok(_) => note = Some(StoreError::Damaged { path: path.into(), what: "made from another mesh" }),
+            Err(StoreError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => note = Some(error),
+        }
+        let templates = ObjectTemplates::from_mesh(mesh, options)?;
+        if let Err(error) = templates.write(path) {
+            note = Some(error);
+        }
+        Ok((templates, note))
+    }
+}
+
+/// FNV-1a (Fowler, Noll, Vo) over what templates depend on.
+fn fingerprint(mesh: &Mesh, options: &TemplateOptions) -> u64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325u64;
+    let mut add = |bytes: &[u8]| {
+        for &b in bytes {
+            hash = (hash ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    };
+    add(options.coverage.name().as_bytes());
+    add(&options.margin.to_le_bytes());
+    add(&options.distance.to_le_bytes());
+    mesh.vertices().iter().flat_map(|v| v.iter()).for_each(|c| add(&c.to_le_bytes()));
+    mesh.faces().iter().flatten().for_each(|i| add(&i.to_le_bytes()));
+    hash
 }
 
 /// One view; `None` when nothing of the mesh is seen from there (a sheet seen edge-on).
@@ -101,6 +147,23 @@ mod tests {
             // The reference point is seen and lies in the middle of the patch.
             assert!(t.relative_depth(SIDE / 2, SIDE / 2).is_some_and(|z| z.abs() < 0.01));
         }
+    }
+
+    #[test]
+    fn kept_templates_are_taken_for_the_same_mesh_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("templates.bin");
+        let options = TemplateOptions::default();
+        let (first, note) = ObjectTemplates::cached(&path, &brick(), &options).unwrap();
+        assert!(note.is_none() && path.is_file());
+        let written = std::fs::metadata(&path).unwrap().modified().unwrap();
+        let (again, note) = ObjectTemplates::cached(&path, &brick(), &options).unwrap();
+        assert!(note.is_none());
+        assert_eq!(first, again);
+        assert_eq!(std::fs::metadata(&path).unwrap().modified().unwrap(), written);
+        let (other, note) = ObjectTemplates::cached(&path, &brick().scaled(1.1), &options).unwrap();
+        assert!(note.unwrap().to_string().contains("another mesh"));
+        assert!((other.diameter / first.diameter - 1.1).abs() < 1e-9);
     }
 
     #[test]

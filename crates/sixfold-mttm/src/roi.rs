@@ -82,7 +82,7 @@ pub struct ProposalOptions {
 
 impl Default for ProposalOptions {
     fn default() -> Self {
-        ProposalOptions { step: 0.14, layer: 0.15, most: 3000 }
+        ProposalOptions { step: 0.12, layer: 0.15, most: 4000 }
     }
 }
 
@@ -95,19 +95,22 @@ pub fn propose(scene: &Scene, diameter: f64, options: &ProposalOptions) -> Vec<R
     if depths.is_empty() {
         return vec![];
     }
-    let middle = depths.len() / 2;
-    let typical = *depths.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let mut step = (options.step * diameter * focal / typical).max(3.0);
+    // The grid is fine enough for what is far; for what is near only some of its places are taken.
+    let far = (0.95 * (depths.len() - 1) as f64) as usize;
+    let far = *depths.select_nth_unstable_by(far, f64::total_cmp).1;
+    let mut share = options.step;
     loop {
-        let rois = sample(scene, step, options.layer * diameter);
+        let step = (share * diameter * focal / far).max(3.0);
+        let rois = sample(scene, step, share * diameter * focal, options.layer * diameter);
         if rois.len() <= options.most {
             return rois;
         }
-        step *= (rois.len() as f64 / options.most as f64).sqrt().max(1.05);
+        share *= (rois.len() as f64 / options.most as f64).sqrt().max(1.05);
     }
 }
 
-fn sample(scene: &Scene, step: f64, layer: f64) -> Vec<Roi> {
+/// Centres every `step` pixels, of near layers every `wanted / depth` pixels.
+fn sample(scene: &Scene, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
     let camera = scene.camera();
     let columns = (camera.width as f64 / step).ceil() as usize;
     let rows = (camera.height as f64 / step).ceil() as usize;
@@ -137,8 +140,10 @@ fn sample(scene: &Scene, step: f64, layer: f64) -> Vec<Roi> {
             let mut start = 0;
             for end in 1..=near.len() {
                 if end == near.len() || near[end] - near[start] > layer {
-                    if end - start >= 4 {
-                        rois.push(Roi { centre: ray * near[(start + end) / 2] });
+                    let distance = near[(start + end) / 2];
+                    let every = (wanted / distance / step).round().max(1.0) as usize;
+                    if end - start >= 4 && i % every == 0 && j % every == 0 {
+                        rois.push(Roi { centre: ray * distance });
                     }
                     start = end;
                 }
@@ -146,4 +151,59 @@ fn sample(scene: &Scene, step: f64, layer: f64) -> Vec<Roi> {
         }
     }
     rois
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::{Camera, DepthImage};
+    use sixfold_match::SceneOptions;
+
+    /// A tilted table with a near and a far box on it that face the camera, 640x480.
+    fn scene() -> Scene {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let depth = DepthImage::from_fn(640, 480, |x, y| match (x, y) {
+            (100..200, 300..380) => 0.6,
+            (400..450, 100..150) => 1.2,
+            _ => 0.5 / (0.3 + 0.001 * y as f32),
+        });
+        Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap()
+    }
+
+    #[test]
+    fn every_place_of_an_object_has_a_centre_nearby() {
+        let scene = scene();
+        let options = ProposalOptions::default();
+        let rois = propose(&scene, 0.1, &options);
+        assert!(!rois.is_empty() && rois.len() <= options.most, "{}", rois.len());
+        for (pixel, z) in [(Vec2::new(150.0, 340.0), 0.6), (Vec2::new(425.0, 125.0), 1.2)] {
+            let p = scene.camera().unproject(&pixel, z);
+            let nearest = rois.iter().map(|r| (r.centre - p).norm()).fold(f64::INFINITY, f64::min);
+            assert!(nearest < 0.1 * options.step * 1.2, "{nearest}");
+        }
+    }
+
+    #[test]
+    fn a_region_sees_its_surroundings_relative_to_its_centre() {
+        let scene = scene();
+        let centre = scene.camera().unproject(&Vec2::new(150.0, 340.0), 0.6);
+        let cells = Roi { centre }.cells(&scene, 0.06, |_| true);
+        let at = |column: usize, row: usize| cells[row * GRID + column];
+        let middle = at(GRID / 2, GRID / 2);
+        assert!(middle[0].abs() < 0.003, "{middle:?}");
+        // The box faces the camera's axis; the region looks along a ray 20 degrees off it.
+        let axis = centre.normalize();
+        assert!((f64::from(middle[3]) + axis.z).abs() < 0.01, "{middle:?}");
+        let nothing = Roi { centre }.cells(&scene, 0.06, |_| false);
+        assert!(nothing.iter().all(|c| *c == UNKNOWN));
+    }
+
+    #[test]
+    fn a_turn_to_a_ray_is_as_small_as_can_be() {
+        for p in [Vec3::z(), Vec3::new(0.3, -0.2, 0.9), Vec3::new(-0.5, 0.0, 0.5)] {
+            let r = ray_rotation(&p);
+            assert!((r * Vec3::z() - p.normalize()).norm() < 1e-12);
+            assert!((r.angle() - p.normalize().z.acos()).abs() < 1e-9);
+        }
+    }
 }

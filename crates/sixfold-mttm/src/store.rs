@@ -19,7 +19,7 @@ const MAGIC: &[u8; 8] = b"SIXFTPL\0";
 const VERSION: u32 = 1;
 const NUMBERS_PER_TEMPLATE: usize = 8;
 const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
-const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 4 * 8 + 4;
+const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 
 /// FNV-1a (Fowler, Noll, Vo).
 fn checksum(bytes: &[u8]) -> u64 {
@@ -42,6 +42,7 @@ impl ObjectTemplates {
             Coverage::Around => 1,
         });
         out.extend_from_slice(&(SIDE as u16).to_le_bytes());
+        out.extend_from_slice(&self.made_from.to_le_bytes());
         for number in [self.diameter, self.size, self.options.margin, self.options.distance] {
             out.extend_from_slice(&number.to_le_bytes());
         }
@@ -143,6 +144,7 @@ impl Reader<'_> {
         if usize::from(u16::from_le_bytes(self.take()?)) != SIDE {
             return None;
         }
+        let made_from = self.take().map(u64::from_le_bytes)?;
         let [diameter, size] = [self.number()?, self.number()?];
         let options = TemplateOptions { coverage, margin: self.number()?, distance: self.number()? };
         let count = self.u32()? as usize;
@@ -154,7 +156,7 @@ impl Reader<'_> {
             return None;
         }
         let templates = (0..count).map(|_| self.template()).collect::<Option<Vec<_>>>()?;
-        Some(ObjectTemplates { diameter, size, options, source, templates })
+        Some(ObjectTemplates { diameter, size, options, source, made_from, templates })
     }
 
     fn template(&mut self) -> Option<Template> {
@@ -188,6 +190,7 @@ mod tests {
             size: 0.132,
             options: TemplateOptions::default(),
             source: Source::Mesh,
+            made_from: 77,
             templates: (0..3).map(template).collect(),
         }
     }

@@ -71,6 +71,8 @@ pub struct ObjectTemplates {
     pub options: TemplateOptions,
     /// What they were made from.
     pub source: Source,
+    /// A hash of the mesh and the options they were made from; 0 for depth images.
+    pub made_from: u64,
     /// The views, without turns in the image plane: those are computed.
     pub templates: Vec<Template>,
 }

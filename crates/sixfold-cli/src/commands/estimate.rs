@@ -20,6 +20,9 @@ use crate::progress::{Progress, check_interrupt};
 const SURE_ENOUGH: f64 = 0.25;
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
+    if a.templates_only {
+        bail!("--templates-only belongs to --method mttm");
+    }
     if a.weights.is_some() || a.object_id.is_some() || a.icp || a.detector.is_some() || a.looks.is_some() {
         bail!(
             "--weights, --object-id, --icp, --looks and, for one image, --detector belong to --method pix2pose; point pair features \
@@ -205,7 +208,7 @@ pub(super) fn given_box(a: &EstimateArguments, camera: &Camera) -> Result<Option
     Ok(Some(region))
 }
 
-fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
+pub(super) fn region_mask(a: &EstimateArguments, camera: &Camera) -> Result<Option<Mask>> {
     let mut mask = a.mask.as_deref().map(read_mask).transpose()?;
     if let (Some(m), Some(path)) = (&mask, &a.mask) {
         camera.check_image(m.width(), m.height()).with_context(|| path.display().to_string())?;

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, anyhow, bail};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{BopDataset, Models, ResultsAppender, Target, write_rgb};
 use sixfold_geometry::Pose;
-use sixfold_match::{Estimate, ObjectModel, Scene, estimate};
+use sixfold_match::{ObjectModel, Scene, estimate};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::estimate::EstimateError;
@@ -16,6 +16,7 @@ use sixfold_pix2pose::estimate::EstimateError;
 use super::boxes::Boxes;
 use super::estimate::{box_mask, estimate_options, scene_options};
 use super::frames::excepted;
+use super::mttm;
 use super::pix2pose::Pix2Pose;
 use crate::Outcome;
 use crate::arguments::{EstimateArguments, Method};
@@ -36,6 +37,8 @@ struct RunRecord {
     looks: Option<usize>,
     #[serde(default)]
     icp: bool,
+    #[serde(default)]
+    templates_only: bool,
     dataset: String,
     split: String,
     targets: Option<String>,
@@ -66,6 +69,8 @@ struct Known {
     mesh: Mesh,
     /// Its point pair features, for that method.
     ppf: Option<ObjectModel>,
+    /// Its templates, for that method.
+    mttm: Option<sixfold_mttm::KnownObject>,
 }
 
 /// A pose of an object with its confidence.
@@ -113,8 +118,15 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                 "--weights, --icp and --looks belong to --method pix2pose; point pair features need none of them"
             )
         }
+        Method::Mttm => {
+            mttm::check(a)?;
+            None
+        }
         Method::Ppf => None,
     };
+    if a.templates_only && a.method != Method::Mttm {
+        bail!("--templates-only belongs to --method mttm");
+    }
     let mut images: BTreeMap<(u32, u32), Vec<Target>> = BTreeMap::new();
     for t in &targets {
         images.entry((t.scene_id, t.im_id)).or_default().push(*t);
@@ -127,6 +139,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         refine: a.refines(),
         looks: pix2pose.as_ref().map(Pix2Pose::looks),
         icp: a.icp,
+        templates_only: a.templates_only,
         dataset: root.display().to_string(),
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
@@ -208,8 +221,16 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                 if let Some(pix2pose) = &pix2pose {
                     pix2pose.check_mesh(o.obj_id, &object.mesh, &file.display().to_string())?;
                 }
-                let ppf = if a.method == Method::Ppf { Some(object.ppf_model()?) } else { None };
-                place.insert(Known { mesh: object.mesh, ppf });
+                place.insert(match a.method {
+                    Method::Ppf => Known { ppf: Some(object.ppf_model()?), mesh: object.mesh, mttm: None },
+                    Method::Pix2pose => Known { mesh: object.mesh, ppf: None, mttm: None },
+                    Method::Mttm => {
+                        let mesh = object.mesh.clone();
+                        let known =
+                            mttm::known_by_mesh(object, &mttm::templates_beside(&file), a.templates_only)?;
+                        Known { mesh, ppf: None, mttm: Some(known.object) }
+                    }
+                });
             }
         }
         let scene = match scenes.entry(*scene_id) {
@@ -219,7 +240,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         let start = Instant::now();
         let found = match &pix2pose {
             Some(pix2pose) => by_pix2pose(a, pix2pose, scene, *im_id, targets, &known, &boxes),
-            None => by_ppf(a, scene, *im_id, targets, &known, &boxes),
+            None => by_depth(a, scene, *im_id, targets, &known, &boxes),
         };
         match found {
             Err(error) => skipped.push(format!("image {key}: {}", crate::describe(&error))),
@@ -362,8 +383,8 @@ fn is_of_box(error: &EstimateError) -> bool {
     matches!(error, EstimateError::Box(_) | EstimateError::Outside { .. })
 }
 
-/// The poses of an image's targets by point pair features.
-fn by_ppf(
+/// The poses of an image's targets by point pair features or templates.
+fn by_depth(
     a: &EstimateArguments,
     scene: &sixfold_bop::Scene,
     im_id: u32,
@@ -374,7 +395,7 @@ fn by_ppf(
     let camera = scene.camera(im_id)?;
     let depth = scene.depth(im_id)?.ok_or_else(|| {
         anyhow!(
-            "has no depth image: point pair features need depth (simulate it with `sixfold simulate-depth`)"
+            "has no depth image: point pair features and templates need depth (simulate it with `sixfold simulate-depth`)"
         )
     })?;
     let options = scene_options(a);
@@ -386,20 +407,27 @@ fn by_ppf(
     for target in targets {
         let Some(o) = target.object else { continue };
         let Some(k) = known.get(&o.obj_id) else { continue };
-        let Some(ppf) = &k.ppf else { continue };
         let regions = boxes.of_target(scene, target, &o, |id| known.get(&id).map(|k| &k.mesh))?;
-        let posed = |e: Estimate| Posed {
+        let posed = |camera_from_object: Pose, confidence: f64| Posed {
             obj_id: o.obj_id,
-            camera_from_object: e.camera_from_object,
-            confidence: e.confidence,
+            camera_from_object,
+            confidence,
+        };
+        let search = |scene: &Scene, instances: usize| -> Vec<Posed> {
+            if let Some(object) = &k.mttm {
+                let found = sixfold_mttm::estimate(scene, object, &mttm::options(a, instances, 0.05)).0;
+                return found.into_iter().map(|e| posed(e.camera_from_object, e.confidence)).collect();
+            }
+            let found = k.ppf.iter().flat_map(|ppf| estimate(scene, ppf, &estimate_options(a, instances)));
+            found.map(|e| posed(e.camera_from_object, e.confidence)).collect()
         };
         if let Some(whole) = &whole {
-            found.extend(estimate(whole, ppf, &estimate_options(a, o.inst_count)).into_iter().map(posed));
+            found.extend(search(whole, o.inst_count));
         }
         for (region, _) in regions {
             let mask = box_mask(&region, &camera);
             let scene = Scene::new(&depth, &camera, Some(&mask), &options).context("depth image")?;
-            found.extend(estimate(&scene, ppf, &estimate_options(a, 1)).into_iter().map(posed));
+            found.extend(search(&scene, 1));
         }
     }
     Ok(found)

@@ -11,6 +11,7 @@ pub(crate) mod eval;
 pub(crate) mod frames;
 pub(crate) mod grasp;
 pub(crate) mod material;
+pub(crate) mod mttm;
 pub(crate) mod object;
 pub(crate) mod pix2pose;
 pub(crate) mod render;

@@ -8,7 +8,8 @@ use sixfold_mesh::{ContinuousSymmetry, ModelInfo, ModelsInfo, read_mesh};
 
 use crate::Outcome;
 use crate::arguments::{Axis, ObjectArguments, ObjectCommand};
-use crate::objects::{Record, Store, new_record};
+use crate::commands::mttm::onboard;
+use crate::objects::{Record, Store, new_record, new_record_of_views};
 use crate::output::report;
 
 #[derive(Serialize)]
@@ -21,7 +22,32 @@ struct Listed {
 pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
     let store = Store { folder: &a.store };
     match &a.command {
-        ObjectCommand::Add { name, mesh, unit, models_info, model_id, turns_about, replace } => {
+        ObjectCommand::Add { name, mesh: None, views, replace, .. } => {
+            let templates = onboard::of_depth(views)?;
+            let record = new_record_of_views(&views.depth, &templates);
+            store.add(name, None, Some(&templates), &record, *replace)?;
+            let listed = Listed { name: name.clone(), record };
+            report(&a.json, &listed, || {
+                println!(
+                    "added {name}: {} template(s), {:.1} mm across as seen",
+                    templates.templates.len(),
+                    1000.0 * templates.diameter
+                );
+            })?;
+            Ok(Outcome::Found)
+        }
+        ObjectCommand::Add {
+            name,
+            mesh: Some(mesh),
+            unit,
+            templates,
+            models_info,
+            model_id,
+            turns_about,
+            replace,
+            ..
+        } => {
+            let unit = unit.as_ref().ok_or_else(|| anyhow!("--unit UNIT is missing"))?;
             let loaded = read_mesh(mesh, *unit)?;
             let mut info = ModelInfo::of_mesh(&loaded);
             if let (Some(file), Some(id)) = (models_info, model_id) {
@@ -41,7 +67,8 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
                 info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
             }
             let record = new_record(mesh, *unit, &loaded, &info);
-            store.add(name, &loaded, &record, *replace)?;
+            let templates = templates.map(|views| onboard::of_mesh(&loaded, views)).transpose()?;
+            store.add(name, Some(&loaded), templates.as_ref(), &record, *replace)?;
             // What methods learn about it is learnt now, not at the first estimate.
             let object = store.load(name)?;
             object.ppf_model()?;
@@ -52,6 +79,9 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
                     1000.0 * listed.record.diameter,
                     listed.record.faces
                 );
+                if let Some(t) = &templates {
+                    println!("{} views with {} turns each", t.templates.len(), t.turns().len());
+                }
             })?;
             Ok(Outcome::Found)
         }
@@ -87,7 +117,11 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
                 let r = &listed.record;
                 println!("{name}");
                 println!("  diameter    {:.2} mm", 1000.0 * r.diameter);
-                println!("  mesh        {} vertices, {} faces", r.vertices, r.faces);
+                if r.without_mesh {
+                    println!("  mesh        none: known from depth images");
+                } else {
+                    println!("  mesh        {} vertices, {} faces", r.vertices, r.faces);
+                }
                 println!(
                     "  symmetries  {} discrete, {} continuous",
                     r.symmetries_discrete.len(),

@@ -6,6 +6,7 @@ mod detect;
 mod eval;
 mod grasp;
 mod image;
+mod mttm;
 mod objects;
 mod pix2pose;
 mod simulate;

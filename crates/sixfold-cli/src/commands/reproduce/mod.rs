@@ -31,6 +31,7 @@ use crate::progress::check_interrupt;
 pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
     match &a.command {
         ReproduceCommand::Pix2pose(pix2pose) => run_pix2pose(pix2pose, a),
+        ReproduceCommand::Mttm(mttm) => super::mttm::reproduce::run(mttm, &a.json),
     }
 }
 

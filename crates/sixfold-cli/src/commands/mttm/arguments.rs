@@ -1,0 +1,68 @@
+//! The command line of template matching.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use sixfold_mttm::Coverage;
+
+/// From which sides templates are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TemplateViews {
+    /// From above, the camera held upright: 301 views with 7 turns, for what stands on a table, z axis up
+    Above,
+    /// From everywhere and however the camera is held: 642 views with 24 turns
+    Around,
+}
+
+impl TemplateViews {
+    pub fn coverage(self) -> Coverage {
+        match self {
+            TemplateViews::Above => Coverage::Above,
+            TemplateViews::Around => Coverage::Around,
+        }
+    }
+}
+
+/// An object known from depth images, for `sixfold object add`.
+#[derive(Debug, Args)]
+pub(crate) struct DepthViewArguments {
+    /// Depth images of an object that has no mesh: its templates for `estimate --method mttm`
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
+    pub depth: Vec<PathBuf>,
+    /// Where the object is in each of them (PNG, above zero inside), in the same order
+    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth")]
+    pub masks: Vec<PathBuf>,
+    /// Camera of the depth images: a JSON file with fx fy cx cy or cam_K, and depth_scale
+    #[arg(long, value_name = "FILE", requires = "depth")]
+    pub camera: Option<PathBuf>,
+    /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
+    #[arg(long, value_name = "MM", requires = "depth")]
+    pub depth_scale: Option<f64>,
+    /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
+    /// metres (default: every view has a frame of its own)
+    #[arg(long, value_name = "FILE", requires = "depth")]
+    pub poses: Option<PathBuf>,
+}
+
+/// `sixfold reproduce mttm`.
+#[derive(Debug, Args)]
+pub(crate) struct ReproduceMttmArguments {
+    /// BOP dataset folder with depth, such as one that `sixfold simulate-depth` wrote
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
+    #[arg(long, value_name = "FILE")]
+    pub targets: Option<PathBuf>,
+    /// Folder for the table, its JSON, and the images done so far
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Take every N-th image
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub every: std::num::NonZeroUsize,
+    /// Leave out point pair features, for comparison on the same images
+    #[arg(long)]
+    pub no_ppf: bool,
+}

@@ -1,0 +1,85 @@
+//! `sixfold object add --templates`, and objects added from depth images alone.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, anyhow, bail};
+use sixfold_bop::{read_depth, read_mask};
+use sixfold_geometry::nalgebra::Matrix4;
+use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
+use sixfold_mesh::Mesh;
+use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
+
+use super::arguments::{DepthViewArguments, TemplateViews};
+use crate::camera_file;
+
+/// The templates of a mesh.
+pub(crate) fn of_mesh(mesh: &Mesh, views: TemplateViews) -> Result<ObjectTemplates> {
+    let options = TemplateOptions { coverage: views.coverage(), ..TemplateOptions::default() };
+    Ok(ObjectTemplates::from_mesh(mesh, &options)?)
+}
+
+struct Read {
+    depth: DepthImage,
+    camera: Camera,
+    mask: Mask,
+    pose: Option<Pose>,
+}
+
+/// The templates of an object in depth images.
+pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<ObjectTemplates> {
+    let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
+    let file = camera_file::read(camera_path)?;
+    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
+        anyhow!("{}: field depth_scale is missing: give it there or as --depth-scale", camera_path.display())
+    })?;
+    if !(scale > 0.0 && scale.is_finite()) {
+        bail!("--depth-scale: found {scale}, expected above 0");
+    }
+    if a.masks.len() != a.depth.len() {
+        bail!(
+            "--mask: found {} masks for {} depth images, expected one for each: templates need to know what is the object",
+            a.masks.len(),
+            a.depth.len()
+        );
+    }
+    let poses = a.poses.as_deref().map(read_poses).transpose()?;
+    if let Some(poses) = &poses
+        && poses.len() != a.depth.len()
+    {
+        bail!(
+            "--poses: found {} poses for {} depth images, expected one for each",
+            poses.len(),
+            a.depth.len()
+        );
+    }
+    let mut read = vec![];
+    for (i, (depth_file, mask_file)) in a.depth.iter().zip(&a.masks).enumerate() {
+        let depth = read_depth(depth_file, scale / 1000.0)?;
+        let camera = file.for_image(depth.width(), depth.height(), camera_path)?;
+        let depth = undistort_depth(&depth, &camera)?;
+        let mask = read_mask(mask_file)?;
+        camera.check_image(mask.width(), mask.height()).with_context(|| mask_file.display().to_string())?;
+        let pose = poses.as_ref().map(|p| p[i]);
+        read.push(Read { depth, camera: camera.without_distortion(), mask, pose });
+    }
+    let views: Vec<DepthView<'_>> = read
+        .iter()
+        .map(|r| DepthView { depth: &r.depth, camera: &r.camera, mask: &r.mask, camera_from_object: r.pose })
+        .collect();
+    let names: Vec<String> = a.depth.iter().map(|f| f.display().to_string()).collect();
+    ObjectTemplates::from_depth(&views, &TemplateOptions::default()).with_context(|| names.join(", "))
+}
+
+fn read_poses(path: &Path) -> Result<Vec<Pose>> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let rows: Vec<[[f64; 4]; 4]> = serde_json::from_str(&text)
+        .with_context(|| format!("{}: expected a list of 4x4 matrices, row by row", path.display()))?;
+    rows.iter()
+        .enumerate()
+        .map(|(i, m)| {
+            let flat: Vec<f64> = m.iter().flatten().copied().collect();
+            Pose::from_matrix(&Matrix4::from_row_slice(&flat))
+                .with_context(|| format!("{}: pose {}", path.display(), i + 1))
+        })
+        .collect()
+}

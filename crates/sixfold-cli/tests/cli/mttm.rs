@@ -1,0 +1,169 @@
+//! `sixfold estimate --method mttm`, `sixfold object add --templates` and `--depth`, `sixfold reproduce mttm`.
+
+use sixfold_bop::{write_depth, write_mask};
+use sixfold_geometry::{Mask, Pose};
+
+use crate::support::*;
+
+const DEPTH: &str = "estimate --method mttm --depth depth.png --camera camera.json";
+
+/// Writes the mask of the part in its image.
+fn write_part_mask(case: &OneImage) {
+    let alone = depth_of(&[(&part(), case.truth)]);
+    let table = depth_of(&[]);
+    let mask = Mask::from_fn(WIDTH, HEIGHT, |x, y| (alone[(x, y)] - table[(x, y)]).abs() > 1e-4);
+    write_mask(&case.path().join("mask.png"), &mask).unwrap();
+}
+
+#[test]
+fn finds_the_pose_by_templates_with_and_without_the_mesh() {
+    let case = OneImage::new();
+    let dir = case.path();
+    let run = sixfold(dir, &format!("{DEPTH} --object part.ply --unit mm --json --out out")).expect(0).json();
+    assert_near(&pose_of(&run["poses"][0]["camera_from_object"]), &case.truth);
+    assert_eq!(run["poses"][0]["verified_by"], "mesh");
+    assert!(dir.join("out/overlay.png").is_file() && dir.join("out/poses.json").is_file());
+    assert!(dir.join("out/masks/1-part-1.png").is_file());
+    // The templates are kept beside the mesh and taken the next time.
+    let kept = dir.join("part.sixfold-templates");
+    let before = std::fs::read(&kept).unwrap();
+    let alone =
+        sixfold(dir, &format!("{DEPTH} --object part.ply --unit mm --json --templates-only")).expect(0);
+    assert_eq!(alone.json()["poses"][0]["verified_by"], "template");
+    assert_near(&pose_of(&alone.json()["poses"][0]["camera_from_object"]), &case.truth);
+    assert_eq!(std::fs::read(&kept).unwrap(), before);
+    // A damaged file is made anew, with a note.
+    std::fs::write(&kept, &before[..1000]).unwrap();
+    let again = sixfold(dir, &format!("{DEPTH} --object part.ply --unit mm --json")).expect(0);
+    assert!(again.stderr.contains("cut off"), "{}", again.stderr);
+    assert_eq!(std::fs::read(&kept).unwrap(), before);
+}
+
+#[test]
+fn an_object_is_stored_with_templates_and_found() {
+    let case = OneImage::new();
+    let dir = case.path();
+    let run = sixfold(dir, "object add thing part.ply --unit mm --templates").expect(0);
+    assert!(run.stdout.contains("301 views with 7 turns"), "{}", run.stdout);
+    let file = dir.join("sixfold-objects/thing/templates.bin");
+    let bytes = std::fs::read(&file).unwrap();
+    let one = sixfold(dir, &format!("--threads 1 {DEPTH} --object thing --json")).expect(0).json();
+    let two = sixfold(dir, &format!("--threads 2 {DEPTH} --object thing --json")).expect(0).json();
+    assert_near(&pose_of(&one["poses"][0]["camera_from_object"]), &case.truth);
+    for field in ["camera_from_object", "confidence", "template", "mask_pixels"] {
+        assert_eq!(one["poses"][0][field], two["poses"][0][field], "{field}");
+    }
+    // The same mesh, the same bytes.
+    sixfold(dir, "object add twin part.ply --unit mm --templates above").expect(0);
+    assert_eq!(std::fs::read(dir.join("sixfold-objects/twin/templates.bin")).unwrap(), bytes);
+    fails(dir, "object add thing part.ply --unit mm --templates", &["thing", "--replace"]);
+    assert_eq!(std::fs::read(&file).unwrap(), bytes);
+}
+
+#[test]
+fn an_object_seen_once_in_depth_is_found_in_another_place() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_part_mask(&case);
+    let pose = case.truth.to_matrix();
+    let rows: Vec<Vec<f64>> = (0..4).map(|i| (0..4).map(|j| pose[(i, j)]).collect()).collect();
+    std::fs::write(dir.join("poses.json"), serde_json::to_string(&[rows]).unwrap()).unwrap();
+    let add = "object add seen --depth depth.png --mask mask.png --camera camera.json";
+    sixfold(dir, &format!("{add} --poses poses.json")).expect(0);
+    sixfold(dir, "object add seen-too --depth depth.png --mask mask.png --camera camera.json").expect(0);
+    let shown = sixfold(dir, "object show seen --json").expect(0).json();
+    assert_eq!(shown["without_mesh"], true);
+    // Pushed 4 cm along the table and turned a little.
+    let moved = case.truth * Pose::exp(&[0.03, 0.02, 0.0, 0.0, 0.0, 0.15].into());
+    write_depth(&dir.join("moved.png"), &depth_of(&[(&part(), moved)]), DEPTH_SCALE).unwrap();
+    let found = "estimate --method mttm --depth moved.png --camera camera.json --json --out out";
+    let run = sixfold(dir, &format!("{found} --object seen")).expect(0).json();
+    assert_eq!(run["poses"][0]["frame"], "object");
+    assert_near(&pose_of(&run["poses"][0]["camera_from_object"]), &moved);
+    // Without a pose the view's own frame is what moves.
+    let run = sixfold(dir, &format!("{found} --object seen-too")).expect(0).json();
+    assert_eq!(run["poses"][0]["frame"], "view");
+    let still = sixfold(dir, &format!("{DEPTH} --json --object seen-too")).expect(0).json();
+    let (there, here) =
+        (pose_of(&run["poses"][0]["camera_from_object"]), pose_of(&still["poses"][0]["camera_from_object"]));
+    assert_near(&(there * here.inverse() * case.truth), &moved);
+    // Only this method can look for it.
+    fails(dir, "estimate --depth depth.png --camera camera.json --object seen", &["seen", "no mesh", "mttm"]);
+}
+
+#[test]
+fn bad_templates_and_bad_depth_are_explained() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_part_mask(&case);
+    fails(dir, "object add x --depth depth.png --camera camera.json", &["--mask"]);
+    fails(
+        dir,
+        "object add x --depth depth.png depth.png --mask mask.png --camera camera.json",
+        &["1 masks for 2 depth images"],
+    );
+    write_mask(&dir.join("none.png"), &Mask::filled(WIDTH, HEIGHT, false)).unwrap();
+    fails(
+        dir,
+        "object add x --depth depth.png --mask none.png --camera camera.json",
+        &["depth.png", "0 of the mask's 0 pixels"],
+    );
+    write_mask(&dir.join("small.png"), &Mask::filled(10, 10, true)).unwrap();
+    fails(
+        dir,
+        "object add x --depth depth.png --mask small.png --camera camera.json",
+        &["small.png", "10x10"],
+    );
+    fails(
+        dir,
+        "object add x --depth depth.png --mask mask.png --camera camera.json --depth-scale 100",
+        &["depth.png", "m large", "depth scale"],
+    );
+    // Nothing half-made is left.
+    sixfold(dir, "object list").expect(1);
+    fails(dir, &format!("{DEPTH} --object part.ply --unit mm --depth-scale 0.0001"), &["depth.png", "1000"]);
+    fails(dir, &format!("{DEPTH} --object part.ply --unit mm --icp"), &["--icp", "pix2pose"]);
+    fails(
+        dir,
+        "estimate --templates-only --depth depth.png --camera camera.json --object part.ply --unit mm",
+        &["--templates-only", "mttm"],
+    );
+}
+
+#[test]
+fn a_store_of_another_version_is_refused_and_kept() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_part_mask(&case);
+    sixfold(dir, "object add seen --depth depth.png --mask mask.png --camera camera.json").expect(0);
+    let file = dir.join("sixfold-objects/seen/templates.bin");
+    let mut bytes = std::fs::read(&file).unwrap();
+    bytes[8] = 2;
+    std::fs::write(&file, &bytes).unwrap();
+    fails(dir, &format!("{DEPTH} --object seen"), &["templates.bin", "another version", "format 2"]);
+    assert_eq!(std::fs::read(&file).unwrap(), bytes);
+}
+
+#[test]
+fn a_dataset_is_estimated_and_reproduced_and_both_go_on() {
+    let tiny = Tiny::new(true);
+    let dir = tiny.path();
+    let estimate = "estimate --method mttm --dataset tiny --out results.csv --json";
+    let first = sixfold(dir, estimate).expect(0).json();
+    assert!(first["poses"].as_u64().unwrap() >= 2, "{first}");
+    let rows = std::fs::read(dir.join("results.csv")).unwrap();
+    sixfold(dir, estimate).expect(0);
+    assert_eq!(std::fs::read(dir.join("results.csv")).unwrap(), rows);
+    fails(dir, &format!("{estimate} --templates-only"), &["results.csv", "other options"]);
+
+    let reproduce = "reproduce mttm --dataset tiny --out reproduced --json";
+    let whole = sixfold(dir, reproduce).expect(0).json();
+    assert_eq!(whole["rows"].as_array().unwrap().len(), 4);
+    assert!(whole["rows"][0]["all"]["add_s"].as_f64().unwrap() > 0.6, "{whole}");
+    assert!(whole["rows"][0]["all"]["iou"].as_f64().unwrap() > 0.6, "{whole}");
+    let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
+    assert!(table.contains("point pair features"), "{table}");
+    // Kept images are not measured again, so the second run gives the same times.
+    assert_eq!(sixfold(dir, reproduce).expect(0).json(), whole);
+    fails(dir, "reproduce mttm --dataset tiny --out reproduced --no-ppf", &["reproduced", "other inputs"]);
+}

@@ -1,0 +1,187 @@
+//! Objects on a table with simulated depth: found by their templates, hidden in part, not there, and known from one view only.
+
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec3};
+use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
+use sixfold_mesh::Mesh;
+use sixfold_mttm::mask::to_image;
+use sixfold_mttm::{
+    DepthView, Estimate, EstimateOptions, KnownObject, ObjectTemplates, TemplateOptions, estimate,
+};
+use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+
+fn camera() -> Camera {
+    Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap()
+}
+
+fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
+    let vertices = (0..8)
+        .map(|i| Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { low[axis] } else { high[axis] }))
+        .collect();
+    let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = sides.iter().flat_map(|s| [[s[0], s[1], s[2]], [s[0], s[2], s[3]]]).collect();
+    Mesh::new(vertices, faces).unwrap()
+}
+
+/// A step with a tower, 12 x 8 x 11 cm, no symmetry.
+fn part() -> Mesh {
+    Mesh::merged(&[
+        cuboid([-0.06, -0.04, 0.0], [0.06, 0.04, 0.03]),
+        cuboid([-0.06, -0.04, 0.03], [-0.02, 0.01, 0.11]),
+        cuboid([0.02, -0.04, 0.03], [0.06, 0.04, 0.055]),
+    ])
+    .unwrap()
+}
+
+/// The camera looks down at a table 0.8 m away by 45 degrees.
+fn on_table(x: f64, y: f64, yaw: f64) -> Pose {
+    let table = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), 135f64.to_radians());
+    let turn = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), yaw);
+    Pose::new(table, Vec3::new(0.0, 0.0, 0.8)) * Pose::new(turn, Vec3::new(x, y, 0.0))
+}
+
+/// Depth of objects on the table, as a sensor with shadow and noise sees it, and the visible part of the first.
+fn look(objects: &[(&Mesh, Pose)], seed: u64) -> (DepthImage, Mask) {
+    let table = cuboid([-0.7, -0.7, -0.02], [0.7, 0.7, 0.0]);
+    let objects: Vec<SceneObject<'_>> = objects
+        .iter()
+        .copied()
+        .chain([(&table, on_table(0.0, 0.0, 0.0))])
+        .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
+        .collect();
+    let mut frame = Frame::new(&camera());
+    frame.render(&objects, &RenderOptions::default());
+    let depth = simulate_depth(&frame.depth(), &frame.normals(&objects), &DepthSensor::xtion(), seed);
+    (depth, frame.mask(0))
+}
+
+fn prepared(depth: &DepthImage) -> Scene {
+    Scene::new(depth, &camera(), None, &SceneOptions::default()).unwrap()
+}
+
+fn known(with_mesh: bool) -> KnownObject {
+    let mesh = part();
+    let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
+    let model = with_mesh.then(|| ObjectModel::new(&mesh, &[], &ModelOptions::default()).unwrap());
+    KnownObject::new(templates, model)
+}
+
+fn off(found: &Estimate, truth: &Pose) -> (f64, f64) {
+    let pose = &found.camera_from_object;
+    (1000.0 * pose.distance_to(truth), pose.rotation_angle_to(truth).to_degrees())
+}
+
+fn iou(found: &Estimate, visible: &Mask, depth: &DepthImage) -> f64 {
+    let mask = to_image(&found.mask, 640, 480);
+    let (mut common, mut either) = (0, 0);
+    for ((m, v), z) in mask.as_slice().iter().zip(visible.as_slice()).zip(depth.as_slice()) {
+        let v = *v && *z > 0.0;
+        common += usize::from(*m && v);
+        either += usize::from(*m || v);
+    }
+    f64::from(common as u32) / f64::from(either.max(1) as u32)
+}
+
+#[test]
+fn found_from_all_sides_with_its_mask() {
+    let (alone, with_mesh) = (known(false), known(true));
+    let options = EstimateOptions::default();
+    for (i, (x, y, yaw)) in [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4)].into_iter().enumerate()
+    {
+        let truth = on_table(x, y, yaw);
+        let (depth, visible) = look(&[(&part(), truth)], i as u64);
+        let scene = prepared(&depth);
+        for (object, millimetres, degrees) in [(&alone, 6.0, 5.0), (&with_mesh, 4.0, 3.0)] {
+            let (found, stages) = estimate(&scene, object, &options);
+            let best = found.first().unwrap_or_else(|| panic!("nothing found at {x} {y} {yaw}"));
+            let (t, r) = off(best, &truth);
+            assert!(t < millimetres && r < degrees, "{x} {y} {yaw}: {t:.1} mm, {r:.1} degrees");
+            let overlap = iou(best, &visible, &depth);
+            assert!(overlap > 0.75, "{x} {y} {yaw}: {overlap}");
+            assert!(stages.sampled > 50 && stages.regions > 0);
+        }
+    }
+}
+
+/// The dissertation's failure: the centroid of what is seen is not that of the object. Here half of the object is hidden behind
+/// a box in front of it.
+#[test]
+fn a_hidden_half_does_not_shift_the_pose() {
+    let truth = on_table(0.0, 0.0, 0.3);
+    let screen = cuboid([-0.05, -0.01, 0.0], [0.05, 0.01, 0.16]);
+    // Nearer to the camera and to the right of the object's middle.
+    let before = on_table(0.075, -0.14, 0.0);
+    let (depth, visible) = look(&[(&part(), truth), (&screen, before)], 5);
+    let (_, whole) = look(&[(&part(), truth)], 5);
+    let count = |m: &Mask| m.as_slice().iter().filter(|v| **v).count() as f64;
+    let share = count(&visible) / count(&whole);
+    assert!((0.3..0.75).contains(&share), "the screen hides {share}");
+    let (found, _) = estimate(&prepared(&depth), &known(false), &EstimateOptions::default());
+    let best = found.first().expect("found");
+    let (t, r) = off(best, &truth);
+    assert!(t < 8.0 && r < 6.0, "{t:.1} mm, {r:.1} degrees, {share:.2} seen");
+    // The centroid of the visible part lies much further from that of the whole.
+    assert!(iou(best, &visible, &depth) > 0.6);
+}
+
+#[test]
+fn what_is_not_there_is_not_surely_found() {
+    let box_alone = cuboid([-0.1, -0.07, 0.0], [0.1, 0.07, 0.09]);
+    let (depth, _) = look(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
+    let (wrong, _) = estimate(&prepared(&depth), &known(true), &EstimateOptions::default());
+    let truth = on_table(0.1, 0.0, 1.0);
+    let (depth, _) = look(&[(&part(), truth)], 3);
+    let (right, _) = estimate(&prepared(&depth), &known(true), &EstimateOptions::default());
+    let sure = |found: &[Estimate]| found.first().map_or(0.0, |e| e.confidence);
+    assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
+    // An empty table: nothing at all.
+    let (depth, _) = look(&[], 3);
+    let (nothing, stages) = estimate(&prepared(&depth), &known(false), &EstimateOptions::default());
+    assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
+    assert!(stages.sampled < 400, "{}", stages.sampled);
+}
+
+#[test]
+fn one_masked_view_is_enough_to_find_it_elsewhere() {
+    let first = on_table(-0.1, 0.05, 0.4);
+    let (depth, mask) = look(&[(&part(), first)], 8);
+    let camera = camera();
+    let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: Some(first) };
+    let templates = ObjectTemplates::from_depth(&[view], &TemplateOptions::default()).unwrap();
+    let object = KnownObject::new(templates, None);
+    let truth = on_table(0.12, -0.06, 0.6);
+    let other = cuboid([-0.04, -0.04, 0.0], [0.04, 0.04, 0.12]);
+    let (depth, visible) = look(&[(&part(), truth), (&other, on_table(-0.12, 0.0, 0.2))], 9);
+    let (found, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+    let best = found.first().expect("found");
+    let (t, r) = off(best, &truth);
+    assert!(t < 12.0 && r < 8.0, "{t:.1} mm, {r:.1} degrees");
+    assert!(iou(best, &visible, &depth) > 0.5);
+}
+
+#[test]
+fn same_result_at_any_number_of_threads() {
+    let (depth, _) = look(&[(&part(), on_table(0.02, 0.03, 1.1))], 2);
+    let (scene, object) = (prepared(&depth), known(true));
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| estimate(&scene, &object, &EstimateOptions::default()).0)
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn two_of_a_kind_are_two() {
+    let poses = [on_table(-0.12, 0.0, 0.4), on_table(0.13, 0.02, 2.2)];
+    let (depth, _) = look(&[(&part(), poses[0]), (&part(), poses[1])], 6);
+    let options = EstimateOptions { max_instances: 2, ..EstimateOptions::default() };
+    let (mut found, _) = estimate(&prepared(&depth), &known(true), &options);
+    assert_eq!(found.len(), 2);
+    found.sort_by(|a, b| {
+        a.camera_from_object.translation().x.total_cmp(&b.camera_from_object.translation().x)
+    });
+    for (e, truth) in found.iter().zip(&poses) {
+        let (t, r) = off(e, truth);
+        assert!(t < 5.0 && r < 4.0, "{t:.1} mm, {r:.1} degrees");
+    }
+}
