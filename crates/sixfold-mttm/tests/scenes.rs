@@ -108,20 +108,22 @@ fn found_from_all_sides_with_its_mask() {
 #[test]
 fn a_hidden_half_does_not_shift_the_pose() {
     let truth = on_table(0.0, 0.0, 0.3);
-    let screen = cuboid([-0.05, -0.01, 0.0], [0.05, 0.01, 0.16]);
+    let screen = cuboid([-0.05, -0.01, 0.0], [0.05, 0.01, 0.2]);
     // Nearer to the camera and to the right of the object's middle.
-    let before = on_table(0.075, -0.14, 0.0);
+    let before = on_table(0.06, -0.085, 0.0);
     let (depth, visible) = look(&[(&part(), truth), (&screen, before)], 5);
     let (_, whole) = look(&[(&part(), truth)], 5);
     let count = |m: &Mask| m.as_slice().iter().filter(|v| **v).count() as f64;
     let share = count(&visible) / count(&whole);
-    assert!((0.3..0.75).contains(&share), "the screen hides {share}");
-    let (found, _) = estimate(&prepared(&depth), &known(false), &EstimateOptions::default());
-    let best = found.first().expect("found");
-    let (t, r) = off(best, &truth);
-    assert!(t < 8.0 && r < 6.0, "{t:.1} mm, {r:.1} degrees, {share:.2} seen");
-    // The centroid of the visible part lies much further from that of the whole.
-    assert!(iou(best, &visible, &depth) > 0.6);
+    assert!((0.3..0.8).contains(&share), "the screen hides {share}");
+    // The screen itself resembles parts of the object: it may be named as well, but the object must be among the first.
+    let options = EstimateOptions { max_instances: 3, ..EstimateOptions::default() };
+    let (found, _) = estimate(&prepared(&depth), &known(true), &options);
+    let all: Vec<(f64, f64)> = found.iter().map(|e| off(e, &truth)).collect();
+    let best = all.iter().position(|(t, r)| *t < 5.0 && *r < 4.0);
+    let best = best.unwrap_or_else(|| panic!("mm and degrees off: {all:?}, {share:.2} seen"));
+    // The centroid of the visible part lies centimetres from that of the whole.
+    assert!(iou(&found[best], &visible, &depth) > 0.6);
 }
 
 #[test]

@@ -67,11 +67,15 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
                 info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
             }
             let record = new_record(mesh, *unit, &loaded, &info);
-            let templates = templates.map(|views| onboard::of_mesh(&loaded, views)).transpose()?;
-            store.add(name, Some(&loaded), templates.as_ref(), &record, *replace)?;
+            store.add(name, Some(&loaded), None, &record, *replace)?;
             // What methods learn about it is learnt now, not at the first estimate.
             let object = store.load(name)?;
             object.ppf_model()?;
+            // From the stored mesh, whose numbers are rounded: that is what later runs compare them with.
+            let templates = templates.map(|views| onboard::of_mesh(&object.mesh, views)).transpose()?;
+            if let Some(templates) = &templates {
+                templates.write(&store.templates_file(name)?)?;
+            }
             let listed = Listed { name: name.clone(), record };
             report(&a.json, &listed, || {
                 println!(

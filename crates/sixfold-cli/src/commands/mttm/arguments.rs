@@ -8,7 +8,7 @@ use sixfold_mttm::Coverage;
 /// From which sides templates are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TemplateViews {
-    /// From above, the camera held upright: 301 views with 7 turns, for what stands on a table, z axis up
+    /// From above, the camera held upright: 305 views with 7 turns, for what stands on a table, z axis up
     Above,
     /// From everywhere and however the camera is held: 642 views with 24 turns
     Around,
