@@ -382,6 +382,11 @@ pub(crate) enum TrainCommand {
         sixfold train detector --object mug.ply --unit mm --out out/mug-detector\n\n\
         Interrupted, it goes on when the same command is given again.")]
     Detector(Box<TrainDetectorArguments>),
+    /// Train the network that transfers grasps from experience, on made-up objects
+    #[cfg(feature = "experience")]
+    #[command(after_help = "Example:\n  sixfold train dgcm --out out/dgcm\n\n\
+        Stopped, the same command goes on.")]
+    Dgcm(Box<crate::commands::train_dgcm::TrainDgcmArguments>),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

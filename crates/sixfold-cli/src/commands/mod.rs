@@ -19,3 +19,5 @@ pub(crate) mod reproduce;
 pub(crate) mod simulate;
 pub(crate) mod train;
 pub(crate) mod train_detector;
+#[cfg(feature = "experience")]
+pub(crate) mod train_dgcm;

@@ -53,6 +53,18 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })?;
             Ok(Outcome::Found)
         }
+        #[cfg(feature = "experience")]
+        TrainCommand::Dgcm(dgcm) => {
+            let summary = super::train_dgcm::train_dgcm(dgcm)?;
+            report(&a.json, &summary, || match summary.seconds {
+                Some(seconds) => {
+                    println!("{} steps in {seconds:.0} s: {}", summary.steps, summary.model);
+                    println!("learning curves: {}", dgcm.out.join("training/curves.png").display());
+                }
+                None => println!("the model after {} steps: {}", summary.steps, summary.model),
+            })?;
+            Ok(Outcome::Found)
+        }
     }
 }
 

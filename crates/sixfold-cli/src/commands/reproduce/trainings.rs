@@ -161,7 +161,7 @@ fn arguments(
     match Arguments::try_parse_from(words)?.command {
         Command::Train(train) => match train.command {
             TrainCommand::Pix2pose(arguments) => Ok(*arguments),
-            TrainCommand::Detector(_) => bail!("the arguments of a training are not those of Pix2Pose"),
+            _ => bail!("the arguments of a training are not those of Pix2Pose"),
         },
         _ => bail!("the arguments of a training are not those of `sixfold train`"),
     }

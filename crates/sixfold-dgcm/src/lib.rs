@@ -1,0 +1,20 @@
+//! DGCM-Net: a grasp that worked once is transferred to the next object of similar shape.
+//!
+//! An object's depth image is encoded into a feature; the nearest stored experiences are retrieved; for each, a network
+//! predicts where every pixel of the object has its counterpart on the experience; the region around the stored grasp is
+//! found again and aligned, and the grasp goes with it. After Park, *6D Pose Estimation of Objects Using Limited Training
+//! Data* (2020), chapter 6.
+//!
+//! Metres and radians, in the camera's frame unless a name says otherwise.
+
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+pub mod crop;
+pub mod families;
+pub mod loss;
+pub mod model;
+pub mod networks;
+pub mod samples;
+pub mod training;
+pub mod vd_noc;

@@ -1,0 +1,199 @@
+//! A trained DGCM-Net as one file, and what it is asked: features, and coordinates of an object in an experience.
+
+use std::path::{Path, PathBuf};
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_nn::weights::{
+    ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
+    write_card_markdown,
+};
+
+use crate::crop::{Crop, CropOptions};
+use crate::networks::{Encoded, FEATURE, Network};
+
+/// Why a model could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The weight file.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The card does not describe a DGCM-Net.
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is no DGCM-Net of this version", file.display())]
+    Card {
+        /// The file.
+        file: PathBuf,
+        /// Field of the card.
+        field: &'static str,
+        /// What it should hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+}
+
+/// A network and how objects are cut out for it.
+#[derive(Debug, Clone)]
+pub struct DgcmModel {
+    network: Network,
+    crop: CropOptions,
+    card: ModelCard,
+    device: Device,
+}
+
+/// What the network says of an input, kept for several experiences.
+#[derive(Debug, Clone)]
+pub struct InputCode {
+    encoded: Encoded,
+    /// The feature, 256 numbers.
+    pub feature: Vec<f32>,
+}
+
+impl DgcmModel {
+    /// A model of a trained network. `card` gets architecture and crop filled in.
+    pub fn new(network: Network, crop: CropOptions, card: ModelCard) -> Self {
+        let mut extra = card.extra.clone();
+        if !extra.is_object() {
+            extra = serde_json::json!({});
+        }
+        extra["crop"] = serde_json::to_value(crop).unwrap_or_default();
+        let card = ModelCard { architecture: network.architecture().to_owned(), extra, ..card };
+        DgcmModel { network: network.valid(), crop, card, device: Device::flex() }
+    }
+
+    /// Reads a weight file.
+    ///
+    /// # Errors
+    /// [`ModelError`] for a file that cannot be read or is no DGCM-Net.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let card = read_card(path)?;
+        let device = Device::flex();
+        let (network, crop) = Self::described(path, &card, &device)?;
+        let (network, card) = load_weights(network, path, &card.architecture)?;
+        Ok(DgcmModel { network: network.valid(), crop, card, device })
+    }
+
+    /// Reads a model from the bytes of a weight file; `name` stands for it in messages.
+    ///
+    /// # Errors
+    /// [`ModelError`].
+    pub fn from_bytes(name: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
+        let device = Device::flex();
+        let compact = "dgcm-compact";
+        let network = Network::of_architecture(compact, &device)
+            .unwrap_or_else(|| unreachable!("the compact network is known"));
+        let (network, card) = load_weights_from_bytes(network, name, bytes, compact)?;
+        let (_, crop) = Self::described(name, &card, &device)?;
+        Ok(DgcmModel { network: network.valid(), crop, card, device })
+    }
+
+    fn described(
+        path: &Path,
+        card: &ModelCard,
+        device: &Device,
+    ) -> Result<(Network, CropOptions), ModelError> {
+        let wrong =
+            |field, expected, found| ModelError::Card { file: path.to_path_buf(), field, expected, found };
+        let network = Network::of_architecture(&card.architecture, device)
+            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
+        let crop: CropOptions = serde_json::from_value(card.extra["crop"].clone())
+            .map_err(|e| wrong("extra.crop", "how objects are cut out", e.to_string()))?;
+        let sane = crop.side == network.side()
+            && crop.size > 0.01
+            && crop.size < 5.0
+            && (1..=50).contains(&crop.normal_radius)
+            && (0.0..0.5).contains(&crop.trim);
+        if !sane {
+            return Err(wrong(
+                "extra.crop",
+                "the network's side, a size of 0.01 to 5 m",
+                format!("{crop:?}"),
+            ));
+        }
+        Ok((network, crop))
+    }
+
+    /// Writes the weight file and, beside it, the card as text.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`].
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        save_weights(&self.network, &self.card, path)?;
+        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+    }
+
+    /// How objects are cut out for the network.
+    pub fn crop_options(&self) -> &CropOptions {
+        &self.crop
+    }
+
+    /// The card.
+    pub fn card(&self) -> &ModelCard {
+        &self.card
+    }
+
+    /// What the network makes of an object's normals.
+    ///
+    /// # Panics
+    /// For a crop of another side than the network's.
+    pub fn encode(&self, crop: &Crop) -> InputCode {
+        assert_eq!(crop.side, self.crop.side, "a crop of another size than the network's");
+        let encoded = self.network.geometry(self.tensor(crop.normal_planes(), 1));
+        let feature = numbers(encoded.feature.clone());
+        InputCode { encoded, feature }
+    }
+
+    /// For every experience (its feature, and its VD-NOC as three planes) the VD-NOC of the input's pixels in the
+    /// experience's frame, pixel by pixel.
+    ///
+    /// # Panics
+    /// For features or VD-NOC of another size than the network's.
+    pub fn coordinates(&self, input: &InputCode, experiences: &[(&[f32], &[f32])]) -> Vec<Vec<[f32; 3]>> {
+        let (count, pixels) = (experiences.len(), self.crop.side * self.crop.side);
+        if count == 0 {
+            return vec![];
+        }
+        let features: Vec<f32> = experiences.iter().flat_map(|(f, _)| f.iter().copied()).collect();
+        let vd_noc: Vec<f32> = experiences.iter().flat_map(|(_, v)| v.iter().copied()).collect();
+        assert_eq!((features.len(), vd_noc.len()), (count * FEATURE, count * 3 * pixels));
+        let features = Tensor::<2>::from_data(TensorData::new(features, [count, FEATURE]), &self.device);
+        let code = self.network.vd_noc(self.tensor(vd_noc, count));
+        let out = numbers(self.network.decode(&input.encoded.repeat(count), features, &code));
+        out.chunks_exact(3 * pixels)
+            .map(|image| (0..pixels).map(|i| [0, 1, 2].map(|k| image[k * pixels + i])).collect())
+            .collect()
+    }
+
+    fn tensor(&self, values: Vec<f32>, count: usize) -> Tensor<4> {
+        let side = self.crop.side;
+        Tensor::from_data(TensorData::new(values, [count, 3, side, side]), &self.device)
+    }
+}
+
+fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::networks::CompactConfig;
+
+    #[test]
+    fn a_model_survives_its_file_and_other_files_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("dgcm.safetensors");
+        let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
+        let model = DgcmModel::new(network, CropOptions::compact(), ModelCard::new("", "test"));
+        model.save(&file).unwrap();
+        let again = DgcmModel::load(&file).unwrap();
+        assert_eq!(again.crop_options(), &CropOptions::compact());
+        let bytes = std::fs::read(&file).unwrap();
+        assert!(DgcmModel::from_bytes(&file, &bytes).is_ok());
+        assert!(folder.path().join("dgcm.md").exists());
+        let missing = DgcmModel::load(&folder.path().join("none.safetensors")).unwrap_err().to_string();
+        assert!(missing.contains("none.safetensors"), "{missing}");
+        let error = DgcmModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
+        assert!(error.contains("dgcm.safetensors"), "{error}");
+    }
+}

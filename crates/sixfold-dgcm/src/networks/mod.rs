@@ -1,0 +1,140 @@
+//! DGCM-Net (dissertation, section 6.2.2, figure 6.3): a geometry encoder, a VD-NOC encoder and a VD-NOC decoder.
+
+mod compact;
+mod paper;
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+
+pub use compact::{Compact, CompactConfig};
+pub use paper::{Paper, PaperConfig};
+
+/// Length of features and codes.
+pub const FEATURE: usize = 256;
+
+/// What an encoder says of a batch.
+#[derive(Debug, Clone)]
+pub struct Encoded {
+    /// `batch x 256`, each value from -1 to 1.
+    pub feature: Tensor<2>,
+    /// Maps at 1/2, 1/4, ... of the resolution, `batch x channels x height x width`.
+    pub maps: Vec<Tensor<4>>,
+}
+
+impl Encoded {
+    /// A part of the batch.
+    pub fn narrow(&self, start: usize, count: usize) -> Encoded {
+        Encoded {
+            feature: self.feature.clone().narrow(0, start, count),
+            maps: self.maps.iter().map(|m| m.clone().narrow(0, start, count)).collect(),
+        }
+    }
+
+    /// A batch of one, repeated.
+    pub fn repeat(&self, count: usize) -> Encoded {
+        Encoded {
+            feature: self.feature.clone().repeat_dim(0, count),
+            maps: self.maps.iter().map(|m| m.clone().repeat_dim(0, count)).collect(),
+        }
+    }
+}
+
+/// The first half of a map's channels: what a skip connection carries.
+fn half(map: &Tensor<4>) -> Tensor<4> {
+    let channels = map.dims()[1];
+    map.clone().narrow(1, 0, channels / 2)
+}
+
+/// One of the networks.
+#[derive(Module, Debug)]
+pub enum Network {
+    /// For two processor cores.
+    Compact(Compact),
+    /// The dissertation's.
+    Paper(Paper),
+}
+
+impl Network {
+    /// Side of the input in pixels.
+    pub fn side(&self) -> usize {
+        match self {
+            Network::Compact(_) => CompactConfig::SIDE,
+            Network::Paper(_) => PaperConfig::SIDE,
+        }
+    }
+
+    /// Its name in weight files.
+    pub fn architecture(&self) -> &'static str {
+        match self {
+            Network::Compact(_) => "dgcm-compact",
+            Network::Paper(_) => "dgcm-paper",
+        }
+    }
+
+    /// A network of this name with random weights, to be filled from a file.
+    pub fn of_architecture(name: &str, device: &Device) -> Option<Network> {
+        match name {
+            "dgcm-compact" => Some(Network::Compact(CompactConfig.init(0, device))),
+            "dgcm-paper" => Some(Network::Paper(PaperConfig.init(0, device))),
+            _ => None,
+        }
+    }
+
+    /// Normals (`batch x 3 x side x side`) to features.
+    pub fn geometry(&self, normals: Tensor<4>) -> Encoded {
+        match self {
+            Network::Compact(n) => n.geometry(normals),
+            Network::Paper(n) => n.geometry(normals),
+        }
+    }
+
+    /// VD-NOC (`batch x 3 x side x side`) to codes.
+    pub fn vd_noc(&self, vd_noc: Tensor<4>) -> Encoded {
+        match self {
+            Network::Compact(n) => n.vd_noc(vd_noc),
+            Network::Paper(n) => n.vd_noc(vd_noc),
+        }
+    }
+
+    /// The VD-NOC of the input's pixels in the experience's frame, `batch x 3 x side x side`, from the input's and the
+    /// experience's features (`batch x 256`) and the experience's code.
+    pub fn decode(&self, input: &Encoded, experience: Tensor<2>, code: &Encoded) -> Tensor<4> {
+        match self {
+            Network::Compact(n) => n.decode(input, experience, code),
+            Network::Paper(n) => n.decode(input, experience, code),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shapes(network: &Network, batch: usize) {
+        let device = Device::flex();
+        let side = network.side();
+        let x = Tensor::<4>::ones([batch, 3, side, side], &device) * 0.3;
+        let f = network.geometry(x.clone());
+        let c = network.vd_noc(x);
+        assert_eq!(f.feature.dims(), [batch, FEATURE]);
+        assert_eq!(c.feature.dims(), [batch, FEATURE]);
+        let out = network.decode(&f.narrow(0, 1).repeat(batch), f.feature.clone(), &c);
+        assert_eq!(out.dims(), [batch, 3, side, side]);
+        let values: Vec<f32> = f.feature.into_data().try_to_vec().unwrap();
+        assert!(values.iter().all(|v| v.abs() <= 1.0));
+    }
+
+    #[test]
+    fn the_compact_network_is_small() {
+        let network = Network::of_architecture("dgcm-compact", &Device::flex()).unwrap();
+        assert!(network.num_params() < 4_000_000, "{}", network.num_params());
+        shapes(&network, 2);
+    }
+
+    #[test]
+    fn the_papers_network_has_its_sizes() {
+        let network = Network::of_architecture("dgcm-paper", &Device::flex()).unwrap();
+        shapes(&network, 1);
+        assert!(Network::of_architecture("other", &Device::flex()).is_none());
+    }
+}

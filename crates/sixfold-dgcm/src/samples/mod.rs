@@ -1,0 +1,7 @@
+//! What the network learns from: views of members of the families, and pairs of views.
+
+mod pairs;
+mod pool;
+
+pub use pairs::{Pair, PairOptions};
+pub use pool::{Pool, PoolOptions, View};

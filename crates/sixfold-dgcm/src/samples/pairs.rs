@@ -1,0 +1,208 @@
+//! Pairs of views and their augmentation (dissertation, section 6.2.2, table 6.1).
+//!
+//! Positive: two views of the same kind of object that share more than half of their visible vertices. The target says for
+//! every pixel of the first where the same place of the object has its VD-NOC in the second. Negative: views of different
+//! families, or of one that share less.
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sixfold_nn::layers::normal;
+
+use super::pool::{Pool, View};
+
+/// How pairs are drawn and augmented.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PairOptions {
+    /// Two views whose share of common visible vertices is above this are a positive pair.
+    pub shared: f64,
+    /// Share of negative pairs that are of one family.
+    pub same_family: f64,
+    /// Largest share of the object's box that is hidden by a block (table 6.1).
+    pub occlusion: f64,
+    /// Standard deviation of the noise on normals and VD-NOC (table 6.1).
+    pub noise: f32,
+    /// Targets are cut off at this: places that the second view does not see lie outside of its extent.
+    pub limit: f64,
+}
+
+impl Default for PairOptions {
+    fn default() -> Self {
+        PairOptions { shared: 0.5, same_family: 0.3, occlusion: 0.25, noise: 0.01, limit: 1.5 }
+    }
+}
+
+/// Two views as the network wants them: planes of `side * side` numbers, three each.
+#[derive(Debug, Clone)]
+pub struct Pair {
+    /// Whether the views show similar geometry.
+    pub positive: bool,
+    /// Normals of the first view, the input.
+    pub input: Vec<f32>,
+    /// Normals of the second view, the experience.
+    pub experience: Vec<f32>,
+    /// VD-NOC of the second view in its own frame.
+    pub vd_noc: Vec<f32>,
+    /// VD-NOC of the first view's pixels in the second view's frame; zeros for a negative pair.
+    pub target: Vec<f32>,
+    /// One where the first view shows the object.
+    pub mask: Vec<f32>,
+}
+
+impl Pool {
+    /// The pair with this number, the same for the same seed.
+    pub fn pair(&self, positive: bool, options: &PairOptions, seed: u64, number: u64) -> Pair {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(number);
+        let (first, second) = self.draw(positive, options, &mut random);
+        let side = self.options().crop.side;
+        let pixels = side * side;
+        let mut pair = Pair {
+            positive,
+            input: vec![0.0; 3 * pixels],
+            experience: vec![0.0; 3 * pixels],
+            vd_noc: vec![0.0; 3 * pixels],
+            target: vec![0.0; 3 * pixels],
+            mask: vec![0.0; pixels],
+        };
+        let hidden = block(first, side, options, &mut random);
+        for p in first.pixels.iter().filter(|p| !hidden(usize::from(p.index))) {
+            let i = usize::from(p.index);
+            let place = if positive { Some(second.counterpart(p)) } else { None };
+            for k in 0..3 {
+                pair.input[k * pixels + i] =
+                    f32::from(p.normal[k]) / 127.0 + options.noise * normal(&mut random);
+                if let Some(place) = place {
+                    pair.target[k * pixels + i] = place[k].clamp(-options.limit, options.limit) as f32;
+                }
+            }
+            pair.mask[i] = 1.0;
+        }
+        let hidden = block(second, side, options, &mut random);
+        for p in second.pixels.iter().filter(|p| !hidden(usize::from(p.index))) {
+            let i = usize::from(p.index);
+            for k in 0..3 {
+                pair.experience[k * pixels + i] =
+                    f32::from(p.normal[k]) / 127.0 + options.noise * normal(&mut random);
+                pair.vd_noc[k * pixels + i] =
+                    f32::from(p.vd_noc[k]) / 127.0 + options.noise * normal(&mut random);
+            }
+        }
+        pair
+    }
+
+    /// Two views of a pair.
+    fn draw(&self, positive: bool, options: &PairOptions, random: &mut impl Rng) -> (&View, &View) {
+        const TRIES: usize = 60;
+        let views = self.views();
+        let mut any = |of: usize| random.random_range(0..of);
+        for _ in 0..TRIES {
+            let first = any(views.len());
+            let group = self.group(first);
+            if positive {
+                // The one of some that shares enough; else another first view.
+                for _ in 0..TRIES {
+                    let second = group[any(group.len())];
+                    if second != first && views[first].shared(&views[second]) > options.shared {
+                        return (&views[first], &views[second]);
+                    }
+                }
+            } else {
+                let same = (any(1000) as f64) < 1000.0 * options.same_family;
+                let second = if same { group[any(group.len())] } else { any(views.len()) };
+                let other = views[first].family != views[second].family;
+                if other || views[first].shared(&views[second]) <= options.shared {
+                    return (&views[first], &views[second]);
+                }
+            }
+        }
+        // A pool with views of one kind only has no negative pairs; a view paired with itself is a positive one.
+        let first = any(views.len());
+        (&views[first], &views[if positive { first } else { any(views.len()) }])
+    }
+}
+
+/// Which pixels a block hides: it comes from one side of the object's box and takes a share of it.
+fn block(
+    view: &View,
+    side: usize,
+    options: &PairOptions,
+    random: &mut ChaCha8Rng,
+) -> impl Fn(usize) -> bool + use<> {
+    let (mut x0, mut y0, mut x1, mut y1) = (side, side, 0, 0);
+    for p in &view.pixels {
+        let (x, y) = (usize::from(p.index) % side, usize::from(p.index) / side);
+        (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x + 1), y1.max(y + 1));
+    }
+    let share = options.occlusion * random.random::<f64>();
+    let from = random.random_range(0..4);
+    let depth = |low: usize, high: usize| (share * high.saturating_sub(low) as f64).round() as usize;
+    let (dx, dy) = (depth(x0, x1), depth(y0, y1));
+    move |index| {
+        let (x, y) = (index % side, index / side);
+        match from {
+            0 => x < x0 + dx,
+            1 => x + dx >= x1,
+            2 => y < y0 + dy,
+            _ => y + dy >= y1,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::samples::PoolOptions;
+
+    fn pool() -> Pool {
+        Pool::new(&PoolOptions { views: 96, ..PoolOptions::default() }, |_| ())
+    }
+
+    #[test]
+    fn targets_are_the_vd_noc_of_the_same_place() {
+        let pool = pool();
+        let options = PairOptions { noise: 0.0, occlusion: 0.0, ..PairOptions::default() };
+        let pixels = 96 * 96;
+        for number in 0..12 {
+            let pair = pool.pair(true, &options, 5, number);
+            let inside: Vec<usize> = (0..pixels).filter(|&i| pair.mask[i] > 0.0).collect();
+            assert!(inside.len() > 150);
+            // Where the second view shows the object at a target's place, its VD-NOC is near it: most places are seen.
+            let second: Vec<usize> =
+                (0..pixels).filter(|&i| (0..3).any(|k| pair.vd_noc[k * pixels + i] != 0.0)).collect();
+            let near = inside
+                .iter()
+                .step_by(7)
+                .filter(|&&i| {
+                    second.iter().any(|&j| {
+                        (0..3)
+                            .all(|k| (pair.target[k * pixels + i] - pair.vd_noc[k * pixels + j]).abs() < 0.15)
+                    })
+                })
+                .count();
+            let asked = inside.len().div_ceil(7);
+            assert!(near * 2 > asked, "pair {number}: {near} of {asked}");
+            let outside = (0..pixels).filter(|&i| pair.mask[i] == 0.0);
+            assert!(outside.into_iter().all(|i| pair.target[i] == 0.0 && pair.input[i] == 0.0));
+        }
+    }
+
+    #[test]
+    fn pairs_keep_to_their_kind_and_to_their_seed() {
+        let pool = pool();
+        let options = PairOptions::default();
+        let (mut same, mut random) = (0, ChaCha8Rng::seed_from_u64(1));
+        for _ in 0..50 {
+            let (a, b) = pool.draw(true, &options, &mut random);
+            assert!(a.family == b.family && a.rest == b.rest && a.shared(b) > 0.5);
+            let (a, b) = pool.draw(false, &options, &mut random);
+            assert!(a.family != b.family || a.shared(b) <= 0.5);
+            same += usize::from(a.family == b.family);
+        }
+        assert!(same < 35, "{same}");
+        let (a, b) = (pool.pair(true, &options, 1, 2), pool.pair(true, &options, 1, 2));
+        assert_eq!((a.input, a.target), (b.input, b.target));
+        let view = &pool.views()[0];
+        assert_eq!(view.shared(view), 1.0);
+    }
+}

@@ -1,0 +1,78 @@
+//! View-dependent normalised object coordinates, VD-NOC (dissertation, equation 6.1): the points that a depth image shows
+//! of an object, moved to the middle of their extent and divided by half of it, axis by axis, with z turned round so that
+//! nearer points have larger values.
+
+use sixfold_geometry::Vec3;
+
+/// The extent of an object in one view, which turns points into VD-NOC and back.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Extent {
+    /// The middle between largest and smallest coordinates, metres, in the camera's frame.
+    pub centre: Vec3,
+    /// Half the difference between largest and smallest coordinates, metres, each above zero.
+    pub half: Vec3,
+}
+
+impl Extent {
+    /// Half extents are at least this, metres: what is seen as a plane has no thickness to divide by.
+    const LEAST: f64 = 0.002;
+
+    /// The extent of points in metres. `trim` is the share of points that is left out at both ends of each axis (flying
+    /// pixels): 0 for equation 6.1 as it stands. `None` without points.
+    pub fn of(points: &[Vec3], trim: f64) -> Option<Extent> {
+        if points.is_empty() {
+            return None;
+        }
+        let cut = (trim.clamp(0.0, 0.49) * points.len() as f64) as usize;
+        let mut low = Vec3::zeros();
+        let mut high = Vec3::zeros();
+        for axis in 0..3 {
+            let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
+            values.sort_by(f64::total_cmp);
+            low[axis] = values[cut];
+            high[axis] = values[values.len() - 1 - cut];
+        }
+        Some(Extent {
+            centre: (low + high) * 0.5,
+            half: ((high - low) * 0.5).sup(&Vec3::repeat(Self::LEAST)),
+        })
+    }
+
+    /// The VD-NOC of a point of the camera's frame; -1 to 1 for points within the extent.
+    pub fn normalise(&self, point: &Vec3) -> Vec3 {
+        let n = (point - self.centre).component_div(&self.half);
+        Vec3::new(n.x, n.y, -n.z)
+    }
+
+    /// The point of a VD-NOC, metres.
+    pub fn restore(&self, n: &Vec3) -> Vec3 {
+        Vec3::new(n.x, n.y, -n.z).component_mul(&self.half) + self.centre
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equation_6_1_by_hand() {
+        let points = [Vec3::new(0.1, -0.2, 1.0), Vec3::new(0.3, 0.2, 1.2), Vec3::new(0.15, 0.1, 1.05)];
+        let extent = Extent::of(&points, 0.0).unwrap();
+        assert!((extent.centre - Vec3::new(0.2, 0.0, 1.1)).norm() < 1e-12);
+        // Every axis has a factor of its own, and the nearest point has z = +1.
+        assert!((extent.normalise(&points[0]) - Vec3::new(-1.0, -1.0, 1.0)).norm() < 1e-12);
+        assert!((extent.normalise(&points[1]) - Vec3::new(1.0, 1.0, -1.0)).norm() < 1e-12);
+        assert!((extent.normalise(&points[2]) - Vec3::new(-0.5, 0.5, 0.5)).norm() < 1e-12);
+        assert!((extent.restore(&extent.normalise(&points[2])) - points[2]).norm() < 1e-12);
+    }
+
+    #[test]
+    fn flying_pixels_can_be_left_out_and_planes_do_not_divide_by_zero() {
+        let mut points: Vec<Vec3> = (0..200).map(|i| Vec3::new(f64::from(i) * 1e-3, 0.0, 1.0)).collect();
+        points.push(Vec3::new(5.0, 0.0, 1.0));
+        assert!(Extent::of(&points, 0.01).unwrap().half.x < 0.11);
+        assert!(Extent::of(&points, 0.0).unwrap().half.x > 2.0);
+        assert!(Extent::of(&points, 0.0).unwrap().normalise(&points[3]).iter().all(|v| v.is_finite()));
+        assert!(Extent::of(&[], 0.0).is_none());
+    }
+}
