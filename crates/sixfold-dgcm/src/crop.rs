@@ -169,7 +169,7 @@ impl Crop {
     }
 
     /// Computes extent and VD-NOC from the points.
-    fn set_extent(&mut self, seen: &[Vec3], trim: f64) {
+    pub(crate) fn set_extent(&mut self, seen: &[Vec3], trim: f64) {
         if let Some(extent) = Extent::of(seen, trim) {
             self.extent = extent;
         }

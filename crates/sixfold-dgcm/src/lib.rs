@@ -11,10 +11,14 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod crop;
+mod crop_turn;
 pub mod families;
 pub mod loss;
 pub mod model;
 pub mod networks;
 pub mod samples;
+pub mod store;
 pub mod training;
 pub mod vd_noc;
+
+pub use crop_turn::turn;

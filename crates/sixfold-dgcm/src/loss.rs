@@ -31,6 +31,17 @@ pub fn metric_loss(
     (sum / pairs as f64, mean(0, positives), mean(positives, negatives))
 }
 
+/// Equation 6.2 for all pairs of a first and a second view of the batch that show different families: the same images say
+/// that much more. `different` (`pairs x pairs`) holds 1 for such pairs.
+pub fn cross_loss(input: &Tensor<2>, experience: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
+    let of_input = input.clone().square().sum_dim(1);
+    let of_experience = experience.clone().square().sum_dim(1).transpose();
+    let product = input.clone().matmul(experience.clone().transpose());
+    let squared = (of_input + of_experience - product * 2.0).clamp_min(0.0);
+    let missing = ((squared + 1e-6).sqrt() * -1.0 + MARGIN).clamp_min(0.0).square();
+    (missing * different.clone()).sum() / (different.sum() + 1e-6)
+}
+
 /// The masked L1 loss of equation 6.3 for coordinates (`batch x 3 x side x side`) where `mask` (`batch x 1 x side x side`)
 /// is 1 on the object, and the mean absolute error of one coordinate there.
 pub fn coordinate_loss(output: Tensor<4>, target: Tensor<4>, mask: Tensor<4>) -> (Tensor<1>, Tensor<1>) {
@@ -63,6 +74,17 @@ mod tests {
         let (loss, near, far) = metric_loss(&a, &b, 1);
         assert!((number(loss) - 41.0 / 3.0).abs() < 1e-4);
         assert!((number(near) - 5.0).abs() < 1e-4 && (number(far) - 13.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn cross_pairs_count_where_families_differ() {
+        let device = Device::flex();
+        let rows = |v: Vec<f32>| Tensor::<2>::from_data(TensorData::new(v, [2, 2]), &device);
+        let a = rows(vec![0.0, 0.0, 3.0, 0.0]);
+        let b = rows(vec![0.0, 0.0, 3.0, 4.0]);
+        // Of the four distances 0, 5, 3, 4 the second and the third count: (10 - 5)^2 and (10 - 3)^2.
+        let loss = number(cross_loss(&a, &b, rows(vec![0.0, 1.0, 1.0, 0.0])));
+        assert!((loss - 37.0).abs() < 1e-2, "{loss}");
     }
 
     #[test]

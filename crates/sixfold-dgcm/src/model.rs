@@ -132,6 +132,16 @@ impl DgcmModel {
         &self.card
     }
 
+    /// A name that tells this network's features from those of another: its architecture and a hash of its card.
+    pub fn fingerprint(&self) -> String {
+        // FNV-1a, which is the same everywhere.
+        let text = serde_json::to_string(&self.card).unwrap_or_default();
+        let hash = text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+        });
+        format!("{}-{hash:016x}", self.card.architecture)
+    }
+
     /// What the network makes of an object's normals.
     ///
     /// # Panics

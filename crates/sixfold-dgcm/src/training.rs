@@ -15,7 +15,8 @@ use sixfold_nn::training::{Course, Trainee, run};
 pub use sixfold_nn::training::{Ending, TrainingError};
 use sixfold_nn::training_log::TrainingRecord;
 
-use crate::loss::{MARGIN, coordinate_loss, metric_loss};
+use crate::families::Family;
+use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
 use crate::networks::Network;
 use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
 
@@ -34,6 +35,10 @@ pub struct TrainingOptions {
     pub weight_decay: f32,
     /// Weight of the coordinates in equation 6.4.
     pub lambda: f64,
+    /// Weight of equation 6.2 for all pairs of views in a batch that show different families, beside the drawn pairs.
+    pub cross_pairs: f64,
+    /// A tensor's gradient that is longer than this (Euclidean) is shortened to it.
+    pub longest_gradient: f32,
     /// How pairs are drawn.
     pub samples: PairOptions,
     /// Seed of weights and pairs.
@@ -45,10 +50,12 @@ impl Default for TrainingOptions {
         TrainingOptions {
             steps: 4000,
             pairs: 8,
-            learning_rate: 1.5e-3,
-            warm_up: 100,
+            learning_rate: 1e-3,
+            warm_up: 200,
             weight_decay: 1e-4,
             lambda: 20.0,
+            cross_pairs: 1.0,
+            longest_gradient: 1.0,
             samples: PairOptions::default(),
             seed: 0,
         }
@@ -59,7 +66,14 @@ impl TrainingOptions {
     /// The dissertation's: 25 positive and 25 negative pairs, rate 0.0001, both losses alike. (It divides the rate by ten
     /// every 5 of 35 epochs; the cosine here ends at zero as well.)
     pub fn paper() -> Self {
-        TrainingOptions { steps: 116_000, pairs: 25, learning_rate: 1e-4, lambda: 1.0, ..Self::default() }
+        TrainingOptions {
+            steps: 116_000,
+            pairs: 25,
+            learning_rate: 1e-4,
+            lambda: 1.0,
+            cross_pairs: 0.0,
+            ..Self::default()
+        }
     }
 }
 
@@ -94,15 +108,25 @@ pub struct Batch {
     vd_noc: Vec<f32>,
     target: Vec<f32>,
     mask: Vec<f32>,
+    /// Families of both views of every pair.
+    families: Vec<(Family, Family)>,
 }
 
 fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
     let pairs = options.pairs as u64;
-    let mut batch = Batch { input: vec![], experience: vec![], vd_noc: vec![], target: vec![], mask: vec![] };
+    let mut batch = Batch {
+        input: vec![],
+        experience: vec![],
+        vd_noc: vec![],
+        target: vec![],
+        mask: vec![],
+        families: vec![],
+    };
     for positive in [true, false] {
         for number in 0..pairs {
             let number = 2 * (step * pairs + number) + u64::from(positive);
             let pair: Pair = pool.pair(positive, &options.samples, options.seed, number);
+            batch.families.push(pair.families);
             batch.input.extend(pair.input);
             batch.experience.extend(pair.experience);
             if positive {
@@ -126,23 +150,38 @@ impl Trainee for State<'_> {
         let input = self.network.geometry(tensor(batch.input, 2 * pairs, 3));
         let experience = self.network.geometry(tensor(batch.experience, 2 * pairs, 3));
         let (metric, near, far) = metric_loss(&input.feature, &experience.feature, pairs);
+        let different: Vec<f32> = batch
+            .families
+            .iter()
+            .flat_map(|a| batch.families.iter().map(|b| f32::from(u8::from(a.0 != b.1))))
+            .collect();
+        let different = Tensor::from_data(TensorData::new(different, [2 * pairs, 2 * pairs]), self.device);
+        let cross = cross_loss(&input.feature, &experience.feature, different);
         let code = self.network.vd_noc(tensor(batch.vd_noc, pairs, 3));
         let features = experience.feature.narrow(0, 0, pairs);
         let out = self.network.decode(&input.narrow(0, pairs), features, &code);
         let (coordinates, error) =
             coordinate_loss(out, tensor(batch.target, pairs, 3), tensor(batch.mask, pairs, 1));
-        let numbers = [&metric, &coordinates, &near, &far, &error].map(|t| {
+        let numbers = [&metric, &cross, &coordinates, &near, &far, &error].map(|t| {
             let value: Vec<f32> = t.clone().inner().into_data().try_to_vec().unwrap_or_default();
             value.first().map_or(f64::NAN, |v| f64::from(*v))
         });
-        let gradients = (metric + coordinates * self.options.lambda).backward();
+        let sum = metric + cross * self.options.cross_pairs + coordinates * self.options.lambda;
+        let gradients = sum.backward();
         let gradients = GradientsParams::from_grads(gradients, &self.network);
         self.network = self.optimiser.step(rate, self.network.clone(), gradients);
-        ["metric", "coordinates", "positive distance", "negative distance", "error on the object"]
-            .into_iter()
-            .map(str::to_owned)
-            .zip(numbers)
-            .collect()
+        [
+            "metric",
+            "cross pairs",
+            "coordinates",
+            "positive distance",
+            "negative distance",
+            "error on the object",
+        ]
+        .into_iter()
+        .map(str::to_owned)
+        .zip(numbers)
+        .collect()
     }
 
     fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
@@ -200,7 +239,7 @@ pub fn train(
     if !(options.lambda >= 0.0 && options.lambda.is_finite()) {
         return wrong("lambda", "a finite number, 0 or more", options.lambda.to_string());
     }
-    let clip = GradientClippingConfig::Norm(10.0);
+    let clip = GradientClippingConfig::Norm(options.longest_gradient);
     let optimiser =
         AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(Some(clip)).init();
     let recorded = Recorded {

@@ -2,11 +2,11 @@
 //!
 //! It differs in what two processor cores can train in half an hour: no ResNet-50 but nine convolutions that start from
 //! random weights (normals are no photographs, and a sixth of the work of ResNet-50 buys six times the samples), ReLU for
-//! LeakyReLU, bilinear doubling and convolutions for deconvolutions, the last doubling by a pixel shuffle.
+//! LeakyReLU in convolutions, bilinear doubling and convolutions for deconvolutions, the last doubling by a pixel shuffle.
 
 use burn::module::Module;
 use burn::nn::Linear;
-use burn::tensor::activation::relu;
+use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -17,6 +17,8 @@ use sixfold_nn::ops::upsample;
 
 use super::{Encoded, FEATURE, half};
 
+/// Of LeakyReLU in the dense layers.
+const SLOPE: f64 = 0.1;
 /// Channels of the geometry encoder's maps, from 1/2 of the resolution to 1/32.
 const GEOMETRY: [usize; 5] = [24, 48, 96, 160, 192];
 /// Channels of the VD-NOC encoder's maps.
@@ -102,7 +104,7 @@ impl Compact {
             }
             maps.push(x.clone());
         }
-        let feature = relu(self.feature.forward(flat(x)));
+        let feature = leaky_relu(self.feature.forward(flat(x)), SLOPE);
         Encoded { feature: self.feature_out.forward(feature).tanh(), maps }
     }
 
@@ -122,7 +124,7 @@ impl Compact {
         let features = Tensor::cat(vec![input.feature.clone(), experience, code.feature.clone()], 1);
         let batch = features.dims()[0];
         let side = CompactConfig::SIDE / 32;
-        let mut x = relu(self.start.forward(features)).reshape([batch, DECODER[0], side, side]);
+        let mut x = leaky_relu(self.start.forward(features), SLOPE).reshape([batch, DECODER[0], side, side]);
         for (k, conv) in self.decoder.iter().enumerate() {
             let skips = vec![upsample(x), half(&input.maps[3 - k]), half(&code.maps[3 - k])];
             x = conv.forward(Tensor::cat(skips, 1));

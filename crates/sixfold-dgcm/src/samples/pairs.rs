@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use sixfold_nn::layers::normal;
 
 use super::pool::{Pool, View};
+use crate::families::Family;
 
 /// How pairs are drawn and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -37,6 +38,8 @@ impl Default for PairOptions {
 pub struct Pair {
     /// Whether the views show similar geometry.
     pub positive: bool,
+    /// Families of the first and of the second view.
+    pub families: (Family, Family),
     /// Normals of the first view, the input.
     pub input: Vec<f32>,
     /// Normals of the second view, the experience.
@@ -59,6 +62,7 @@ impl Pool {
         let pixels = side * side;
         let mut pair = Pair {
             positive,
+            families: (first.family, second.family),
             input: vec![0.0; 3 * pixels],
             experience: vec![0.0; 3 * pixels],
             vd_noc: vec![0.0; 3 * pixels],

@@ -1,0 +1,209 @@
+//! The memory of what worked: every successful grasp with what the camera saw (dissertation, section 6.2.1).
+//!
+//! [`ExperienceStore`] is what a store can do, [`SqliteStore`] one in a single file; a store on a server for several robots
+//! has the same interface. Searching is not the store's task: [`FeatureIndex`] holds all features in memory, asks the store
+//! only for what has changed, and finds the nearest exactly.
+
+mod encode;
+mod experience;
+mod index;
+#[cfg(feature = "sqlite")]
+mod sqlite;
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+pub use experience::{COPIES, Copy, Experience, Stored};
+pub use index::{FeatureIndex, Match};
+#[cfg(feature = "sqlite")]
+pub use sqlite::SqliteStore;
+
+/// Why a store cannot do what was asked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    /// The file cannot be opened.
+    #[error("{}: the experience store cannot be opened: {reason}", file.display())]
+    Open {
+        /// The file.
+        file: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The file holds something else.
+    #[error(
+        "{}: found {found}, expected an experience store; give a file that `sixfold grasp learn` or `sixfold grasp store add` wrote", file.display()
+    )]
+    NotAStore {
+        /// The file.
+        file: PathBuf,
+        /// What it is.
+        found: String,
+    },
+    /// The store was written by another version.
+    #[error(
+        "{}: the experience store has version {found}, expected {expected}: use the version of Sixfold that wrote it, and export and add its experiences", file.display()
+    )]
+    Version {
+        /// The file.
+        file: PathBuf,
+        /// Its version.
+        found: i64,
+        /// The version this program knows.
+        expected: i64,
+    },
+    /// The file is damaged.
+    #[error(
+        "{}: the experience store is damaged ({reason}); what can still be read can be saved with `sixfold grasp store export`", file.display()
+    )]
+    Broken {
+        /// The file.
+        file: PathBuf,
+        /// What SQLite says.
+        reason: String,
+    },
+    /// There is no room.
+    #[error(
+        "{}: the disk is full: the last experience was not stored, all earlier ones are safe; make room and go on", file.display()
+    )]
+    Full {
+        /// The file.
+        file: PathBuf,
+    },
+    /// Another process keeps writing.
+    #[error("{}: another process has been writing for 20 s; try again when it is done", file.display())]
+    Busy {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The store may not be written.
+    #[error("{}: the experience store may only be read; check the permissions of file and folder", file.display())]
+    ReadOnly {
+        /// The file.
+        file: PathBuf,
+    },
+    /// A field of an experience cannot be used.
+    #[error("experience {id}: field {field}: expected {expected}, found {found}")]
+    Field {
+        /// Number of the experience, 0 for a new one.
+        id: i64,
+        /// The field.
+        field: &'static str,
+        /// What it may hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+    /// Anything else.
+    #[error("{}: {reason}", file.display())]
+    Other {
+        /// The file.
+        file: PathBuf,
+        /// What SQLite says.
+        reason: String,
+    },
+}
+
+/// How far a reader has followed a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Position {
+    /// The last feature read.
+    pub feature: i64,
+    /// The last removal read.
+    pub removal: i64,
+}
+
+/// A feature of a stored experience or of one of its in-plane copies.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StoredFeature {
+    /// Number of the experience.
+    pub experience: i64,
+    /// The copy's turn about the optical axis, radians; 0 for the experience itself.
+    pub angle: f64,
+    /// The network that made it: features of different networks cannot be compared.
+    pub network: String,
+    /// 256 numbers.
+    pub feature: Vec<f32>,
+}
+
+/// What happened in a store since a position.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Changes {
+    /// New features, in the order in which they were stored.
+    pub features: Vec<StoredFeature>,
+    /// Experiences that were forgotten.
+    pub forgotten: Vec<i64>,
+    /// Where the store is now.
+    pub position: Position,
+}
+
+/// A line of a list of experiences.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Summary {
+    /// Number of the experience.
+    pub id: i64,
+    /// Seconds since 1970.
+    pub time: i64,
+    /// What was grasped.
+    pub object: String,
+    /// The part that was grasped, where it is known.
+    pub part: Option<String>,
+    /// The gripper's name.
+    pub gripper: String,
+    /// Distance of the contacts, metres.
+    pub width: f64,
+    /// The network that made its features.
+    pub network: String,
+    /// Where it comes from.
+    pub provenance: String,
+}
+
+/// What a store of experiences does. Numbers of experiences are never used twice.
+pub trait ExperienceStore {
+    /// Stores an experience with its in-plane copies and returns its number. When it returns, the experience survives
+    /// whatever happens to the process or to the power. An experience that is there already keeps its number, and the
+    /// second value is false.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is stored then.
+    fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError>;
+
+    /// An experience by its number; `None` when there is none.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn get(&self, id: i64) -> Result<Option<Stored>, StoreError>;
+
+    /// All experiences, in the order of their numbers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn list(&self) -> Result<Vec<Summary>, StoreError>;
+
+    /// Forgets an experience; false when there was none.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn forget(&mut self, id: i64) -> Result<bool, StoreError>;
+
+    /// What was stored and forgotten since a position ([`Position::default`]: everything).
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn changes(&self, since: Position) -> Result<Changes, StoreError>;
+
+    /// Takes over all experiences of another store that are not here yet; how many were new.
+    ///
+    /// # Errors
+    /// [`StoreError`]; what was taken over until then is kept.
+    fn merge(&mut self, other: &dyn ExperienceStore) -> Result<usize, StoreError> {
+        let mut added = 0;
+        for summary in other.list()? {
+            if let Some(stored) = other.get(summary.id)? {
+                added += usize::from(self.add(&stored.experience)?.1);
+            }
+        }
+        Ok(added)
+    }
+}
