@@ -19,6 +19,7 @@ pub mod networks;
 pub mod samples;
 pub mod store;
 pub mod training;
+pub mod transfer;
 pub mod vd_noc;
 
 pub use crop_turn::turn;

@@ -26,7 +26,8 @@ pub fn metric_loss(
         sum = sum + (far * -1.0 + MARGIN).clamp_min(0.0).square().sum();
     }
     let mean = |start: usize, count: usize| {
-        distance.clone().narrow(0, start.min(pairs - 1), count.max(1).min(pairs)).mean()
+        let start = start.min(pairs - 1);
+        distance.clone().narrow(0, start, count.clamp(1, pairs - start)).mean()
     };
     (sum / pairs as f64, mean(0, positives), mean(positives, negatives))
 }

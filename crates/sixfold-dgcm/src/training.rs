@@ -25,8 +25,10 @@ use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
 pub struct TrainingOptions {
     /// Optimiser steps.
     pub steps: u64,
-    /// Positive pairs in a step, and as many negative ones.
+    /// Positive pairs in a step.
     pub pairs: usize,
+    /// Negative pairs in a step.
+    pub negatives: usize,
     /// Highest learning rate; it falls to zero as a cosine.
     pub learning_rate: f64,
     /// Steps over which the rate rises at first.
@@ -49,13 +51,14 @@ impl Default for TrainingOptions {
     fn default() -> Self {
         TrainingOptions {
             steps: 4000,
-            pairs: 8,
-            learning_rate: 1e-3,
+            pairs: 10,
+            negatives: 3,
+            learning_rate: 5e-4,
             warm_up: 200,
             weight_decay: 1e-4,
-            lambda: 20.0,
+            lambda: 300.0,
             cross_pairs: 1.0,
-            longest_gradient: 1.0,
+            longest_gradient: 50.0,
             samples: PairOptions::default(),
             seed: 0,
         }
@@ -113,7 +116,6 @@ pub struct Batch {
 }
 
 fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
-    let pairs = options.pairs as u64;
     let mut batch = Batch {
         input: vec![],
         experience: vec![],
@@ -122,9 +124,9 @@ fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
         mask: vec![],
         families: vec![],
     };
-    for positive in [true, false] {
-        for number in 0..pairs {
-            let number = 2 * (step * pairs + number) + u64::from(positive);
+    for (positive, count) in [(true, options.pairs as u64), (false, options.negatives as u64)] {
+        for number in 0..count {
+            let number = 2 * (step * count + number) + u64::from(positive);
             let pair: Pair = pool.pair(positive, &options.samples, options.seed, number);
             batch.families.push(pair.families);
             batch.input.extend(pair.input);
@@ -144,18 +146,19 @@ impl Trainee for State<'_> {
 
     fn step(&mut self, batch: Batch, rate: f64) -> BTreeMap<String, f64> {
         let (pairs, side) = (self.options.pairs, self.network.side());
+        let all = pairs + self.options.negatives;
         let tensor = |values: Vec<f32>, count: usize, channels: usize| {
             Tensor::<4>::from_data(TensorData::new(values, [count, channels, side, side]), self.device)
         };
-        let input = self.network.geometry(tensor(batch.input, 2 * pairs, 3));
-        let experience = self.network.geometry(tensor(batch.experience, 2 * pairs, 3));
+        let input = self.network.geometry(tensor(batch.input, all, 3));
+        let experience = self.network.geometry(tensor(batch.experience, all, 3));
         let (metric, near, far) = metric_loss(&input.feature, &experience.feature, pairs);
         let different: Vec<f32> = batch
             .families
             .iter()
             .flat_map(|a| batch.families.iter().map(|b| f32::from(u8::from(a.0 != b.1))))
             .collect();
-        let different = Tensor::from_data(TensorData::new(different, [2 * pairs, 2 * pairs]), self.device);
+        let different = Tensor::from_data(TensorData::new(different, [all, all]), self.device);
         let cross = cross_loss(&input.feature, &experience.feature, different);
         let code = self.network.vd_noc(tensor(batch.vd_noc, pairs, 3));
         let features = experience.feature.narrow(0, 0, pairs);
@@ -257,7 +260,7 @@ pub fn train(
             warm_up: options.warm_up.min(options.steps.saturating_sub(1)),
             steps: options.steps,
         },
-        samples_per_step: 2 * options.pairs,
+        samples_per_step: options.pairs + options.negatives,
         log_every: pace.log_every,
         checkpoint_every: pace.checkpoint_every,
         sample_threads: pace.sample_threads,
@@ -285,7 +288,8 @@ mod tests {
     fn it_learns_and_goes_on_where_it_stopped() {
         let pool = Pool::new(&PoolOptions { views: 64, ..PoolOptions::default() }, |_| ());
         let device = Device::flex().autodiff();
-        let options = TrainingOptions { steps: 16, pairs: 2, warm_up: 2, ..TrainingOptions::default() };
+        let options =
+            TrainingOptions { steps: 16, pairs: 2, negatives: 1, warm_up: 2, ..TrainingOptions::default() };
         let pace = TrainingPace { checkpoint_every: 5, log_every: 4, sample_threads: 1 };
         let go = |folder: &Path, stop_at: Option<u64>| {
             let stop = AtomicBool::new(false);

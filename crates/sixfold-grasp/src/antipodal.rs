@@ -167,19 +167,19 @@ fn search(
     grasps
 }
 
-struct Planner<'a> {
-    gripper: &'a Gripper,
-    options: &'a AntipodalOptions,
+pub(crate) struct Planner<'a> {
+    pub gripper: &'a Gripper,
+    pub options: &'a AntipodalOptions,
     /// The direction from which an approach may tilt.
-    down: Vec3,
-    centre: Vec3,
-    object: CompletedObject,
-    tree: KdTree,
-    scene: CollisionScene,
+    pub down: Vec3,
+    pub centre: Vec3,
+    pub object: CompletedObject,
+    pub tree: KdTree,
+    pub scene: CollisionScene,
     /// Half angle of the friction cone, radians.
-    cone: f64,
+    pub cone: f64,
     /// A point stands for the square of this of surface, metres.
-    step: f64,
+    pub step: f64,
 }
 
 impl Planner<'_> {
@@ -288,7 +288,7 @@ impl Planner<'_> {
     }
 
     /// The grasp at about this pose: moved along x so that the object is midway between the pads, tested and judged.
-    fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
+    pub fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
         if self.scene.hit(self.gripper, pose, opening).is_some() {
             return None;
         }
@@ -305,7 +305,7 @@ impl Planner<'_> {
     }
 
     /// Points between the pads, in the gripper's frame: index and point.
-    fn between(&self, pose: &Pose, opening: f64) -> Vec<(usize, Vec3)> {
+    pub fn between(&self, pose: &Pose, opening: f64) -> Vec<(usize, Vec3)> {
         let rotation = pose.rotation_matrix().transpose();
         let origin = pose.translation();
         let (half_opening, half_width) = (0.5 * opening, 0.5 * self.gripper.finger_width);
@@ -326,7 +326,7 @@ impl Planner<'_> {
     }
 
     /// How far the points between the pads reach along x, without the two outermost on each side.
-    fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
+    pub fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
         if between.len() < 8 {
             return None;
         }

@@ -93,18 +93,26 @@ pub struct Attempt {
     pub trial_seconds: f64,
 }
 
-/// Makes attempt `number`: pose, view point and noise are drawn from `seed` and `number` alone.
-///
-/// # Errors
-/// [`SimulationError`] for options out of range.
-pub fn attempt(
-    mesh: &Mesh,
-    parts: &ConvexParts,
-    gripper: &Gripper,
-    options: &AttemptOptions,
-    seed: u64,
-    number: u64,
-) -> Result<Attempt, SimulationError> {
+/// An object at rest on the table, and what a depth camera sees of it: where an attempt starts.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// [`Ending::NoRest`] or [`Ending::NotSeen`] when there is nothing to grasp; [`Ending::NoProposal`] as long as nothing was
+    /// proposed.
+    pub ending: Ending,
+    /// Where the object lies.
+    pub world_from_object: Pose,
+    /// What the camera sees.
+    pub seen: Option<SimulatedView>,
+    /// The same, prepared for grasping.
+    pub view: Option<GraspView>,
+    /// Seed of everything random that follows.
+    pub noise: u64,
+    /// Time from the depth image to the prepared view, seconds.
+    pub seconds: f64,
+}
+
+/// The scene of attempt `number`: pose, view point and noise are drawn from `seed` and `number` alone.
+pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u64, number: u64) -> Scene {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(number);
     let yaw = random.random_range(-std::f64::consts::PI..std::f64::consts::PI);
@@ -122,17 +130,15 @@ pub fn attempt(
     let distance = draw(options.distance);
     let offset = Vec3::new(draw((-0.05, 0.05)), draw((-0.05, 0.05)), 0.0);
     let noise: u64 = random.random();
-
-    let mut result = Attempt {
+    let mut result = Scene {
         ending: Ending::NoRest,
         world_from_object: start,
+        seen: None,
         view: None,
-        proposals: vec![],
-        report: None,
-        planning_seconds: 0.0,
-        trial_seconds: 0.0,
+        noise,
+        seconds: 0.0,
     };
-    let Some(rest) = settle(parts, &start) else { return Ok(result) };
+    let Some(rest) = settle(parts, &start) else { return result };
     // Back to the middle of the table, wherever it rolled.
     let (low, high) = mesh.transformed(&rest).bounding_box();
     let middle = (low + high) * 0.5;
@@ -142,25 +148,55 @@ pub fn attempt(
         ViewPoint { azimuth, elevation, distance, target: offset + Vec3::z() * (0.5 * (high.z - low.z)) };
     result.ending = Ending::NotSeen;
     let Ok(seen) = simulate_view(mesh, &rest, &point, options.sensor.as_ref(), noise) else {
-        return Ok(result);
+        return result;
     };
     let began = std::time::Instant::now();
-    let world_from_camera = seen.world_from_camera;
     let view_options = ViewOptions { seed: noise, ..options.view };
     let masks = find_objects(&seen.depth, &seen.camera, &view_options).unwrap_or_default();
-    let view =
+    result.view =
         masks.first().and_then(|mask| GraspView::new(&seen.depth, &seen.camera, mask, &view_options).ok());
-    result.view = Some(seen);
-    let Some(view) = view else { return Ok(result) };
-    result.ending = Ending::NoProposal;
-    let planner = AntipodalOptions { seed: noise, ..options.planner };
+    result.seconds = began.elapsed().as_secs_f64();
+    result.seen = Some(seen);
+    if result.view.is_some() {
+        result.ending = Ending::NoProposal;
+    }
+    result
+}
+
+/// Makes attempt `number` with the geometric planner: pose, view point and noise are drawn from `seed` and `number` alone.
+///
+/// # Errors
+/// [`SimulationError`] for options out of range.
+pub fn attempt(
+    mesh: &Mesh,
+    parts: &ConvexParts,
+    gripper: &Gripper,
+    options: &AttemptOptions,
+    seed: u64,
+    number: u64,
+) -> Result<Attempt, SimulationError> {
+    let scene = scene(mesh, parts, options, seed, number);
+    let mut result = Attempt {
+        ending: scene.ending,
+        world_from_object: scene.world_from_object,
+        view: scene.seen,
+        proposals: vec![],
+        report: None,
+        planning_seconds: 0.0,
+        trial_seconds: 0.0,
+    };
+    let (Some(view), Some(seen)) = (scene.view, &result.view) else { return Ok(result) };
+    let world_from_camera = seen.world_from_camera;
+    let rest = scene.world_from_object;
+    let began = std::time::Instant::now();
+    let planner = AntipodalOptions { seed: scene.noise, ..options.planner };
     let grasps = antipodal_grasps(&view, gripper, &planner).map_err(|e| SimulationError::Option {
         field: e.field,
         found: e.found,
         expected: e.expected,
     })?;
     let clusters = cluster_grasps(&grasps, &options.clusters);
-    result.planning_seconds = began.elapsed().as_secs_f64();
+    result.planning_seconds = scene.seconds + began.elapsed().as_secs_f64();
     result.proposals = clusters.iter().map(|c| c.best).collect();
     let Some(grasp) = result.proposals.first() else { return Ok(result) };
     let began = std::time::Instant::now();

@@ -33,7 +33,7 @@ mod trial;
 mod view;
 mod world;
 
-pub use attempt::{Attempt, AttemptOptions, Ending, attempt};
+pub use attempt::{Attempt, AttemptOptions, Ending, Scene, attempt, scene};
 pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
 pub use settle::settle;

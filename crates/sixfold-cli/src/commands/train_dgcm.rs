@@ -37,12 +37,15 @@ pub(crate) struct TrainDgcmArguments {
     /// Training steps (default: 4000; the dissertation's network: 116000)
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
-    /// Positive pairs in a step, and as many negative ones (default: 8; the dissertation's network: 25)
+    /// Positive pairs in a step (default: 10, with 3 negative ones; the dissertation's network: 25 of both)
     #[arg(long, value_name = "N")]
     pub pairs: Option<usize>,
-    /// Highest learning rate (default: 0.0015; the dissertation's network: 0.0001)
+    /// Highest learning rate (default: 0.0005; the dissertation's network: 0.0001)
     #[arg(long, value_name = "RATE")]
     pub learning_rate: Option<f64>,
+    /// Weight of the coordinates' loss beside the features' (default: 300; the dissertation's network: 1)
+    #[arg(long, value_name = "WEIGHT")]
+    pub lambda: Option<f64>,
     /// Simulated views to learn from, made at the start (about 35 kB of memory each)
     #[arg(long, value_name = "N", default_value = "6000")]
     pub views: usize,
@@ -93,6 +96,7 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<DgcmSummary> {
     let options = TrainingOptions {
         steps: a.steps.unwrap_or(default.steps),
         pairs: a.pairs.unwrap_or(default.pairs),
+        lambda: a.lambda.unwrap_or(default.lambda),
         learning_rate: a.learning_rate.unwrap_or(default.learning_rate),
         seed: a.seed,
         ..default

@@ -2,7 +2,7 @@
 //!
 //! It differs in what two processor cores can train in half an hour: no ResNet-50 but nine convolutions that start from
 //! random weights (normals are no photographs, and a sixth of the work of ResNet-50 buys six times the samples), ReLU for
-//! LeakyReLU in convolutions, bilinear doubling and convolutions for deconvolutions, the last doubling by a pixel shuffle.
+//! LeakyReLU in convolutions, bilinear doubling and convolutions for deconvolutions, the last step from a quarter of the resolution by a pixel shuffle.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -24,7 +24,7 @@ const GEOMETRY: [usize; 5] = [24, 48, 96, 160, 192];
 /// Channels of the VD-NOC encoder's maps.
 const CODE: [usize; 5] = [16, 32, 64, 128, 128];
 /// Channels of the decoder at 1/32 of the resolution, and after each doubling.
-const DECODER: [usize; 5] = [64, 128, 96, 64, 32];
+const DECODER: [usize; 4] = [64, 128, 96, 64];
 
 /// Sizes of the compact network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,7 +52,7 @@ impl CompactConfig {
         let refine: Vec<Conv> = GEOMETRY[1..4].iter().map(|&c| same([c, c], rng)).collect();
         let code: Vec<Conv> = steps(CODE).into_iter().map(|c| down(c, rng)).collect();
         let smallest = (Self::SIDE / 32).pow(2);
-        let decoder: Vec<Conv> = (0..4)
+        let decoder: Vec<Conv> = (0..3)
             .map(|k| {
                 let skips = (GEOMETRY[3 - k] + CODE[3 - k]) / 2;
                 same([DECODER[k] + skips, DECODER[k + 1]], rng)
@@ -67,7 +67,7 @@ impl CompactConfig {
             code_out: dense([CODE[4] * smallest, FEATURE], rng, device),
             start: dense([3 * FEATURE, DECODER[0] * smallest], rng, device),
             decoder,
-            head: ConvConfig::new([DECODER[4], 12], 3, Activation::Linear).init(0.1, rng, device),
+            head: ConvConfig::new([DECODER[3], 48], 3, Activation::Linear).init(0.1, rng, device),
         }
     }
 }
@@ -133,14 +133,15 @@ impl Compact {
     }
 }
 
-/// `batch x 4c x h x w` to `batch x c x 2h x 2w`: four channels become a block of 2x2 pixels.
+/// `batch x 16c x h x w` to `batch x c x 4h x 4w`: sixteen channels become a block of 4x4 pixels. Coordinates change little from
+/// pixel to pixel, and where the object ends the input's own mask says.
 fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
     let [batch, channels, height, width] = x.dims();
-    let c = channels / 4;
-    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
+    let c = channels / 16;
+    x.reshape([batch, c, 4, 4, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
         batch,
         c,
-        2 * height,
-        2 * width,
+        4 * height,
+        4 * width,
     ])
 }

@@ -72,18 +72,7 @@ impl Experience {
         time: i64,
         provenance: &str,
     ) -> Experience {
-        let trim = model.crop_options().trim;
-        let copies = COPIES
-            .iter()
-            .map(|&angle| {
-                let feature = if angle == 0.0 {
-                    model.encode(&crop).feature
-                } else {
-                    model.encode(&crop.turned(angle, trim)).feature
-                };
-                Copy { angle, feature }
-            })
-            .collect();
+        let copies = copies(model, &crop);
         Experience {
             region: region(&crop, &grasp.camera_from_gripper, grasp.opening, gripper),
             crop,
@@ -98,6 +87,12 @@ impl Experience {
             time,
             provenance: provenance.to_owned(),
         }
+    }
+
+    /// The same with the features of another network.
+    pub fn encoded(&self, model: &DgcmModel) -> Experience {
+        let copies = copies(model, &self.crop);
+        Experience { copies, network: model.fingerprint(), ..self.clone() }
     }
 
     /// Tests what a store relies on.
@@ -124,6 +119,22 @@ impl Experience {
         }
         Ok(())
     }
+}
+
+/// The features of a crop and of its in-plane copies.
+fn copies(model: &DgcmModel, crop: &Crop) -> Vec<Copy> {
+    let trim = model.crop_options().trim;
+    COPIES
+        .iter()
+        .map(|&angle| {
+            let feature = if angle == 0.0 {
+                model.encode(crop).feature
+            } else {
+                model.encode(&crop.turned(angle, trim)).feature
+            };
+            Copy { angle, feature }
+        })
+        .collect()
 }
 
 /// Pixels whose points lie between the fingers or within a centimetre of them: where gripper and object overlap

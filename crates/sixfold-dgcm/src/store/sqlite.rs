@@ -309,6 +309,7 @@ impl ExperienceStore for SqliteStore {
             found: format!("{} pixels a side", experience.crop.side),
         })?;
         let e = experience;
+        // Without the time: what is stored twice after an interruption is the same experience.
         let key = encode::key(&[
             &images.depth,
             &images.vd_noc,
@@ -319,7 +320,6 @@ impl ExperienceStore for SqliteStore {
             e.gripper.name.as_bytes(),
             e.network.as_bytes(),
             e.provenance.as_bytes(),
-            &e.time.to_le_bytes(),
         ]);
         let inserted = self.insert(experience, &key, &images);
         self.checked(inserted)

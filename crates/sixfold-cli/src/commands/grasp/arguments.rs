@@ -35,10 +35,28 @@ pub(crate) enum GraspCommand {
         sixfold grasp measure --object can.ply mug.ply --unit mm --trials 20\n  \
         sixfold grasp measure --list benches/grasp-objects.json --meshes DIR --out out/grasps")]
     Measure(MeasureArguments),
+    /// Learn by doing: a simulated hand tries grasps, and what works becomes experience
+    #[cfg(all(feature = "physics", feature = "experience"))]
+    #[command(after_help = "Examples:\n  \
+        sixfold grasp learn --experiences experience.db --families all --members 6 --attempts 4 --out out/learn\n  \
+        sixfold grasp learn --experiences experience.db --object drill.ply --unit mm --attempts 12 --out out/drill\n\n\
+        When the nearest experience is near enough, its grasp is tried, else the geometric planner's. Stopped, the same \
+        command goes on.")]
+    Learn(Box<super::learn::LearnArguments>),
+    /// Compare geometry, experience and both on the same simulated scenes
+    #[cfg(all(feature = "physics", feature = "experience"))]
+    #[command(after_help = "Example:\n  \
+        sixfold grasp compare --experiences experience.db --list benches/grasp-objects.json --meshes DIR --hard --out out/compare\n\n\
+        Stopped, the same command goes on.")]
+    Compare(Box<super::compare::CompareArguments>),
+    /// The store of experiences: add, list, show, forget, merge, export, refresh
+    #[cfg(feature = "experience")]
+    Store(Box<super::store::StoreArguments>),
 }
 
+/// A depth image and what belongs to it.
 #[derive(Debug, Args)]
-pub(crate) struct ProposeArguments {
+pub(crate) struct InputArguments {
     /// Depth image: PNG, one channel of 16 bits
     #[arg(long, value_name = "FILE")]
     pub depth: PathBuf,
@@ -54,12 +72,29 @@ pub(crate) struct ProposeArguments {
     /// Colour image for the overlay
     #[arg(long, value_name = "FILE")]
     pub rgb: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ProposeArguments {
+    #[command(flatten)]
+    pub input: InputArguments,
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
     /// Most grasps
     #[arg(long, value_name = "N", default_value = "5")]
     pub number: NonZeroUsize,
+    /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote
+    #[cfg(feature = "experience")]
+    #[arg(long, value_name = "FILE")]
+    pub experiences: Option<PathBuf>,
+    #[cfg(feature = "experience")]
+    #[command(flatten)]
+    pub network: super::experience::NetworkArguments,
+    /// Only experiences on parts of this name, and nothing by geometry alone (such as handle)
+    #[cfg(feature = "experience")]
+    #[arg(long, value_name = "NAME", requires = "experiences")]
+    pub part: Option<String>,
     /// Take only what was seen: assume nothing of the object's far side
     #[arg(long)]
     pub seen_only: bool,

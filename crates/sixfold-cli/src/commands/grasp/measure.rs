@@ -1,25 +1,24 @@
 //! `sixfold grasp measure`: how often the planner's first proposal holds, per class, from single simulated depth views.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{Context, Result, bail};
-use serde::{Deserialize, Serialize};
+use anyhow::{Context, Result};
+use serde::Serialize;
 use sixfold_bop::write_rgb;
-use sixfold_geometry::Pose;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
-use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_simulation::{
     Attempt, AttemptOptions, ConvexParts, Ending, PartsOptions, TrialOptions, TrialReport, attempt,
     wilson_interval,
 };
 
 use super::arguments::MeasureArguments;
+use super::object_list::{file_name, named_objects};
 use super::try_one::physics;
 use crate::Outcome;
 use crate::output::{pose_rows, report, write_atomically};
+use crate::overlay;
 use crate::progress::{Progress, check_interrupt};
-use crate::{objects, overlay};
 
 /// Pictures of this many attempts on each object are kept.
 const PICTURES: u64 = 2;
@@ -31,7 +30,7 @@ pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
     if a.no_noise {
         options.sensor = None;
     }
-    let objects = named_objects(a)?;
+    let objects = named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?;
     let trials = a.trials.get() as u64;
     let mut progress = Progress::new("attempts", objects.len() * a.trials.get());
     let mut measured: Vec<Measured> = vec![];
@@ -188,7 +187,7 @@ fn classes(measured: &[Measured]) -> Vec<Class> {
     classes
 }
 
-fn ending_name(ending: Ending) -> String {
+pub(super) fn ending_name(ending: Ending) -> String {
     match serde_json::to_value(ending) {
         Ok(serde_json::Value::String(word)) => word,
         Ok(serde_json::Value::Object(map)) => {
@@ -217,74 +216,6 @@ fn print_table(whole: &Whole) {
             endings.join(", ")
         );
     }
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Listed {
-    class: String,
-    mesh: PathBuf,
-    unit: Unit,
-    /// The axis of the mesh that points up when the object stands.
-    #[serde(default)]
-    up: Up,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(rename_all = "lowercase")]
-enum Up {
-    X,
-    Y,
-    #[default]
-    Z,
-}
-
-impl Up {
-    /// Turns the axis to z.
-    fn turn(&self) -> Pose {
-        let quarter = std::f64::consts::FRAC_PI_2;
-        match self {
-            Up::X => Pose::exp(&[0.0, 0.0, 0.0, 0.0, -quarter, 0.0].into()),
-            Up::Y => Pose::exp(&[0.0, 0.0, 0.0, quarter, 0.0, 0.0].into()),
-            Up::Z => Pose::identity(),
-        }
-    }
-}
-
-/// Class, name and mesh of every object.
-fn named_objects(a: &MeasureArguments) -> Result<Vec<(String, String, Mesh)>> {
-    let Some(list) = &a.list else {
-        return a
-            .objects
-            .iter()
-            .map(|name| {
-                let object = objects::find(name, a.unit, &a.store)?;
-                Ok((object.name.clone(), object.name.clone(), object.mesh))
-            })
-            .collect();
-    };
-    let text = std::fs::read_to_string(list).with_context(|| list.display().to_string())?;
-    let listed: Vec<Listed> = serde_json::from_str(&text).with_context(|| {
-        format!("{}: expected a list of objects with class, mesh and unit", list.display())
-    })?;
-    if listed.is_empty() {
-        bail!("{}: the list is empty: name at least one object", list.display());
-    }
-    let folder = match &a.meshes {
-        Some(folder) => folder.clone(),
-        None => list.parent().map(Path::to_path_buf).unwrap_or_default(),
-    };
-    listed
-        .into_iter()
-        .map(|l| {
-            let mesh = read_mesh(folder.join(&l.mesh), l.unit)?.transformed(&l.up.turn());
-            Ok((l.class, l.mesh.display().to_string(), mesh))
-        })
-        .collect()
-}
-
-fn file_name(name: &str) -> String {
-    name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
 }
 
 /// The view with the gripper that was tried: green when it held, red when not.

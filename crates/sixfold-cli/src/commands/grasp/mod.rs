@@ -1,9 +1,22 @@
 //! `sixfold grasp`: grasps of a parallel-jaw gripper.
 
 pub(crate) mod arguments;
+#[cfg(all(feature = "physics", feature = "experience"))]
+mod compare;
+#[cfg(feature = "experience")]
+mod experience;
+mod input;
+#[cfg(all(feature = "physics", feature = "experience"))]
+mod journal;
+#[cfg(all(feature = "physics", feature = "experience"))]
+mod learn;
 #[cfg(feature = "physics")]
 mod measure;
+#[cfg(feature = "physics")]
+mod object_list;
 mod propose;
+#[cfg(feature = "experience")]
+mod store;
 #[cfg(feature = "physics")]
 mod try_one;
 
@@ -22,6 +35,12 @@ pub(crate) fn run(a: &GraspArguments) -> Result<Outcome> {
         GraspCommand::Try(a) => try_one::run(a),
         #[cfg(feature = "physics")]
         GraspCommand::Measure(a) => measure::run(a),
+        #[cfg(all(feature = "physics", feature = "experience"))]
+        GraspCommand::Learn(a) => learn::run(a),
+        #[cfg(all(feature = "physics", feature = "experience"))]
+        GraspCommand::Compare(a) => compare::run(a),
+        #[cfg(feature = "experience")]
+        GraspCommand::Store(a) => store::run(a),
     }
 }
 

@@ -2,19 +2,20 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
-use sixfold_geometry::{undistort_depth, undistort_rgb};
+use sixfold_bop::write_rgb;
+use sixfold_geometry::Pose;
 use sixfold_grasp::{
-    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, GraspCluster, GraspView, ViewOptions,
-    antipodal_grasps, cluster_grasps, draw_grasps, find_objects,
+    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
+    antipodal_grasps, cluster_grasps, draw_grasps,
 };
 
 use super::arguments::ProposeArguments;
+use super::input::{self, Input};
 use crate::Outcome;
 use crate::output::{pose_rows, report, write_atomically};
-use crate::{camera_file, overlay};
+use crate::overlay;
 
 /// The best grasp's colour; the others are blue.
 const BEST: [u8; 3] = [60, 220, 80];
@@ -22,67 +23,35 @@ const OTHER: [u8; 3] = [86, 150, 233];
 
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let gripper = super::gripper(&a.gripper)?;
-    let file = camera_file::read(&a.camera)?;
-    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
-        anyhow!(
-            "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",
-            a.camera.display()
-        )
-    })?;
-    if !(scale > 0.0 && scale.is_finite()) {
-        bail!("--depth-scale: found {scale}, expected above 0");
-    }
-    let depth = read_depth(&a.depth, scale / 1000.0)?;
-    let camera = file.for_image(depth.width(), depth.height(), &a.camera)?;
-    let depth = undistort_depth(&depth, &camera)?;
-    let rgb = match &a.rgb {
-        None => None,
-        Some(path) => {
-            Some(undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?)
-        }
-    };
-    let camera = camera.without_distortion();
-    let began = std::time::Instant::now();
-    let options = ViewOptions { seed: a.seed, ..ViewOptions::default() };
-    let mask = match &a.mask {
-        Some(path) => Some(read_mask(path)?),
-        None => find_objects(&depth, &camera, &options)
-            .with_context(|| a.depth.display().to_string())?
-            .into_iter()
-            .next(),
-    };
-    let where_from = a.mask.as_ref().unwrap_or(&a.depth).display().to_string();
-    let view = match &mask {
-        Some(mask) => Some(GraspView::new(&depth, &camera, mask, &options).context(where_from)?),
-        None => None,
-    };
-    let clusters: Vec<GraspCluster> = match &view {
+    let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.seed)?;
+    let proposed: Vec<Proposed> = match &view {
         None => vec![],
         Some(view) => {
             let default = AntipodalOptions::default();
             let completion = default.completion.filter(|_| !a.seen_only);
             let planner = AntipodalOptions { seed: a.seed, completion, ..default };
-            let grasps = antipodal_grasps(view, &gripper, &planner)?;
-            let mut clusters = cluster_grasps(&grasps, &ClusterOptions::default());
-            clusters.truncate(a.number.get());
-            clusters
+            #[cfg(feature = "experience")]
+            let found = match &a.experiences {
+                Some(_) => with_experience(a, view, &gripper, &planner)?,
+                None => by_geometry(view, &gripper, &planner)?,
+            };
+            #[cfg(not(feature = "experience"))]
+            let found = by_geometry(view, &gripper, &planner)?;
+            found.into_iter().take(a.number.get()).collect()
         }
     };
     let seconds = began.elapsed().as_secs_f64();
-    if view.as_ref().is_some_and(|v| v.cut_by_edge) {
-        eprintln!("note: the object is cut by the edge of the image: what lies outside was not seen");
-    }
     let picture = match &a.out {
         None => None,
         Some(folder) => {
             let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let drawn: Vec<DrawnGrasp> = clusters
+            let drawn: Vec<DrawnGrasp> = proposed
                 .iter()
                 .enumerate()
                 .rev()
-                .map(|(i, c)| DrawnGrasp {
-                    camera_from_gripper: c.best.camera_from_gripper,
-                    opening: c.best.opening,
+                .map(|(i, p)| DrawnGrasp {
+                    camera_from_gripper: p.pose,
+                    opening: p.opening,
                     color: if i == 0 { BEST } else { OTHER },
                 })
                 .collect();
@@ -92,7 +61,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         }
     };
     let whole = Whole {
-        method: "antipodal",
+        method: method(a),
         gripper: gripper.name.clone(),
         object_pixels: view.as_ref().map_or(0, |v| v.mask.as_slice().iter().filter(|m| **m).count()),
         table: view
@@ -100,7 +69,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
             .and_then(|v| v.table)
             .map(|t| Table { normal: t.normal.into(), offset: t.offset }),
         cut_by_edge: view.as_ref().is_some_and(|v| v.cut_by_edge),
-        grasps: clusters.iter().map(Proposed::new).collect(),
+        grasps: proposed,
         overlay: picture,
         seconds,
     };
@@ -140,20 +109,102 @@ struct Proposed {
     parts: AntipodalQuality,
     cluster_score: f64,
     cluster_members: usize,
+    /// The experience it was transferred from, or that agrees with it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    experience: Option<FromExperience>,
+    #[serde(skip)]
+    pose: Pose,
+}
+
+#[derive(Serialize)]
+struct FromExperience {
+    kind: &'static str,
+    /// Number of the experience in its store.
+    id: Option<i64>,
+    /// Distance of the features.
+    distance: Option<f64>,
+    /// Whether a difference in size was taken for a scale or for a turn.
+    hypothesis: Option<&'static str>,
+    /// The share of experience that agrees with the grasp.
+    share: f64,
 }
 
 impl Proposed {
-    fn new(cluster: &GraspCluster) -> Proposed {
+    fn new(grasp: &Grasp, score: f64, members: usize) -> Proposed {
         Proposed {
-            camera_from_gripper: pose_rows(&cluster.best.camera_from_gripper),
-            opening: cluster.best.opening,
-            width: cluster.best.width,
-            quality: cluster.best.quality.total(),
-            parts: cluster.best.quality,
-            cluster_score: cluster.score,
-            cluster_members: cluster.members,
+            camera_from_gripper: pose_rows(&grasp.camera_from_gripper),
+            opening: grasp.opening,
+            width: grasp.width,
+            quality: grasp.quality.total(),
+            parts: grasp.quality,
+            cluster_score: score,
+            cluster_members: members,
+            experience: None,
+            pose: grasp.camera_from_gripper,
         }
     }
+}
+
+fn by_geometry(view: &GraspView, gripper: &Gripper, planner: &AntipodalOptions) -> Result<Vec<Proposed>> {
+    let grasps = antipodal_grasps(view, gripper, planner)?;
+    let clusters = cluster_grasps(&grasps, &ClusterOptions::default());
+    Ok(clusters.iter().map(|c| Proposed::new(&c.best, c.score, c.members)).collect())
+}
+
+#[cfg(feature = "experience")]
+fn method(a: &ProposeArguments) -> &'static str {
+    match (&a.experiences, &a.part) {
+        (None, _) => "antipodal",
+        (Some(_), None) => "antipodal and dgcm",
+        (Some(_), Some(_)) => "dgcm",
+    }
+}
+
+#[cfg(not(feature = "experience"))]
+fn method(_: &ProposeArguments) -> &'static str {
+    "antipodal"
+}
+
+/// Grasps of both kinds, ranked together; with a part's name, those from experience only.
+#[cfg(feature = "experience")]
+fn with_experience(
+    a: &ProposeArguments,
+    view: &GraspView,
+    gripper: &Gripper,
+    planner: &AntipodalOptions,
+) -> Result<Vec<Proposed>> {
+    use sixfold_dgcm::transfer::{Hypothesis, Kind, ProposeOptions, propose, rank};
+    let Some(file) = &a.experiences else { return Ok(vec![]) };
+    let model = super::experience::model(&a.network)?;
+    let mut memory = super::experience::memory(file, &model)?;
+    let options = ProposeOptions { judge: *planner, part: a.part.clone(), ..ProposeOptions::default() };
+    let found = propose(view, gripper, &model, &mut memory, &options)?;
+    if found.nearest.is_empty() {
+        let wanted = a.part.as_ref().map_or(String::new(), |part| format!(" on a part named {part}"));
+        eprintln!("note: {} holds no experience{wanted} that this network can use", file.display());
+    }
+    let geometry = if a.part.is_some() { vec![] } else { antipodal_grasps(view, gripper, planner)? };
+    let ranked = rank(&geometry, &found.proposals, &ClusterOptions::default());
+    Ok(ranked
+        .iter()
+        .map(|r| {
+            let proposal = r.proposal.map(|i| &found.proposals[i]);
+            let experience = FromExperience {
+                kind: match r.kind {
+                    Kind::Geometry => "geometry",
+                    Kind::Experience => "experience",
+                },
+                id: proposal.map(|p| p.from.experience),
+                distance: proposal.map(|p| p.from.distance),
+                hypothesis: proposal.map(|p| match p.hypothesis {
+                    Hypothesis::Scaled => "scaled",
+                    Hypothesis::Turned => "turned",
+                }),
+                share: r.experience,
+            };
+            Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) }
+        })
+        .collect())
 }
 
 fn print_table(whole: &Whole, folder: Option<&std::path::Path>) {

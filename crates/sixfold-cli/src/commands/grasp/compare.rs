@@ -1,0 +1,348 @@
+//! `sixfold grasp compare`: geometry, experience and both, on the same simulated scenes (table 6.2).
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use sixfold_bop::write_rgb;
+use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank};
+use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Gripper, antipodal_grasps, draw_grasps};
+use sixfold_mesh::{Mesh, Unit};
+use sixfold_render::DepthSensor;
+use sixfold_simulation::{
+    AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval,
+};
+
+use super::arguments::PhysicsArguments;
+use super::experience::{NetworkArguments, memory, model};
+use super::journal::Journal;
+use super::measure::ending_name;
+use super::object_list::{file_name, named_objects};
+use super::try_one::physics;
+use crate::Outcome;
+use crate::arguments::JsonArguments;
+use crate::output::{report, write_atomically};
+use crate::overlay;
+use crate::progress::{Progress, check_interrupt};
+
+/// Pictures of this many scenes of each object are kept.
+const PICTURES: u64 = 2;
+/// The methods, in the order of the table.
+pub(super) const METHODS: [&str; 3] = ["geometry", "experience", "both"];
+
+#[derive(Debug, Args)]
+pub(crate) struct CompareArguments {
+    /// The store of experiences
+    #[arg(long, value_name = "FILE")]
+    pub experiences: PathBuf,
+    /// Objects: mesh files, or names of stored objects; each is a class of its own
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., required_unless_present = "list")]
+    pub objects: Vec<String>,
+    /// Unit of the mesh files: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// List of objects, as for `sixfold grasp measure`
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
+    pub list: Option<PathBuf>,
+    /// Folder that the list's meshes are in (default: the list's own)
+    #[arg(long, value_name = "DIR", requires = "list")]
+    pub meshes: Option<PathBuf>,
+    /// Scenes of each object
+    #[arg(long, value_name = "N", default_value = "15")]
+    pub trials: u64,
+    /// A harder setting: twice the sensor's noise and lost edges, pads with a friction of 0.35, objects of 0.4 kg
+    #[arg(long)]
+    pub hard: bool,
+    #[command(flatten)]
+    pub physics: PhysicsArguments,
+    #[command(flatten)]
+    pub network: NetworkArguments,
+    /// Folder for trials.jsonl (from which a stopped run goes on), table.json and pictures of the first scenes
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Seed of poses, view points, noise and the planner
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+/// With what scenes are made and grasps are tried.
+pub(super) struct Hardness {
+    pub gripper: Gripper,
+    pub options: AttemptOptions,
+}
+
+/// The usual setting, or the hard one.
+pub(super) fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
+    let (mut gripper, mut trial) = physics(a)?;
+    let mut options = AttemptOptions::default();
+    if hard {
+        gripper.friction = a.friction.unwrap_or(0.35);
+        // The command line's default is the easy setting's mass.
+        trial.mass = if a.mass == 0.2 { 0.4 } else { a.mass };
+        let kinect = DepthSensor::kinect();
+        options.sensor = Some(DepthSensor {
+            axial_base: 2.0 * kinect.axial_base,
+            axial_growth: 2.0 * kinect.axial_growth,
+            lateral: 1.5 * kinect.lateral,
+            edge_loss: 0.8,
+            ..kinect
+        });
+    }
+    options.trial = trial;
+    Ok(Hardness { gripper, options })
+}
+
+/// One method on one scene.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Row {
+    class: String,
+    object: String,
+    number: u64,
+    method: String,
+    ending: String,
+    held: bool,
+    /// Whether the object came to rest: else it was no attempt.
+    counts: bool,
+    /// Distance of the nearest experience's feature.
+    nearest: Option<f64>,
+    /// Candidates of geometry and of experience.
+    candidates: (usize, usize),
+    /// Whether the tried grasp was one transferred from experience.
+    transferred: bool,
+    seconds: f64,
+    trial_seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Recorded<'a> {
+    objects: Vec<&'a str>,
+    trials: u64,
+    hard: bool,
+    seed: u64,
+    network: String,
+    experiences: usize,
+    gripper: &'a Gripper,
+    mass: f64,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    hard: bool,
+    experiences: usize,
+    friction: f64,
+    mass: f64,
+    classes: Vec<Class>,
+    median_seconds: [f64; 3],
+}
+
+#[derive(Serialize)]
+struct Class {
+    class: String,
+    trials: usize,
+    /// Of geometry, experience and both.
+    rates: [f64; 3],
+    /// Wilson, 95 %.
+    intervals: [(f64, f64); 3],
+}
+
+pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
+    if a.trials == 0 {
+        bail!("--trials: found 0, expected at least 1");
+    }
+    let Hardness { gripper, options } = hardness(&a.physics, a.hard)?;
+    let network = model(&a.network)?;
+    let mut memory = memory(&a.experiences, &network)?;
+    let objects = named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?;
+    let recorded = Recorded {
+        objects: objects.iter().map(|o| o.1.as_str()).collect(),
+        trials: a.trials,
+        hard: a.hard,
+        seed: a.seed,
+        network: network.fingerprint(),
+        experiences: memory.len(),
+        gripper: &gripper,
+        mass: options.trial.mass,
+    };
+    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("trials.jsonl"), &recorded)?;
+    let mut progress = Progress::new("scenes", objects.len() * a.trials as usize);
+    let scenes = Scenes { a, gripper: &gripper, options: &options, network: &network };
+    for (class, name, mesh) in &objects {
+        // A scene whose rows are not all there is made again.
+        let done = |number: u64| rows.iter().filter(|r| r.object == *name && r.number == number).count() >= 3;
+        let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
+        (missing.len()..a.trials as usize).for_each(|_| progress.step(name.clone()));
+        if missing.is_empty() {
+            continue;
+        }
+        let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
+        for number in missing {
+            check_interrupt("finished scenes are kept; run the same command again to go on")?;
+            rows.retain(|r| r.object != *name || r.number != number);
+            for row in scenes.rows(class, name, mesh, &parts, number, &mut memory)? {
+                journal.row(&row)?;
+                rows.push(row);
+            }
+            progress.step(name.clone());
+        }
+    }
+    progress.finish();
+    let whole = Whole {
+        hard: a.hard,
+        experiences: memory.len(),
+        friction: gripper.friction,
+        mass: options.trial.mass,
+        classes: classes(&rows),
+        median_seconds: METHODS.map(|m| {
+            let mut seconds: Vec<f64> =
+                rows.iter().filter(|r| r.method == m && r.counts).map(|r| r.seconds).collect();
+            seconds.sort_by(f64::total_cmp);
+            seconds.get(seconds.len() / 2).copied().unwrap_or(0.0)
+        }),
+    };
+    write_atomically(&a.out.join("table.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    report(&a.json, &whole, || print_table(&whole))?;
+    Ok(if rows.iter().any(|r| r.held) { Outcome::Found } else { Outcome::NothingFound })
+}
+
+struct Scenes<'a> {
+    a: &'a CompareArguments,
+    gripper: &'a Gripper,
+    options: &'a AttemptOptions,
+    network: &'a DgcmModel,
+}
+
+impl Scenes<'_> {
+    /// All methods on one scene.
+    fn rows(
+        &self,
+        class: &str,
+        name: &str,
+        mesh: &Mesh,
+        parts: &ConvexParts,
+        number: u64,
+        memory: &mut Memory,
+    ) -> Result<Vec<Row>> {
+        let scene = scene(mesh, parts, self.options, self.a.seed, number);
+        let empty = Row {
+            class: class.to_owned(),
+            object: name.to_owned(),
+            number,
+            method: String::new(),
+            ending: ending_name(scene.ending),
+            held: false,
+            counts: scene.ending != Ending::NoRest,
+            nearest: None,
+            candidates: (0, 0),
+            transferred: false,
+            seconds: scene.seconds,
+            trial_seconds: 0.0,
+        };
+        let rows = METHODS.map(|m| Row { method: m.to_owned(), ..empty.clone() });
+        let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows.to_vec()) };
+        let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
+        let began = Instant::now();
+        let geometry = antipodal_grasps(view, self.gripper, &planner)?;
+        let of_geometry = began.elapsed().as_secs_f64();
+        let began = Instant::now();
+        let options = ProposeOptions { judge: planner, ..ProposeOptions::default() };
+        let found = propose(view, self.gripper, self.network, memory, &options)?;
+        let of_experience = began.elapsed().as_secs_f64();
+        let clusters = ClusterOptions::default();
+        let ranked = [
+            rank(&geometry, &[], &clusters),
+            rank(&[], &found.proposals, &clusters),
+            rank(&geometry, &found.proposals, &clusters),
+        ];
+        let seconds = [of_geometry, of_experience, of_geometry + of_experience];
+        let mut out = vec![];
+        for ((mut row, ranked), seconds) in rows.into_iter().zip(&ranked).zip(seconds) {
+            row.nearest = found.nearest.first().map(|m| m.distance);
+            row.candidates = (geometry.len(), found.proposals.len());
+            row.seconds += seconds;
+            if let Some(best) = ranked.first() {
+                let began = Instant::now();
+                let world_from_gripper = seen.world_from_camera * best.grasp.camera_from_gripper;
+                let tried = try_grasp(
+                    parts,
+                    &scene.world_from_object,
+                    self.gripper,
+                    &world_from_gripper,
+                    best.grasp.opening,
+                    &self.options.trial,
+                )?;
+                row.trial_seconds = began.elapsed().as_secs_f64();
+                let ending = Ending::Tried(tried.outcome);
+                row.ending = ending_name(ending);
+                row.held = ending.is_success();
+                row.transferred = best.proposal.is_some();
+                if number < PICTURES {
+                    self.picture(&row, seen, best)?;
+                }
+            }
+            out.push(row);
+        }
+        Ok(out)
+    }
+
+    /// The view with the gripper that was tried: green when it held, red when not.
+    fn picture(&self, row: &Row, seen: &sixfold_simulation::SimulatedView, best: &Ranked) -> Result<()> {
+        let color = if row.held { [60, 220, 80] } else { [235, 70, 60] };
+        let grasp = &best.grasp;
+        let drawn =
+            [DrawnGrasp { camera_from_gripper: grasp.camera_from_gripper, opening: grasp.opening, color }];
+        let background = overlay::depth_picture(&seen.depth);
+        let image = draw_grasps(&background, Some(&seen.depth), &seen.camera, self.gripper, &drawn)?;
+        let name = format!("{}-{}-{}.png", file_name(&row.object), row.number, row.method);
+        Ok(write_rgb(&self.a.out.join(name), &image)?)
+    }
+}
+
+fn classes(rows: &[Row]) -> Vec<Class> {
+    let mut names: Vec<&str> = vec![];
+    for row in rows {
+        if !names.contains(&row.class.as_str()) {
+            names.push(&row.class);
+        }
+    }
+    let of = |name: &str, wanted: &dyn Fn(&Row) -> bool| {
+        let mut rates = [0.0; 3];
+        let mut intervals = [(0.0, 0.0); 3];
+        let mut trials = 0;
+        for (k, method) in METHODS.iter().enumerate() {
+            let mine: Vec<&Row> =
+                rows.iter().filter(|r| r.method == *method && r.counts && wanted(r)).collect();
+            let held = mine.iter().filter(|r| r.held).count();
+            trials = mine.len();
+            rates[k] = held as f64 / trials.max(1) as f64;
+            intervals[k] = wilson_interval(held, trials);
+        }
+        Class { class: name.to_owned(), trials, rates, intervals }
+    };
+    let mut classes: Vec<Class> = names.iter().map(|n| of(n, &|r: &Row| r.class == *n)).collect();
+    classes.push(of("all", &|_| true));
+    classes
+}
+
+fn print_table(whole: &Whole) {
+    println!("{:>10} {:>7} {:>20} {:>20} {:>20}", "", "scenes", "geometry", "experience", "both");
+    for c in &whole.classes {
+        let cells: Vec<String> = (0..3)
+            .map(|k| format!("{:.2} ({:.2} to {:.2})", c.rates[k], c.intervals[k].0, c.intervals[k].1))
+            .collect();
+        println!("{:>10} {:>7} {:>20} {:>20} {:>20}", c.class, c.trials, cells[0], cells[1], cells[2]);
+    }
+    let s = whole.median_seconds;
+    println!("median seconds from depth to ranked grasps: {:.3}, {:.3}, {:.3}", s[0], s[1], s[2]);
+    println!(
+        "{} experiences; friction {}, {} kg; 95 % intervals after Wilson",
+        whole.experiences, whole.friction, whole.mass
+    );
+}

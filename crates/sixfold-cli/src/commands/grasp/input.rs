@@ -1,0 +1,61 @@
+//! A depth image from files, prepared for grasping.
+
+use anyhow::{Context, Result, anyhow, bail};
+use sixfold_bop::{read_depth, read_mask, read_rgb};
+use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
+use sixfold_grasp::{GraspView, ViewOptions, find_objects};
+
+use super::arguments::InputArguments;
+use crate::camera_file;
+
+/// What was read, without distortion.
+pub(super) struct Input {
+    pub depth: DepthImage,
+    pub camera: Camera,
+    pub rgb: Option<RgbImage>,
+    /// The object; `None` when nothing stands on the table.
+    pub view: Option<GraspView>,
+    pub began: std::time::Instant,
+}
+
+/// Reads and prepares the view of the masked object, or of the largest thing on the table.
+pub(super) fn read(a: &InputArguments, seed: u64) -> Result<Input> {
+    let file = camera_file::read(&a.camera)?;
+    let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
+        anyhow!(
+            "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",
+            a.camera.display()
+        )
+    })?;
+    if !(scale > 0.0 && scale.is_finite()) {
+        bail!("--depth-scale: found {scale}, expected above 0");
+    }
+    let depth = read_depth(&a.depth, scale / 1000.0)?;
+    let camera = file.for_image(depth.width(), depth.height(), &a.camera)?;
+    let depth = undistort_depth(&depth, &camera)?;
+    let rgb = match &a.rgb {
+        None => None,
+        Some(path) => {
+            Some(undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?)
+        }
+    };
+    let camera = camera.without_distortion();
+    let began = std::time::Instant::now();
+    let options = ViewOptions { seed, ..ViewOptions::default() };
+    let mask = match &a.mask {
+        Some(path) => Some(read_mask(path)?),
+        None => find_objects(&depth, &camera, &options)
+            .with_context(|| a.depth.display().to_string())?
+            .into_iter()
+            .next(),
+    };
+    let where_from = a.mask.as_ref().unwrap_or(&a.depth).display().to_string();
+    let view = match &mask {
+        Some(mask) => Some(GraspView::new(&depth, &camera, mask, &options).context(where_from)?),
+        None => None,
+    };
+    if view.as_ref().is_some_and(|v| v.cut_by_edge) {
+        eprintln!("note: the object is cut by the edge of the image: what lies outside was not seen");
+    }
+    Ok(Input { depth, camera, rgb, view, began })
+}

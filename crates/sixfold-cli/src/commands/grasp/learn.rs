@@ -1,0 +1,390 @@
+//! `sixfold grasp learn`: the incremental loop of section 6.2.1 with a simulated hand. Propose from experience when some is
+//! near enough, else by geometry; execute; store what worked; go on.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sixfold_dgcm::crop::Crop;
+use sixfold_dgcm::families::{Family, Member, Rest, member};
+use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::store::Experience;
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, Gripper, antipodal_grasps};
+use sixfold_mesh::{Mesh, Unit};
+use sixfold_simulation::{
+    AttemptOptions, ConvexParts, PartsOptions, Scene, scene, try_grasp, wilson_interval,
+};
+
+use super::arguments::PhysicsArguments;
+use super::compare::{Hardness, hardness};
+use super::experience::{NetworkArguments, model, new_memory, now};
+use super::journal::Journal;
+use super::measure::ending_name;
+use super::object_list::named_objects;
+use crate::Outcome;
+use crate::arguments::JsonArguments;
+use crate::output::report;
+use crate::progress::{Progress, check_interrupt};
+
+#[derive(Debug, Args)]
+pub(crate) struct LearnArguments {
+    /// The store of experiences; it is made where there is none
+    #[arg(long, value_name = "FILE")]
+    pub experiences: PathBuf,
+    /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"])]
+    pub families: Vec<String>,
+    /// Made-up objects of each family
+    #[arg(long, value_name = "N", default_value = "4", requires = "families")]
+    pub members: u64,
+    /// Objects to learn on: mesh files, or names of stored objects
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "families")]
+    pub objects: Vec<String>,
+    /// Unit of the mesh files: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// List of objects, as for `sixfold grasp measure`
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["families", "objects"])]
+    pub list: Option<PathBuf>,
+    /// Folder that the list's meshes are in (default: the list's own)
+    #[arg(long, value_name = "DIR", requires = "list")]
+    pub meshes: Option<PathBuf>,
+    /// Scenes of each object
+    #[arg(long, value_name = "N", default_value = "4")]
+    pub attempts: u64,
+    /// Grasps tried in a scene until one holds, the best first
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub tries: usize,
+    /// Feature distance of the nearest experience from which on it proposes: 0 for never (dissertation: 0.9)
+    #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
+    pub near: f64,
+    /// Try and store only grasps on parts of this name (made-up objects: handle of mug and drill)
+    #[arg(long, value_name = "NAME")]
+    pub part: Option<String>,
+    /// Stronger sensor noise, less friction and a heavier object, see `sixfold grasp compare --help`
+    #[arg(long)]
+    pub hard: bool,
+    #[command(flatten)]
+    pub physics: PhysicsArguments,
+    #[command(flatten)]
+    pub network: NetworkArguments,
+    /// Folder for attempts.jsonl, from which a stopped run goes on
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Seed of objects, poses, view points, noise and the planner
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+/// What is learned on.
+pub(super) struct Pupil {
+    pub class: String,
+    pub name: String,
+    pub mesh: Mesh,
+    /// A made-up object, which knows its parts, and how it lies.
+    pub made: Option<(Member, Rest)>,
+}
+
+impl Pupil {
+    /// The part that a grasp is on: that of the surface nearest to the middle between the pads, a centimetre behind the
+    /// tips.
+    fn part(&self, camera_from_object: &Pose, grasp: &Grasp) -> Option<&'static str> {
+        let (member, rest) = self.made.as_ref()?;
+        let middle = grasp.camera_from_gripper.transform_point(&(Vec3::z() * -0.01));
+        let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
+        Some(member.part_at(&member_from_camera.transform_point(&middle)))
+    }
+}
+
+/// Made-up objects, the same for the same seed.
+pub(super) fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<Pupil>> {
+    let mut pupils = vec![];
+    let families: Vec<Family> = if names.iter().any(|n| n == "all") {
+        Family::ALL.to_vec()
+    } else {
+        names
+            .iter()
+            .map(|name| {
+                let known = || Family::ALL.map(Family::name).join(", ");
+                Family::ALL
+                    .into_iter()
+                    .find(|f| f.name() == name)
+                    .with_context(|| format!("--families: found {name}, expected all or some of {}", known()))
+            })
+            .collect::<Result<_>>()?
+    };
+    for family in families {
+        for number in 0..members {
+            let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x6465_6d6f);
+            random.set_stream(number * 64 + family as u64);
+            let made = member(family, &mut random)?;
+            let rest = family.rests()[number as usize % family.rests().len()];
+            pupils.push(Pupil {
+                class: family.name().to_owned(),
+                name: format!("{}-{number}", family.name()),
+                mesh: made.mesh.transformed(&rest.rotation()),
+                made: Some((made, rest)),
+            });
+        }
+    }
+    Ok(pupils)
+}
+
+/// One grasp that was tried.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Row {
+    object: String,
+    class: String,
+    attempt: u64,
+    /// Whether experience proposed it; else geometry did.
+    from_experience: bool,
+    /// Distance of the nearest experience's feature.
+    nearest: Option<f64>,
+    ending: String,
+    held: bool,
+    /// Which of the proposals it was, from 0.
+    rank: usize,
+    /// Number of the experience that came of it.
+    stored: Option<i64>,
+}
+
+#[derive(Serialize)]
+struct Recorded<'a> {
+    experiences: &'a std::path::Path,
+    objects: Vec<&'a str>,
+    attempts: u64,
+    tries: usize,
+    near: f64,
+    part: &'a Option<String>,
+    hard: bool,
+    seed: u64,
+    network: String,
+    gripper: &'a Gripper,
+}
+
+#[derive(Serialize)]
+struct Whole {
+    attempts: usize,
+    held: usize,
+    rate: f64,
+    /// Wilson, 95 %.
+    interval: (f64, f64),
+    from_experience: usize,
+    experiences: usize,
+    objects: Vec<Curve>,
+}
+
+/// How it went with one object, attempt by attempt.
+#[derive(Serialize)]
+struct Curve {
+    object: String,
+    held: Vec<bool>,
+    nearest: Vec<Option<f64>>,
+    from_experience: Vec<bool>,
+}
+
+pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
+    if !(a.near >= 0.0) {
+        bail!("--near: found {}, expected 0 or more", a.near);
+    }
+    if a.tries == 0 || a.attempts == 0 {
+        bail!("--tries and --attempts: expected at least 1");
+    }
+    let Hardness { gripper, options } = hardness(&a.physics, a.hard)?;
+    let network = model(&a.network)?;
+    let pupils: Vec<Pupil> = if a.families.is_empty() {
+        named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?
+            .into_iter()
+            .map(|(class, name, mesh)| Pupil { class, name, mesh, made: None })
+            .collect()
+    } else {
+        made_up(&a.families, a.members, a.seed)?
+    };
+    let recorded = Recorded {
+        experiences: &a.experiences,
+        objects: pupils.iter().map(|p| p.name.as_str()).collect(),
+        attempts: a.attempts,
+        tries: a.tries,
+        near: a.near,
+        part: &a.part,
+        hard: a.hard,
+        seed: a.seed,
+        network: network.fingerprint(),
+        gripper: &gripper,
+    };
+    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
+    let mut memory = new_memory(&a.experiences, &network)?;
+    let mut robot = Robot { a, gripper, options, network, memory: &mut memory };
+    let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
+    for pupil in &pupils {
+        let done =
+            |rows: &[Row], attempt| rows.iter().any(|r| r.object == pupil.name && r.attempt == attempt);
+        if (0..a.attempts).all(|n| done(&rows, n)) {
+            (0..a.attempts).for_each(|_| progress.step(pupil.name.clone()));
+            continue;
+        }
+        let parts = ConvexParts::of_mesh(&pupil.mesh, &PartsOptions::default())
+            .with_context(|| pupil.name.clone())?;
+        for attempt in 0..a.attempts {
+            if !done(&rows, attempt) {
+                check_interrupt("what was learned is kept; run the same command again to go on")?;
+                let row = robot.attempt(pupil, &parts, attempt)?;
+                journal.row(&row)?;
+                rows.push(row);
+            }
+            progress.step(pupil.name.clone());
+        }
+    }
+    progress.finish();
+    let held = rows.iter().filter(|r| r.held).count();
+    let whole = Whole {
+        attempts: rows.len(),
+        held,
+        rate: held as f64 / rows.len().max(1) as f64,
+        interval: wilson_interval(held, rows.len()),
+        from_experience: rows.iter().filter(|r| r.from_experience).count(),
+        experiences: memory.len(),
+        objects: pupils
+            .iter()
+            .map(|p| {
+                let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
+                Curve {
+                    object: p.name.clone(),
+                    held: mine.iter().map(|r| r.held).collect(),
+                    nearest: mine.iter().map(|r| r.nearest).collect(),
+                    from_experience: mine.iter().map(|r| r.from_experience).collect(),
+                }
+            })
+            .collect(),
+    };
+    report(&a.json, &whole, || {
+        for c in &whole.objects {
+            let marks: String = c
+                .held
+                .iter()
+                .zip(&c.from_experience)
+                .map(|(held, e)| match (held, e) {
+                    (true, true) => 'E',
+                    (true, false) => 'G',
+                    (false, true) => 'e',
+                    (false, false) => 'g',
+                })
+                .collect();
+            println!("{:>16} {marks}", c.object);
+        }
+        println!("G geometry, E experience; capitals held");
+        println!(
+            "{} of {} held ({:.2}, 95 % interval {:.2} to {:.2}), {} from experience; {} experiences in {}",
+            whole.held,
+            whole.attempts,
+            whole.rate,
+            whole.interval.0,
+            whole.interval.1,
+            whole.from_experience,
+            whole.experiences,
+            a.experiences.display()
+        );
+    })?;
+    Ok(if held > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+struct Robot<'a> {
+    a: &'a LearnArguments,
+    gripper: Gripper,
+    options: AttemptOptions,
+    network: DgcmModel,
+    memory: &'a mut Memory,
+}
+
+impl Robot<'_> {
+    fn attempt(&mut self, pupil: &Pupil, parts: &ConvexParts, attempt: u64) -> Result<Row> {
+        let scene = scene(&pupil.mesh, parts, &self.options, self.a.seed, attempt);
+        let mut row = Row {
+            object: pupil.name.clone(),
+            class: pupil.class.clone(),
+            attempt,
+            from_experience: false,
+            nearest: None,
+            ending: ending_name(scene.ending),
+            held: false,
+            rank: 0,
+            stored: None,
+        };
+        let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
+        let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
+        let mut geometry = antipodal_grasps(view, &self.gripper, &planner)?;
+        let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
+        let on_part = |grasp: &Grasp| {
+            self.a.part.is_none() || pupil.part(&camera_from_object, grasp) == self.a.part.as_deref()
+        };
+        if pupil.made.is_some() {
+            geometry.retain(on_part);
+        }
+        let mut proposals = vec![];
+        if self.a.near > 0.0 {
+            self.memory.refresh()?;
+            let options =
+                ProposeOptions { judge: planner, part: self.a.part.clone(), ..ProposeOptions::default() };
+            let found = propose(view, &self.gripper, &self.network, self.memory, &options)?;
+            row.nearest = found.nearest.first().map(|m| m.distance);
+            if row.nearest.is_some_and(|d| d < self.a.near) {
+                proposals = found.proposals;
+            }
+        }
+        row.from_experience = !proposals.is_empty();
+        let ranked = rank(&geometry, &proposals, &ClusterOptions::default());
+        for (number, candidate) in ranked.iter().take(self.a.tries).enumerate() {
+            let world_from_gripper = seen.world_from_camera * candidate.grasp.camera_from_gripper;
+            let opening = candidate.grasp.opening;
+            let tried = try_grasp(
+                parts,
+                &scene.world_from_object,
+                &self.gripper,
+                &world_from_gripper,
+                opening,
+                &self.options.trial,
+            )?;
+            let ending = sixfold_simulation::Ending::Tried(tried.outcome);
+            row.ending = ending_name(ending);
+            row.rank = number;
+            if ending.is_success() {
+                row.held = true;
+                row.stored = self.remember(pupil, &scene, &candidate.grasp, &camera_from_object, attempt)?;
+                break;
+            }
+        }
+        Ok(row)
+    }
+
+    fn remember(
+        &mut self,
+        pupil: &Pupil,
+        scene: &Scene,
+        grasp: &Grasp,
+        camera_from_object: &Pose,
+        attempt: u64,
+    ) -> Result<Option<i64>> {
+        let Some(view) = &scene.view else { return Ok(None) };
+        let Ok(crop) = Crop::new(&view.depth, &view.camera, &view.mask, self.network.crop_options()) else {
+            return Ok(None);
+        };
+        let known = pupil.part(camera_from_object, grasp);
+        let part = known.or(self.a.part.as_deref());
+        let provenance = format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, self.a.seed);
+        let experience =
+            Experience::new(&self.network, crop, grasp, &self.gripper, &pupil.name, part, now(), &provenance);
+        let (id, _) = self.memory.store().add(&experience)?;
+        self.memory.refresh()?;
+        Ok(Some(id))
+    }
+}

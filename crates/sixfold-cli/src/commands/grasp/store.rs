@@ -1,0 +1,442 @@
+//! `sixfold grasp store`: the experiences, looked at and looked after.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, Subcommand};
+use serde::{Deserialize, Serialize};
+use sixfold_bop::write_rgb;
+use sixfold_dgcm::crop::Crop;
+use sixfold_dgcm::store::{Experience, ExperienceStore, SqliteStore, Stored, Summary};
+use sixfold_geometry::nalgebra::Matrix4;
+use sixfold_geometry::{Image, Pose, RgbImage};
+use sixfold_grasp::{AntipodalQuality, DrawnGrasp, Grasp, draw_grasps};
+
+use super::arguments::InputArguments;
+use super::experience::{NetworkArguments, model, now};
+use super::input;
+use crate::Outcome;
+use crate::arguments::JsonArguments;
+use crate::output::{pose_rows, report, write_atomically};
+use crate::progress::{Progress, check_interrupt};
+
+#[derive(Debug, Args)]
+pub(crate) struct StoreArguments {
+    #[command(subcommand)]
+    pub command: StoreCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum StoreCommand {
+    /// Store a grasp that worked: a depth image and a grasp on it
+    Add(Box<AddArguments>),
+    /// List all experiences
+    List {
+        /// The store
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
+    /// Show one experience: what is known, and a picture
+    Show {
+        /// The store
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// Number of the experience
+        #[arg(value_name = "ID")]
+        id: i64,
+        /// The picture: normals with the gripper, VD-NOC, region of interest
+        #[arg(long, value_name = "PNG")]
+        picture: Option<PathBuf>,
+    },
+    /// Forget experiences
+    Forget {
+        /// The store
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// Numbers of the experiences
+        #[arg(value_name = "ID", required = true)]
+        ids: Vec<i64>,
+    },
+    /// Take over the experiences of other stores
+    Merge {
+        /// The store that gets them; it is made where there is none
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// The other stores
+        #[arg(value_name = "OTHER", required = true)]
+        others: Vec<PathBuf>,
+    },
+    /// Write all experiences as files: pictures, and JSON with everything else
+    Export {
+        /// The store
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// Folder for the files
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+    },
+    /// Encode all experiences anew, with another network, into another store
+    Refresh {
+        /// The store
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// The new store
+        #[arg(long, value_name = "FILE")]
+        out: PathBuf,
+        #[command(flatten)]
+        network: NetworkArguments,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct AddArguments {
+    /// The store; it is made where there is none
+    #[arg(value_name = "FILE")]
+    pub file: PathBuf,
+    #[command(flatten)]
+    pub input: InputArguments,
+    /// The grasp: a grasps.json of `sixfold grasp propose`, or JSON with camera_from_gripper (4x4, metres), opening and width
+    #[arg(long, value_name = "FILE")]
+    pub grasp: PathBuf,
+    /// Which grasp of a list, from 1
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub number: usize,
+    /// Gripper: jaws-140, jaws-85, or a file
+    #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
+    pub gripper: String,
+    /// What was grasped
+    #[arg(long, value_name = "NAME")]
+    pub object: String,
+    /// The part that was grasped, such as handle
+    #[arg(long, value_name = "NAME")]
+    pub part: Option<String>,
+    /// Where the experience comes from
+    #[arg(long, value_name = "TEXT", default_value = "added by hand")]
+    pub provenance: String,
+    #[command(flatten)]
+    pub network: NetworkArguments,
+}
+
+pub(super) fn run(a: &StoreArguments) -> Result<Outcome> {
+    match &a.command {
+        StoreCommand::Add(add) => self::add(add, &a.json),
+        StoreCommand::List { file } => list(file, &a.json),
+        StoreCommand::Show { file, id, picture } => show(file, *id, picture.as_deref(), &a.json),
+        StoreCommand::Forget { file, ids } => forget(file, ids, &a.json),
+        StoreCommand::Merge { file, others } => merge(file, others, &a.json),
+        StoreCommand::Export { file, out } => export(file, out, &a.json),
+        StoreCommand::Refresh { file, out, network } => refresh(file, out, network, &a.json),
+    }
+}
+
+#[derive(Deserialize)]
+struct GraspFile {
+    camera_from_gripper: [[f64; 4]; 4],
+    opening: f64,
+    width: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum GraspsFile {
+    List { grasps: Vec<GraspFile> },
+    One(GraspFile),
+}
+
+fn read_grasp(path: &Path, number: usize) -> Result<Grasp> {
+    let file = path.display();
+    let text = std::fs::read_to_string(path).with_context(|| file.to_string())?;
+    let read: GraspsFile = serde_json::from_str(&text).with_context(|| {
+        format!("{file}: expected camera_from_gripper (4x4, metres), opening and width (metres), or a list of them as `grasps`")
+    })?;
+    let grasps = match read {
+        GraspsFile::List { grasps } => grasps,
+        GraspsFile::One(grasp) => vec![grasp],
+    };
+    let count = grasps.len();
+    let Some(grasp) = number.checked_sub(1).and_then(|i| grasps.into_iter().nth(i)) else {
+        bail!("--number: found {number}, expected 1 to {count}: {file} holds {count} grasps");
+    };
+    for (field, value) in [("opening", grasp.opening), ("width", grasp.width)] {
+        if !(value > 0.0 && value < 1.0) {
+            bail!("{file}: field {field}: found {value}, expected above 0 and below 1 m");
+        }
+    }
+    let pose = Pose::from_matrix(&Matrix4::from_fn(|i, j| grasp.camera_from_gripper[i][j]))
+        .with_context(|| format!("{file}: field camera_from_gripper"))?;
+    let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.0, observed: 0.0 };
+    Ok(Grasp { camera_from_gripper: pose, opening: grasp.opening, width: grasp.width, quality })
+}
+
+#[derive(Serialize)]
+struct Added {
+    id: i64,
+    /// False when it was there already.
+    new: bool,
+    region_pixels: usize,
+}
+
+fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
+    let gripper = super::gripper(&a.gripper)?;
+    let grasp = read_grasp(&a.grasp, a.number)?;
+    let network = model(&a.network)?;
+    let input = input::read(&a.input, 0)?;
+    let Some(view) = &input.view else {
+        bail!("{}: nothing stands on the table; give --mask", a.input.depth.display());
+    };
+    let crop = Crop::new(&view.depth, &view.camera, &view.mask, network.crop_options())
+        .with_context(|| a.input.depth.display().to_string())?;
+    let part = a.part.as_deref();
+    let experience = Experience::new(&network, crop, &grasp, &gripper, &a.object, part, now(), &a.provenance);
+    let region_pixels = experience.region.iter().filter(|r| **r).count();
+    if region_pixels == 0 {
+        bail!(
+            "{}: the gripper is nowhere near the object; do grasp and depth image belong together, and is the grasp in metres in the camera's frame?",
+            a.grasp.display()
+        );
+    }
+    let (id, new) = SqliteStore::create(&a.file)?.add(&experience)?;
+    report(json, &Added { id, new, region_pixels }, || {
+        println!("experience {id} {}", if new { "is stored" } else { "was stored already" });
+    })?;
+    Ok(Outcome::Found)
+}
+
+fn list(file: &Path, json: &JsonArguments) -> Result<Outcome> {
+    let all = SqliteStore::open(file)?.list()?;
+    report(json, &all, || {
+        println!(
+            "{:>6} {:>12} {:>10} {:>10} {:>10} {}",
+            "id", "object", "part", "gripper", "width (m)", "from"
+        );
+        for s in &all {
+            let part = s.part.as_deref().unwrap_or("-");
+            println!(
+                "{:>6} {:>12} {:>10} {:>10} {:>10.4} {}",
+                s.id, s.object, part, s.gripper, s.width, s.provenance
+            );
+        }
+        println!("{} experiences", all.len());
+    })?;
+    Ok(if all.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+/// An experience without its images.
+#[derive(Serialize)]
+struct Shown {
+    #[serde(flatten)]
+    summary: Summary,
+    camera_from_gripper: [[f64; 4]; 4],
+    opening: f64,
+    /// Focal lengths and principal point of the crop, pixels.
+    camera: [f64; 4],
+    side: usize,
+    object_pixels: usize,
+    region_pixels: usize,
+    copies: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    feature: Option<Vec<f32>>,
+}
+
+impl Shown {
+    fn new(stored: &Stored) -> Shown {
+        let e = &stored.experience;
+        let c = &e.crop.camera;
+        Shown {
+            summary: Summary {
+                id: stored.id,
+                time: e.time,
+                object: e.object.clone(),
+                part: e.part.clone(),
+                gripper: e.gripper.name.clone(),
+                width: e.width,
+                network: e.network.clone(),
+                provenance: e.provenance.clone(),
+            },
+            camera_from_gripper: pose_rows(&e.camera_from_gripper),
+            opening: e.opening,
+            camera: [c.fx, c.fy, c.cx, c.cy],
+            side: e.crop.side,
+            object_pixels: e.crop.pixels().count(),
+            region_pixels: e.region.iter().filter(|r| **r).count(),
+            copies: e.copies.len(),
+            feature: None,
+        }
+    }
+}
+
+fn found(store: &SqliteStore, file: &Path, id: i64) -> Result<Stored> {
+    match store.get(id)? {
+        Some(stored) => Ok(stored),
+        None => bail!(
+            "{}: there is no experience {id}; `sixfold grasp store list` shows which there are",
+            file.display()
+        ),
+    }
+}
+
+fn show(file: &Path, id: i64, picture: Option<&Path>, json: &JsonArguments) -> Result<Outcome> {
+    let stored = found(&SqliteStore::open(file)?, file, id)?;
+    if let Some(path) = picture {
+        write_rgb(path, &self::picture(&stored.experience)?)?;
+    }
+    let shown = Shown::new(&stored);
+    report(json, &shown, || {
+        let s = &shown.summary;
+        println!("experience {}: {} ({})", s.id, s.object, s.part.as_deref().unwrap_or("no part"));
+        println!("gripper {}, opening {:.3} m, width {:.3} m", s.gripper, shown.opening, s.width);
+        println!(
+            "{} pixels of the object, {} in the region of interest",
+            shown.object_pixels, shown.region_pixels
+        );
+        println!("network {}, {} features, from: {}", s.network, shown.copies, s.provenance);
+    })?;
+    Ok(Outcome::Found)
+}
+
+/// Three squares side by side, each pixel four times as large: normals with the gripper, VD-NOC, and the region of
+/// interest over the normals.
+fn picture(e: &Experience) -> Result<RgbImage> {
+    const ZOOM: usize = 4;
+    let side = e.crop.side * ZOOM;
+    let color = |values: &[[f32; 3]]| -> RgbImage {
+        Image::from_fn(side, side, |x, y| {
+            let i = (y / ZOOM) * e.crop.side + x / ZOOM;
+            if e.crop.mask[i] {
+                values[i].map(|v| (127.5 + 127.5 * v).clamp(0.0, 255.0) as u8)
+            } else {
+                [24; 3]
+            }
+        })
+    };
+    let normals = color(&e.crop.normals);
+    let camera = e.crop.camera.resize(side, side);
+    let drawn =
+        [DrawnGrasp { camera_from_gripper: e.camera_from_gripper, opening: e.opening, color: [60, 220, 80] }];
+    let with_gripper = draw_grasps(&normals, None, &camera, &e.gripper, &drawn)?;
+    let vd_noc = color(&e.crop.vd_noc);
+    let region = Image::from_fn(side, side, |x, y| {
+        let i = (y / ZOOM) * e.crop.side + x / ZOOM;
+        if e.region[i] { [240, 170, 40] } else { normals[(x, y)] }
+    });
+    Ok(Image::from_fn(3 * side, side, |x, y| match x / side {
+        0 => with_gripper[(x, y)],
+        1 => vd_noc[(x - side, y)],
+        _ => region[(x - 2 * side, y)],
+    }))
+}
+
+#[derive(Serialize)]
+struct Forgotten {
+    forgotten: Vec<i64>,
+    unknown: Vec<i64>,
+}
+
+fn forget(file: &Path, ids: &[i64], json: &JsonArguments) -> Result<Outcome> {
+    let mut store = SqliteStore::open(file)?;
+    let mut done = Forgotten { forgotten: vec![], unknown: vec![] };
+    for &id in ids {
+        if store.forget(id)? { done.forgotten.push(id) } else { done.unknown.push(id) }
+    }
+    report(json, &done, || {
+        println!("{} experiences forgotten", done.forgotten.len());
+        for id in &done.unknown {
+            println!("there was no experience {id}");
+        }
+    })?;
+    Ok(if done.forgotten.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+#[derive(Serialize)]
+struct Merged {
+    added: usize,
+    experiences: usize,
+}
+
+fn merge(file: &Path, others: &[PathBuf], json: &JsonArguments) -> Result<Outcome> {
+    let sources: Vec<SqliteStore> = others.iter().map(|o| SqliteStore::open(o)).collect::<Result<_, _>>()?;
+    let mut store = SqliteStore::create(file)?;
+    let mut added = 0;
+    for (source, name) in sources.iter().zip(others) {
+        check_interrupt("what was taken over is kept; the same command goes on")?;
+        added += store.merge(source).with_context(|| name.display().to_string())?;
+    }
+    let merged = Merged { added, experiences: store.list()?.len() };
+    report(json, &merged, || {
+        println!("{} experiences taken over, {} in {}", merged.added, merged.experiences, file.display());
+    })?;
+    Ok(if added > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+#[derive(Serialize)]
+struct Exported {
+    experiences: usize,
+    unreadable: usize,
+    folder: PathBuf,
+}
+
+fn export(file: &Path, out: &Path, json: &JsonArguments) -> Result<Outcome> {
+    let store = SqliteStore::open(file)?;
+    let all = store.list()?;
+    let mut progress = Progress::new("experiences", all.len());
+    let mut done = Exported { experiences: 0, unreadable: 0, folder: out.to_path_buf() };
+    for summary in &all {
+        check_interrupt("what was written is whole")?;
+        match store.get(summary.id) {
+            Ok(Some(stored)) => {
+                let name = format!("{:06}", stored.id);
+                write_rgb(&out.join(format!("{name}.png")), &picture(&stored.experience)?)?;
+                let feature = stored.experience.copies.first().map(|c| c.feature.clone());
+                let shown = Shown { feature, ..Shown::new(&stored) };
+                let text = serde_json::to_string_pretty(&shown)?;
+                write_atomically(&out.join(format!("{name}.json")), text.as_bytes())?;
+                done.experiences += 1;
+            }
+            Ok(None) => {}
+            Err(error) => {
+                eprintln!("left out: {error}");
+                done.unreadable += 1;
+            }
+        }
+        progress.step(summary.object.clone());
+    }
+    progress.finish();
+    report(json, &done, || println!("{} experiences are in {}", done.experiences, out.display()))?;
+    Ok(match (done.experiences, done.unreadable) {
+        (_, 1..) => Outcome::Incomplete,
+        (0, _) => Outcome::NothingFound,
+        _ => Outcome::Found,
+    })
+}
+
+fn refresh(file: &Path, out: &Path, network: &NetworkArguments, json: &JsonArguments) -> Result<Outcome> {
+    if file == out {
+        bail!("--out: expected another file than the store itself");
+    }
+    let network = model(network)?;
+    let source = SqliteStore::open(file)?;
+    let mut target = SqliteStore::create(out)?;
+    let all = source.list()?;
+    let mut progress = Progress::new("experiences", all.len());
+    let mut added = 0;
+    for summary in &all {
+        check_interrupt("what was encoded is kept; the same command goes on")?;
+        let Some(stored) = source.get(summary.id)? else { continue };
+        if stored.experience.crop.side != network.crop_options().side {
+            bail!(
+                "experience {}: its crop has {} pixels a side, the network wants {}; it has to be recorded again",
+                stored.id,
+                stored.experience.crop.side,
+                network.crop_options().side
+            );
+        }
+        added += usize::from(target.add(&stored.experience.encoded(&network))?.1);
+        progress.step(summary.object.clone());
+    }
+    progress.finish();
+    let merged = Merged { added, experiences: target.list()?.len() };
+    report(json, &merged, || println!("{} experiences are in {}", merged.experiences, out.display()))?;
+    Ok(if merged.experiences > 0 { Outcome::Found } else { Outcome::NothingFound })
+}

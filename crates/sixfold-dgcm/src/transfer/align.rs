@@ -1,0 +1,162 @@
+//! One experience, aligned with the object: the region of interest found again by its VD-NOC, rotation by the singular
+//! value decomposition of equation 6.5, translation by extents, then iterative closest points.
+//!
+//! An object that is wider here than in the experience may be a wider object, or the same object turned: normalised
+//! coordinates cannot tell (the dissertation's boxes fail for it, section 6.3.2). Both are tried. The first hypothesis aligns
+//! normalised coordinates, as equation 6.5 does; the second aligns metres.
+
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, Vec3, icp, kabsch};
+
+use crate::crop::Crop;
+use crate::vd_noc::Extent;
+
+/// How an experience is aligned.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AlignOptions {
+    /// Largest distance of a pixel's VD-NOC from those of the experience's region: theta_c.
+    pub threshold: f64,
+    /// Fewest pixels of a region.
+    pub min_pixels: usize,
+    /// ICP may move the alignment by this, metres.
+    pub icp_distance: f64,
+    /// ICP may turn the alignment by this, radians.
+    pub icp_angle: f64,
+}
+
+impl Default for AlignOptions {
+    fn default() -> Self {
+        AlignOptions { threshold: 0.3, min_pixels: 20, icp_distance: 0.03, icp_angle: 25f64.to_radians() }
+    }
+}
+
+/// What is assumed when two extents differ.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hypothesis {
+    /// The object is another size: equation 6.5.
+    Scaled,
+    /// The object is turned.
+    Turned,
+}
+
+/// An experience's frame, found in what is seen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Transferred {
+    /// Takes points of the experience's camera to the camera of what is seen.
+    pub camera_from_experience: Pose,
+    /// What was assumed.
+    pub hypothesis: Hypothesis,
+    /// Pixels of the region here.
+    pub pixels: usize,
+    /// Root mean square of the point-to-plane distances after ICP, metres; `None` where ICP was not used: it found too little, or
+    /// went too far.
+    pub rms: Option<f64>,
+    /// How much larger the region is here than in the experience, along the experience's camera axes.
+    pub scale: Vec3,
+}
+
+/// Aligns an experience (its crop and region) with an object (its crop and cloud), given the VD-NOC of the object's
+/// pixels in the experience's frame. Up to two alignments, one per hypothesis; none when the region is not found again.
+pub fn transfer(
+    input: &Crop,
+    cloud: &IndexedCloud,
+    coordinates: &[[f32; 3]],
+    experience: &Crop,
+    region: &[bool],
+    options: &AlignOptions,
+) -> Vec<Transferred> {
+    let wanted: Vec<usize> =
+        (0..region.len().min(experience.mask.len())).filter(|&i| region[i] && experience.mask[i]).collect();
+    if wanted.len() < options.min_pixels {
+        return vec![];
+    }
+    let noc = |v: &[f32; 3]| Vec3::from_fn(|k, _| f64::from(v[k]));
+    // Some of the region's points stand for all: theta_c is far larger than their distances.
+    let stride = wanted.len().div_ceil(150);
+    let anchors: Vec<Vec3> = wanted.iter().step_by(stride).map(|&i| noc(&experience.vd_noc[i])).collect();
+    let limit = options.threshold * options.threshold;
+    let here: Vec<usize> = input
+        .pixels()
+        .filter(|&i| {
+            let v = noc(&coordinates[i]);
+            anchors.iter().any(|a| (a - v).norm_squared() < limit)
+        })
+        .collect();
+    if here.len() < options.min_pixels {
+        return vec![];
+    }
+    let experience_points: Vec<Vec3> = wanted.iter().map(|&i| experience.point(i)).collect();
+    let input_points: Vec<Vec3> = here.iter().map(|&i| input.point(i)).collect();
+    let restored: Vec<Vec3> =
+        here.iter().map(|&i| experience.extent.restore(&noc(&coordinates[i]))).collect();
+
+    let mut found: Vec<Transferred> = vec![];
+    for hypothesis in [Hypothesis::Scaled, Hypothesis::Turned] {
+        let rotation = match hypothesis {
+            Hypothesis::Scaled => {
+                let normalised = |points: &[Vec3], extent: &Extent| -> Vec<Vec3> {
+                    points.iter().map(|p| (p - extent.centre).component_div(&extent.half)).collect()
+                };
+                kabsch(
+                    &normalised(&restored, &experience.extent),
+                    &normalised(&input_points, &input.extent),
+                    None,
+                )
+            }
+            Hypothesis::Turned => kabsch(&restored, &input_points, None),
+        };
+        let Ok(rotation) = rotation else { continue };
+        let rotation = rotation.with_translation(Vec3::zeros());
+        if found.iter().any(|f| f.camera_from_experience.rotation_angle_to(&rotation) < 4f64.to_radians()) {
+            continue;
+        }
+        let turned: Vec<Vec3> = experience_points.iter().map(|p| rotation.transform_point(p)).collect();
+        let (Some(source), Some(target)) = (Extent::of(&turned, 0.02), Extent::of(&input_points, 0.02))
+        else {
+            continue;
+        };
+        let start = rotation.with_translation(target.centre - source.centre);
+        let scale = target.half.component_div(&source.half);
+        let (pose, rms) = refine(experience, &wanted, cloud, &start, options);
+        found.push(Transferred { camera_from_experience: pose, hypothesis, pixels: here.len(), rms, scale });
+    }
+    found
+}
+
+/// ICP of the experience's region on the object's cloud. What slides away along a surface that fixes nothing is not used.
+fn refine(
+    experience: &Crop,
+    wanted: &[usize],
+    cloud: &IndexedCloud,
+    start: &Pose,
+    options: &AlignOptions,
+) -> (Pose, Option<f64>) {
+    let stride = wanted.len().div_ceil(250);
+    let chosen: Vec<usize> = wanted.iter().step_by(stride).copied().collect();
+    let source = PointCloud {
+        points: chosen.iter().map(|&i| experience.point(i)).collect(),
+        normals: chosen.iter().map(|&i| Vec3::from_fn(|k, _| f64::from(experience.normals[i][k]))).collect(),
+    };
+    let level = |rejection_distance, iterations| IcpLevel { rejection_distance, iterations, stride: 1 };
+    let icp_options = IcpOptions {
+        levels: vec![level(0.03, 6), level(0.015, 6), level(0.008, 8)],
+        max_angle: 60f64.to_radians(),
+        convergence: 1e-5,
+        min_correspondences: 10,
+    };
+    match icp(&source, cloud, start, &icp_options) {
+        Ok(report) => {
+            let middle = source.centroid().unwrap_or_else(Vec3::zeros);
+            let moved =
+                (report.target_from_source.transform_point(&middle) - start.transform_point(&middle)).norm();
+            let turned = report.target_from_source.rotation_angle_to(start);
+            if moved <= options.icp_distance && turned <= options.icp_angle {
+                (report.target_from_source, Some(report.rms))
+            } else {
+                (*start, None)
+            }
+        }
+        Err(_) => (*start, None),
+    }
+}

@@ -1,0 +1,137 @@
+//! Grasps by geometry and grasps from experience, ranked together.
+//!
+//! The dissertation adds to the score of each geometric candidate what experience says of it (section 6.3.2). So it can
+//! only choose among what the geometric planner proposes, and fails where all of that is bad. Here the transferred grasps
+//! are candidates as well, judged by the same two numbers.
+
+use sixfold_grasp::{ClusterOptions, Grasp};
+
+use super::Proposal;
+
+/// Where a grasp comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Kind {
+    /// The geometric planner.
+    Geometry,
+    /// Experience.
+    Experience,
+}
+
+/// A grasp with its rank's numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ranked {
+    /// The grasp.
+    pub grasp: Grasp,
+    /// Where it comes from.
+    pub kind: Kind,
+    /// What decides: the mean of the next two for both kinds together.
+    pub score: f64,
+    /// Quality of its contacts over the best one's, 0 to 1.
+    pub geometry: f64,
+    /// The share of experience that agrees with it, 0 to 1.
+    pub experience: f64,
+    /// The number of the proposal it is, for grasps from experience.
+    pub proposal: Option<usize>,
+    /// Grasps within the cluster.
+    pub members: usize,
+}
+
+/// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees). Without experience that is the
+/// order of the planner's clusters, without geometry that of summed scores of equation 6.6 (section 6.3.2).
+pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
+    let all: f64 = experience.iter().map(|p| p.score).sum();
+    let best = geometry
+        .iter()
+        .chain(experience.iter().filter(|p| p.firm).map(|p| &p.grasp))
+        .map(|g| g.quality.total())
+        .fold(1e-9, f64::max);
+    let near = |a: &Grasp, b: &Grasp| {
+        let (distance, angle) = a.difference(b);
+        distance <= clusters.distance && angle <= clusters.angle
+    };
+    let candidates = geometry
+        .iter()
+        .map(|g| (g, Kind::Geometry, None))
+        .chain(experience.iter().enumerate().map(|(i, p)| (&p.grasp, Kind::Experience, Some(i))));
+    let mut ranked: Vec<Ranked> = candidates
+        .map(|(grasp, kind, proposal)| {
+            let agreeing: f64 = experience.iter().filter(|p| near(grasp, &p.grasp)).map(|p| p.score).sum();
+            let experience_share = if all > 0.0 { agreeing / all } else { 0.0 };
+            let quality = grasp.quality.total() / best;
+            let score = match (geometry.is_empty(), experience.is_empty()) {
+                (true, _) => experience_share,
+                (_, true) => quality,
+                _ => 0.5 * (quality + experience_share),
+            };
+            Ranked {
+                grasp: *grasp,
+                kind,
+                score,
+                geometry: quality,
+                experience: experience_share,
+                proposal,
+                members: 1,
+            }
+        })
+        .collect();
+    // Equal scores: the better contacts first.
+    ranked.sort_by(|a, b| b.score.total_cmp(&a.score).then(b.geometry.total_cmp(&a.geometry)));
+    let mut chosen: Vec<Ranked> = vec![];
+    let mut sums: Vec<f64> = vec![];
+    for candidate in ranked {
+        match chosen.iter().position(|c| near(&c.grasp, &candidate.grasp)) {
+            Some(cluster) => {
+                chosen[cluster].members += 1;
+                sums[cluster] += candidate.geometry;
+            }
+            None => {
+                chosen.push(candidate);
+                sums.push(candidate.geometry);
+            }
+        }
+    }
+    if experience.is_empty() {
+        // The planner alone: clusters by summed quality.
+        let mut order: Vec<usize> = (0..chosen.len()).collect();
+        order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]).then(a.cmp(&b)));
+        return order.into_iter().map(|i| chosen[i]).collect();
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::Match;
+    use crate::transfer::Hypothesis;
+    use sixfold_geometry::Pose;
+    use sixfold_grasp::AntipodalQuality;
+
+    fn grasp(x: f64, alignment: f64) -> Grasp {
+        let quality = AntipodalQuality { alignment, support: 1.0, centring: 1.0, observed: 1.0 };
+        let pose = Pose::exp(&[x, 0.0, 0.6, 0.0, 0.0, 0.0].into());
+        Grasp { camera_from_gripper: pose, opening: 0.06, width: 0.04, quality }
+    }
+
+    fn proposal(x: f64, score: f64) -> Proposal {
+        let from = Match { experience: 1, angle: 0.0, distance: -score.ln() };
+        Proposal { grasp: grasp(x, 0.5), score, from, hypothesis: Hypothesis::Scaled, moved: 0.0, firm: true }
+    }
+
+    #[test]
+    fn experience_decides_between_grasps_of_like_quality() {
+        let geometry = [grasp(0.0, 0.95), grasp(0.2, 0.9)];
+        let options = ClusterOptions::default();
+        let alone = rank(&geometry, &[], &options);
+        assert!(alone[0].grasp.camera_from_gripper.translation().x.abs() < 1e-9);
+        let both = rank(&geometry, &[proposal(0.21, 0.5), proposal(0.2, 0.4)], &options);
+        assert!((both[0].grasp.camera_from_gripper.translation().x - 0.2).abs() < 0.02);
+        assert_eq!((both[0].kind, both[0].members), (Kind::Geometry, 3));
+        // Candidates of experience where geometry has nothing.
+        let only = rank(&geometry, &[proposal(-0.3, 0.5)], &options);
+        assert!(only.iter().any(|r| r.kind == Kind::Experience && r.proposal == Some(0)));
+        let dgcm = rank(&[], &[proposal(0.0, 0.1), proposal(0.2, 0.3), proposal(0.21, 0.3)], &options);
+        assert!(dgcm[0].grasp.camera_from_gripper.translation().x > 0.1 && dgcm[0].experience > 0.8);
+    }
+}

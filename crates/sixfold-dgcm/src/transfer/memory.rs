@@ -1,0 +1,93 @@
+//! The experiences at hand: the index of all features and the experiences that were retrieved lately.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::model::DgcmModel;
+use crate::store::{ExperienceStore, FeatureIndex, Match, StoreError, Stored, Summary};
+
+/// Experiences of one store for one network.
+pub struct Memory {
+    store: Box<dyn ExperienceStore>,
+    index: FeatureIndex,
+    /// By number; what is known for steering.
+    labels: HashMap<i64, Summary>,
+    kept: HashMap<i64, Arc<Stored>>,
+}
+
+impl Memory {
+    /// All experiences of a store that can be used with a model.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn new(store: Box<dyn ExperienceStore>, model: &DgcmModel) -> Result<Memory, StoreError> {
+        let mut memory = Memory {
+            store,
+            index: FeatureIndex::new(&model.fingerprint()),
+            labels: HashMap::new(),
+            kept: HashMap::new(),
+        };
+        memory.refresh()?;
+        Ok(memory)
+    }
+
+    /// Takes over what others have stored and forgotten.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn refresh(&mut self) -> Result<(), StoreError> {
+        self.index.refresh(&*self.store)?;
+        self.labels = self.store.list()?.into_iter().map(|s| (s.id, s)).collect();
+        self.kept.retain(|id, _| self.labels.contains_key(id));
+        Ok(())
+    }
+
+    /// The store.
+    pub fn store(&mut self) -> &mut dyn ExperienceStore {
+        &mut *self.store
+    }
+
+    /// Features at hand.
+    pub fn index(&self) -> &FeatureIndex {
+        &self.index
+    }
+
+    /// Experiences at hand, those of other networks included.
+    pub fn len(&self) -> usize {
+        self.labels.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.labels.is_empty()
+    }
+
+    /// The nearest experiences that `wanted` accepts.
+    pub fn nearest(
+        &self,
+        feature: &[f32],
+        count: usize,
+        wanted: impl Fn(&Summary) -> bool + Sync,
+    ) -> Vec<Match> {
+        let labels = &self.labels;
+        self.index.nearest(feature, count, |id| labels.get(&id).is_some_and(&wanted))
+    }
+
+    /// An experience; `None` when it was forgotten meanwhile.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn get(&mut self, id: i64) -> Result<Option<Arc<Stored>>, StoreError> {
+        const KEPT: usize = 500;
+        if let Some(stored) = self.kept.get(&id) {
+            return Ok(Some(stored.clone()));
+        }
+        let Some(stored) = self.store.get(id)? else { return Ok(None) };
+        let stored = Arc::new(stored);
+        if self.kept.len() >= KEPT {
+            self.kept.clear();
+        }
+        self.kept.insert(id, stored.clone());
+        Ok(Some(stored))
+    }
+}

@@ -1,0 +1,11 @@
+//! From experiences to grasps on what is seen now (dissertation, section 6.2.3).
+
+mod align;
+mod combine;
+mod memory;
+mod propose;
+
+pub use align::{AlignOptions, Hypothesis, Transferred, transfer};
+pub use combine::{Kind, Ranked, rank};
+pub use memory::Memory;
+pub use propose::{Proposal, Proposals, ProposeError, ProposeOptions, propose};

@@ -1,0 +1,246 @@
+//! Grasps from the nearest experiences: retrieval, transfer, stand-off, and a place where the gripper is free.
+
+use rayon::prelude::*;
+use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
+use sixfold_grasp::{AntipodalOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError};
+use thiserror::Error;
+
+use super::Memory;
+use super::align::{AlignOptions, Hypothesis, Transferred, transfer};
+use crate::crop::{Crop, CropError};
+use crate::crop_turn::turn;
+use crate::model::DgcmModel;
+use crate::store::{Match, StoreError, Summary};
+
+/// Why nothing can be proposed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ProposeError {
+    /// The object cannot be cut out.
+    #[error(transparent)]
+    Crop(#[from] CropError),
+    /// The store.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// An option is out of range.
+    #[error(transparent)]
+    Options(#[from] OptionsError),
+    /// The object's cloud has no normals.
+    #[error(transparent)]
+    Cloud(#[from] IcpError),
+}
+
+/// How grasps are transferred.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProposeOptions {
+    /// Nearest features that are tried (dissertation: 10).
+    pub neighbours: usize,
+    /// How they are aligned.
+    pub align: AlignOptions,
+    /// How grasps are tested and judged.
+    pub judge: AntipodalOptions,
+    /// Only experiences on parts of this name.
+    pub part: Option<String>,
+    /// Not those whose object has this name: what a test must not know.
+    pub without_object: Option<String>,
+}
+
+impl Default for ProposeOptions {
+    fn default() -> Self {
+        ProposeOptions {
+            neighbours: 10,
+            align: AlignOptions::default(),
+            judge: AntipodalOptions::default(),
+            part: None,
+            without_object: None,
+        }
+    }
+}
+
+/// A grasp from experience.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Proposal {
+    /// The grasp, free of collisions with what is known.
+    pub grasp: Grasp,
+    /// Equation 6.6: `exp(-distance of the features)`.
+    pub score: f64,
+    /// The experience.
+    pub from: Match,
+    /// What was assumed about its size.
+    pub hypothesis: Hypothesis,
+    /// How far the grasp was moved from where the transfer had put it, metres.
+    pub moved: f64,
+    /// The contacts are inside their friction cones as far as they are known.
+    pub firm: bool,
+}
+
+/// All that experience says of an object.
+#[derive(Debug, Clone)]
+pub struct Proposals {
+    /// The nearest experiences, nearest first.
+    pub nearest: Vec<Match>,
+    /// The object as the network sees it.
+    pub crop: Crop,
+    /// The grasps, those of the nearest experience first.
+    pub proposals: Vec<Proposal>,
+}
+
+/// Proposes grasps on the object of a view.
+///
+/// # Errors
+/// [`ProposeError`]. No experience, or none that fits, is no error: there are no proposals then.
+pub fn propose(
+    view: &GraspView,
+    gripper: &Gripper,
+    model: &DgcmModel,
+    memory: &mut Memory,
+    options: &ProposeOptions,
+) -> Result<Proposals, ProposeError> {
+    let crop = Crop::new(&view.depth, &view.camera, &view.mask, model.crop_options())?;
+    let input = model.encode(&crop);
+    let wanted = |s: &Summary| {
+        options.part.as_ref().is_none_or(|part| s.part.as_ref() == Some(part))
+            && options.without_object.as_ref().is_none_or(|object| s.object != *object)
+    };
+    let nearest = memory.nearest(&input.feature, options.neighbours, wanted);
+    let trim = model.crop_options().trim;
+    let mut experiences = vec![];
+    for m in &nearest {
+        if let Some(stored) = memory.get(m.experience)? {
+            let copy = if m.angle == 0.0 {
+                stored.experience.crop.clone()
+            } else {
+                stored.experience.crop.turned(m.angle, trim)
+            };
+            experiences.push((*m, stored, copy));
+        }
+    }
+    experiences.retain(|(_, stored, copy)| copy.side == crop.side && !stored.experience.copies.is_empty());
+    let fitter = GraspFitter::new(view, gripper, &options.judge)?;
+    if experiences.is_empty() || view.object.is_empty() {
+        return Ok(Proposals { nearest, crop, proposals: vec![] });
+    }
+    let cloud = IndexedCloud::new(view.object.clone())?;
+    let planes: Vec<Vec<f32>> = experiences.iter().map(|(.., copy)| copy.vd_noc_planes()).collect();
+    let asked: Vec<(&[f32], &[f32])> = experiences
+        .iter()
+        .zip(&planes)
+        .map(|((m, stored, _), planes)| {
+            let copies = &stored.experience.copies;
+            let feature = copies.iter().find(|c| c.angle == m.angle).unwrap_or(&copies[0]);
+            (feature.feature.as_slice(), planes.as_slice())
+        })
+        .collect();
+    let coordinates = model.coordinates(&input, &asked);
+    let found: Vec<Vec<Proposal>> = experiences
+        .par_iter()
+        .zip(&coordinates)
+        .map(|((from, stored, copy), coordinates)| {
+            let e = &stored.experience;
+            let region = turned_region(&e.region, copy);
+            let turned_grasp = turn(from.angle) * e.camera_from_gripper;
+            let aligned = transfer(&crop, &cloud, coordinates, copy, &region, &options.align);
+            aligned
+                .iter()
+                .filter_map(|t| {
+                    let source = Source { copy, grasp: &turned_grasp, opening: e.opening, width: e.width };
+                    place(&fitter, gripper, &source, t, options).map(|(grasp, moved, firm)| Proposal {
+                        grasp,
+                        score: (-from.distance).exp(),
+                        from: *from,
+                        hypothesis: t.hypothesis,
+                        moved,
+                        firm,
+                    })
+                })
+                .collect()
+        })
+        .collect();
+    Ok(Proposals { nearest, crop, proposals: found.into_iter().flatten().collect() })
+}
+
+/// The region of an experience in its in-plane copy, whose pixels know where they come from.
+fn turned_region(region: &[bool], copy: &Crop) -> Vec<bool> {
+    (0..copy.mask.len())
+        .map(|i| copy.mask[i] && region.get(copy.source[i] as usize).copied().unwrap_or(false))
+        .collect()
+}
+
+/// What is transferred.
+struct Source<'a> {
+    copy: &'a Crop,
+    grasp: &'a Pose,
+    opening: f64,
+    width: f64,
+}
+
+/// The transferred grasp at its stand-off, at the nearest place where the gripper is free: shifted and turned by a little,
+/// or drawn back. The grasp, how far it was moved, and whether its contacts are inside their friction cones.
+fn place(
+    fitter: &GraspFitter<'_>,
+    gripper: &Gripper,
+    source: &Source<'_>,
+    t: &Transferred,
+    options: &ProposeOptions,
+) -> Option<(Grasp, f64, bool)> {
+    let room = (source.opening - source.width).max(2.0 * options.judge.clearance);
+    // The scale across the fingers, along the closing direction of the experience.
+    let closing = source.grasp.transform_direction(&Vec3::x()).map(f64::abs);
+    let scale = (t.scale.dot(&closing.component_mul(&closing))).clamp(0.5, 2.0);
+    let widths = [source.width, source.width * scale];
+    let mut openings: Vec<f64> = widths
+        .iter()
+        .map(|w| w + room)
+        .chain([gripper.max_opening])
+        .map(|o| o.clamp(0.01, gripper.max_opening))
+        .collect();
+    openings.dedup_by(|a, b| (*a - *b).abs() < 0.002);
+    let start = t.camera_from_experience * *source.grasp;
+    let start = stand_off(fitter, gripper, source, &start);
+    let mut best: Option<(f64, Grasp, f64)> = None;
+    let mut loose: Option<(Grasp, f64)> = None;
+    for back in [0.0, 0.008, 0.02, 0.035] {
+        for angle in [0.0f64, -0.15, 0.15, -0.35, 0.35] {
+            for shift in [0.0, -0.006, 0.006, -0.014, 0.014] {
+                let about = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle);
+                let pose = start * Pose::new(about, Vec3::new(shift, 0.0, -back));
+                let moved = back + f64::abs(shift) + 0.05 * angle.abs();
+                for &opening in &openings {
+                    if let Some(grasp) = fitter.fit(&pose, opening) {
+                        let value = grasp.quality.total() * (-moved / 0.03).exp();
+                        if best.as_ref().is_none_or(|b| value > b.0) {
+                            best = Some((value, grasp, moved));
+                        }
+                    } else if loose.is_none() && angle == 0.0 {
+                        loose = fitter.accept(&pose, opening).map(|grasp| (grasp, moved));
+                    }
+                }
+            }
+        }
+        if best.is_some() {
+            break;
+        }
+    }
+    best.map(|(_, grasp, moved)| (grasp, moved, true)).or(loose.map(|(grasp, moved)| (grasp, moved, false)))
+}
+
+/// Moves a grasp along its approach until its tips reach over the object as far as they did in the experience.
+fn stand_off(fitter: &GraspFitter<'_>, gripper: &Gripper, source: &Source<'_>, pose: &Pose) -> Pose {
+    let gripper_from_camera = source.grasp.inverse();
+    let then = source
+        .copy
+        .pixels()
+        .map(|i| gripper_from_camera.transform_point(&source.copy.point(i)))
+        .filter(|p| {
+            p.x.abs() < 0.5 * source.opening && p.y.abs() < 0.5 * gripper.finger_width && p.z.abs() < 0.2
+        })
+        .map(|p| p.z)
+        .min_by(f64::total_cmp);
+    match (then, fitter.reach(pose, source.opening)) {
+        (Some(then), Some(now)) => {
+            *pose * Pose::from_translation(Vec3::z() * (now - then).clamp(-0.06, 0.06))
+        }
+        _ => *pose,
+    }
+}

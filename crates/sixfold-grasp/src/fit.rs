@@ -1,0 +1,83 @@
+//! A grasp that comes from elsewhere (transferred from experience, or from a person), fitted to what is seen: the object
+//! brought midway between the pads, tested for collision, its contacts judged as the planner judges its own.
+
+use sixfold_geometry::{KdTree, Pose, Vec3};
+
+use crate::antipodal::Planner;
+use crate::{
+    AntipodalOptions, AntipodalQuality, CollisionScene, CompletedObject, Grasp, GraspView, Gripper,
+    OptionsError, complete_by_mirrors,
+};
+
+/// Fits grasps to the object of a view.
+pub struct GraspFitter<'a> {
+    planner: Planner<'a>,
+}
+
+impl<'a> GraspFitter<'a> {
+    /// A fitter for a view and a gripper. The object's far side is assumed as the options say.
+    ///
+    /// # Errors
+    /// [`OptionsError`].
+    pub fn new(
+        view: &'a GraspView,
+        gripper: &'a Gripper,
+        options: &'a AntipodalOptions,
+    ) -> Result<GraspFitter<'a>, OptionsError> {
+        options.check()?;
+        let object = match &options.completion {
+            Some(completion) => complete_by_mirrors(view, completion),
+            None => {
+                CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] }
+            }
+        };
+        let planner = Planner {
+            gripper,
+            options,
+            down: view.table.map_or_else(Vec3::z, |t| -t.normal),
+            centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
+            tree: KdTree::new(&object.cloud.points),
+            scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
+            object,
+            cone: gripper.friction.atan(),
+            step: view.step,
+        };
+        Ok(GraspFitter { planner })
+    }
+
+    /// The grasp at about this pose, moved along the closing direction so that the object is midway between the pads;
+    /// `None` when the gripper would hit something or a contact lies outside its friction cone.
+    pub fn fit(&self, camera_from_gripper: &Pose, opening: f64) -> Option<Grasp> {
+        if self.planner.object.cloud.normals.len() != self.planner.object.cloud.len() {
+            return None;
+        }
+        self.planner.grasp(camera_from_gripper, opening)
+    }
+
+    /// The grasp at this very pose when the gripper stands free and something is between its pads, whatever its contacts
+    /// look like: the sides that touch may be those that the camera does not see. Its quality has no alignment.
+    pub fn accept(&self, camera_from_gripper: &Pose, opening: f64) -> Option<Grasp> {
+        let planner = &self.planner;
+        if !(opening > 0.0 && opening <= planner.gripper.max_opening)
+            || planner.scene.hit(planner.gripper, camera_from_gripper, opening).is_some()
+        {
+            return None;
+        }
+        let (low, high) = planner.extent(&planner.between(camera_from_gripper, opening))?;
+        let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.5, observed: 0.0 };
+        Some(Grasp { camera_from_gripper: *camera_from_gripper, opening, width: high - low, quality })
+    }
+
+    /// How far behind the finger tips the gripper first meets the object along its approach, metres (negative: the
+    /// tips reach over it); `None` when nothing is between the pads' planes.
+    pub fn reach(&self, camera_from_gripper: &Pose, opening: f64) -> Option<f64> {
+        let gripper_from_camera = camera_from_gripper.inverse();
+        let half = (0.5 * opening, 0.5 * self.planner.gripper.finger_width);
+        let depths = self.planner.object.cloud.points[..self.planner.object.observed]
+            .iter()
+            .map(|p| gripper_from_camera.transform_point(p))
+            .filter(|p| p.x.abs() < half.0 && p.y.abs() < half.1 && p.z.abs() < 0.2)
+            .map(|p| p.z);
+        depths.min_by(f64::total_cmp)
+    }
+}
