@@ -14,7 +14,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-pub use experience::{COPIES, Copy, Experience, Stored};
+pub use experience::{COPIES, Copy, Experience, Stored, region};
 pub use index::{FeatureIndex, Match};
 #[cfg(feature = "sqlite")]
 pub use sqlite::SqliteStore;

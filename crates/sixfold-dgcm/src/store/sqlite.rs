@@ -176,6 +176,10 @@ impl SqliteStore {
         if let Some(id) = known {
             return Ok((id, false));
         }
+        // As a gripper file, which says what kind it is.
+        let mut gripper = serde_json::to_value(&e.gripper).unwrap_or_default();
+        gripper["kind"] = "parallel-jaws".into();
+        let gripper = gripper.to_string();
         let camera = &e.crop.camera;
         let numbers = [camera.fx, camera.fy, camera.cx, camera.cy];
         let numbers: Vec<u8> = numbers.iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -188,7 +192,7 @@ impl SqliteStore {
                 e.time,
                 e.object,
                 e.part,
-                serde_json::to_string(&e.gripper).unwrap_or_default(),
+                gripper,
                 e.opening,
                 e.width,
                 encode::pose(&e.camera_from_gripper),

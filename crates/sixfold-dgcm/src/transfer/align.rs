@@ -18,6 +18,8 @@ pub struct AlignOptions {
     pub threshold: f64,
     /// Fewest pixels of a region.
     pub min_pixels: usize,
+    /// Predicted coordinates whose alignment leaves more than this (root mean square, in units of VD-NOC) are not used.
+    pub max_residual: f64,
     /// ICP may move the alignment by this, metres.
     pub icp_distance: f64,
     /// ICP may turn the alignment by this, radians.
@@ -26,7 +28,13 @@ pub struct AlignOptions {
 
 impl Default for AlignOptions {
     fn default() -> Self {
-        AlignOptions { threshold: 0.3, min_pixels: 20, icp_distance: 0.03, icp_angle: 25f64.to_radians() }
+        AlignOptions {
+            threshold: 0.3,
+            min_pixels: 20,
+            max_residual: 0.3,
+            icp_distance: 0.03,
+            icp_angle: 25f64.to_radians(),
+        }
     }
 }
 
@@ -38,6 +46,19 @@ pub enum Hypothesis {
     Scaled,
     /// The object is turned.
     Turned,
+    /// The object is seen from the same side: its own VD-NOC are taken, and nothing is turned before ICP.
+    SameSide,
+}
+
+impl Hypothesis {
+    /// Its name in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Hypothesis::Scaled => "scaled",
+            Hypothesis::Turned => "turned",
+            Hypothesis::SameSide => "same_side",
+        }
+    }
 }
 
 /// An experience's frame, found in what is seen.
@@ -57,7 +78,8 @@ pub struct Transferred {
 }
 
 /// Aligns an experience (its crop and region) with an object (its crop and cloud), given the VD-NOC of the object's
-/// pixels in the experience's frame. Up to two alignments, one per hypothesis; none when the region is not found again.
+/// pixels in the experience's frame as the network predicts them. Up to three alignments, one per hypothesis; none when the
+/// region is not found again.
 pub fn transfer(
     input: &Crop,
     cloud: &IndexedCloud,
@@ -71,49 +93,29 @@ pub fn transfer(
     if wanted.len() < options.min_pixels {
         return vec![];
     }
-    let noc = |v: &[f32; 3]| Vec3::from_fn(|k, _| f64::from(v[k]));
     // Some of the region's points stand for all: theta_c is far larger than their distances.
     let stride = wanted.len().div_ceil(150);
     let anchors: Vec<Vec3> = wanted.iter().step_by(stride).map(|&i| noc(&experience.vd_noc[i])).collect();
-    let limit = options.threshold * options.threshold;
-    let here: Vec<usize> = input
-        .pixels()
-        .filter(|&i| {
-            let v = noc(&coordinates[i]);
-            anchors.iter().any(|a| (a - v).norm_squared() < limit)
-        })
-        .collect();
-    if here.len() < options.min_pixels {
-        return vec![];
-    }
     let experience_points: Vec<Vec3> = wanted.iter().map(|&i| experience.point(i)).collect();
-    let input_points: Vec<Vec3> = here.iter().map(|&i| input.point(i)).collect();
-    let restored: Vec<Vec3> =
-        here.iter().map(|&i| experience.extent.restore(&noc(&coordinates[i]))).collect();
-
     let mut found: Vec<Transferred> = vec![];
-    for hypothesis in [Hypothesis::Scaled, Hypothesis::Turned] {
-        let rotation = match hypothesis {
-            Hypothesis::Scaled => {
-                let normalised = |points: &[Vec3], extent: &Extent| -> Vec<Vec3> {
-                    points.iter().map(|p| (p - extent.centre).component_div(&extent.half)).collect()
-                };
-                kabsch(
-                    &normalised(&restored, &experience.extent),
-                    &normalised(&input_points, &input.extent),
-                    None,
-                )
-            }
-            Hypothesis::Turned => kabsch(&restored, &input_points, None),
+    for hypothesis in [Hypothesis::Scaled, Hypothesis::Turned, Hypothesis::SameSide] {
+        let own = hypothesis == Hypothesis::SameSide;
+        let coordinates = if own { &input.vd_noc } else { coordinates };
+        let here = pixels_near(input, coordinates, &anchors, options.threshold);
+        if here.len() < options.min_pixels {
+            continue;
+        }
+        let points: Vec<Vec3> = here.iter().map(|&i| input.point(i)).collect();
+        let restored: Vec<Vec3> =
+            here.iter().map(|&i| experience.extent.restore(&noc(&coordinates[i]))).collect();
+        let Some(rotation) = rotation(hypothesis, &restored, &points, experience, input, options) else {
+            continue;
         };
-        let Ok(rotation) = rotation else { continue };
-        let rotation = rotation.with_translation(Vec3::zeros());
         if found.iter().any(|f| f.camera_from_experience.rotation_angle_to(&rotation) < 4f64.to_radians()) {
             continue;
         }
         let turned: Vec<Vec3> = experience_points.iter().map(|p| rotation.transform_point(p)).collect();
-        let (Some(source), Some(target)) = (Extent::of(&turned, 0.02), Extent::of(&input_points, 0.02))
-        else {
+        let (Some(source), Some(target)) = (Extent::of(&turned, 0.02), Extent::of(&points, 0.02)) else {
             continue;
         };
         let start = rotation.with_translation(target.centre - source.centre);
@@ -122,6 +124,48 @@ pub fn transfer(
         found.push(Transferred { camera_from_experience: pose, hypothesis, pixels: here.len(), rms, scale });
     }
     found
+}
+
+fn noc(v: &[f32; 3]) -> Vec3 {
+    Vec3::from_fn(|k, _| f64::from(v[k]))
+}
+
+/// The region of interest here: pixels whose VD-NOC are within `threshold` of one of the region's there.
+fn pixels_near(input: &Crop, coordinates: &[[f32; 3]], anchors: &[Vec3], threshold: f64) -> Vec<usize> {
+    let limit = threshold * threshold;
+    input
+        .pixels()
+        .filter(|&i| {
+            let v = noc(&coordinates[i]);
+            anchors.iter().any(|a| (a - v).norm_squared() < limit)
+        })
+        .collect()
+}
+
+/// The rotation from the experience's camera to the object's under a hypothesis; `None` where the coordinates do not agree
+/// with any rotation.
+fn rotation(
+    hypothesis: Hypothesis,
+    restored: &[Vec3],
+    points: &[Vec3],
+    experience: &Crop,
+    input: &Crop,
+    options: &AlignOptions,
+) -> Option<Pose> {
+    let normalised = |points: &[Vec3], extent: &Extent| -> Vec<Vec3> {
+        points.iter().map(|p| (p - extent.centre).component_div(&extent.half)).collect()
+    };
+    let (source, target) = match hypothesis {
+        Hypothesis::SameSide => return Some(Pose::identity()),
+        Hypothesis::Scaled => (normalised(restored, &experience.extent), normalised(points, &input.extent)),
+        Hypothesis::Turned => (restored.to_vec(), points.to_vec()),
+    };
+    let pose = kabsch(&source, &target, None).ok()?;
+    let squares: f64 =
+        source.iter().zip(&target).map(|(s, t)| (pose.transform_point(s) - t).norm_squared()).sum();
+    let residual = (squares / source.len() as f64).sqrt();
+    let unit = if hypothesis == Hypothesis::Turned { input.extent.half.mean() } else { 1.0 };
+    (residual <= options.max_residual * unit).then(|| pose.with_translation(Vec3::zeros()))
 }
 
 /// ICP of the experience's region on the object's cloud. What slides away along a surface that fixes nothing is not used.

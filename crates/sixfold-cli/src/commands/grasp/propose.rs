@@ -173,7 +173,7 @@ fn with_experience(
     gripper: &Gripper,
     planner: &AntipodalOptions,
 ) -> Result<Vec<Proposed>> {
-    use sixfold_dgcm::transfer::{Hypothesis, Kind, ProposeOptions, propose, rank};
+    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank};
     let Some(file) = &a.experiences else { return Ok(vec![]) };
     let model = super::experience::model(&a.network)?;
     let mut memory = super::experience::memory(file, &model)?;
@@ -196,10 +196,7 @@ fn with_experience(
                 },
                 id: proposal.map(|p| p.from.experience),
                 distance: proposal.map(|p| p.from.distance),
-                hypothesis: proposal.map(|p| match p.hypothesis {
-                    Hypothesis::Scaled => "scaled",
-                    Hypothesis::Turned => "turned",
-                }),
+                hypothesis: proposal.map(|p| p.hypothesis.name()),
                 share: r.experience,
             };
             Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) }

@@ -1,0 +1,289 @@
+//! The store's promise: what `add` has returned for is there, whenever the writer is killed, and readers go on meanwhile.
+//!
+//! `SIXFOLD_KILLS=1000 cargo test --workspace --release --test kill -- --nocapture` kills a writer a thousand times.
+#![cfg(feature = "sqlite")]
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sixfold_dgcm::crop::{Crop, CropOptions};
+use sixfold_dgcm::networks::FEATURE;
+use sixfold_dgcm::store::{
+    COPIES, Copy, Experience, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError,
+};
+use sixfold_geometry::{Camera, Image, Mask, Pose};
+use sixfold_grasp::Gripper;
+
+/// An experience that can be told from all others, with a feature that follows from its number.
+fn experience(number: i64) -> Experience {
+    let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
+    let inside = |x: usize, y: usize| (120..180).contains(&x) && (90..150).contains(&y);
+    let depth = Image::from_fn(320, 240, |x, y| if inside(x, y) { 0.7 + 0.0003 * x as f32 } else { 0.0 });
+    let crop = Crop::new(&depth, &camera, &Mask::from_fn(320, 240, inside), &CropOptions::compact()).unwrap();
+    let region = crop.mask.iter().enumerate().map(|(i, m)| *m && i % 3 == 0).collect();
+    Experience {
+        crop,
+        camera_from_gripper: Pose::exp(&[0.0, 0.01, 0.7, 0.1, 3.0, number as f64 * 1e-3].into()),
+        opening: 0.07,
+        width: 0.05,
+        region,
+        copies: COPIES.iter().map(|&angle| Copy { angle, feature: feature(number, angle) }).collect(),
+        network: "test".to_owned(),
+        gripper: Gripper::built_in("jaws-85").unwrap(),
+        object: format!("object {number}"),
+        part: (number % 2 == 0).then(|| "handle".to_owned()),
+        time: 1_700_000_000 + number,
+        provenance: "a test".to_owned(),
+    }
+}
+
+fn feature(number: i64, angle: f64) -> Vec<f32> {
+    let mut random = ChaCha8Rng::seed_from_u64(number as u64 ^ angle.to_bits());
+    (0..FEATURE).map(|_| random.random_range(-1.0f32..1.0)).collect()
+}
+
+/// This test binary again, as a process of its own that does one thing.
+fn process(what: &str, file: &Path) -> Child {
+    Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "helper_process", "--nocapture", "--ignored"])
+        .env("SIXFOLD_HELPER", what)
+        .env("SIXFOLD_HELPER_FILE", file)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+#[test]
+#[ignore = "started by the other tests"]
+fn helper_process() {
+    let (Ok(what), Ok(file)) = (std::env::var("SIXFOLD_HELPER"), std::env::var("SIXFOLD_HELPER_FILE")) else {
+        return;
+    };
+    let file = PathBuf::from(file);
+    let mut out = std::io::stdout();
+    if what == "write" {
+        let mut store = SqliteStore::create(&file).unwrap();
+        let first = store.list().unwrap().len() as i64;
+        for number in first.. {
+            let (id, new) = store.add(&experience(number)).unwrap();
+            assert!(new);
+            // The acknowledgement leaves the process only after `add` has returned.
+            writeln!(out, "\nstored {number} {id}").unwrap();
+            out.flush().unwrap();
+        }
+    } else {
+        let store = SqliteStore::open(&file).unwrap();
+        let mut index = FeatureIndex::new("test");
+        let end = Instant::now() + Duration::from_secs(20);
+        while Instant::now() < end {
+            let before = index.len();
+            index.refresh(&store).unwrap();
+            assert!(index.len() >= before && index.len() % COPIES.len() == 0, "half an experience was seen");
+            writeln!(out, "\nread {}", index.len() / COPIES.len()).unwrap();
+            out.flush().unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+/// The numbers after a word in the lines that a process printed.
+fn said(text: &str, word: &str) -> Vec<Vec<i64>> {
+    text.lines()
+        .filter_map(|line| line.strip_prefix(word))
+        .filter_map(|rest| rest.split_whitespace().map(|n| n.parse().ok()).collect())
+        .collect()
+}
+
+#[test]
+fn nothing_acknowledged_is_lost_when_the_writer_is_killed() {
+    let kills: u64 = std::env::var("SIXFOLD_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(12);
+    let folder = tempfile::tempdir().unwrap();
+    let mut file = folder.path().join("experience.db");
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let mut acknowledged = 0;
+    let mut all = 0;
+    for kill in 0..kills {
+        // A new store now and then: its making is interrupted too, and lists stay short.
+        if kill % 25 == 0 {
+            file = folder.path().join(format!("experience-{kill}.db"));
+            acknowledged = 0;
+        }
+        let mut writer = process("write", &file);
+        std::thread::sleep(Duration::from_micros(random.random_range(0..120_000)));
+        writer.kill().unwrap();
+        let output = writer.wait_with_output().unwrap();
+        let rows = said(&String::from_utf8_lossy(&output.stdout), "stored ");
+        let last = rows.iter().filter(|r| r.len() == 2).map(|r| r[0] + 1).max();
+        let newly = last.unwrap_or(acknowledged) - acknowledged;
+        assert!(newly >= 0);
+        all += newly;
+        acknowledged = acknowledged.max(last.unwrap_or(0));
+        if !file.exists() {
+            assert_eq!(acknowledged, 0);
+            continue;
+        }
+        let store = SqliteStore::create(&file).unwrap();
+        store.check_integrity().unwrap();
+        let listed = store.list().unwrap();
+        let found = listed.len() as i64;
+        // One more may be there: it was stored, and the writer was killed before it could say so.
+        assert!(found == acknowledged || found == acknowledged + 1, "kill {kill}: {found} of {acknowledged}");
+        acknowledged = found;
+        if let Some(last) = listed.last() {
+            let stored = store.get(last.id).unwrap().unwrap().experience;
+            assert_eq!(stored.object, format!("object {}", found - 1));
+            assert_eq!(stored.copies[0].feature, feature(found - 1, 0.0));
+        }
+        assert_eq!(store.changes(Position::default()).unwrap().features.len(), COPIES.len() * found as usize);
+    }
+    println!("{kills} kills, {all} experiences acknowledged, none lost");
+    assert!(kills < 10 || all > 0, "the writer never got as far as storing anything");
+}
+
+#[test]
+fn two_processes_read_while_one_writes() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("experience.db");
+    SqliteStore::create(&file).unwrap();
+    let mut writer = process("write", &file);
+    let mut readers = [process("read", &file), process("read", &file)];
+    // Both readers hear of new experiences while the writer goes on.
+    for reader in &mut readers {
+        let lines = BufReader::new(reader.stdout.take().unwrap()).lines();
+        let mut counts: Vec<i64> = vec![];
+        for line in lines {
+            counts.extend(said(&line.unwrap(), "read ").iter().map(|r| r[0]));
+            counts.dedup();
+            if counts.len() > 4 {
+                break;
+            }
+        }
+        assert!(counts.len() > 4 && counts.is_sorted(), "{counts:?}");
+        assert!(writer.try_wait().unwrap().is_none(), "the writer goes on");
+    }
+    for mut child in readers.into_iter().chain([writer]) {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+}
+
+#[test]
+fn an_experience_comes_back_as_it_went_in() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = SqliteStore::create(&folder.path().join("a.db")).unwrap();
+    let mine = experience(4);
+    let (id, new) = store.add(&mine).unwrap();
+    assert!(new);
+    assert_eq!(store.add(&mine).unwrap(), (id, false), "the same experience keeps its number");
+    let back = store.get(id).unwrap().unwrap().experience;
+    assert_eq!((&back.region, &back.copies, &back.gripper), (&mine.region, &mine.copies, &mine.gripper));
+    assert_eq!((back.part.as_deref(), back.time), (Some("handle"), mine.time));
+    assert!(back.camera_from_gripper.distance_to(&mine.camera_from_gripper) < 1e-12);
+    assert_eq!(back.crop.mask, mine.crop.mask);
+    for i in mine.crop.pixels() {
+        // Depth in steps of 0.1 mm; the pixel's ray instead of the nearest pixel's.
+        assert!((back.crop.point(i) - mine.crop.point(i)).norm() < 2e-3);
+        assert!((0..3).all(|k| (back.crop.vd_noc[i][k] - mine.crop.vd_noc[i][k]).abs() < 0.01));
+    }
+}
+
+#[test]
+fn stores_are_merged_forgotten_and_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut a = SqliteStore::create(&folder.path().join("a.db")).unwrap();
+    let mut b = SqliteStore::create(&folder.path().join("b.db")).unwrap();
+    for number in 0..4 {
+        a.add(&experience(number)).unwrap();
+    }
+    for number in 2..6 {
+        b.add(&experience(number)).unwrap();
+    }
+    let mut index = FeatureIndex::new("test");
+    index.refresh(&a).unwrap();
+    assert_eq!(index.len(), 4 * COPIES.len());
+    assert_eq!(a.merge(&b).unwrap(), 2);
+    assert_eq!(a.merge(&b).unwrap(), 0);
+    assert!(a.forget(2).unwrap() && !a.forget(2).unwrap() && !a.forget(99).unwrap());
+    index.refresh(&a).unwrap();
+    assert_eq!(index.len(), 5 * COPIES.len());
+    let nearest = index.nearest(&feature(5, COPIES[1]), 1, |_| true)[0];
+    assert_eq!((nearest.experience, nearest.angle), (6, COPIES[1]));
+    assert!(nearest.distance < 1e-6);
+    assert!(index.nearest(&feature(1, 0.0), 3, |_| true).iter().all(|m| m.experience != 2));
+    // A number is never used twice.
+    a.forget(6).unwrap();
+    assert_eq!(a.add(&experience(50)).unwrap(), (7, true));
+    let mut other = FeatureIndex::new("another network");
+    other.refresh(&a).unwrap();
+    assert!(other.is_empty());
+}
+
+#[test]
+fn what_is_no_store_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("x.db");
+    let error = SqliteStore::open(&file).unwrap_err().to_string();
+    assert!(error.contains("x.db") && error.contains("no such file"), "{error}");
+    std::fs::write(&file, "not a database, but long enough to look like one to somebody who is in a hurry")
+        .unwrap();
+    let error = SqliteStore::open(&file).unwrap_err();
+    assert!(matches!(error, StoreError::NotAStore { .. }), "{error}");
+
+    let version = folder.path().join("version.db");
+    SqliteStore::create(&version).unwrap();
+    write_version(&version, 7);
+    let error = SqliteStore::open(&version).unwrap_err();
+    assert!(matches!(error, StoreError::Version { found: 7, expected: 1, .. }), "{error}");
+    assert!(SqliteStore::create(&version).is_err());
+
+    // Pages overwritten in the middle of the file.
+    let broken = folder.path().join("broken.db");
+    {
+        let mut store = SqliteStore::create(&broken).unwrap();
+        for number in 0..6 {
+            store.add(&experience(number)).unwrap();
+        }
+    }
+    let mut bytes = std::fs::read(&broken).unwrap();
+    let length = bytes.len();
+    assert!(length > 40_000, "the log is in the file once all connections are closed: {length}");
+    for page in 1..length / 4096 {
+        bytes[page * 4096..page * 4096 + 64].fill(0xA5);
+    }
+    std::fs::write(&broken, &bytes).unwrap();
+    let store = SqliteStore::open(&broken);
+    let error = store.and_then(|s| s.list().map(|_| s)).map(|s| s.check_integrity()).err();
+    let error = error.expect("a damaged store is noticed");
+    assert!(matches!(error, StoreError::Broken { .. }), "{error}");
+
+    // A disk with room for a few experiences only.
+    let full = folder.path().join("full.db");
+    let mut store = SqliteStore::create(&full).unwrap();
+    store.limit_size(300_000).unwrap();
+    let mut stored = 0;
+    let error = (0..200).find_map(|number| match store.add(&experience(number)) {
+        Ok(_) => {
+            stored += 1;
+            None
+        }
+        Err(error) => Some(error),
+    });
+    assert!(matches!(error, Some(StoreError::Full { .. })), "{error:?}");
+    assert!(stored > 0);
+    drop(store);
+    let store = SqliteStore::open(&full).unwrap();
+    store.check_integrity().unwrap();
+    assert_eq!(store.list().unwrap().len(), stored);
+}
+
+/// Writes another version into a store: the four bytes at offset 60 of a SQLite file.
+fn write_version(file: &Path, version: u32) {
+    let mut bytes = std::fs::read(file).unwrap();
+    bytes[60..64].copy_from_slice(&version.to_be_bytes());
+    std::fs::write(file, bytes).unwrap();
+}
