@@ -4,6 +4,8 @@ mod bad_input;
 mod dataset;
 mod detect;
 mod eval;
+#[cfg(all(feature = "experience", feature = "physics"))]
+mod experience;
 mod grasp;
 mod image;
 mod mttm;

@@ -66,7 +66,7 @@ pub(crate) struct LearnArguments {
     /// Try and store only grasps on parts of this name (made-up objects: handle of mug and drill)
     #[arg(long, value_name = "NAME")]
     pub part: Option<String>,
-    /// Stronger sensor noise, less friction and a heavier object, see `sixfold grasp compare --help`
+    /// Stronger sensor noise, an imprecise hand, less friction and a heavier object, see `sixfold grasp compare --help`
     #[arg(long)]
     pub hard: bool,
     #[command(flatten)]
@@ -200,7 +200,8 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
     if a.tries == 0 || a.attempts == 0 {
         bail!("--tries and --attempts: expected at least 1");
     }
-    let Hardness { gripper, options } = hardness(&a.physics, a.hard)?;
+    let setting = hardness(&a.physics, a.hard)?;
+    let Hardness { gripper, options, .. } = &setting;
     let network = model(&a.network)?;
     let pupils: Vec<Pupil> = if a.families.is_empty() {
         named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?
@@ -220,11 +221,11 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         hard: a.hard,
         seed: a.seed,
         network: network.fingerprint(),
-        gripper: &gripper,
+        gripper: &setting.real,
     };
     let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
     let mut memory = new_memory(&a.experiences, &network)?;
-    let mut robot = Robot { a, gripper, options, network, memory: &mut memory };
+    let mut robot = Robot { a, setting: &setting, gripper, options, network, memory: &mut memory };
     let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
     for pupil in &pupils {
         let done =
@@ -300,15 +301,16 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
 
 struct Robot<'a> {
     a: &'a LearnArguments,
-    gripper: Gripper,
-    options: AttemptOptions,
+    setting: &'a Hardness,
+    gripper: &'a Gripper,
+    options: &'a AttemptOptions,
     network: DgcmModel,
     memory: &'a mut Memory,
 }
 
 impl Robot<'_> {
     fn attempt(&mut self, pupil: &Pupil, parts: &ConvexParts, attempt: u64) -> Result<Row> {
-        let scene = scene(&pupil.mesh, parts, &self.options, self.a.seed, attempt);
+        let scene = scene(&pupil.mesh, parts, self.options, self.a.seed, attempt);
         let mut row = Row {
             object: pupil.name.clone(),
             class: pupil.class.clone(),
@@ -322,7 +324,7 @@ impl Robot<'_> {
         };
         let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
         let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
-        let mut geometry = antipodal_grasps(view, &self.gripper, &planner)?;
+        let mut geometry = antipodal_grasps(view, self.gripper, &planner)?;
         let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
         let on_part = |grasp: &Grasp| {
             self.a.part.is_none() || pupil.part(&camera_from_object, grasp) == self.a.part.as_deref()
@@ -335,7 +337,7 @@ impl Robot<'_> {
             self.memory.refresh()?;
             let options =
                 ProposeOptions { judge: planner, part: self.a.part.clone(), ..ProposeOptions::default() };
-            let found = propose(view, &self.gripper, &self.network, self.memory, &options)?;
+            let found = propose(view, self.gripper, &self.network, self.memory, &options)?;
             row.nearest = found.nearest.first().map(|m| m.distance);
             if row.nearest.is_some_and(|d| d < self.a.near) {
                 proposals = found.proposals;
@@ -344,13 +346,14 @@ impl Robot<'_> {
         row.from_experience = !proposals.is_empty();
         let ranked = rank(&geometry, &proposals, &ClusterOptions::default());
         for (number, candidate) in ranked.iter().take(self.a.tries).enumerate() {
-            let world_from_gripper = seen.world_from_camera * candidate.grasp.camera_from_gripper;
+            let sent = seen.world_from_camera * candidate.grasp.camera_from_gripper;
+            let reached = self.setting.reached(&sent, scene.noise);
             let opening = candidate.grasp.opening;
             let tried = try_grasp(
                 parts,
                 &scene.world_from_object,
-                &self.gripper,
-                &world_from_gripper,
+                &self.setting.real,
+                &reached,
                 opening,
                 &self.options.trial,
             )?;

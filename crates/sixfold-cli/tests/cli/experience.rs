@@ -1,0 +1,133 @@
+//! Grasps from experience: `sixfold train dgcm`, `sixfold grasp store`, `sixfold grasp learn`, `sixfold grasp propose
+//! --experiences`, `sixfold grasp compare`.
+
+use std::fs;
+use std::path::Path;
+
+use sixfold_bop::write_mask;
+use sixfold_render::render_depth;
+
+use crate::support::*;
+
+const VIEW: &str = "grasp propose --depth depth.png --camera camera.json --mask mask.png";
+
+/// An object on a table, and a network that has learned next to nothing: what is stored and found does not depend on it.
+fn folder() -> OneImage {
+    let case = OneImage::new();
+    let alone = render_depth(&part(), &case.truth, &camera());
+    write_mask(&case.path().join("mask.png"), &alone.map(|&z| z > 0.0)).unwrap();
+    let run = sixfold(case.path(), "train dgcm --views 64 --steps 2 --pairs 2 --out net --json").expect(0);
+    assert_eq!(run.json()["steps"], 2);
+    fs::rename(case.path().join("net/model.safetensors"), case.path().join("w.safetensors")).unwrap();
+    case
+}
+
+fn add(folder: &Path, file: &str, more: &str) -> Run {
+    let command = format!(
+        "grasp store add {file} --depth depth.png --camera camera.json --mask mask.png --grasp out/grasps.json --object part --weights w.safetensors {more} --json"
+    );
+    sixfold(folder, &command)
+}
+
+#[test]
+fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
+    let case = folder();
+    let path = case.path();
+    sixfold(path, &format!("{VIEW} --out out")).expect(0);
+    let first = add(path, "a.db", "--part handle").expect(0).json();
+    assert_eq!((first["id"].as_i64(), first["new"].as_bool()), (Some(1), Some(true)));
+    assert_eq!(add(path, "a.db", "--part handle").expect(0).json()["new"], false);
+    add(path, "b.db", "--number 2").expect(0);
+
+    let found =
+        sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --json")).expect(0).json();
+    assert_eq!(found["method"], "antipodal and dgcm");
+    let of_experience = found["grasps"][0]["experience"]["share"].as_f64().unwrap();
+    assert!(of_experience > 0.0, "the object itself is stored: {found}");
+    let part = format!("{VIEW} --experiences a.db --weights w.safetensors --part");
+    let handle = sixfold(path, &format!("{part} handle --json")).expect(0).json();
+    let grasps = handle["grasps"].as_array().unwrap();
+    assert!(grasps.iter().all(|g| g["experience"]["kind"] == "experience" && g["experience"]["id"] == 1));
+    let lid = sixfold(path, &format!("{part} lid")).expect(1);
+    assert!(lid.stderr.contains("no experience on a part named lid"), "{}", lid.stderr);
+
+    let merged = sixfold(path, "grasp store merge a.db b.db --json").expect(0).json();
+    assert_eq!((merged["added"].as_i64(), merged["experiences"].as_i64()), (Some(1), Some(2)));
+    sixfold(path, "grasp store merge a.db b.db").expect(1);
+    sixfold(path, "grasp store show a.db 1 --picture shown.png").expect(0);
+    assert!(fs::metadata(path.join("shown.png")).unwrap().len() > 2000);
+    sixfold(path, "grasp store export a.db --out files").expect(0);
+    let text = fs::read_to_string(path.join("files/000001.json")).unwrap();
+    let exported: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(exported["part"], "handle");
+    assert_eq!(exported["feature"].as_array().unwrap().len(), 256);
+    let again = "grasp store refresh a.db --out c.db --weights w.safetensors --json";
+    assert_eq!(sixfold(path, again).expect(0).json()["experiences"], 2);
+    sixfold(path, "grasp store forget a.db 1 2").expect(0);
+    sixfold(path, "grasp store list a.db").expect(1);
+    sixfold(path, "grasp store forget a.db 1").expect(1);
+}
+
+#[test]
+fn a_hand_learns_goes_on_and_is_compared() {
+    let case = folder();
+    let path = case.path();
+    let learn = "grasp learn --experiences e.db --object part.ply --unit mm --attempts 3 --tries 3 --near 9 --weights w.safetensors --out learn --json";
+    let first = sixfold(path, learn).expect(0).json();
+    assert_eq!(first["attempts"], 3);
+    let held = first["held"].as_i64().unwrap();
+    assert!(held >= 1);
+    assert_eq!(first["experiences"].as_i64(), Some(held));
+    // From the second success on there is experience, and near is far enough for all of it.
+    assert!(first["from_experience"].as_i64().unwrap() >= 1, "{first}");
+    // Nothing is left to do; a line that was cut off is done again.
+    let journal = path.join("learn/attempts.jsonl");
+    let text = fs::read_to_string(&journal).unwrap();
+    fs::write(&journal, &text[..text.len() - 20]).unwrap();
+    let second = sixfold(path, learn).expect(0).json();
+    assert_eq!(second["attempts"], 3);
+    fails(path, &learn.replace("--attempts 3", "--attempts 4"), &["attempts.jsonl", "other options"]);
+
+    let compare = "grasp compare --experiences e.db --object part.ply --unit mm --trials 2 --weights w.safetensors --out compare --json";
+    let table = sixfold(path, compare);
+    assert!(table.code <= 1, "{}", table.stderr);
+    let table = table.json();
+    assert_eq!(table["classes"][0]["trials"], 2);
+    assert!(
+        path.join("compare/part-0-both.png").exists() || path.join("compare/part-ply-0-both.png").exists()
+    );
+    assert_eq!(sixfold(path, compare).json()["classes"], table["classes"]);
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let case = folder();
+    let path = case.path();
+    sixfold(path, &format!("{VIEW} --out out")).expect(0);
+    fails(path, "grasp store list none.db", &["none.db", "no such file"]);
+    fs::write(
+        path.join("text.db"),
+        "not a database, but long enough to look like one to somebody in a hurry",
+    )
+    .unwrap();
+    fails(path, "grasp store list text.db", &["text.db", "expected an experience store"]);
+    fails(
+        path,
+        "grasp store add a.db --depth depth.png --camera camera.json --grasp out/grasps.json --object a --weights none",
+        &["--weights", "sixfold train dgcm"],
+    );
+    let command = format!("{VIEW} --experiences text.db --weights w.safetensors");
+    fails(path, &command, &["text.db"]);
+    let run = add(path, "a.db", "--number 99");
+    assert_eq!(run.code, 2);
+    assert!(run.stderr.contains("--number: found 99"), "{}", run.stderr);
+    let far = r#"{"camera_from_gripper": [[1,0,0,5],[0,1,0,0],[0,0,1,1],[0,0,0,1]], "opening": 0.05, "width": 0.03}"#;
+    fs::write(path.join("far.json"), far).unwrap();
+    let command = "grasp store add a.db --depth depth.png --camera camera.json --mask mask.png --grasp far.json --object a --weights w.safetensors";
+    fails(path, command, &["far.json", "nowhere near the object"]);
+    fs::write(path.join("far.json"), far.replace("0.05", "-1")).unwrap();
+    fails(path, command, &["far.json", "opening"]);
+    let learn = "grasp learn --experiences e.db --weights w.safetensors --out learn";
+    fails(path, &format!("{learn} --families chair"), &["--families", "chair", "mug"]);
+    fails(path, "train dgcm --views 3 --out x", &["--views", "64"]);
+}
