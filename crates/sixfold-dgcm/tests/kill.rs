@@ -83,7 +83,10 @@ fn helper_process() {
         while Instant::now() < end {
             let before = index.len();
             index.refresh(&store).unwrap();
-            assert!(index.len() >= before && index.len() % COPIES.len() == 0, "half an experience was seen");
+            assert!(
+                index.len() >= before && index.len().is_multiple_of(COPIES.len()),
+                "half an experience was seen"
+            );
             writeln!(out, "\nread {}", index.len() / COPIES.len()).unwrap();
             out.flush().unwrap();
             std::thread::sleep(Duration::from_millis(5));

@@ -47,6 +47,7 @@ fn half(map: &Tensor<4>) -> Tensor<4> {
 
 /// One of the networks.
 #[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant)]
 pub enum Network {
     /// For two processor cores.
     Compact(Compact),

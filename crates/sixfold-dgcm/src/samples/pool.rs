@@ -210,7 +210,7 @@ fn view(
     let side = ((options.crop.size + 0.14) * FOCAL / distance).ceil() as usize;
     let centre = 0.5 * (side as f64 - 1.0);
     let camera = Camera::new(FOCAL, FOCAL, centre, centre, side, side).ok()?;
-    let objects = [SceneObject { mesh: &**mesh, camera_from_object }];
+    let objects = [SceneObject { mesh, camera_from_object }];
     let mut frame = Frame::new(&camera);
     frame.render(&objects, &RenderOptions { parallel: false, ..RenderOptions::default() });
     let surfaces = frame.surfaces(&objects);

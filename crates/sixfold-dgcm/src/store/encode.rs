@@ -111,6 +111,12 @@ pub(super) fn pose(pose: &Pose) -> Vec<u8> {
     (0..16).flat_map(|i| m[(i / 4, i % 4)].to_le_bytes()).collect()
 }
 
+/// A pose to the micrometre, which reading and writing do not change.
+pub(super) fn rounded(pose: &Pose) -> Vec<u8> {
+    let m = pose.to_matrix();
+    (0..12).flat_map(|i| ((m[(i / 4, i % 4)] * 1e6).round() as i64).to_le_bytes()).collect()
+}
+
 pub(super) fn from_pose(bytes: &[u8]) -> Option<Pose> {
     let numbers = doubles(bytes);
     (numbers.len() == 16)

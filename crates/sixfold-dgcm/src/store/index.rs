@@ -1,18 +1,20 @@
 //! The nearest experiences to a feature, exactly, over a copy of all features in memory.
 //!
-//! In 256 dimensions a tree finds nothing faster than looking at everything. Everything is looked at twice: first in 8-bit
-//! numbers, a quarter of the memory to read, which gives each distance within known bounds; then the few that may be among
-//! the nearest in full. The result is the same as of a plain search.
+//! In 256 dimensions a tree finds nothing faster than looking at everything. Everything is looked at in whole numbers of 16
+//! bits first, whose distances are off by a known bound; most rows are given up after a quarter of their numbers. The few
+//! that may be among the nearest are then compared in full. The result is the same as of a plain search.
 
 use rayon::prelude::*;
 
 use super::{ExperienceStore, Position, StoreError};
 use crate::networks::FEATURE;
 
-/// Steps of the 8-bit numbers for values from -1 to 1.
-const STEPS: f32 = 127.0;
-/// No 8-bit feature is further than this from its own: half a step in every dimension.
-const ROUNDING: f32 = 0.5 / STEPS * 16.0;
+/// Steps of the whole numbers from 0 to 1. 256 squared differences of twice this fit into 32 bits.
+const STEPS: f32 = 1024.0;
+/// No feature in whole numbers is further than this from its own: half a step in every dimension.
+const ROUNDING: f64 = 0.5 / STEPS as f64 * 16.0;
+/// Numbers of a row after which it may be given up.
+const FIRST: usize = 64;
 /// Features that one task looks at.
 const BLOCK: usize = 2048;
 
@@ -34,7 +36,7 @@ pub struct FeatureIndex {
     /// Experience and angle of every feature.
     owners: Vec<(i64, f64)>,
     exact: Vec<f32>,
-    coarse: Vec<i8>,
+    coarse: Vec<i16>,
     position: Position,
 }
 
@@ -90,7 +92,7 @@ impl FeatureIndex {
     /// Adds one feature.
     ///
     /// # Panics
-    /// If it has not 256 numbers.
+    /// If it has not 256 numbers. They lie between -1 and 1, as the networks' do; others are found as if they did.
     pub fn insert(&mut self, experience: i64, angle: f64, feature: &[f32]) {
         assert_eq!(feature.len(), FEATURE);
         self.owners.push((experience, angle));
@@ -104,25 +106,37 @@ impl FeatureIndex {
         if count == 0 || self.is_empty() || feature.len() != FEATURE {
             return vec![];
         }
-        let query: Vec<i8> = feature.iter().map(|v| quantise(*v)).collect();
-        let coarse: Vec<f32> = self
+        let query: Vec<i16> = feature.iter().map(|v| quantise(*v)).collect();
+        // Whatever is further than the count-th nearest of its block, and than both rounding errors, is not among the nearest.
+        let mut candidates: Vec<(usize, i32)> = self
             .coarse
             .par_chunks(BLOCK * FEATURE)
-            .flat_map_iter(|block| block.chunks_exact(FEATURE).map(|row| coarse_distance(row, &query)))
+            .enumerate()
+            .flat_map_iter(|(block, rows)| {
+                let mut near = Nearest::new(count);
+                for (i, row) in rows.chunks_exact(FEATURE).enumerate() {
+                    let first = squared(&row[..FIRST], &query[..FIRST]);
+                    if first > near.limit {
+                        continue;
+                    }
+                    let all = first + squared(&row[FIRST..], &query[FIRST..]);
+                    let number = block * BLOCK + i;
+                    if all <= near.limit && wanted(self.owners[number].0) {
+                        near.take(number, all);
+                    }
+                }
+                near.candidates
+            })
             .collect();
-        // The count-th smallest upper bound: whatever has a larger lower bound is not among the nearest.
-        let mut bounds: Vec<f32> =
-            coarse.iter().zip(&self.owners).filter(|(_, o)| wanted(o.0)).map(|(d, _)| *d).collect();
-        if bounds.is_empty() {
+        let mut distances: Vec<i32> = candidates.iter().map(|c| c.1).collect();
+        if distances.is_empty() {
             return vec![];
         }
-        let last = count.min(bounds.len()) - 1;
-        let (_, kth, _) = bounds.select_nth_unstable_by(last, f32::total_cmp);
-        let limit = *kth + 4.0 * ROUNDING + 1e-3;
-        let mut found: Vec<(usize, f64)> = coarse
-            .iter()
-            .enumerate()
-            .filter(|(i, d)| **d <= limit && wanted(self.owners[*i].0))
+        let last = count.min(distances.len()) - 1;
+        let limit = reach(*distances.select_nth_unstable(last).1);
+        candidates.retain(|c| c.1 <= limit);
+        let mut found: Vec<(usize, f64)> = candidates
+            .into_iter()
             .map(|(i, _)| {
                 let row = &self.exact[i * FEATURE..(i + 1) * FEATURE];
                 let sum: f64 = row.iter().zip(feature).map(|(a, b)| f64::from(a - b).powi(2)).sum();
@@ -138,21 +152,51 @@ impl FeatureIndex {
     }
 }
 
-fn quantise(v: f32) -> i8 {
-    (v * STEPS).round().clamp(-127.0, 127.0) as i8
+/// The candidates of a block.
+struct Nearest {
+    count: usize,
+    /// The smallest squared distances so far, smallest first, `count` at most.
+    best: Vec<i32>,
+    /// What is further than this cannot be among the nearest.
+    limit: i32,
+    candidates: Vec<(usize, i32)>,
 }
 
-/// Distance of two 8-bit features in the units of the full ones.
-fn coarse_distance(a: &[i8], b: &[i8]) -> f32 {
-    let sum: i32 = a
-        .iter()
+impl Nearest {
+    fn new(count: usize) -> Nearest {
+        Nearest { count, best: vec![], limit: i32::MAX, candidates: vec![] }
+    }
+
+    fn take(&mut self, number: usize, distance: i32) {
+        self.candidates.push((number, distance));
+        let place = self.best.partition_point(|d| *d <= distance);
+        self.best.insert(place, distance);
+        self.best.truncate(self.count);
+        if self.best.len() == self.count {
+            self.limit = reach(self.best[self.count - 1]);
+        }
+    }
+}
+
+/// The largest squared distance in whole numbers of a feature that may still be nearer than one at `squared`.
+fn reach(squared: i32) -> i32 {
+    let distance = f64::from(squared).sqrt() + 4.0 * ROUNDING * f64::from(STEPS) + 1.0;
+    (distance * distance).min(f64::from(i32::MAX)) as i32
+}
+
+fn quantise(v: f32) -> i16 {
+    (v * STEPS).round().clamp(-STEPS, STEPS) as i16
+}
+
+/// Squared distance of two rows of whole numbers.
+fn squared(a: &[i16], b: &[i16]) -> i32 {
+    a.iter()
         .zip(b)
         .map(|(a, b)| {
-            let d = i16::from(*a) - i16::from(*b);
+            let d = a.wrapping_sub(*b);
             i32::from(d) * i32::from(d)
         })
-        .sum();
-    (sum as f32).sqrt() / STEPS
+        .sum()
 }
 
 #[cfg(test)]

@@ -317,7 +317,7 @@ impl ExperienceStore for SqliteStore {
         let key = encode::key(&[
             &images.depth,
             &images.vd_noc,
-            &encode::pose(&e.camera_from_gripper),
+            &encode::rounded(&e.camera_from_gripper),
             &e.opening.to_le_bytes(),
             e.object.as_bytes(),
             e.part.as_deref().unwrap_or_default().as_bytes(),

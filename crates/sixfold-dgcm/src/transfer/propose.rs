@@ -189,6 +189,7 @@ fn place(
     let closing = source.grasp.transform_direction(&Vec3::x()).map(f64::abs);
     let scale = (t.scale.dot(&closing.component_mul(&closing))).clamp(0.5, 2.0);
     let widths = [source.width, source.width * scale];
+    let expected = widths.map(|w| w.max(0.002));
     let mut openings: Vec<f64> = widths
         .iter()
         .map(|w| w + room)
@@ -208,7 +209,13 @@ fn place(
                 let moved = back + f64::abs(shift) + 0.05 * angle.abs();
                 for &opening in &openings {
                     if let Some(grasp) = fitter.fit(&pose, opening) {
-                        let value = grasp.quality.total() * (-moved / 0.03).exp();
+                        // Something much wider or thinner is another part of the object.
+                        let other = expected.iter().map(|w| (grasp.width / w).ln().abs());
+                        let other = other.fold(f64::INFINITY, f64::min);
+                        if other > OTHER_PART.ln() {
+                            continue;
+                        }
+                        let value = grasp.quality.total() * (-moved / 0.03 - other).exp();
                         if best.as_ref().is_none_or(|b| value > b.0) {
                             best = Some((value, grasp, moved));
                         }
@@ -224,6 +231,9 @@ fn place(
     }
     best.map(|(_, grasp, moved)| (grasp, moved, true)).or(loose.map(|(grasp, moved)| (grasp, moved, false)))
 }
+
+/// Contacts that are this many times as far apart as in the experience, or as little, are on another part.
+const OTHER_PART: f64 = 2.2;
 
 /// Moves a grasp along its approach until its tips reach over the object as far as they did in the experience.
 fn stand_off(fitter: &GraspFitter<'_>, gripper: &Gripper, source: &Source<'_>, pose: &Pose) -> Pose {

@@ -194,7 +194,7 @@ struct Curve {
 }
 
 pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
-    if !(a.near >= 0.0) {
+    if a.near.is_nan() || a.near < 0.0 {
         bail!("--near: found {}, expected 0 or more", a.near);
     }
     if a.tries == 0 || a.attempts == 0 {
@@ -385,7 +385,7 @@ impl Robot<'_> {
         let part = known.or(self.a.part.as_deref());
         let provenance = format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, self.a.seed);
         let experience =
-            Experience::new(&self.network, crop, grasp, &self.gripper, &pupil.name, part, now(), &provenance);
+            Experience::new(&self.network, crop, grasp, self.gripper, &pupil.name, part, now(), &provenance);
         let (id, _) = self.memory.store().add(&experience)?;
         self.memory.refresh()?;
         Ok(Some(id))

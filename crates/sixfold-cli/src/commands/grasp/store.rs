@@ -207,10 +207,7 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
 fn list(file: &Path, json: &JsonArguments) -> Result<Outcome> {
     let all = SqliteStore::open(file)?.list()?;
     report(json, &all, || {
-        println!(
-            "{:>6} {:>12} {:>10} {:>10} {:>10} {}",
-            "id", "object", "part", "gripper", "width (m)", "from"
-        );
+        println!("{:>6} {:>12} {:>10} {:>10} {:>10} from", "id", "object", "part", "gripper", "width (m)");
         for s in &all {
             let part = s.part.as_deref().unwrap_or("-");
             println!(
