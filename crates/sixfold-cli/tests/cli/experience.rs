@@ -42,8 +42,11 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     let found =
         sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --json")).expect(0).json();
     assert_eq!(found["method"], "antipodal and dgcm");
-    let of_experience = found["grasps"][0]["experience"]["share"].as_f64().unwrap();
-    assert!(of_experience > 0.0, "the object itself is stored: {found}");
+    let share = |grasp: &serde_json::Value| grasp["experience"]["share"].as_f64().unwrap();
+    assert!(
+        found["grasps"].as_array().unwrap().iter().any(|g| share(g) > 0.0),
+        "the object itself is stored: {found}"
+    );
     let part = format!("{VIEW} --experiences a.db --weights w.safetensors --part");
     let handle = sixfold(path, &format!("{part} handle --json")).expect(0).json();
     let grasps = handle["grasps"].as_array().unwrap();

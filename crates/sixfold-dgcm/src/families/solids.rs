@@ -44,22 +44,17 @@ impl Builder {
             }
         }
         for row in 0..fine.len().saturating_sub(1) {
-            self.band(first + row * sides, first + (row + 1) * sides, sides, true);
+            self.band(first + row * sides, first + (row + 1) * sides, sides);
         }
     }
 
-    /// Faces between two rings of vertices. `outwards`: the rings run to the right when seen from outside with the first one
-    /// below.
-    fn band(&mut self, below: usize, above: usize, sides: usize, outwards: bool) {
+    /// Faces between two rings of vertices that run to the right when seen from outside with the first one below.
+    fn band(&mut self, below: usize, above: usize, sides: usize) {
         for k in 0..sides {
             let next = (k + 1) % sides;
             let [a, b, c, d] = [below + k, below + next, above + next, above + k].map(|i| i as u32);
             // Faces on an axis have no area, but they keep the count.
-            if outwards {
-                self.faces.extend([[a, b, c], [a, c, d]]);
-            } else {
-                self.faces.extend([[a, c, b], [a, d, c]]);
-            }
+            self.faces.extend([[a, b, c], [a, c, d]]);
         }
     }
 
@@ -108,10 +103,9 @@ impl Builder {
             }
         }
         for i in 0..n - 1 {
-            // across, side and along are right-handed in the order across x side = -along.
-            self.band(first + i * sides, first + (i + 1) * sides, sides, false);
+            self.band(first + i * sides, first + (i + 1) * sides, sides);
         }
-        for (ring, end, outwards) in [(first, path[0], true), (first + (n - 1) * sides, path[n - 1], false)] {
+        for (ring, end, outwards) in [(first, path[0], false), (first + (n - 1) * sides, path[n - 1], true)] {
             let centre = self.vertices.len() as u32;
             self.vertices.push(end);
             for k in 0..sides {

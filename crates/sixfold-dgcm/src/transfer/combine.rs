@@ -56,7 +56,8 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
         .chain(experience.iter().enumerate().map(|(i, p)| (&p.grasp, Kind::Experience, Some(i))));
     let mut ranked: Vec<Ranked> = candidates
         .map(|(grasp, kind, proposal)| {
-            let agreeing: f64 = experience.iter().filter(|p| near(grasp, &p.grasp)).map(|p| p.score).sum();
+            let agreeing =
+                experience.iter().filter(|p| near(grasp, &p.grasp)).fold(0.0, |sum, p| sum + p.score);
             let experience_share = if all > 0.0 { agreeing / all } else { 0.0 };
             let quality = grasp.quality.total() / best;
             let score = match (geometry.is_empty(), experience.is_empty()) {
