@@ -3,7 +3,7 @@
 //!
 //! The dissertation trains on scanned objects whose axes are stretched at random (section 6.2.2). Here the members of a
 //! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
-//! another ([`solids`]). Real objects are thereby all held out.
+//! another (`solids.rs`). Real objects are thereby all held out.
 
 mod solids;
 
