@@ -92,9 +92,10 @@ pub(crate) fn options(a: &EstimateArguments, instances: usize, min_score: f64) -
 
 /// What template matching has no use for.
 pub(crate) fn check(a: &EstimateArguments) -> Result<()> {
-    if a.weights.is_some() || a.object_id.is_some() || a.icp || a.detector.is_some() || a.no_refine {
+    let pix2pose = a.weights.is_some() || a.object_id.is_some() || a.icp || a.no_refine || a.looks.is_some();
+    if pix2pose || a.detector.is_some() {
         bail!(
-            "--weights, --object-id, --icp, --no-refine and --detector belong to --method pix2pose; template matching needs \
+            "--weights, --object-id, --icp, --no-refine, --looks and --detector belong to --method pix2pose; template matching needs \
              none of them"
         );
     }
