@@ -164,7 +164,7 @@ mod tests {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
         let depth = DepthImage::from_fn(640, 480, |x, y| match (x, y) {
             (100..200, 300..380) => 0.6,
-            (400..450, 100..150) => 1.2,
+            (400..450, 100..150) => 1.0,
             _ => 0.5 / (0.3 + 0.001 * y as f32),
         });
         Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap()
@@ -176,7 +176,7 @@ mod tests {
         let options = ProposalOptions::default();
         let rois = propose(&scene, 0.1, &options);
         assert!(!rois.is_empty() && rois.len() <= options.most, "{}", rois.len());
-        for (pixel, z) in [(Vec2::new(150.0, 340.0), 0.6), (Vec2::new(425.0, 125.0), 1.2)] {
+        for (pixel, z) in [(Vec2::new(150.0, 340.0), 0.6), (Vec2::new(425.0, 125.0), 1.0)] {
             let p = scene.camera().unproject(&pixel, z);
             let nearest = rois.iter().map(|r| (r.centre - p).norm()).fold(f64::INFINITY, f64::min);
             assert!(nearest < 0.1 * options.step * 1.2, "{nearest}");
