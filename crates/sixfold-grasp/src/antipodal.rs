@@ -137,17 +137,7 @@ fn search(
     if object.cloud.is_empty() || object.cloud.normals.len() != object.cloud.len() {
         return vec![];
     }
-    let planner = Planner {
-        gripper,
-        options,
-        down: view.table.map_or_else(Vec3::z, |t| -t.normal),
-        centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
-        tree: KdTree::new(&object.cloud.points),
-        scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
-        object,
-        cone: gripper.friction.atan(),
-        step: view.step,
-    };
+    let planner = Planner::new(view, gripper, object, options);
     let mut grasps = vec![];
     for round in 0..options.rounds {
         if round > 0 && grasps.len() >= options.enough {
@@ -182,7 +172,26 @@ pub(crate) struct Planner<'a> {
     pub step: f64,
 }
 
-impl Planner<'_> {
+impl<'a> Planner<'a> {
+    pub fn new(
+        view: &GraspView,
+        gripper: &'a Gripper,
+        object: CompletedObject,
+        options: &'a AntipodalOptions,
+    ) -> Planner<'a> {
+        Planner {
+            gripper,
+            options,
+            down: view.table.map_or_else(Vec3::z, |t| -t.normal),
+            centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
+            tree: KdTree::new(&object.cloud.points),
+            scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
+            object,
+            cone: gripper.friction.atan(),
+            step: view.step,
+        }
+    }
+
     /// All grasps from one first contact.
     fn sample(&self, random: &mut ChaCha8Rng) -> Vec<Grasp> {
         let cloud = &self.object.cloud;

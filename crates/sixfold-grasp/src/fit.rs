@@ -1,12 +1,12 @@
 //! A grasp that comes from elsewhere (transferred from experience, or from a person), fitted to what is seen: the object
 //! brought midway between the pads, tested for collision, its contacts judged as the planner judges its own.
 
-use sixfold_geometry::{KdTree, Pose, Vec3};
+use sixfold_geometry::Pose;
 
 use crate::antipodal::Planner;
 use crate::{
-    AntipodalOptions, AntipodalQuality, CollisionScene, CompletedObject, Grasp, GraspView, Gripper,
-    OptionsError, complete_by_mirrors,
+    AntipodalOptions, AntipodalQuality, CompletedObject, Grasp, GraspView, Gripper, OptionsError,
+    complete_by_mirrors,
 };
 
 /// Fits grasps to the object of a view.
@@ -31,18 +31,7 @@ impl<'a> GraspFitter<'a> {
                 CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] }
             }
         };
-        let planner = Planner {
-            gripper,
-            options,
-            down: view.table.map_or_else(Vec3::z, |t| -t.normal),
-            centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
-            tree: KdTree::new(&object.cloud.points),
-            scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
-            object,
-            cone: gripper.friction.atan(),
-            step: view.step,
-        };
-        Ok(GraspFitter { planner })
+        Ok(GraspFitter { planner: Planner::new(view, gripper, object, options) })
     }
 
     /// The grasp at about this pose, moved along the closing direction so that the object is midway between the pads;

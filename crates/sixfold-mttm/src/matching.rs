@@ -216,7 +216,7 @@ fn chosen_points(template: &Template, size: f64) -> Vec<Chosen> {
     let mut chosen = vec![];
     for (i, &[x, y]) in pixels.iter().enumerate() {
         let row = (y as f64 / spacing) as usize;
-        let column = (x as f64 / spacing + if row % 2 == 0 { 0.0 } else { 0.5 }) as usize;
+        let column = (x as f64 / spacing + if row.is_multiple_of(2) { 0.0 } else { 0.5 }) as usize;
         if taken.insert((row, column)) {
             chosen.push(Chosen {
                 place: [x as f64 - centre, y as f64 - centre],

@@ -7,6 +7,8 @@ use clap::{Args, Subcommand};
 #[cfg(feature = "physics")]
 use sixfold_mesh::Unit;
 
+#[cfg(feature = "physics")]
+use super::object_list::ObjectsArguments;
 use crate::arguments::JsonArguments;
 
 #[derive(Debug, Args)]
@@ -51,6 +53,7 @@ pub(crate) enum GraspCommand {
     Compare(Box<super::compare::CompareArguments>),
     /// The store of experiences: add, list, show, forget, merge, export, refresh
     #[cfg(feature = "experience")]
+    #[command(after_help = "Example:\n  sixfold grasp store list experience.db")]
     Store(Box<super::store::StoreArguments>),
 }
 
@@ -180,18 +183,8 @@ pub(crate) struct TryArguments {
 #[cfg(feature = "physics")]
 #[derive(Debug, Args)]
 pub(crate) struct MeasureArguments {
-    /// Objects: mesh files, or names of stored objects; each is a class of its own
-    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., required_unless_present = "list")]
-    pub objects: Vec<String>,
-    /// Unit of the mesh files: m, cm, mm, in
-    #[arg(long, value_name = "UNIT")]
-    pub unit: Option<Unit>,
-    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm", "up": "z"}, ...]
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
-    pub list: Option<PathBuf>,
-    /// Folder that the list's meshes are in (default: the list's own)
-    #[arg(long, value_name = "DIR", requires = "list")]
-    pub meshes: Option<PathBuf>,
+    #[command(flatten)]
+    pub objects: ObjectsArguments,
     /// Attempts on each object
     #[arg(long, value_name = "N", default_value = "15")]
     pub trials: NonZeroUsize,
@@ -209,9 +202,6 @@ pub(crate) struct MeasureArguments {
     /// Seed of poses, view points, noise and the planner
     #[arg(long, default_value = "0")]
     pub seed: u64,
-    /// Folder of stored objects
-    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
-    pub store: PathBuf,
     #[command(flatten)]
     pub json: JsonArguments,
 }

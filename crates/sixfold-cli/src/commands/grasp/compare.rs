@@ -13,7 +13,7 @@ use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank};
 use sixfold_geometry::Pose;
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Gripper, antipodal_grasps, draw_grasps};
-use sixfold_mesh::{Mesh, Unit};
+use sixfold_mesh::Mesh;
 use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{
@@ -24,7 +24,7 @@ use super::arguments::PhysicsArguments;
 use super::experience::{NetworkArguments, memory, model};
 use super::journal::Journal;
 use super::measure::ending_name;
-use super::object_list::{file_name, named_objects};
+use super::object_list::{ObjectsArguments, file_name, named_objects};
 use super::try_one::physics;
 use crate::Outcome;
 use crate::arguments::JsonArguments;
@@ -42,18 +42,8 @@ pub(crate) struct CompareArguments {
     /// The store of experiences
     #[arg(long, value_name = "FILE")]
     pub experiences: PathBuf,
-    /// Objects: mesh files, or names of stored objects; each is a class of its own
-    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., required_unless_present = "list")]
-    pub objects: Vec<String>,
-    /// Unit of the mesh files: m, cm, mm, in
-    #[arg(long, value_name = "UNIT")]
-    pub unit: Option<Unit>,
-    /// List of objects, as for `sixfold grasp measure`
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
-    pub list: Option<PathBuf>,
-    /// Folder that the list's meshes are in (default: the list's own)
-    #[arg(long, value_name = "DIR", requires = "list")]
-    pub meshes: Option<PathBuf>,
+    #[command(flatten)]
+    pub objects: ObjectsArguments,
     /// Scenes of each object
     #[arg(long, value_name = "N", default_value = "15")]
     pub trials: u64,
@@ -71,9 +61,6 @@ pub(crate) struct CompareArguments {
     /// Seed of poses, view points, noise and the planner
     #[arg(long, default_value = "0")]
     pub seed: u64,
-    /// Folder of stored objects
-    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
-    pub store: PathBuf,
     #[command(flatten)]
     pub json: JsonArguments,
 }
@@ -189,7 +176,7 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
     let Hardness { gripper, real, options, .. } = &setting;
     let network = model(&a.network)?;
     let mut memory = memory(&a.experiences, &network)?;
-    let objects = named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?;
+    let objects = named_objects(&a.objects)?;
     let recorded = Recorded {
         objects: objects.iter().map(|o| o.1.as_str()).collect(),
         trials: a.trials,

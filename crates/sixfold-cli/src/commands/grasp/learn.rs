@@ -15,7 +15,7 @@ use sixfold_dgcm::store::Experience;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, Gripper, antipodal_grasps};
-use sixfold_mesh::{Mesh, Unit};
+use sixfold_mesh::Mesh;
 use sixfold_simulation::{
     AttemptOptions, ConvexParts, PartsOptions, Scene, scene, try_grasp, wilson_interval,
 };
@@ -25,7 +25,7 @@ use super::compare::{Hardness, hardness};
 use super::experience::{NetworkArguments, model, new_memory, now};
 use super::journal::Journal;
 use super::measure::ending_name;
-use super::object_list::named_objects;
+use super::object_list::{ObjectsArguments, named_objects};
 use crate::Outcome;
 use crate::arguments::JsonArguments;
 use crate::output::report;
@@ -37,23 +37,13 @@ pub(crate) struct LearnArguments {
     #[arg(long, value_name = "FILE")]
     pub experiences: PathBuf,
     /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
-    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"])]
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
     pub families: Vec<String>,
     /// Made-up objects of each family
     #[arg(long, value_name = "N", default_value = "4", requires = "families")]
     pub members: u64,
-    /// Objects to learn on: mesh files, or names of stored objects
-    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "families")]
-    pub objects: Vec<String>,
-    /// Unit of the mesh files: m, cm, mm, in
-    #[arg(long, value_name = "UNIT")]
-    pub unit: Option<Unit>,
-    /// List of objects, as for `sixfold grasp measure`
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["families", "objects"])]
-    pub list: Option<PathBuf>,
-    /// Folder that the list's meshes are in (default: the list's own)
-    #[arg(long, value_name = "DIR", requires = "list")]
-    pub meshes: Option<PathBuf>,
+    #[command(flatten)]
+    pub objects: ObjectsArguments,
     /// Scenes of each object
     #[arg(long, value_name = "N", default_value = "4")]
     pub attempts: u64,
@@ -79,9 +69,6 @@ pub(crate) struct LearnArguments {
     /// Seed of objects, poses, view points, noise and the planner
     #[arg(long, default_value = "0")]
     pub seed: u64,
-    /// Folder of stored objects
-    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
-    pub store: PathBuf,
     #[command(flatten)]
     pub json: JsonArguments,
 }
@@ -204,7 +191,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
     let Hardness { gripper, options, .. } = &setting;
     let network = model(&a.network)?;
     let pupils: Vec<Pupil> = if a.families.is_empty() {
-        named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?
+        named_objects(&a.objects)?
             .into_iter()
             .map(|(class, name, mesh)| Pupil { class, name, mesh, made: None })
             .collect()

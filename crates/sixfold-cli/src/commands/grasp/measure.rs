@@ -30,7 +30,7 @@ pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
     if a.no_noise {
         options.sensor = None;
     }
-    let objects = named_objects(&a.objects, a.unit, a.list.as_deref(), a.meshes.as_deref(), &a.store)?;
+    let objects = named_objects(&a.objects)?;
     let trials = a.trials.get() as u64;
     let mut progress = Progress::new("attempts", objects.len() * a.trials.get());
     let mut measured: Vec<Measured> = vec![];

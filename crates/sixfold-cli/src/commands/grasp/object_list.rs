@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use clap::Args;
 use serde::Deserialize;
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
@@ -41,19 +42,37 @@ impl Up {
     }
 }
 
+/// Objects by name, or by a list.
+#[derive(Debug, Args)]
+pub(crate) struct ObjectsArguments {
+    /// Objects: mesh files, or names of stored objects; each is a class of its own
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1..)]
+    pub objects: Vec<String>,
+    /// Unit of the mesh files: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm", "up": "z"}, ...]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
+    pub list: Option<PathBuf>,
+    /// Folder that the list's meshes are in (default: the list's own)
+    #[arg(long, value_name = "DIR", requires = "list")]
+    pub meshes: Option<PathBuf>,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+}
+
 /// Class, name and mesh of every object.
-pub(super) fn named_objects(
-    names: &[String],
-    unit: Option<Unit>,
-    list: Option<&Path>,
-    meshes: Option<&Path>,
-    store: &Path,
-) -> Result<Vec<(String, String, Mesh)>> {
-    let Some(list) = list else {
-        return names
+pub(super) fn named_objects(a: &ObjectsArguments) -> Result<Vec<(String, String, Mesh)>> {
+    let Some(list) = a.list.as_deref() else {
+        if a.objects.is_empty() {
+            bail!("--object NAME_OR_MESH or --list FILE is missing");
+        }
+        return a
+            .objects
             .iter()
             .map(|name| {
-                let object = objects::find(name, unit, store)?;
+                let object = objects::find(name, a.unit, &a.store)?;
                 Ok((object.name.clone(), object.name.clone(), object.mesh))
             })
             .collect();
@@ -65,8 +84,8 @@ pub(super) fn named_objects(
     if listed.is_empty() {
         bail!("{}: the list is empty: name at least one object", list.display());
     }
-    let folder = match meshes {
-        Some(folder) => folder.to_path_buf(),
+    let folder = match &a.meshes {
+        Some(folder) => folder.clone(),
         None => list.parent().map(Path::to_path_buf).unwrap_or_default(),
     };
     listed

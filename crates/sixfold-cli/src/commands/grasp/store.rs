@@ -31,14 +31,20 @@ pub(crate) struct StoreArguments {
 #[derive(Debug, Subcommand)]
 pub(crate) enum StoreCommand {
     /// Store a grasp that worked: a depth image and a grasp on it
+    #[command(
+        after_help = "Example:\n  sixfold grasp store add experience.db --depth depth.png --mask mask.png --camera camera.json --grasp grasps.json \
+        --object mug --part handle"
+    )]
     Add(Box<AddArguments>),
     /// List all experiences
+    #[command(after_help = "Example:\n  sixfold grasp store list experience.db")]
     List {
         /// The store
         #[arg(value_name = "FILE")]
         file: PathBuf,
     },
     /// Show one experience: what is known, and a picture
+    #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
     Show {
         /// The store
         #[arg(value_name = "FILE")]
@@ -51,6 +57,7 @@ pub(crate) enum StoreCommand {
         picture: Option<PathBuf>,
     },
     /// Forget experiences
+    #[command(after_help = "Example:\n  sixfold grasp store forget experience.db 3 4")]
     Forget {
         /// The store
         #[arg(value_name = "FILE")]
@@ -60,6 +67,7 @@ pub(crate) enum StoreCommand {
         ids: Vec<i64>,
     },
     /// Take over the experiences of other stores
+    #[command(after_help = "Example:\n  sixfold grasp store merge all.db robot-a.db robot-b.db")]
     Merge {
         /// The store that gets them; it is made where there is none
         #[arg(value_name = "FILE")]
@@ -69,6 +77,7 @@ pub(crate) enum StoreCommand {
         others: Vec<PathBuf>,
     },
     /// Write all experiences as files: pictures, and JSON with everything else
+    #[command(after_help = "Example:\n  sixfold grasp store export experience.db --out out/experiences")]
     Export {
         /// The store
         #[arg(value_name = "FILE")]
@@ -78,6 +87,9 @@ pub(crate) enum StoreCommand {
         out: PathBuf,
     },
     /// Encode all experiences anew, with another network, into another store
+    #[command(
+        after_help = "Example:\n  sixfold grasp store refresh experience.db --out new.db --weights dgcm.safetensors"
+    )]
     Refresh {
         /// The store
         #[arg(value_name = "FILE")]
