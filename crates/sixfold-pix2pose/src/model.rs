@@ -1,11 +1,10 @@
 //! A trained model: the network with the objects it knows, as one file.
 
-use crate::aligned::Correction;
 use crate::loss::OutputKind;
 use crate::networks::{Compact, CompactConfig};
 use crate::networks::{GeneratorOutput, PaperGenerator, PaperGeneratorConfig};
 use crate::networks::{ResNet50Generator, ResNet50GeneratorConfig};
-use crate::object::ObjectEntry;
+use crate::object::{Correction, ObjectEntry};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};

@@ -1,8 +1,7 @@
 //! What a network has to know of an object: how its coordinates are normalised and under which turns it looks the same.
 
-use crate::aligned::Correction;
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::{KdTree, Pose, Vec3};
+use sixfold_geometry::{Camera, KdTree, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::BoundingBoxScale;
 
@@ -87,6 +86,27 @@ impl ObjectEntry {
     }
 }
 
+/// By how much aligned poses were off on the photographs of the training, on average: annotations made in another sensor's
+/// image, a principal point a pixel away, a mesh a little larger than its object.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Correction {
+    /// Of the object's place in the image, pixels.
+    pub shift: [f64; 2],
+    /// Of its distance, as a share of it.
+    pub depth: f64,
+}
+
+impl Correction {
+    /// The pose without the error; rotation as it is.
+    pub fn apply(&self, camera: &Camera, camera_from_object: &Pose) -> Pose {
+        let t = camera_from_object.translation();
+        let Some(pixel) = camera.project(&t) else { return *camera_from_object };
+        let depth = t.z * (1.0 - self.depth);
+        let moved = camera.unproject(&(pixel - Vec2::from(self.shift)), depth);
+        Pose::new(camera_from_object.rotation(), moved)
+    }
+}
+
 /// Outlier thresholds of the entries to the BOP challenge (section 3.4.4).
 pub const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
 
@@ -154,6 +174,24 @@ pub fn symmetry_deviation(mesh: &Mesh, object_from_object: &Pose) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_correction_moves_the_object_in_the_image_and_along_its_view() {
+        let camera = Camera::new(500.0, 520.0, 320.0, 240.0, 640, 480).unwrap();
+        let pose = Pose::exp(&[0.1, -0.05, 0.9, 0.4, 0.2, -0.1].into());
+        let correction = Correction { shift: [1.0, -2.0], depth: 0.01 };
+        let moved = correction.apply(&camera, &pose);
+        let (before, after) =
+            (camera.project(&pose.translation()).unwrap(), camera.project(&moved.translation()).unwrap());
+        assert!((before - after - Vec2::new(1.0, -2.0)).norm() < 1e-9);
+        assert!((moved.translation().z - 0.99 * pose.translation().z).abs() < 1e-12);
+        assert_eq!(moved.rotation(), pose.rotation());
+        let none = Correction::default().apply(&camera, &pose);
+        assert!((none.translation() - pose.translation()).norm() < 1e-12);
+        // Behind the camera nothing can be said.
+        let behind = Pose::from_translation(Vec3::new(0.0, 0.0, -1.0));
+        assert_eq!(correction.apply(&camera, &behind), behind);
+    }
 
     #[test]
     fn a_mesh_of_another_size_or_place_is_refused() {

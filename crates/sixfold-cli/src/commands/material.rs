@@ -1,9 +1,12 @@
-//! What a training learns from: photographs and models of a dataset, or meshes; backgrounds.
+//! What trainings have in common: what they learn from (photographs and models of a dataset, or meshes; backgrounds), and what
+//! they say in the end.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Result, bail};
+use serde::Serialize;
 use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::Rect;
@@ -22,6 +25,18 @@ pub(super) struct Material {
     pub description: String,
     /// The dataset and its frames, if it is one.
     pub frames: Option<(BopDataset, Vec<(u32, u32)>)>,
+}
+
+/// What a training came to.
+#[derive(Serialize)]
+pub(super) struct Summary {
+    pub model: String,
+    pub objects: Vec<u32>,
+    pub photographs: usize,
+    pub steps: u64,
+    /// Of training; `None` where a model was only exported.
+    pub seconds: Option<f64>,
+    pub losses: BTreeMap<String, f64>,
 }
 
 /// What `a` names: all its objects, and the photographed instances of which at least the share `least_visible` is seen.

@@ -5,7 +5,6 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use burn::tensor::Device;
-use serde::Serialize;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
@@ -19,7 +18,7 @@ use sixfold_pix2pose::refine::outline_mesh;
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
 use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 
-use super::material::{Material, backgrounds, command_line, continued_from, material};
+use super::material::{Material, Summary, backgrounds, command_line, continued_from, material};
 use super::train_detector::train_detector;
 use crate::Outcome;
 use crate::arguments::{NetworkKind, TrainArguments, TrainCommand, TrainPix2PoseArguments};
@@ -66,18 +65,6 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             Ok(Outcome::Found)
         }
     }
-}
-
-/// What a training came to.
-#[derive(Serialize)]
-pub(super) struct Summary {
-    pub model: String,
-    pub objects: Vec<u32>,
-    pub photographs: usize,
-    pub steps: u64,
-    /// Of training; `None` where a model was only exported.
-    pub seconds: Option<f64>,
-    pub losses: BTreeMap<String, f64>,
 }
 
 /// Trains, or goes on with a training, and writes the model.

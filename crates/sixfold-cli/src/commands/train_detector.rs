@@ -12,8 +12,7 @@ use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use sixfold_pix2pose::samples::read_real_crops;
 
-use super::material::{command_line, continued_from, material, plain_backgrounds};
-use super::train::Summary;
+use super::material::{Summary, command_line, continued_from, material, plain_backgrounds};
 use crate::arguments::{DetectorKind, TrainDetectorArguments};
 use crate::progress::{Progress, interrupted};
 
