@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
-use sixfold_geometry::{Camera, Mask, Rect, undistort_depth, undistort_rgb};
+use sixfold_geometry::{Camera, DepthImage, Mask, Rect, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
 
 use crate::Outcome;
@@ -19,6 +19,46 @@ use crate::progress::{Progress, check_interrupt};
 /// Least confidence of a pose in one image: on real frames most wrong poses lie below, most right ones above.
 const SURE_ENOUGH: f64 = 0.25;
 
+/// One image as methods on depth want it, without lens distortion.
+pub(super) struct Input {
+    pub depth: DepthImage,
+    /// For the overlay.
+    pub rgb: Option<RgbImage>,
+    pub camera: Camera,
+    pub scene: Scene,
+}
+
+impl Input {
+    /// Reads the files that the arguments name.
+    pub fn read(a: &EstimateArguments) -> Result<Input> {
+        let depth_file = a
+            .depth
+            .as_deref()
+            .ok_or_else(|| anyhow!("give --depth FILE (with --camera and --object) or --dataset DIR"))?;
+        let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
+        if a.objects.is_empty() {
+            bail!("--object NAME_OR_MESH is missing: what is to be found?");
+        }
+        let file = camera_file::read(camera_path)?;
+        let depth = read_depth(depth_file, depth_scale(a, &file, camera_path)? / 1000.0)?;
+        let (width, height) = depth.size();
+        let camera = file.for_image(width, height, camera_path)?;
+        let depth = undistort_depth(&depth, &camera)?;
+        let rgb = match &a.rgb {
+            None => None,
+            Some(path) => {
+                let raw = read_rgb(path)?;
+                Some(undistort_rgb(&raw, &camera).with_context(|| path.display().to_string())?)
+            }
+        };
+        let camera = camera.without_distortion();
+        let mask = region_mask(a, &camera)?;
+        let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
+            .with_context(|| depth_file.display().to_string())?;
+        Ok(Input { depth, rgb, camera, scene })
+    }
+}
+
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     if a.templates_only {
         bail!("--templates-only belongs to --method mttm");
@@ -29,32 +69,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
              need none of them"
         );
     }
-    let depth_file = a
-        .depth
-        .as_deref()
-        .ok_or_else(|| anyhow!("give --depth FILE (with --camera and --object) or --dataset DIR"))?;
-    let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
-    if a.objects.is_empty() {
-        bail!("--object NAME_OR_MESH is missing: what is to be found?");
-    }
-    let file = camera_file::read(camera_path)?;
-    let scale = depth_scale(a, &file, camera_path)?;
-    let depth = read_depth(depth_file, scale / 1000.0)?;
-    let (width, height) = depth.size();
-    let camera = file.for_image(width, height, camera_path)?;
-    // Lens distortion ends here: everything behind works on pinhole images.
-    let depth = undistort_depth(&depth, &camera)?;
-    let rgb = match &a.rgb {
-        None => None,
-        Some(path) => {
-            let raw = read_rgb(path)?;
-            Some(undistort_rgb(&raw, &camera).with_context(|| path.display().to_string())?)
-        }
-    };
-    let camera = camera.without_distortion();
-    let mask = region_mask(a, &camera)?;
-    let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
-        .with_context(|| depth_file.display().to_string())?;
+    let Input { depth, rgb, camera, scene } = Input::read(a)?;
     let mut options = estimate_options(a, a.instances.get());
     // A person who asks about one image wants no guesses; a dataset's scores sort them out.
     options.min_score = a.min_score.unwrap_or(SURE_ENOUGH);

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::{BopDataset, EvalOptions, Evaluation, evaluate, write_recall_curves, write_rgb};
+use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves, write_rgb};
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
 
 use self::colour::Colour;
@@ -51,6 +51,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let folder = sample_folder(a.data.as_deref())?;
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
+    let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let mut known: BTreeMap<u32, Known> = BTreeMap::new();
     let mut progress = Progress::new("poses", targets.len());
     let mut rows = vec![];
@@ -68,7 +69,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 let Some(o) = t.object else { continue };
                 let began = Instant::now();
                 if let std::collections::btree_map::Entry::Vacant(place) = known.entry(o.obj_id) {
-                    place.insert(Known::new(&dataset, o.obj_id, &a.out.join("objects"))?);
+                    place.insert(Known::new(&dataset, &infos, o.obj_id, &a.out.join("objects"))?);
                 }
                 let Some(k) = known.get(&o.obj_id) else { continue };
                 let estimates = estimate(&prepared, &k.model, &EstimateOptions::default());

@@ -6,7 +6,7 @@ use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models, Placement, adi};
 use sixfold_geometry::Pose;
 use sixfold_match::ObjectModel;
-use sixfold_mesh::ModelInfo;
+use sixfold_mesh::{ModelInfo, ModelsInfo};
 
 use crate::objects::Object;
 
@@ -19,11 +19,11 @@ pub(super) struct Known {
 
 impl Known {
     /// Object `id`; its description is kept in `folder`.
-    pub fn new(dataset: &BopDataset, id: u32, folder: &Path) -> Result<Known> {
+    pub fn new(dataset: &BopDataset, infos: &ModelsInfo, id: u32, folder: &Path) -> Result<Known> {
         let mesh = dataset.model(id, Models::Rendering)?;
         let points = ModelPoints::new(mesh.vertices())
             .ok_or_else(|| anyhow!("object {id}: the model has no vertices"))?;
-        let info = dataset.models_info(Models::Rendering)?.and_then(|infos| infos.0.get(&id).cloned());
+        let info = infos.0.get(&id).cloned();
         let info = info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
         let description = folder.join(format!("{id:06}.sixfold-ppf"));
         let object = Object { name: id.to_string(), mesh, info, description };

@@ -6,10 +6,9 @@ pub(crate) mod reproduce;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Context, Result, bail};
 use serde::Serialize;
-use sixfold_bop::{read_depth, read_rgb, write_mask, write_rgb};
-use sixfold_geometry::{undistort_depth, undistort_rgb};
+use sixfold_bop::{write_mask, write_rgb};
 use sixfold_match::{Scene, VerificationScore};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::mask::to_image;
@@ -17,10 +16,9 @@ use sixfold_mttm::{
     Estimate, EstimateOptions, KnownObject, ObjectTemplates, Source, Stages, TemplateOptions, estimate,
 };
 
-use super::estimate::{depth_scale, region_mask, scene_options};
+use super::estimate::Input;
 use crate::Outcome;
 use crate::arguments::EstimateArguments;
-use crate::camera_file;
 use crate::objects::{self, Object, Store};
 use crate::output::{pose_rows, report, write_atomically};
 use crate::overlay::{self, Drawn};
@@ -105,27 +103,8 @@ pub(crate) fn check(a: &EstimateArguments) -> Result<()> {
 /// One image.
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     check(a)?;
-    let depth_file = a
-        .depth
-        .as_deref()
-        .ok_or_else(|| anyhow!("give --depth FILE (with --camera and --object) or --dataset DIR"))?;
-    let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
-    if a.objects.is_empty() {
-        bail!("--object NAME_OR_MESH is missing: what is to be found?");
-    }
-    let file = camera_file::read(camera_path)?;
-    let depth = read_depth(depth_file, depth_scale(a, &file, camera_path)? / 1000.0)?;
-    let (width, height) = depth.size();
-    let camera = file.for_image(width, height, camera_path)?;
-    let depth = undistort_depth(&depth, &camera)?;
-    let background = match &a.rgb {
-        None => overlay::depth_picture(&depth),
-        Some(path) => undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?,
-    };
-    let camera = camera.without_distortion();
-    let mask = region_mask(a, &camera)?;
-    let scene = Scene::new(&depth, &camera, mask.as_ref(), &scene_options(a))
-        .with_context(|| depth_file.display().to_string())?;
+    let Input { depth, rgb, camera, scene } = Input::read(a)?;
+    let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
     warn_about(&scene, a.keep_plane);
     let options = options(a, a.instances.get(), SURE_ENOUGH);
     let mut progress = Progress::new("objects", a.objects.len());
@@ -146,7 +125,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             for (k, e) in estimates.iter().enumerate() {
                 let path =
                     folder.join("masks").join(format!("{}-{}-{}.png", i + 1, file_name(&known.name), k + 1));
-                write_mask(&path, &to_image(&e.mask, width, height))?;
+                write_mask(&path, &to_image(&e.mask, camera.width, camera.height))?;
             }
         }
         pictures = Some(path);
