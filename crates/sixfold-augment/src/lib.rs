@@ -16,6 +16,7 @@ mod patch;
 mod random;
 mod shapes;
 mod texture;
+mod window;
 
 pub use backgrounds::{Backgrounds, PhotographOptions};
 pub use color::ColorAugmentation;
@@ -26,3 +27,4 @@ pub use patch::{AffineMap, Patch};
 pub use random::{Random, stream, uniform};
 pub use shapes::{Shape, occluder_of_fraction};
 pub use texture::procedural_texture;
+pub use window::Window;

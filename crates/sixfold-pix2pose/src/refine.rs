@@ -11,8 +11,7 @@
 
 use crate::estimate::{Found, Hypothesis, View};
 use crate::samples::second_stage::GREY;
-use crate::samples::window::Window;
-use sixfold_augment::Patch;
+use sixfold_augment::{Patch, Window};
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, stream, uniform};
+use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, Window, stream, uniform};
 use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, simplify};
 use sixfold_render::BoundingBoxScale;
@@ -16,7 +16,7 @@ use super::real::RealCrop;
 use super::rendering::{color_patch, colors, random_lights, random_material, randomly_colored, targets};
 use super::second_stage;
 use super::symmetry::canonical;
-use super::window::{Extent, Window, turned, turned_pixel};
+use super::window::{Extent, turned, turned_pixel, window_around};
 
 /// Renders of each object that serve as clutter and occluders, and their side in pixels.
 const CUTOUTS_PER_OBJECT: u64 = 16;
@@ -205,7 +205,7 @@ impl SampleSource {
         let extent = if random.random::<f32>() < options.visible_box_chance { of_visible() } else { None };
         let extent =
             extent.or(whole).or_else(of_visible).unwrap_or(Extent::at(Vec2::new(camera.cx, camera.cy)));
-        let window = Window::around(&extent, options, random);
+        let window = window_around(&extent, options, random);
         let map = window.map(camera, options.size, turn);
         let (mut patch, inside) =
             Patch::warp(crop.image(), &map, options.size, options.size, [second_stage::GREY; 3]);
@@ -236,7 +236,7 @@ impl SampleSource {
         let extent = object
             .extent(&object.camera, &pose)
             .unwrap_or(Extent::at(Vec2::new(object.camera.cx, object.camera.cy)));
-        let window = Window::around(&extent, options, random);
+        let window = window_around(&extent, options, random);
         let (coordinates, mask) = targets(
             &object.mesh,
             &object.scale,

@@ -1,23 +1,15 @@
-//! The square window that a crop shows, and how crop pixels relate to those of a photograph that is turned about its
-//! principal point.
+//! Where the window of a training crop lies, and photographs that are turned about their principal point.
 //!
 //! A turn of the image about the principal point by `R_z` is exactly a turn of the scene about the camera's axis: the
 //! photograph of pose `P` becomes that of `R_z P` (for `fx != fy` with a small shear, which is kept). So targets are
 //! rendered at `R_z P` with the window's camera, and nothing but colour is ever interpolated.
 
 use rand::RngExt;
-use sixfold_augment::{AffineMap, Random};
+use sixfold_augment::{Random, Window};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
 
 use super::options::SampleOptions;
-
-/// A square part of the image plane; pixel centres at whole numbers.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Window {
-    pub centre: Vec2,
-    pub side: f64,
-}
 
 /// Smallest and largest corner of a set of points in the image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,43 +40,13 @@ impl Extent {
     }
 }
 
-impl Window {
-    /// A crop about a box, moved and scaled at random.
-    pub fn around(extent: &Extent, options: &SampleOptions, random: &mut Random) -> Window {
-        let mut symmetric = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
-        let longest = extent.longest().max(2.0);
-        let shift = Vec2::new(symmetric(options.centre_jitter), symmetric(options.centre_jitter)) * longest;
-        let side = longest * options.crop_factor * (1.0 + symmetric(options.size_jitter));
-        Window { centre: extent.centre() + shift, side }
-    }
-
-    /// The camera of the crop at `size x size` pixels.
-    pub fn camera(&self, camera: &Camera, size: usize) -> Camera {
-        let scale = size as f64 / self.side;
-        let corner = self.centre - Vec2::repeat(0.5 * self.side);
-        Camera {
-            fx: camera.fx * scale,
-            fy: camera.fy * scale,
-            cx: (camera.cx - corner.x) * scale - 0.5,
-            cy: (camera.cy - corner.y) * scale - 0.5,
-            width: size,
-            height: size,
-            distortion: None,
-        }
-    }
-
-    /// From pixels of the crop (`size x size`, of the photograph turned by `turn` radians) to the photograph's.
-    pub fn map(&self, camera: &Camera, size: usize, turn: f64) -> AffineMap {
-        let step = self.side / size as f64;
-        let (s, c) = turn.sin_cos();
-        let (across, down) = (s * camera.fx / camera.fy, s * camera.fy / camera.fx);
-        // Offset of the turned pixel of crop pixel (0, 0) from the principal point.
-        let q = self.centre - Vec2::repeat(0.5 * self.side - 0.5 * step) - Vec2::new(camera.cx, camera.cy);
-        AffineMap {
-            x: [(c * step) as f32, (across * step) as f32, (camera.cx + c * q.x + across * q.y) as f32],
-            y: [(-down * step) as f32, (c * step) as f32, (camera.cy - down * q.x + c * q.y) as f32],
-        }
-    }
+/// A crop about a box, moved and scaled at random.
+pub(super) fn window_around(extent: &Extent, options: &SampleOptions, random: &mut Random) -> Window {
+    let mut symmetric = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
+    let longest = extent.longest().max(2.0);
+    let shift = Vec2::new(symmetric(options.centre_jitter), symmetric(options.centre_jitter)) * longest;
+    let side = longest * options.crop_factor * (1.0 + symmetric(options.size_jitter));
+    Window { centre: extent.centre() + shift, side }
 }
 
 /// The scene turned about the camera's axis.

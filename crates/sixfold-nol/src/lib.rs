@@ -1,0 +1,14 @@
+//! Neural Object Learning: renders an object in new poses from few cluttered photographs with rough poses and an untextured
+//! mesh, and makes those poses better (K. Park, *6D Pose Estimation of Objects Using Limited Training Data*, TU Wien 2020,
+//! chapter 4).
+//!
+//! A [`Photograph`] is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
+//! every photograph that sees the same place of the surface ([`SourceView::project`]).
+
+mod photograph;
+mod projection;
+mod source;
+
+pub use photograph::{NolError, Photograph};
+pub use projection::{Projection, TargetSurface};
+pub use source::SourceView;

@@ -1,0 +1,151 @@
+//! A photograph cut to the object, with what is known of its geometry at the present pose.
+
+use sixfold_augment::{Coverage, Patch, Window};
+use sixfold_geometry::{Camera, Pose, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+use crate::photograph::{NolError, Photograph};
+use crate::projection::{Projection, TargetSurface};
+
+/// Colour where the crop reaches out of the image.
+const OUTSIDE: f32 = 0.5;
+/// The crop's side in units of the object's box: room for a pose that is off.
+const MARGIN: f64 = 1.3;
+/// A point counts as seen up to this depth behind what the mesh shows there, in units of the mesh's diameter.
+const BEHIND: f64 = 0.02;
+
+/// A square crop of a photograph about the object.
+#[derive(Debug, Clone)]
+pub struct SourceView {
+    /// Colours, `side x side`.
+    pub patch: Patch,
+    /// Where the object is visible, 0 to 1: the mask, or 1 wherever the image reaches.
+    pub visible: Coverage,
+    /// The crop's camera.
+    pub camera: Camera,
+    /// The present pose.
+    camera_from_object: Pose,
+    /// Depth of the mesh at that pose, row by row, metres; 0 beside it.
+    depth: Vec<f32>,
+    /// Depth by which a point may lie behind, metres.
+    behind: f32,
+}
+
+impl SourceView {
+    /// Cuts the object out at the photograph's pose, `side` pixels wide.
+    ///
+    /// # Errors
+    /// [`NolError::OutsideImage`] where the mesh reaches behind the camera.
+    pub fn new(photograph: &Photograph, mesh: &Mesh, side: usize) -> Result<Self, NolError> {
+        let (camera, pose) = (photograph.camera(), photograph.camera_from_object());
+        let Some((centre, longest)) = Photograph::box_of(camera, mesh, pose) else {
+            let t = pose.translation();
+            return Err(NolError::OutsideImage {
+                name: photograph.name().to_owned(),
+                translation: [t.x, t.y, t.z],
+            });
+        };
+        let window = Window { centre, side: longest.max(4.0) * MARGIN };
+        let map = window.map(camera, side, 0.0);
+        let (patch, mut visible) = Patch::warp(photograph.image(), &map, side, side, [OUTSIDE; 3]);
+        if let Some(mask) = photograph.mask() {
+            let (width, height) = mask.size();
+            let at = |x: isize, y: isize| {
+                let inside = x >= 0 && y >= 0 && (x as usize) < width && (y as usize) < height;
+                f32::from(u8::from(inside && mask[(x as usize, y as usize)]))
+            };
+            for (i, value) in visible.data.iter_mut().enumerate() {
+                let [u, v] = map.apply((i % side) as f32, (i / side) as f32);
+                let (x, y) = (u.floor(), v.floor());
+                let (fx, fy) = (u - x, v - y);
+                let (x, y) = (x as isize, y as isize);
+                let top = at(x, y) * (1.0 - fx) + at(x + 1, y) * fx;
+                let bottom = at(x, y + 1) * (1.0 - fx) + at(x + 1, y + 1) * fx;
+                *value *= top * (1.0 - fy) + bottom * fy;
+            }
+        }
+        Ok(Self::of_crop(patch, visible, window.camera(camera, side), *pose, mesh))
+    }
+
+    /// A view from a crop that is there already.
+    pub fn of_crop(patch: Patch, visible: Coverage, camera: Camera, pose: Pose, mesh: &Mesh) -> Self {
+        let (low, high) = mesh.bounding_box();
+        let mut view = SourceView {
+            patch,
+            visible,
+            camera,
+            camera_from_object: pose,
+            depth: vec![],
+            behind: (BEHIND * (high - low).norm()) as f32,
+        };
+        view.set_pose(mesh, pose, &mut Frame::new(&camera));
+        view
+    }
+
+    /// The present pose.
+    pub fn camera_from_object(&self) -> &Pose {
+        &self.camera_from_object
+    }
+
+    /// Pixels along a side.
+    pub fn side(&self) -> usize {
+        self.patch.width
+    }
+
+    /// Depth of the mesh at the present pose, row by row, metres; 0 beside it.
+    pub fn depth(&self) -> &[f32] {
+        &self.depth
+    }
+
+    /// Another pose for the same crop.
+    pub fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut Frame) {
+        self.camera_from_object = camera_from_object;
+        frame.set_camera(&self.camera);
+        frame.render(&[SceneObject { mesh, camera_from_object }], &RenderOptions::default());
+        self.depth.clear();
+        let inverse = frame.inverse_depth().iter();
+        self.depth.extend(inverse.map(|z| if *z > 0.0 { 1.0 / z } else { 0.0 }));
+    }
+
+    /// Where the crop shows a place of the surface (object frame, metres; unit normal), and the cosine of the angle between
+    /// normal and line of sight. `None` where it is turned away, hidden by the object itself, or outside the crop. What else
+    /// hides it, `visible` says.
+    #[inline]
+    pub fn see(&self, point: &Vec3, normal: &Vec3) -> Option<([f32; 2], f32)> {
+        let p = self.camera_from_object.transform_point(point);
+        let n = self.camera_from_object.transform_direction(normal);
+        let cosine = -n.dot(&p) / p.norm();
+        if cosine <= 0.0 || p.z <= 0.0 {
+            return None;
+        }
+        let pixel = self.camera.project(&p)?;
+        let last = (self.side() - 1) as f64;
+        if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x <= last && pixel.y <= last) {
+            return None;
+        }
+        let (x, y) = (pixel.x as usize, pixel.y as usize);
+        let limit = p.z as f32 - self.behind;
+        let side = self.side();
+        let (x1, y1) = ((x + 1).min(side - 1), (y + 1).min(side - 1));
+        let seen = [(x, y), (x1, y), (x, y1), (x1, y1)].into_iter().any(|(x, y)| {
+            let z = self.depth[y * side + x];
+            z > 0.0 && z >= limit
+        });
+        seen.then_some(([pixel.x as f32, pixel.y as f32], cosine as f32))
+    }
+
+    /// Every place of a new view, looked up in this crop.
+    pub fn project(&self, target: &TargetSurface) -> Projection {
+        let mut projection = Projection {
+            pixels: Vec::with_capacity(target.points.len()),
+            cosines: Vec::with_capacity(target.points.len()),
+        };
+        for (point, normal) in target.points.iter().zip(&target.normals) {
+            let (pixel, cosine) = self.see(point, normal).unwrap_or(([0.0; 2], 0.0));
+            projection.pixels.push(pixel);
+            projection.cosines.push(cosine);
+        }
+        projection
+    }
+}
