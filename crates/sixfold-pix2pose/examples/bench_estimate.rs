@@ -1,8 +1,9 @@
 //! Time per box of each part of an estimate: DATASET TARGETS.json WEIGHTS.
 use sixfold_bop::{BopDataset, Models, ground_truth_visibility};
+use sixfold_outline::outline_mesh;
 use sixfold_pix2pose::estimate::{EstimateOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
-use sixfold_pix2pose::refine::{RefineOptions, outline_mesh, refine};
+use sixfold_pix2pose::refine::{RefineOptions, refine};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;

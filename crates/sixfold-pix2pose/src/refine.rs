@@ -13,8 +13,8 @@ use crate::estimate::{Found, Hypothesis, View};
 use crate::samples::second_stage::GREY;
 use sixfold_augment::{Patch, Window};
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
-use sixfold_mesh::{Mesh, simplify};
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_mesh::Mesh;
+use sixfold_outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
 
 /// How poses are aligned.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,15 +70,6 @@ pub struct Refined {
     pub improved: bool,
 }
 
-/// Faces of a mesh that is drawn for its outline alone.
-const OUTLINE_FACES: usize = 4000;
-
-/// The mesh with no more faces than its outline needs, for [`refine`]: scans have tens of thousands, and drawing them takes
-/// longer than all the rest.
-pub fn outline_mesh(mesh: &Mesh) -> Mesh {
-    if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }
-}
-
 /// Aligns the best hypothesis of what [`crate::estimate::estimate`] found in the same image.
 pub fn refine(
     image: &RgbImage,
@@ -122,11 +113,8 @@ pub fn refine(
         .collect();
     let (low, high) = mesh.bounding_box();
     let mut aligner = Aligner {
-        mesh,
         camera,
-        frame: Frame::new(&crop),
-        odds: odds(&patch, &network, options.color),
-        side,
+        outline: Outline::new(mesh, &crop, log_odds(&patch, &network, options.color)),
         crop,
         centre: (low + high) * 0.5,
         correspondences: found
@@ -149,7 +137,7 @@ pub fn refine(
         }
     }
     let last = options.reaches.last().copied().unwrap_or(3.0);
-    let lines = aligner.lines(last, &pose);
+    let lines = aligner.outline.lines(last, &pose);
     if lines.len() < LEAST_LINES || !pose.translation().iter().all(|t| t.is_finite()) {
         return unchanged;
     }
@@ -157,90 +145,16 @@ pub fn refine(
     Refined { camera_from_object: pose, lines: lines.len(), distance, improved: true }
 }
 
-/// Fewer lines do not hold a pose.
-const LEAST_LINES: usize = 12;
-
 /// How probably the object is visible at a position in 0..1 of a view's sides.
 fn seen(view: &View, u: f64, v: f64) -> f32 {
     let side = view.prediction.side;
     sample(&view.prediction.visible, side, u * side as f64 - 0.5, v * side as f64 - 0.5)
 }
 
-/// Value of a square map at pixel `(x, y)`.
-fn sample(map: &[f32], side: usize, x: f64, y: f64) -> f32 {
-    let last = (side - 1) as f64;
-    let (x, y) = (x.clamp(0.0, last), y.clamp(0.0, last));
-    let (x0, y0) = (x.floor().min(last - 1.0), y.floor().min(last - 1.0));
-    let (fx, fy) = ((x - x0) as f32, (y - y0) as f32);
-    let at = |dx: usize, dy: usize| map[(y0 as usize + dy) * side + x0 as usize + dx];
-    (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
-}
-
-/// Bins of the colour histograms along each channel.
-const BINS: usize = 16;
-
-/// Log odds of object against background at every pixel: from the network's probability, and from colour histograms of
-/// what it takes for the one and the other.
-fn odds(patch: &Patch, network: &[f32], color: f32) -> Vec<f32> {
-    let area = network.len();
-    let bins = BINS * BINS * BINS;
-    let mut counts = [vec![0.5f32; bins], vec![0.5f32; bins]];
-    let bin = |i: usize| {
-        (0..3)
-            .fold(0, |bin, c| bin * BINS + ((patch.data[c * area + i] * BINS as f32) as usize).min(BINS - 1))
-    };
-    for (i, p) in network.iter().enumerate() {
-        // What is uncertain says nothing.
-        if *p > 0.75 {
-            counts[0][bin(i)] += *p;
-        } else if *p < 0.25 {
-            counts[1][bin(i)] += 1.0 - *p;
-        }
-    }
-    // A little of each bin goes to its neighbours.
-    for count in &mut counts {
-        for stride in [1, BINS, BINS * BINS] {
-            let before = count.clone();
-            for (b, value) in count.iter_mut().enumerate() {
-                let place = b / stride % BINS;
-                let below = if place > 0 { before[b - stride] } else { before[b] };
-                let above = if place + 1 < BINS { before[b + stride] } else { before[b] };
-                *value = 0.5 * before[b] + 0.25 * (below + above);
-            }
-        }
-        let sum: f32 = count.iter().sum();
-        count.iter_mut().for_each(|v| *v /= sum);
-    }
-    (0..area)
-        .map(|i| {
-            let p = network[i].clamp(0.01, 0.99);
-            let b = bin(i);
-            let colors = (counts[0][b] / counts[1][b]).ln().clamp(-3.0, 3.0);
-            (p / (1.0 - p)).ln().clamp(-3.0, 3.0) + color * colors
-        })
-        .collect()
-}
-
-/// A line across the outline on which the border was found.
-struct Line {
-    /// Point of the outline in the camera's frame, metres.
-    point: Vec3,
-    /// Outward normal in the crop.
-    normal: Vec2,
-    /// From the outline to the border along the normal, crop pixels.
-    offset: f64,
-    /// Variance of the offset.
-    variance: f64,
-}
-
 struct Aligner<'a> {
-    mesh: &'a Mesh,
     camera: &'a Camera,
-    frame: Frame,
+    outline: Outline<'a>,
     crop: Camera,
-    /// Log odds of the object at every pixel of the crop.
-    odds: Vec<f32>,
-    side: usize,
     /// The object's centre, about which it is turned.
     centre: Vec3,
     correspondences: Vec<(Vec3, Vec2)>,
@@ -248,109 +162,15 @@ struct Aligner<'a> {
 }
 
 impl Aligner<'_> {
-    /// Lines across the rendered outline, with the most likely border on each.
-    fn lines(&mut self, reach: f64, pose: &Pose) -> Vec<Line> {
-        let objects = [SceneObject { mesh: self.mesh, camera_from_object: *pose }];
-        self.frame.render(&objects, &RenderOptions::default());
-        let side = self.side;
-        let inverse_depth = self.frame.inverse_depth();
-        let mut soft = Patch::filled(side, side, [0.0; 3]);
-        for (value, z) in soft.data[..side * side].iter_mut().zip(inverse_depth) {
-            *value = f32::from(*z > 0.0);
-        }
-        soft.blur(1.5);
-        let soft = &soft.data[..side * side];
-        let mut lines = Vec::new();
-        let margin = 2;
-        for y in margin..side - margin {
-            for x in margin..side - margin {
-                let i = y * side + x;
-                let border = inverse_depth[i] > 0.0
-                    && [i - 1, i + 1, i - side, i + side].into_iter().any(|j| inverse_depth[j] <= 0.0);
-                if !border {
-                    continue;
-                }
-                let gradient = Vec2::new(
-                    f64::from(soft[i + 1] - soft[i - 1]) * 0.5,
-                    f64::from(soft[i + side] - soft[i - side]) * 0.5,
-                );
-                let steep = gradient.norm();
-                if steep < 0.05 {
-                    continue;
-                }
-                let normal = -gradient / steep;
-                // The outline lies where the blurred silhouette is one half.
-                let start = Vec2::new(x as f64, y as f64)
-                    + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(-1.0, 1.5);
-                if let Some((offset, variance)) = self.border(&start, &normal, reach) {
-                    let depth = 1.0 / f64::from(inverse_depth[i]);
-                    lines.push(Line { point: self.crop.unproject(&start, depth), normal, offset, variance });
-                }
-            }
-        }
-        lines
-    }
-
-    /// Mean and variance of the border's place on a line through `start` along the outward normal.
-    fn border(&self, start: &Vec2, normal: &Vec2, reach: f64) -> Option<(f64, f64)> {
-        const STEP: f64 = 0.5;
-        let count = (2.0 * reach / STEP) as usize + 1;
-        let at = |k: usize| k as f64 * STEP - reach;
-        let odds: Vec<f32> = (0..count)
-            .map(|k| {
-                let p = start + normal * at(k);
-                sample(&self.odds, self.side, p.x, p.y)
-            })
-            .collect();
-        // Something covers the object here, or there is no border within reach.
-        let third = count / 3;
-        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-        if mean(&odds[..third]) < 0.5 || mean(&odds[count - third..]) > -0.5 {
-            return None;
-        }
-        // Log likelihood of a border before sample k: object up to there, background behind.
-        let mut likelihood = Vec::with_capacity(count + 1);
-        let mut sum = 0.0;
-        likelihood.push(0.0);
-        for o in &odds {
-            sum += f64::from(*o) * STEP;
-            likelihood.push(sum);
-        }
-        let best = likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
-        for (k, l) in likelihood.iter().enumerate() {
-            let weight = (l - best).exp();
-            let place = at(k) - 0.5 * STEP;
-            total += weight;
-            first += weight * place;
-            second += weight * place * place;
-        }
-        let mean = first / total;
-        Some((mean, (second / total - mean * mean).max(0.1)))
-    }
-
     /// The next pose, and how far the outline moved in crop pixels.
     fn step(&mut self, reach: f64, pose: &Pose) -> Option<(Pose, f64)> {
-        let lines = self.lines(reach, pose);
+        let lines = self.outline.lines(reach, pose);
         if lines.len() < LEAST_LINES {
             return None;
         }
         let centre = pose.transform_point(&self.centre);
         let mut equations = NormalEquations::default();
-        let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
-        let middle = offsets.len() / 2;
-        let deviation = 1.4826 * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
-        let robust = self.options.robust * deviation.max(0.5);
-        for line in &lines {
-            let rows = motion(&self.crop, &line.point, &centre);
-            let jacobian: [f64; 6] =
-                std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
-            let mut weight = self.options.line * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
-            if robust > 0.0 {
-                weight *= tukey(line.offset / robust);
-            }
-            equations.add(&jacobian, -line.offset, weight);
-        }
+        add_lines(&mut equations, &lines, &self.crop, &centre, reach, self.options.line, self.options.robust);
         self.add_correspondences(&mut equations, pose, &centre);
         let step = equations.solve(1e-3)?;
         let about = Pose::from_translation(centre);
@@ -420,27 +240,6 @@ impl Aligner<'_> {
             }
         }
     }
-}
-
-/// Derivative of a point's pixel by a twist `(v, w)` about `centre`, pixels per metre and radian.
-fn motion(camera: &Camera, point: &Vec3, centre: &Vec3) -> [[f64; 6]; 2] {
-    let (x, y, z) = (point.x, point.y, point.z);
-    let rows = [
-        Vec3::new(camera.fx / z, 0.0, -camera.fx * x / (z * z)),
-        Vec3::new(0.0, camera.fy / z, -camera.fy * y / (z * z)),
-    ];
-    let arm = point - centre;
-    rows.map(|row| {
-        // d(w x arm) = row . (w x arm) = w . (arm x row)
-        let turn = arm.cross(&row);
-        [row.x, row.y, row.z, turn.x, turn.y, turn.z]
-    })
-}
-
-/// Weight of a residual in units of its noise (Tukey's biweight, tuned to 95 % efficiency).
-fn tukey(r: f64) -> f64 {
-    let t = r / 4.685;
-    if t.abs() >= 1.0 { 0.0 } else { (1.0 - t * t).powi(2) }
 }
 
 #[cfg(test)]

@@ -8,12 +8,12 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
+use sixfold_outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::{AlignedToDepth, DepthScene};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, View, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::object::ObjectEntry;
-use sixfold_pix2pose::refine::outline_mesh;
 
 use crate::arguments::EstimateArguments;
 

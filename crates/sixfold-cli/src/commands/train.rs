@@ -9,12 +9,12 @@ use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
+use sixfold_outline::outline_mesh;
 use sixfold_pix2pose::adversarial::{AdversarialOptions, train_adversarial};
 use sixfold_pix2pose::aligned::measure_corrections;
 use sixfold_pix2pose::model::{ImageSizes, Network, Pix2PoseModel};
 use sixfold_pix2pose::networks::{CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
 use sixfold_pix2pose::object::{ObjectEntry, SymmetryMap, lmo_threshold};
-use sixfold_pix2pose::refine::outline_mesh;
 use sixfold_pix2pose::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
 use sixfold_pix2pose::training::{TrainingOptions, TrainingOutcome, last_checkpoint, train};
 

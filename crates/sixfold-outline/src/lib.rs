@@ -1,0 +1,11 @@
+//! Aligns a mesh's outline with the object's border in a colour image: region-based tracking (Prisacariu and Reid 2012) with
+//! the sparse lines of Stoiber et al. 2020. Needs no colours of the mesh.
+//!
+//! [`log_odds`] says where the object is, [`Outline::lines`] where its border lies across the rendered outline,
+//! [`add_lines`] what that says about the pose.
+
+mod lines;
+mod odds;
+
+pub use lines::{LEAST_LINES, Line, Outline, add_lines, motion, outline_mesh, sample, tukey};
+pub use odds::{color_odds, log_odds};

@@ -1,0 +1,196 @@
+//! Lines across the rendered outline, and the border of the object found on each (Stoiber et al. 2020).
+
+use sixfold_augment::Patch;
+use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
+use sixfold_mesh::{Mesh, simplify};
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+/// Fewer lines do not hold a pose.
+pub const LEAST_LINES: usize = 12;
+
+/// Faces of a mesh that is drawn for its outline alone.
+const OUTLINE_FACES: usize = 4000;
+
+/// The mesh with no more faces than its outline needs, for [`refine`]: scans have tens of thousands, and drawing them takes
+/// longer than all the rest.
+pub fn outline_mesh(mesh: &Mesh) -> Mesh {
+    if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }
+}
+
+/// Value of a square map at pixel `(x, y)`.
+pub fn sample(map: &[f32], side: usize, x: f64, y: f64) -> f32 {
+    let last = (side - 1) as f64;
+    let (x, y) = (x.clamp(0.0, last), y.clamp(0.0, last));
+    let (x0, y0) = (x.floor().min(last - 1.0), y.floor().min(last - 1.0));
+    let (fx, fy) = ((x - x0) as f32, (y - y0) as f32);
+    let at = |dx: usize, dy: usize| map[(y0 as usize + dy) * side + x0 as usize + dx];
+    (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
+}
+
+/// A line across the outline on which the border was found.
+#[derive(Debug, Clone, Copy)]
+pub struct Line {
+    /// Point of the outline in the camera's frame, metres.
+    pub point: Vec3,
+    /// Outward normal in the crop.
+    pub normal: Vec2,
+    /// From the outline to the border along the normal, crop pixels.
+    pub offset: f64,
+    /// Variance of the offset.
+    pub variance: f64,
+}
+
+/// A mesh whose outline is looked for in one crop.
+#[derive(Debug)]
+pub struct Outline<'a> {
+    mesh: &'a Mesh,
+    frame: Frame,
+    crop: Camera,
+    odds: Vec<f32>,
+    side: usize,
+}
+
+impl<'a> Outline<'a> {
+    /// `odds` are the log odds of the object at every pixel of a square crop, row by row ([`crate::log_odds`]); `mesh` is
+    /// best one of [`outline_mesh`].
+    ///
+    /// # Panics
+    /// When `odds` has not as many numbers as the crop has pixels.
+    pub fn new(mesh: &'a Mesh, crop: &Camera, odds: Vec<f32>) -> Self {
+        assert_eq!(odds.len(), crop.width * crop.height, "one number per pixel of a square crop");
+        Outline { mesh, frame: Frame::new(crop), crop: *crop, odds, side: crop.width }
+    }
+
+    /// Lines across the rendered outline, with the most likely border on each.
+    pub fn lines(&mut self, reach: f64, pose: &Pose) -> Vec<Line> {
+        let objects = [SceneObject { mesh: self.mesh, camera_from_object: *pose }];
+        self.frame.render(&objects, &RenderOptions::default());
+        let side = self.side;
+        let inverse_depth = self.frame.inverse_depth();
+        let mut soft = Patch::filled(side, side, [0.0; 3]);
+        for (value, z) in soft.data[..side * side].iter_mut().zip(inverse_depth) {
+            *value = f32::from(*z > 0.0);
+        }
+        soft.blur(1.5);
+        let soft = &soft.data[..side * side];
+        let mut lines = Vec::new();
+        let margin = 2;
+        for y in margin..side - margin {
+            for x in margin..side - margin {
+                let i = y * side + x;
+                let border = inverse_depth[i] > 0.0
+                    && [i - 1, i + 1, i - side, i + side].into_iter().any(|j| inverse_depth[j] <= 0.0);
+                if !border {
+                    continue;
+                }
+                let gradient = Vec2::new(
+                    f64::from(soft[i + 1] - soft[i - 1]) * 0.5,
+                    f64::from(soft[i + side] - soft[i - side]) * 0.5,
+                );
+                let steep = gradient.norm();
+                if steep < 0.05 {
+                    continue;
+                }
+                let normal = -gradient / steep;
+                // The outline lies where the blurred silhouette is one half.
+                let start = Vec2::new(x as f64, y as f64)
+                    + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(-1.0, 1.5);
+                if let Some((offset, variance)) = self.border(&start, &normal, reach) {
+                    let depth = 1.0 / f64::from(inverse_depth[i]);
+                    lines.push(Line { point: self.crop.unproject(&start, depth), normal, offset, variance });
+                }
+            }
+        }
+        lines
+    }
+
+    /// Mean and variance of the border's place on a line through `start` along the outward normal.
+    fn border(&self, start: &Vec2, normal: &Vec2, reach: f64) -> Option<(f64, f64)> {
+        const STEP: f64 = 0.5;
+        let count = (2.0 * reach / STEP) as usize + 1;
+        let at = |k: usize| k as f64 * STEP - reach;
+        let odds: Vec<f32> = (0..count)
+            .map(|k| {
+                let p = start + normal * at(k);
+                sample(&self.odds, self.side, p.x, p.y)
+            })
+            .collect();
+        // Something covers the object here, or there is no border within reach.
+        let third = count / 3;
+        let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
+        if mean(&odds[..third]) < 0.5 || mean(&odds[count - third..]) > -0.5 {
+            return None;
+        }
+        // Log likelihood of a border before sample k: object up to there, background behind.
+        let mut likelihood = Vec::with_capacity(count + 1);
+        let mut sum = 0.0;
+        likelihood.push(0.0);
+        for o in &odds {
+            sum += f64::from(*o) * STEP;
+            likelihood.push(sum);
+        }
+        let best = likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
+        for (k, l) in likelihood.iter().enumerate() {
+            let weight = (l - best).exp();
+            let place = at(k) - 0.5 * STEP;
+            total += weight;
+            first += weight * place;
+            second += weight * place * place;
+        }
+        let mean = first / total;
+        Some((mean, (second / total - mean * mean).max(0.1)))
+    }
+}
+
+/// Adds the distances of lines to the normal equations of a twist about `centre` (camera frame). `line` is the weight of a line
+/// in independent measurements; lines count less the further their border is, in units of `robust` deviations of all lines
+/// (Tukey's biweight; 0 for all alike).
+pub fn add_lines(
+    equations: &mut NormalEquations,
+    lines: &[Line],
+    crop: &Camera,
+    centre: &Vec3,
+    reach: f64,
+    line_weight: f64,
+    robust: f64,
+) {
+    if lines.is_empty() {
+        return;
+    }
+    let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
+    let middle = offsets.len() / 2;
+    let deviation = 1.4826 * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let robust = robust * deviation.max(0.5);
+    for line in lines {
+        let rows = motion(crop, &line.point, centre);
+        let jacobian: [f64; 6] =
+            std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
+        let mut weight = line_weight * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
+        if robust > 0.0 {
+            weight *= tukey(line.offset / robust);
+        }
+        equations.add(&jacobian, -line.offset, weight);
+    }
+}
+
+/// Derivative of a point's pixel by a twist `(v, w)` about `centre`, pixels per metre and radian.
+pub fn motion(camera: &Camera, point: &Vec3, centre: &Vec3) -> [[f64; 6]; 2] {
+    let (x, y, z) = (point.x, point.y, point.z);
+    let rows = [
+        Vec3::new(camera.fx / z, 0.0, -camera.fx * x / (z * z)),
+        Vec3::new(0.0, camera.fy / z, -camera.fy * y / (z * z)),
+    ];
+    let arm = point - centre;
+    rows.map(|row| {
+        // d(w x arm) = row . (w x arm) = w . (arm x row)
+        let turn = arm.cross(&row);
+        [row.x, row.y, row.z, turn.x, turn.y, turn.z]
+    })
+}
+
+/// Weight of a residual in units of its noise (Tukey's biweight, tuned to 95 % efficiency).
+pub fn tukey(r: f64) -> f64 {
+    let t = r / 4.685;
+    if t.abs() >= 1.0 { 0.0 } else { (1.0 - t * t).powi(2) }
+}
