@@ -72,6 +72,17 @@ impl ColorAugmentation {
         }
     }
 
+    /// Table 4.1: that of the photographs that new views are put together from. (The table's noise has a standard deviation of 10;
+    /// here it is anything up to that.)
+    pub fn table_4_1() -> Self {
+        ColorAugmentation {
+            multiply_per_channel: 0.0,
+            noise_chance: 1.0,
+            noise: [0.0, 10.0 / 255.0],
+            ..ColorAugmentation::table_3_2()
+        }
+    }
+
     /// Table 3.2 with the noise and the strong contrast of the author's public code.
     pub fn real_images() -> Self {
         ColorAugmentation {

@@ -387,6 +387,10 @@ pub(crate) enum TrainCommand {
     #[command(after_help = "Example:\n  sixfold train dgcm --out out/dgcm\n\n\
         Stopped, the same command goes on.")]
     Dgcm(Box<crate::commands::train_dgcm::TrainDgcmArguments>),
+    /// Train the network that renders new views of an object from few photographs, on made-up objects
+    #[command(after_help = "Example:\n  sixfold train nol --backgrounds photographs --out out/nol\n\n\
+        Stopped, the same command goes on.")]
+    Nol(Box<crate::commands::train_nol::TrainNolArguments>),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

@@ -4,6 +4,7 @@ pub mod kernels;
 pub mod layers;
 pub mod lite0;
 pub mod ops;
+pub mod recurrent;
 
 pub mod batch_norm;
 pub mod checkpoint;

@@ -207,10 +207,15 @@ impl Lite0 {
     /// Last feature map of every stage. `x` is `batch x 3 x height x width`; the maps have 16, 24, 40, 80, 112, 192 and
     /// 320 channels at 1/2, 1/4, 1/8, 1/16, 1/16, 1/32 and 1/32 of the resolution, as many as there are stages.
     pub fn forward(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
+        self.forward_stages(x, STAGES.len())
+    }
+
+    /// [`Self::forward`] up to this number of stages.
+    pub fn forward_stages(&self, x: Tensor<4>, stages: usize) -> Vec<Tensor<4>> {
         let mut x = self.stem.forward(x);
         let mut blocks = self.blocks.iter();
         let mut maps = Vec::new();
-        for (repeats, ..) in STAGES {
+        for (repeats, ..) in STAGES.into_iter().take(stages) {
             let stage: Vec<&Block> = blocks.by_ref().take(repeats).collect();
             if stage.is_empty() {
                 break;

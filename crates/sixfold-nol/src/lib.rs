@@ -5,10 +5,19 @@
 //! A [`Photograph`] is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
+mod features;
+pub mod loss;
+pub mod model;
+pub mod network;
 mod photograph;
+mod preview;
 mod projection;
+pub mod quality;
+pub mod samples;
 mod source;
+pub mod training;
 
+pub use features::SourceFeatures;
 pub use photograph::{NolError, Photograph};
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;

@@ -11,7 +11,7 @@ use crate::projection::{Projection, TargetSurface};
 /// Colour where the crop reaches out of the image.
 const OUTSIDE: f32 = 0.5;
 /// The crop's side in units of the object's box: room for a pose that is off.
-const MARGIN: f64 = 1.3;
+pub(crate) const MARGIN: f64 = 1.3;
 /// A point counts as seen up to this depth behind what the mesh shows there, in units of the mesh's diameter.
 const BEHIND: f64 = 0.02;
 

@@ -21,3 +21,4 @@ pub(crate) mod train;
 pub(crate) mod train_detector;
 #[cfg(feature = "experience")]
 pub(crate) mod train_dgcm;
+pub(crate) mod train_nol;

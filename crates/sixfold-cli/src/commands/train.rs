@@ -52,6 +52,24 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })?;
             Ok(Outcome::Found)
         }
+        TrainCommand::Nol(nol) => {
+            let summary = super::train_nol::train_nol(nol)?;
+            report(&a.json, &summary, || {
+                match summary.seconds {
+                    Some(seconds) => {
+                        println!("{} steps in {seconds:.0} s: {}", summary.steps, summary.model);
+                        println!("learning curves: {}", nol.out.join("training/curves.png").display());
+                    }
+                    None => println!("the model after {} steps: {}", summary.steps, summary.model),
+                }
+                let q = &summary.quality;
+                println!(
+                    "new made-up objects: {:.2} dB with rough poses (averaging {:.2}), {:.2} dB with exact ones (averaging {:.2})",
+                    q.rough, q.rough_average, q.exact, q.exact_average
+                );
+            })?;
+            Ok(Outcome::Found)
+        }
         #[cfg(feature = "experience")]
         TrainCommand::Dgcm(dgcm) => {
             let summary = super::train_dgcm::train_dgcm(dgcm)?;

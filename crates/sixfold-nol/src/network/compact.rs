@@ -1,0 +1,90 @@
+//! The compact network: the dissertation's structure for two processor cores.
+//!
+//! It differs in the encoder, EfficientNet-Lite0 with ImageNet weights that stay as they are (its maps of 16, 24, 40 and 112
+//! channels at 1/2 to 1/16 of the resolution), in two LSTM layers of 16 channels for three of 32, 32 and 16, in a narrower weight
+//! block, and in a decoder of four blocks at half the resolution.
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use sixfold_nn::batch_norm::{BatchNorm, BatchNormConfig};
+use sixfold_nn::conv_norm::{BareConv, BareConvConfig};
+use sixfold_nn::lite0::{Lite0, imagenet_encoder};
+use sixfold_nn::weights::WeightsError;
+
+use super::decoder::DecoderConfig;
+use super::integrator::IntegratorConfig;
+use super::weighting::WeightingConfig;
+use super::{Head, HeadConfig, Parts, REDUCED};
+
+/// The encoder's maps that are used, and their channels.
+const MAPS: [(usize, usize); 4] = [(0, 16), (1, 24), (2, 40), (4, 112)];
+
+/// The compact network's options.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct CompactConfig {
+    /// What is left out for comparison.
+    pub parts: Parts,
+}
+
+impl CompactConfig {
+    /// The network on the ImageNet encoder that the program carries, the rest random.
+    ///
+    /// # Errors
+    /// [`WeightsError`] if the program carries another encoder than its own version's.
+    pub fn init(&self, seed: u64, device: &Device) -> Result<Compact, WeightsError> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let rng = &mut rng;
+        let reduce = MAPS.iter().zip(REDUCED).map(|(&(_, inputs), outputs)| {
+            BareConvConfig::new([inputs, outputs], 3).init(rng, device)
+        });
+        let reduce = reduce.collect();
+        let norm = REDUCED.iter().map(|&c| BatchNormConfig::new(c).init(device)).collect();
+        let head = HeadConfig {
+            integrator: IntegratorConfig { kind: self.parts.integrator, hidden: &[16] },
+            weighting: WeightingConfig { channels: [16, 16, 8] },
+            decoder: self.parts.decoder.then_some(DecoderConfig {
+                filters: 24,
+                blocks: 4,
+                expansion: 4,
+                linear_ratio: 0.8,
+                half: true,
+            }),
+        };
+        Ok(Compact {
+            encoder: imagenet_encoder(&Device::flex())?,
+            reduce,
+            norm,
+            head: head.init(rng, device),
+        })
+    }
+}
+
+/// The compact network, made by [`CompactConfig`].
+#[derive(Module, Debug)]
+pub struct Compact {
+    /// Frozen, on a device without gradients, and in no file: the program carries it.
+    #[module(skip)]
+    encoder: Lite0,
+    reduce: Vec<BareConv>,
+    norm: Vec<BatchNorm>,
+    pub(super) head: Head,
+}
+
+impl Compact {
+    /// See [`super::Network::encode`].
+    pub fn encode(&self, images: Tensor<4>) -> Vec<Tensor<4>> {
+        let training = images.device().is_autodiff();
+        let maps = self.encoder.forward_stages(if training { images.inner() } else { images }, 5);
+        let layers = self.reduce.iter().zip(&self.norm);
+        layers
+            .zip(MAPS)
+            .map(|((conv, norm), (map, _))| {
+                let map = maps[map].clone();
+                let map = if training { Tensor::from_inner(map) } else { map };
+                conv.forward_norm(map, norm, None, 0.0)
+            })
+            .collect()
+    }
+}

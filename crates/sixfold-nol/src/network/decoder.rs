@@ -1,0 +1,108 @@
+//! The decoder of the training (dissertation, section 4.2.1): WDSR-B (Yu et al. 2018), wide activations before narrow linear
+//! layers. It takes up what the sources' colours are off by, so that the weights are not blamed for it.
+//!
+//! Without the original's weight normalisation; zeros at the border.
+
+use burn::module::Module;
+use burn::tensor::module::avg_pool2d;
+use burn::tensor::ops::AvgPoolOptions;
+use burn::tensor::{Device, Tensor};
+use rand_chacha::ChaCha8Rng;
+use sixfold_nn::kernels::Activation;
+use sixfold_nn::layers::{Conv, ConvConfig, Padding};
+
+use super::{CHANNELS, COLOURS};
+
+/// Sizes of the decoder.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct DecoderConfig {
+    /// Channels between the blocks.
+    pub filters: usize,
+    /// Residual blocks.
+    pub blocks: usize,
+    /// Channels at the activation, in units of `filters`.
+    pub expansion: usize,
+    /// Channels of the narrow layer, in units of `filters`.
+    pub linear_ratio: f32,
+    /// The blocks work at half the resolution and their result is shuffled up; else, as in the original, at the whole one, and
+    /// the result of twice that is brought down again.
+    pub half: bool,
+}
+
+impl DecoderConfig {
+    pub fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Decoder {
+        let (filters, wide) = (self.filters, self.filters * self.expansion);
+        let narrow = (filters as f32 * self.linear_ratio) as usize;
+        let head = ConvConfig::new([CHANNELS, filters], 3, Activation::Linear);
+        let head = if self.half {
+            ConvConfig { padding: Padding::Zeros(1), ..head.with_stride(2) }
+        } else {
+            head
+        };
+        let head = head.init(1.0, rng, device);
+        let blocks = (0..self.blocks)
+            .map(|_| Block {
+                wide: ConvConfig::new([filters, wide], 1, Activation::Relu).init(2.0, rng, device),
+                narrow: ConvConfig::new([wide, narrow], 1, Activation::Linear).init(1.0, rng, device),
+                mix: ConvConfig::new([narrow, filters], 3, Activation::Linear).init(0.1, rng, device),
+            })
+            .collect();
+        let tail =
+            ConvConfig::new([filters, 4 * COLOURS], 3, Activation::Linear).init(0.1, rng, device);
+        let shuffled = if self.half { 1 } else { 4 };
+        // The skip begins as the colours themselves: the decoder has to learn differences only.
+        let config = ConvConfig::new([CHANNELS, shuffled * COLOURS], 5, Activation::Linear);
+        let mut weight = vec![0.0; config.weight_shape().iter().product()];
+        for output in 0..shuffled * COLOURS {
+            weight[(output * CHANNELS + output / shuffled) * 25 + 12] = 1.0;
+        }
+        let skip = config.with_values(weight, vec![0.0; shuffled * COLOURS], device);
+        Decoder { head, blocks, tail, skip, half: self.half }
+    }
+}
+
+#[derive(Module, Debug)]
+struct Block {
+    wide: Conv,
+    narrow: Conv,
+    mix: Conv,
+}
+
+/// WDSR-B, made by [`DecoderConfig`].
+#[derive(Module, Debug)]
+pub(super) struct Decoder {
+    head: Conv,
+    blocks: Vec<Block>,
+    tail: Conv,
+    skip: Conv,
+    half: bool,
+}
+
+impl Decoder {
+    /// X^S (`B x 17 x height x width`, sides even) to X^phi (`B x 3 x height x width`).
+    pub fn forward(&self, sum: Tensor<4>) -> Tensor<4> {
+        let mut x = self.head.forward(sum.clone());
+        for block in &self.blocks {
+            let inner = block.narrow.forward(block.wide.forward(x.clone()));
+            x = x + block.mix.forward(inner);
+        }
+        let (body, skip) = (self.tail.forward(x), self.skip.forward(sum));
+        if self.half {
+            return pixel_shuffle(body) + skip;
+        }
+        // Bilinear halving with pixel centres at halves is the mean of 2x2 pixels.
+        avg_pool2d(pixel_shuffle(body + skip), AvgPoolOptions::new([2, 2]))
+    }
+}
+
+/// `batch x 4c x h x w` to `batch x c x 2h x 2w`: four channels become 2x2 pixels.
+fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
+    let [batch, channels, height, width] = x.dims();
+    let c = channels / 4;
+    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
+        batch,
+        c,
+        2 * height,
+        2 * width,
+    ])
+}

@@ -1,0 +1,67 @@
+//! A picture of what the training has come to, drawn with every checkpoint.
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::{Device, Tensor};
+use sixfold_augment::Backgrounds;
+
+use crate::network::{COLOURS, Network};
+use crate::samples::{Batch, SampleOptions, make_sample};
+use crate::training::pass;
+
+/// Rows of the picture, and sources in each.
+const ROWS: u64 = 5;
+const SOURCES: usize = 5;
+const SIDE: usize = 128;
+
+/// The same made-up objects every time.
+pub(crate) struct Preview {
+    batch: Batch,
+    file: PathBuf,
+}
+
+impl Preview {
+    pub fn new(textures: &Backgrounds, options: &SampleOptions, seed: u64, folder: &Path) -> Self {
+        // Numbers that no training comes to.
+        let sample = |row| make_sample(textures, options, SIDE, SOURCES, seed, u64::MAX - row);
+        let samples: Vec<_> = (0..ROWS).map(sample).collect();
+        Preview { batch: Batch::of_samples(&samples), file: folder.join("preview.png") }
+    }
+
+    /// Draws sources, the true target, the sources' average, X^D and X^phi. A picture that cannot be written is no reason to stop
+    /// a training.
+    pub fn draw(&self, network: &Network) {
+        let passed = pass(network, self.batch.clone(), &Device::flex());
+        let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
+        let (average, _) = self.batch.average();
+        let images = [
+            plain(passed.target * passed.mask.clone()),
+            average,
+            plain(passed.blend.sum.narrow(1, 0, COLOURS)),
+            plain(passed.image * passed.mask),
+        ];
+        let (rows, columns) = (self.batch.samples, SOURCES + images.len());
+        let mut picture = vec![0u8; 3 * rows * columns * SIDE * SIDE];
+        let mut put = |row: usize, column: usize, values: &[f32], number: usize| {
+            for (c, plane) in values[number * COLOURS * SIDE * SIDE..].chunks(SIDE * SIDE).take(COLOURS).enumerate() {
+                for (i, v) in plane.iter().enumerate() {
+                    let (y, x) = (row * SIDE + i / SIDE, column * SIDE + i % SIDE);
+                    picture[3 * (y * columns * SIDE + x) + c] = (127.5 * (v.clamp(-1.0, 1.0) + 1.0)) as u8;
+                }
+            }
+        };
+        for row in 0..rows {
+            for k in 0..SOURCES {
+                put(row, k, &self.batch.images, k * rows + row);
+            }
+            for (k, image) in images.iter().enumerate() {
+                put(row, SOURCES + k, image, row);
+            }
+        }
+        let (width, height) = ((columns * SIDE) as u32, (rows * SIDE) as u32);
+        let saved = image::save_buffer(&self.file, &picture, width, height, image::ExtendedColorType::Rgb8);
+        if let Err(error) = saved {
+            eprintln!("{}: cannot be written: {error}", self.file.display());
+        }
+    }
+}

@@ -1,0 +1,14 @@
+//! What the network learns from (dissertation, section 4.2.2): made-up objects with random textures, seen in cluttered images with
+//! poses that are off.
+//!
+//! The dissertation renders 1,000 sets of ten images of scanned objects before the training; here every sample is made when it is
+//! needed, a function of seed and number alone, and no scanned object takes part.
+
+mod batch;
+mod object;
+mod view;
+
+pub use batch::{Batch, BatchOptions, Looked, look_up};
+pub(crate) use batch::{order, share};
+pub use object::PaintedObject;
+pub use view::{Sample, SampleOptions, make_sample};

@@ -1,0 +1,243 @@
+//! One sample: a target view, and source views with clutter, other light, other colours and poses that are off (dissertation, table
+//! 4.1).
+
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+use sixfold_augment::{
+    Backgrounds, ColorAugmentation, Coverage, Patch, Random, Shape, Window, occluder_of_fraction, stream, uniform,
+};
+use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
+
+use super::object::{Lamp, PaintedObject, between, random_direction};
+use crate::photograph::Photograph;
+use crate::projection::TargetSurface;
+use crate::source::{MARGIN, SourceView};
+
+/// The target's side in units of the object's box.
+const TARGET_MARGIN: f64 = 1.1;
+
+/// How samples are made.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SampleOptions {
+    /// Longest side of an object, smallest and largest, metres.
+    pub size: [f64; 2],
+    /// Distance from camera to object, smallest and largest, metres.
+    pub distance: [f64; 2],
+    /// Poses of sources are off by up to this along every axis, metres (table 4.1).
+    pub translation: f64,
+    /// And turned by up to this about every axis, radians (table 4.1).
+    pub rotation: f64,
+    /// In this share of the samples poses are good: off by 0 to 30 % of that, as refined ones are.
+    pub good_poses: f64,
+    /// Chance that something stands in front of the object in a source.
+    pub occluded: f64,
+    /// Most of the object that it hides.
+    pub occlusion: f32,
+    /// Chance that the source's mask leaves out what is hidden.
+    pub mask_known: f64,
+}
+
+impl Default for SampleOptions {
+    fn default() -> Self {
+        SampleOptions {
+            size: [0.06, 0.3],
+            distance: [0.4, 1.2],
+            translation: 0.01,
+            rotation: 0.05,
+            good_poses: 0.5,
+            occluded: 0.4,
+            occlusion: 0.4,
+            mask_known: 0.7,
+        }
+    }
+}
+
+/// What the network is given and what it should say.
+#[derive(Debug, Clone)]
+pub struct Sample {
+    /// The photographs' crops, with poses that are off.
+    pub sources: Vec<SourceView>,
+    /// What the target view shows; its pose is exact.
+    pub surface: TargetSurface,
+    /// X^GT, `side x side`.
+    pub target: Patch,
+}
+
+/// The sample with this number and `sources` sources, all crops `side` pixels wide; the same for the same seed.
+pub fn make_sample(
+    textures: &Backgrounds,
+    options: &SampleOptions,
+    side: usize,
+    sources: usize,
+    seed: u64,
+    number: u64,
+) -> Sample {
+    let random = &mut stream(seed, number);
+    let object = PaintedObject::random(textures, options.size, random);
+    let camera = photographs_camera(random);
+    // Half of the objects are seen from above only, as on a table.
+    let upright = random.random::<bool>();
+    let direction = |random: &mut Random| {
+        let d = random_direction(random);
+        if upright { Vec3::new(d.x, d.y, d.z.abs()) } else { d }
+    };
+    let off = if random.random::<f64>() < options.good_poses { between(random, 0.0, 0.3) } else { 1.0 };
+    let shiny = random.random::<bool>();
+    let lamp = Lamp {
+        towards: direction(random),
+        ambient: uniform(random, [0.5, 0.9]),
+        diffuse: uniform(random, [0.1, 0.6]),
+        specular: 0.0,
+        shininess: uniform(random, [8.0, 60.0]),
+    };
+    // The object lies still while the camera goes round it, or is turned under a lamp that stands still.
+    let turned = random.random::<f64>() < 0.3;
+
+    let from = direction(random);
+    let pose = seen_from(&from, options, random);
+    let window = window_of(&camera, &object, &pose, TARGET_MARGIN);
+    let target_camera = window.camera(&camera, side);
+    let surface = TargetSurface::new(&object.mesh, &target_camera, &pose);
+    let (target, _) = object.draw(&target_camera, &pose, &lamp, Patch::filled(side, side, [0.5; 3]));
+
+    let sources = (0..sources)
+        .map(|_| {
+            // Sources are chosen because they show what the target shows: most lie within 60 degrees.
+            let around = direction(random);
+            let near = between(random, 0.3, 2.0);
+            let from = (from * near + around).try_normalize(1e-6).unwrap_or(around);
+            let pose = seen_from(&from, options, random);
+            let towards =
+                if turned { direction(random) } else { lamp.towards + random_direction(random) * 0.3 };
+            let lamp = Lamp {
+                towards: towards.try_normalize(1e-6).unwrap_or(lamp.towards),
+                ambient: lamp.ambient * uniform(random, [0.85, 1.15]),
+                diffuse: lamp.diffuse * uniform(random, [0.8, 1.2]),
+                specular: if shiny { uniform(random, [0.0, 0.6]) } else { 0.0 },
+                ..lamp
+            };
+            source(&object, textures, options, &camera, &pose, off, &lamp, side, random)
+        })
+        .collect();
+    Sample { sources, surface, target }
+}
+
+/// A camera of 640x480 pixels.
+fn photographs_camera(random: &mut Random) -> Camera {
+    let f = between(random, 480.0, 680.0);
+    Camera { fx: f, fy: f, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None }
+}
+
+/// The pose of an object seen from a direction (object frame), somewhere in the image.
+fn seen_from(direction: &Vec3, options: &SampleOptions, random: &mut Random) -> Pose {
+    let z = -direction;
+    let helper = if z.z.abs() < 0.95 { Vec3::z() } else { Vec3::x() };
+    let x = z.cross(&helper).normalize();
+    let y = z.cross(&x);
+    let rotation = UnitQuaternion::from_matrix(&Mat3::from_columns(&[x, y, z]).transpose());
+    let roll = if random.random::<f64>() < 0.8 { 0.5 } else { std::f64::consts::PI };
+    let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), between(random, -roll, roll));
+    let distance = between(random, options.distance[0], options.distance[1]);
+    let aside = Vec3::new(between(random, -0.3, 0.3), between(random, -0.22, 0.22), 1.0);
+    Pose::new(roll * rotation, aside * distance)
+}
+
+/// A pose that is off as table 4.1 has it, in units of `share`.
+fn perturbed(pose: &Pose, options: &SampleOptions, share: f64, random: &mut Random) -> Pose {
+    let mut each =
+        |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
+    let (shift, angles) = (each(options.translation), each(options.rotation));
+    let turn = UnitQuaternion::from_euler_angles(angles.x, angles.y, angles.z);
+    Pose::new(turn * pose.rotation(), pose.translation() + shift)
+}
+
+fn window_of(camera: &Camera, object: &PaintedObject, pose: &Pose, margin: f64) -> Window {
+    let Some((centre, longest)) = Photograph::box_of(camera, &object.mesh, pose) else {
+        unreachable!("an object of 30 cm at 40 cm lies before the camera")
+    };
+    Window { centre, side: longest.max(4.0) * margin }
+}
+
+#[allow(clippy::too_many_arguments)]
+fn source(
+    object: &PaintedObject,
+    textures: &Backgrounds,
+    options: &SampleOptions,
+    camera: &Camera,
+    pose: &Pose,
+    off: f64,
+    lamp: &Lamp,
+    side: usize,
+    random: &mut Random,
+) -> SourceView {
+    let said = perturbed(pose, options, off, random);
+    let camera = window_of(camera, object, &said, MARGIN).camera(camera, side);
+    let (mut patch, seen) = object.draw(&camera, pose, lamp, textures.patch(side, side, random));
+    patch.soften_border(&seen, 0.7);
+    let mut visible = Coverage::filled(side, side, 1.0);
+    if random.random::<f64>() < options.occluded {
+        let shape = Shape::random(random);
+        let centre = [0; 2].map(|_| random.random::<f32>() * side as f32);
+        let fraction = uniform(random, [0.05, options.occlusion]);
+        if let Some(cover) = occluder_of_fraction(&shape, centre, &seen, fraction) {
+            patch.blend(&textures.patch(side, side, random), &cover);
+            if random.random::<f64>() < options.mask_known {
+                visible.remove(&cover);
+            }
+        }
+    }
+    // Small objects are enlarged by the crop and come out soft.
+    if random.random::<f64>() < 0.4 {
+        patch.blur(uniform(random, [0.0, 1.2]));
+    }
+    ColorAugmentation::table_4_1().apply(&mut patch, random);
+    SourceView::of_crop(patch, visible, camera, said, &object.mesh)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_keep_to_their_seed_and_sources_see_the_target() {
+        let textures = Backgrounds::procedural();
+        let options = SampleOptions::default();
+        let sample = |number| make_sample(&textures, &options, 64, 4, 3, number);
+        let (a, b) = (sample(5), sample(5));
+        assert_eq!(a.target, b.target);
+        assert_eq!(a.sources[2].patch, b.sources[2].patch);
+        let (mut seen, mut all) = (0, 0);
+        for number in 0..20 {
+            let s = sample(number);
+            assert!(s.surface.pixels.len() > 200, "{}", s.surface.pixels.len());
+            for source in &s.sources {
+                let projection = source.project(&s.surface);
+                seen += projection.cosines.iter().filter(|c| **c > 0.0).count();
+                all += projection.cosines.len();
+            }
+        }
+        let share = seen as f64 / all as f64;
+        assert!((0.4..0.95).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn without_perturbation_sources_show_the_targets_colours() {
+        let textures = Backgrounds::procedural();
+        let options = SampleOptions { translation: 0.0, rotation: 0.0, occluded: 0.0, ..SampleOptions::default() };
+        let mut off = vec![];
+        for number in 0..8 {
+            let s = make_sample(&textures, &options, 96, 1, 1, number);
+            let projection = s.sources[0].project(&s.surface);
+            for (i, (place, cosine)) in projection.pixels.iter().zip(&projection.cosines).enumerate() {
+                if *cosine > 0.3 {
+                    let at = s.surface.pixels[i] as usize;
+                    let (x, y) = (place[0] as usize, place[1] as usize);
+                    off.push((s.target.data[at] - s.sources[0].patch.data[y * 96 + x]).abs());
+                }
+            }
+        }
+        let mean = off.iter().sum::<f32>() / off.len() as f32;
+        assert!(mean < 0.16, "{mean}");
+    }
+}
