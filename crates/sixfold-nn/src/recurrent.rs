@@ -176,10 +176,8 @@ impl<B: RecurrentOps, C: CheckpointStrategy> RecurrentOps for Autodiff<B, C> {
 pub fn lstm_cell(gates: Tensor<4>, before: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let ([batch, all, height, width], shape) = (gates.dims(), before.dims());
     assert_eq!([batch, all, height, width], [shape[0], 4 * shape[1], shape[2], shape[3]], "gates of an LSTM");
-    let out = Tensor::<4>::from_dispatch(Dispatch::sixfold_lstm(
-        gates.into_dispatch(),
-        before.into_dispatch(),
-    ));
+    let out =
+        Tensor::<4>::from_dispatch(Dispatch::sixfold_lstm(gates.into_dispatch(), before.into_dispatch()));
     (out.clone().narrow(0, 0, batch), out.narrow(0, batch, batch))
 }
 

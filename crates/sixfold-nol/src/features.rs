@@ -55,7 +55,8 @@ impl SourceFeatures {
         for map in &self.maps {
             let [height, width] = map.size;
             let (to_x, to_y) = (width as f32 / self.side as f32, height as f32 / self.side as f32);
-            let (u, v) = (share(x, self.side) * width as f32 - 0.5, share(y, self.side) * height as f32 - 0.5);
+            let (u, v) =
+                (share(x, self.side) * width as f32 - 0.5, share(y, self.side) * height as f32 - 0.5);
             let (u_in, v_in) = (u.clamp(0.0, (width - 1) as f32), v.clamp(0.0, (height - 1) as f32));
             // Beyond the outer pixels nothing changes.
             let (to_x, to_y) = (if u == u_in { to_x } else { 0.0 }, if v == v_in { to_y } else { 0.0 });
@@ -98,9 +99,7 @@ mod tests {
             features.sample(x, y, &mut a);
             assert!(v.iter().zip(&a).all(|(v, a)| (v - a).abs() < 1e-5));
             let h = 0.01;
-            for (slope, ahead, behind) in
-                [(&dx, (x + h, y), (x - h, y)), (&dy, (x, y + h), (x, y - h))]
-            {
+            for (slope, ahead, behind) in [(&dx, (x + h, y), (x - h, y)), (&dy, (x, y + h), (x, y - h))] {
                 features.sample(ahead.0, ahead.1, &mut a);
                 features.sample(behind.0, behind.1, &mut b);
                 for c in 0..n {

@@ -173,14 +173,12 @@ impl NolModel {
         let pixels = area.width * area.height;
         let mut values = vec![0.0; order.len() * CHANNELS * pixels];
         let mut valid = vec![0.0; order.len() * pixels];
-        values
-            .par_chunks_mut(CHANNELS * pixels)
-            .zip(valid.par_chunks_mut(pixels))
-            .zip(&order)
-            .for_each(|((values, valid), &source)| {
+        values.par_chunks_mut(CHANNELS * pixels).zip(valid.par_chunks_mut(pixels)).zip(&order).for_each(
+            |((values, valid), &source)| {
                 let (looked, features) = (&looked[source], &features[source]);
                 let mut at_place = [0.0; CHANNELS];
-                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines) {
+                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines)
+                {
                     let at = area.index(target, *point as usize);
                     features.sample(pixel[0], pixel[1], &mut at_place);
                     at_place[COLOURS + FEATURES] = *cosine;
@@ -189,7 +187,8 @@ impl NolModel {
                     }
                     valid[at] = 1.0;
                 }
-            });
+            },
+        );
         let tensor = |values: Vec<f32>, channels: usize| {
             let shape = [order.len(), channels, area.height, area.width];
             Tensor::<4>::from_data(TensorData::new(values, shape), &self.device)

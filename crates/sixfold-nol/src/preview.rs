@@ -43,7 +43,9 @@ impl Preview {
         let (rows, columns) = (self.batch.samples, SOURCES + images.len());
         let mut picture = vec![0u8; 3 * rows * columns * SIDE * SIDE];
         let mut put = |row: usize, column: usize, values: &[f32], number: usize| {
-            for (c, plane) in values[number * COLOURS * SIDE * SIDE..].chunks(SIDE * SIDE).take(COLOURS).enumerate() {
+            for (c, plane) in
+                values[number * COLOURS * SIDE * SIDE..].chunks(SIDE * SIDE).take(COLOURS).enumerate()
+            {
                 for (i, v) in plane.iter().enumerate() {
                     let (y, x) = (row * SIDE + i / SIDE, column * SIDE + i % SIDE);
                     picture[3 * (y * columns * SIDE + x) + c] = (127.5 * (v.clamp(-1.0, 1.0) + 1.0)) as u8;
@@ -59,7 +61,11 @@ impl Preview {
             }
         }
         let (width, height) = ((columns * SIDE) as u32, (rows * SIDE) as u32);
-        let saved = image::save_buffer(&self.file, &picture, width, height, image::ExtendedColorType::Rgb8);
+        // The first picture comes before the first checkpoint, which makes the folder.
+        let folder = self.file.parent().map_or(Ok(()), std::fs::create_dir_all);
+        let saved = folder.map_err(image::ImageError::IoError).and_then(|()| {
+            image::save_buffer(&self.file, &picture, width, height, image::ExtendedColorType::Rgb8)
+        });
         if let Err(error) = saved {
             eprintln!("{}: cannot be written: {error}", self.file.display());
         }

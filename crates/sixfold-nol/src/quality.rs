@@ -2,12 +2,16 @@
 
 use std::collections::BTreeMap;
 
+use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
 use sixfold_augment::Backgrounds;
+use sixfold_nn::lite0::imagenet_encoder;
+use sixfold_nn::weights::WeightsError;
 
-use crate::loss::psnr;
+use crate::loss::{Perceptual, image_loss, psnr, squared_error};
 use crate::model::NolModel;
-use crate::samples::{SampleOptions, look_up, make_sample};
+use crate::network::COLOURS;
+use crate::samples::{Batch, SampleOptions, make_sample};
 
 /// What to measure on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,85 +32,103 @@ impl Default for QualityOptions {
     }
 }
 
-/// Mean peak signal-to-noise ratios over the objects, decibels, where any source sees something.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+/// Means over the objects, where any source sees something.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Likeness {
+    /// Peak signal-to-noise ratio, decibels. It forgives blur.
+    pub psnr: f64,
+    /// Difference of features, as in equation 4.1 for the compact network. It does not.
+    pub features: f64,
+}
+
+/// X^D and the average of the same sources beside the truth.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Quality {
-    /// Of X^D, with poses off as table 4.1 has it.
-    pub rough: f64,
-    /// Of the sources' average there.
-    pub rough_average: f64,
-    /// Of X^D with exact poses.
-    pub exact: f64,
-    /// Of the sources' average there.
-    pub exact_average: f64,
+    /// X^D, with poses off as table 4.1 has it.
+    pub rough: Likeness,
+    /// The sources' average there.
+    pub rough_average: Likeness,
+    /// X^D with exact poses.
+    pub exact: Likeness,
+    /// The sources' average there.
+    pub exact_average: Likeness,
 }
 
 impl Quality {
     /// For a model card.
     pub fn scores(&self) -> BTreeMap<String, f64> {
         [
-            ("PSNR, rough poses", self.rough),
-            ("PSNR of averaging, rough poses", self.rough_average),
-            ("PSNR, exact poses", self.exact),
-            ("PSNR of averaging, exact poses", self.exact_average),
+            ("rough poses", self.rough),
+            ("rough poses, averaging", self.rough_average),
+            ("exact poses", self.exact),
+            ("exact poses, averaging", self.exact_average),
         ]
         .into_iter()
-        .map(|(name, value)| (name.to_owned(), value))
+        .flat_map(|(name, likeness)| {
+            [
+                (format!("PSNR in dB, {name}"), likeness.psnr),
+                (format!("difference of features, {name}"), likeness.features),
+            ]
+        })
         .collect()
     }
 }
 
-/// Measures a model.
+/// Measures a model on objects with these textures.
+///
+/// # Errors
+/// [`WeightsError`] if the program carries another encoder than its own version's.
 pub fn quality(
     model: &NolModel,
     textures: &Backgrounds,
     samples: &SampleOptions,
     options: &QualityOptions,
-) -> Quality {
+) -> Result<Quality, WeightsError> {
+    let perceptual = Perceptual::Lite0(Box::new(imagenet_encoder(&Device::flex())?));
     let rough = SampleOptions { good_poses: 0.0, ..*samples };
     let exact = SampleOptions { translation: 0.0, rotation: 0.0, ..*samples };
     let [rough, exact] = [rough, exact].map(|samples| {
-        let mut sums = [0.0; 2];
+        let mut means = [Likeness::default(); 2];
         for number in 0..options.objects {
-            let errors = errors(model, textures, &samples, options, number);
-            sums.iter_mut().zip(errors).for_each(|(sum, e)| *sum += psnr(e) / options.objects.max(1) as f64);
+            let found = compare(model, textures, &samples, options, number, &perceptual);
+            for (mean, one) in means.iter_mut().zip(found) {
+                mean.psnr += one.psnr / options.objects.max(1) as f64;
+                mean.features += one.features / options.objects.max(1) as f64;
+            }
         }
-        sums
+        means
     });
-    Quality { rough: rough[0], rough_average: rough[1], exact: exact[0], exact_average: exact[1] }
+    Ok(Quality { rough: rough[0], rough_average: rough[1], exact: exact[0], exact_average: exact[1] })
 }
 
-/// Mean squared errors of X^D and of averaging for one object.
-fn errors(
+/// X^D and averaging for one object.
+fn compare(
     model: &NolModel,
     textures: &Backgrounds,
     samples: &SampleOptions,
     options: &QualityOptions,
     number: u64,
-) -> [f64; 2] {
+    perceptual: &Perceptual,
+) -> [Likeness; 2] {
     let sample = make_sample(textures, samples, options.side, options.sources, options.seed, number);
     let features = model.encode(&sample.sources);
     let rendering = model.render(&sample.surface, &sample.sources, &features);
-    let mut average = vec![([0.0f32; 3], 0.0f32); sample.surface.points.len()];
-    for (source, features) in sample.sources.iter().zip(&features) {
-        let looked = look_up(source, &sample.surface);
-        let mut values = vec![0.0; features.channels()];
-        for (point, pixel) in looked.points.iter().zip(&looked.pixels) {
-            features.sample(pixel[0], pixel[1], &mut values);
-            let (sum, count) = &mut average[*point as usize];
-            (0..3).for_each(|c| sum[c] += 0.5 * values[c] + 0.5);
-            *count += 1.0;
-        }
+    let batch = Batch::of_samples(std::slice::from_ref(&sample));
+    let (side, pixels) = (options.side, options.side * options.side);
+    let mut image = vec![0.0; COLOURS * pixels];
+    let mut mask = vec![0.0; pixels];
+    for (i, at) in sample.surface.pixels.iter().map(|p| *p as usize).enumerate() {
+        (0..COLOURS).for_each(|c| image[c * pixels + at] = 2.0 * rendering.colours[i][c] - 1.0);
+        mask[at] = f32::from(u8::from(rendering.seen[i]));
     }
-    let pixels = options.side * options.side;
-    let (mut errors, mut count) = ([0.0f64; 2], 0.0f64);
-    for (i, (sum, sources)) in average.iter().enumerate().filter(|(_, (_, n))| *n > 0.0) {
-        for c in 0..3 {
-            let truth = sample.target.data[c * pixels + sample.surface.pixels[i] as usize];
-            errors[0] += f64::from(rendering.colours[i][c] - truth).powi(2);
-            errors[1] += f64::from(sum[c] / sources - truth).powi(2);
-            count += 1.0;
-        }
-    }
-    errors.map(|e| e / count.max(1.0))
+    let tensor = |values: Vec<f32>, channels: usize| {
+        Tensor::<4>::from_data(TensorData::new(values, [1, channels, side, side]), &Device::flex())
+    };
+    let (truth, mask) = (tensor(batch.target.clone(), COLOURS), tensor(mask, 1));
+    [image, batch.average().0].map(|image| {
+        let image = tensor(image, COLOURS);
+        let error = squared_error(image.clone(), truth.clone(), mask.clone()).into_scalar::<f32>();
+        let (_, features) = image_loss(image, truth.clone(), mask.clone(), perceptual);
+        Likeness { psnr: psnr(f64::from(error)), features: f64::from(features.into_scalar::<f32>()) }
+    })
 }

@@ -17,7 +17,7 @@ use sixfold_nn::training::{Course, Trainee, run};
 pub use sixfold_nn::training::{Ending, TrainingError};
 use sixfold_nn::training_log::TrainingRecord;
 
-use crate::loss::{Perceptual, WEIGHTS, image_loss, psnr, smooth_loss, squared_error};
+use crate::loss::{Perceptual, WEIGHTS, image_loss, smooth_loss, squared_error};
 use crate::network::{Blend, COLOURS, Network};
 use crate::preview::Preview;
 use crate::samples::{Batch, BatchOptions, SampleOptions};
@@ -48,14 +48,14 @@ pub struct TrainingOptions {
 impl Default for TrainingOptions {
     fn default() -> Self {
         TrainingOptions {
-            steps: 3000,
+            steps: 7500,
             learning_rate: 2e-3,
             warm_up: 100,
             weight_decay: 1e-4,
             longest_gradient: 5.0,
             weights: WEIGHTS,
             samples: SampleOptions::default(),
-            batch: BatchOptions { sides: vec![96, 128], most_sources: 8, sources: 10, most_samples: 4 },
+            batch: BatchOptions { sides: vec![96, 128, 160], most_sources: 8, sources: 10, most_samples: 4 },
             seed: 0,
         }
     }
@@ -147,20 +147,16 @@ impl Trainee for State<'_> {
         let smoothness = smooth_loss(out.blend.sum.clone(), out.mask.clone());
         let number = |t: &Tensor<1>| f64::from(t.clone().inner().into_scalar::<f32>());
         let error = |image: &Tensor<4>| {
-            let error = squared_error(
-                image.clone().inner(),
-                out.target.clone().inner(),
-                out.mask.clone().inner(),
-            );
-            psnr(f64::from(error.into_scalar::<f32>()))
+            let (target, mask) = (out.target.clone().inner(), out.mask.clone().inner());
+            f64::from(squared_error(image.clone().inner(), target, mask).into_scalar::<f32>())
         };
         let losses = [
             ("colours", number(&colours)),
             ("features", number(&features)),
             ("smoothness", number(&smoothness)),
-            ("PSNR", error(&out.blend.sum.clone().narrow(1, 0, COLOURS))),
-            ("PSNR decoded", error(&out.image)),
-            ("PSNR of averaging", psnr(averaging)),
+            ("squared error", error(&out.blend.sum.clone().narrow(1, 0, COLOURS))),
+            ("squared error decoded", error(&out.image)),
+            ("squared error of averaging", averaging),
         ];
         let [of_colours, of_features, of_smoothness] = self.options.weights;
         let sum = colours * of_colours + features * of_features + smoothness * of_smoothness;
@@ -239,8 +235,7 @@ pub fn train(
         checkpoint_every: pace.checkpoint_every,
         sample_threads: pace.sample_threads,
     };
-    let batches =
-        |step| Batch::of_step(textures, &options.samples, &options.batch, options.seed, step);
+    let batches = |step| Batch::of_step(textures, &options.samples, &options.batch, options.seed, step);
     Ok(run(state, batches, &course, &recorded, folder, stop, progress)?.map(|state| state.network.valid()))
 }
 

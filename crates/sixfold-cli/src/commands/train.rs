@@ -63,10 +63,10 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
                     None => println!("the model after {} steps: {}", summary.steps, summary.model),
                 }
                 let q = &summary.quality;
-                println!(
-                    "new made-up objects: {:.2} dB with rough poses (averaging {:.2}), {:.2} dB with exact ones (averaging {:.2})",
-                    q.rough, q.rough_average, q.exact, q.exact_average
-                );
+                println!("like the truth, on new made-up objects:");
+                for (name, score) in q.scores() {
+                    println!("  {name}: {score:.3}");
+                }
             })?;
             Ok(Outcome::Found)
         }

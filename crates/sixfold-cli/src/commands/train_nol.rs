@@ -9,7 +9,7 @@ use serde::Serialize;
 use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_nol::loss::Perceptual;
+use sixfold_nol::loss::{Perceptual, psnr};
 use sixfold_nol::model::NolModel;
 use sixfold_nol::network::{CompactConfig, IntegratorKind, Network, PaperConfig, Parts};
 use sixfold_nol::quality::{Quality, QualityOptions, quality};
@@ -56,7 +56,7 @@ pub(crate) struct TrainNolArguments {
     /// Folder of photographs (PNG, JPEG) for textures, backgrounds and clutter (default: procedural textures only)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
-    /// Training steps (default: 3000; the dissertation's network: 350000)
+    /// Training steps (default: 7500; the dissertation's network: 350000)
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
     /// Highest learning rate (default: 0.002; the dissertation's network: 0.001)
@@ -88,7 +88,9 @@ pub(super) struct NolSummary {
 /// Trains, or goes on with a training, and writes the model.
 pub(super) fn train_nol(a: &TrainNolArguments) -> Result<NolSummary> {
     if a.encoder.is_some() && a.network == NolKind::Compact {
-        bail!("--encoder: the compact network has its encoder within the program; it belongs to --network paper");
+        bail!(
+            "--encoder: the compact network has its encoder within the program; it belongs to --network paper"
+        );
     }
     let parts = Parts {
         integrator: match a.integrator {
@@ -143,7 +145,7 @@ pub(super) fn train_nol(a: &TrainNolArguments) -> Result<NolSummary> {
         let mut model = NolModel::new(network, parts, card);
         // First without scores: nothing that was trained may be lost.
         model.save(&path)?;
-        let quality = quality(&model, &textures, &options.samples, &QualityOptions::default());
+        let quality = quality(&model, &textures, &options.samples, &QualityOptions::default())?;
         model.card_mut().scores = quality.scores();
         model.save(&path)?;
         Ok(NolSummary { model: path.display().to_string(), steps, seconds, losses, quality })
@@ -163,9 +165,9 @@ pub(super) fn train_nol(a: &TrainNolArguments) -> Result<NolSummary> {
             "colours {:.3}, features {:.3}, PSNR {:.2} dB (decoded {:.2}, averaging {:.2}), {:.2} steps/s",
             loss("colours"),
             loss("features"),
-            loss("PSNR"),
-            loss("PSNR decoded"),
-            loss("PSNR of averaging"),
+            psnr(loss("squared error")),
+            psnr(loss("squared error decoded")),
+            psnr(loss("squared error of averaging")),
             record.samples_per_second
         ));
         last = record.clone();

@@ -93,13 +93,13 @@ mod tests {
     fn pixel_centres_give_pixels_and_the_gradient_is_that_of_finite_differences() {
         let size = [3, 4];
         let map: Vec<f32> = (0..2 * 12).map(|i| (i as f32 * 0.7).sin()).collect();
-        let exact = Places { size: [1, 2], images: vec![vec![Place { pixel: 1, x: 2.5 / 4.0, y: 1.5 / 3.0 }]] };
+        let exact =
+            Places { size: [1, 2], images: vec![vec![Place { pixel: 1, x: 2.5 / 4.0, y: 1.5 / 3.0 }]] };
         let out = gather_forward(&map, 2, size, &exact);
         assert_eq!(out[0], 0.0);
         assert!((out[1] - map[6]).abs() < 1e-6 && (out[3] - map[18]).abs() < 1e-6);
-        let images = vec![
-            (0..5).map(|i| Place { pixel: i, x: 0.21 * i as f32, y: 0.9 - 0.17 * i as f32 }).collect(),
-        ];
+        let images =
+            vec![(0..5).map(|i| Place { pixel: i, x: 0.21 * i as f32, y: 0.9 - 0.17 * i as f32 }).collect()];
         let places = Places { size: [2, 3], images };
         let weights: Vec<f32> = (0..12).map(|i| (i as f32 * 1.9).cos()).collect();
         let value = |map: &[f32]| -> f64 {

@@ -36,9 +36,10 @@ impl CompactConfig {
     pub fn init(&self, seed: u64, device: &Device) -> Result<Compact, WeightsError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let rng = &mut rng;
-        let reduce = MAPS.iter().zip(REDUCED).map(|(&(_, inputs), outputs)| {
-            BareConvConfig::new([inputs, outputs], 3).init(rng, device)
-        });
+        let reduce = MAPS
+            .iter()
+            .zip(REDUCED)
+            .map(|(&(_, inputs), outputs)| BareConvConfig::new([inputs, outputs], 3).init(rng, device));
         let reduce = reduce.collect();
         let norm = REDUCED.iter().map(|&c| BatchNormConfig::new(c).init(device)).collect();
         let head = HeadConfig {

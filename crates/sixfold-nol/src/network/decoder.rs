@@ -34,11 +34,8 @@ impl DecoderConfig {
         let (filters, wide) = (self.filters, self.filters * self.expansion);
         let narrow = (filters as f32 * self.linear_ratio) as usize;
         let head = ConvConfig::new([CHANNELS, filters], 3, Activation::Linear);
-        let head = if self.half {
-            ConvConfig { padding: Padding::Zeros(1), ..head.with_stride(2) }
-        } else {
-            head
-        };
+        let head =
+            if self.half { ConvConfig { padding: Padding::Zeros(1), ..head.with_stride(2) } } else { head };
         let head = head.init(1.0, rng, device);
         let blocks = (0..self.blocks)
             .map(|_| Block {
@@ -47,8 +44,7 @@ impl DecoderConfig {
                 mix: ConvConfig::new([narrow, filters], 3, Activation::Linear).init(0.1, rng, device),
             })
             .collect();
-        let tail =
-            ConvConfig::new([filters, 4 * COLOURS], 3, Activation::Linear).init(0.1, rng, device);
+        let tail = ConvConfig::new([filters, 4 * COLOURS], 3, Activation::Linear).init(0.1, rng, device);
         let shuffled = if self.half { 1 } else { 4 };
         // The skip begins as the colours themselves: the decoder has to learn differences only.
         let config = ConvConfig::new([CHANNELS, shuffled * COLOURS], 5, Activation::Linear);

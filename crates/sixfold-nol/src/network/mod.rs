@@ -174,8 +174,7 @@ mod tests {
             (0..sources * 2 * 96).map(|i| f32::from(u8::from(i % 3 != 0 && i % 96 != 5))).collect();
         let valid = Tensor::<4>::from_data(TensorData::new(valid, [sources * 2, 1, height, width]), &device);
         let shape = [sources * 2, CHANNELS, height, width];
-        let looked_up =
-            Tensor::<4>::random(shape, Distribution::Uniform(-1.0, 1.0), &device) * valid.clone();
+        let looked_up = Tensor::<4>::random(shape, Distribution::Uniform(-1.0, 1.0), &device) * valid.clone();
         let blend = network.blend(looked_up, valid.clone(), sources);
         assert_eq!(blend.sum.dims(), [2, CHANNELS, height, width]);
         let weights: Vec<f32> = blend.weights.into_data().try_to_vec().unwrap();

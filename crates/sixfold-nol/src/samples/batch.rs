@@ -155,12 +155,17 @@ impl Batch {
         let mut images = Vec::with_capacity(all);
         for k in 0..sources {
             for (b, sample) in samples.iter().enumerate() {
-                assert_eq!((sample.target.width, sample.sources.len()), (side, sources), "samples of one kind");
+                assert_eq!(
+                    (sample.target.width, sample.sources.len()),
+                    (side, sources),
+                    "samples of one kind"
+                );
                 let (source, looked) = (&sample.sources[orders[b][k]], &looked[b][orders[b][k]]);
                 batch.images.extend(source.patch.data.iter().map(|v| 2.0 * v - 1.0));
                 let n = k * count + b;
                 let mut places = Vec::with_capacity(looked.points.len());
-                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines) {
+                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines)
+                {
                     let at = sample.surface.pixels[*point as usize];
                     places.push(Place { pixel: at, x: share(pixel[0], side), y: share(pixel[1], side) });
                     let at = at as usize;
@@ -202,4 +207,3 @@ impl Batch {
         (image, error / f64::from(count.max(1)))
     }
 }
-

@@ -45,10 +45,11 @@ pub(super) fn between(random: &mut Random, low: f64, high: f64) -> f64 {
 /// A rotation, each as likely as any other.
 fn random_turn(random: &mut Random) -> UnitQuaternion<f64> {
     let axis = random_direction(random);
-    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), between(random, 0.0, std::f64::consts::TAU));
-    UnitQuaternion::rotation_between(&Vec3::z(), &axis).unwrap_or_else(|| {
-        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
-    }) * turn
+    let turn =
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), between(random, 0.0, std::f64::consts::TAU));
+    UnitQuaternion::rotation_between(&Vec3::z(), &axis)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
+        * turn
 }
 
 /// A unit vector, each as likely as any other.

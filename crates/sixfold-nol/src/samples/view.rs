@@ -4,7 +4,8 @@
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sixfold_augment::{
-    Backgrounds, ColorAugmentation, Coverage, Patch, Random, Shape, Window, occluder_of_fraction, stream, uniform,
+    Backgrounds, ColorAugmentation, Coverage, Patch, Random, Shape, Window, occluder_of_fraction, stream,
+    uniform,
 };
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
@@ -145,8 +146,7 @@ fn seen_from(direction: &Vec3, options: &SampleOptions, random: &mut Random) -> 
 
 /// A pose that is off as table 4.1 has it, in units of `share`.
 fn perturbed(pose: &Pose, options: &SampleOptions, share: f64, random: &mut Random) -> Pose {
-    let mut each =
-        |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
+    let mut each = |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
     let (shift, angles) = (each(options.translation), each(options.rotation));
     let turn = UnitQuaternion::from_euler_angles(angles.x, angles.y, angles.z);
     Pose::new(turn * pose.rotation(), pose.translation() + shift)
@@ -224,7 +224,8 @@ mod tests {
     #[test]
     fn without_perturbation_sources_show_the_targets_colours() {
         let textures = Backgrounds::procedural();
-        let options = SampleOptions { translation: 0.0, rotation: 0.0, occluded: 0.0, ..SampleOptions::default() };
+        let options =
+            SampleOptions { translation: 0.0, rotation: 0.0, occluded: 0.0, ..SampleOptions::default() };
         let mut off = vec![];
         for number in 0..8 {
             let s = make_sample(&textures, &options, 96, 1, 1, number);
