@@ -52,9 +52,8 @@ impl NormalEquations {
         self.count += other.count;
     }
 
-    /// The step that lowers the cost, damped by `lambda` (0 for Gauss-Newton); `None` when the residuals do
-    /// not hold all six degrees of freedom.
-    pub fn solve(&self, lambda: f64) -> Option<Vector6<f64>> {
+    /// `H` and `g`, for a larger system of which these six unknowns are a part.
+    pub fn parts(&self) -> (Matrix6<f64>, Vector6<f64>) {
         let mut h = Matrix6::zeros();
         let mut k = 0;
         for i in 0..6 {
@@ -64,10 +63,17 @@ impl NormalEquations {
                 k += 1;
             }
         }
+        (h, Vector6::from(self.g))
+    }
+
+    /// The step that lowers the cost, damped by `lambda` (0 for Gauss-Newton); `None` when the residuals do
+    /// not hold all six degrees of freedom.
+    pub fn solve(&self, lambda: f64) -> Option<Vector6<f64>> {
+        let (mut h, g) = self.parts();
         for i in 0..6 {
             h[(i, i)] += lambda * h[(i, i)] + 1e-12;
         }
-        let step = h.cholesky()?.solve(&-Vector6::from(self.g));
+        let step = h.cholesky()?.solve(&-g);
         step.iter().all(|v| v.is_finite()).then_some(step)
     }
 }

@@ -7,17 +7,23 @@
 
 mod features;
 pub mod loss;
+mod maps;
 pub mod model;
 pub mod network;
 mod photograph;
 mod preview;
 mod projection;
 pub mod quality;
+pub mod refine;
 pub mod samples;
+pub mod select;
 mod source;
+mod surface;
+pub mod synthesis;
 pub mod training;
 
 pub use features::SourceFeatures;
+pub use maps::Maps;
 pub use photograph::{NolError, Photograph};
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;

@@ -248,6 +248,7 @@ mod tests {
     use crate::model::Prediction;
     use sixfold_geometry::Rect;
     use sixfold_geometry::nalgebra::UnitQuaternion;
+    use sixfold_render::{Frame, RenderOptions, SceneObject};
 
     /// A box with a tower on one corner: no turn maps it onto itself.
     fn part() -> Mesh {

@@ -1,0 +1,78 @@
+//! Square images of any number of channels that are looked up between pixels, with their gradients.
+
+use sixfold_augment::Patch;
+
+/// Channels over a square crop, interleaved: what one lookup needs lies together.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Maps {
+    channels: usize,
+    side: usize,
+    /// `side * side * channels` numbers.
+    data: Vec<f32>,
+}
+
+impl Maps {
+    /// From planes, channel by channel.
+    ///
+    /// # Panics
+    /// When `planes` does not hold `channels * side * side` numbers.
+    pub fn from_planes(planes: &[f32], channels: usize, side: usize) -> Self {
+        let area = side * side;
+        assert_eq!(planes.len(), channels * area, "one number per pixel and channel");
+        let mut data = vec![0.0; planes.len()];
+        for (c, plane) in planes.chunks_exact(area.max(1)).enumerate() {
+            for (i, value) in plane.iter().enumerate() {
+                data[i * channels + c] = *value;
+            }
+        }
+        Maps { channels, side, data }
+    }
+
+    /// The colours of a square patch, blurred by `sigma` pixels.
+    pub fn of_patch(patch: &Patch, sigma: f32) -> Self {
+        let mut patch = patch.clone();
+        patch.blur(sigma);
+        Maps::from_planes(&patch.data, 3, patch.width)
+    }
+
+    /// Channels.
+    pub fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// Pixels along a side.
+    pub fn side(&self) -> usize {
+        self.side
+    }
+
+    fn corner(&self, x: f32, y: f32) -> (usize, f32, f32) {
+        let last = (self.side - 2) as f32;
+        let (x0, y0) = (x.floor().clamp(0.0, last), y.floor().clamp(0.0, last));
+        (y0 as usize * self.side + x0 as usize, (x - x0).clamp(0.0, 1.0), (y - y0).clamp(0.0, 1.0))
+    }
+
+    /// The channels at a pixel, bilinearly; the border's beyond it.
+    pub fn sample(&self, x: f32, y: f32, out: &mut [f32]) {
+        let (i, fx, fy) = self.corner(x, y);
+        let c = self.channels;
+        let row = self.side * c;
+        let top = &self.data[i * c..i * c + 2 * c];
+        let bottom = &self.data[i * c + row..i * c + row + 2 * c];
+        for (k, out) in out.iter_mut().enumerate().take(c) {
+            let above = top[k] * (1.0 - fx) + top[c + k] * fx;
+            let below = bottom[k] * (1.0 - fx) + bottom[c + k] * fx;
+            *out = above * (1.0 - fy) + below * fy;
+        }
+    }
+
+    /// The channels at a pixel and their change per pixel to the right and downwards (central differences over one pixel).
+    pub fn sample_with_gradient(&self, x: f32, y: f32, out: &mut [f32], dx: &mut [f32], dy: &mut [f32]) {
+        self.sample(x, y, out);
+        let mut before = vec![0.0f32; self.channels];
+        for (gradient, [u, v]) in [(dx, [0.5f32, 0.0]), (dy, [0.0, 0.5])] {
+            self.sample(x - u, y - v, &mut before);
+            self.sample(x + u, y + v, gradient);
+            gradient.iter_mut().zip(&before).for_each(|(g, before)| *g -= before);
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! What the photographs together show at points of the surface.
+//!
+//! The dissertation takes the first rendering of its network as the common appearance, in one target view. Points spread over
+//! the whole surface make all target views at once.
+
+use sixfold_geometry::Vec3;
+
+use crate::maps::Maps;
+use crate::source::SourceView;
+
+/// What one photograph shows at every point: channels, and how much it counts (0: not seen).
+#[derive(Debug, Clone, Default)]
+pub(super) struct Shown {
+    /// `points * channels` numbers.
+    pub values: Vec<f32>,
+    pub weights: Vec<f32>,
+}
+
+/// Looks all points up in one photograph at its present pose. `reach` grows the photograph's mask, in units of its blur.
+pub(super) fn look(
+    view: &SourceView,
+    maps: &Maps,
+    allowed: &[f32],
+    points: &[Vec3],
+    normals: &[Vec3],
+) -> Shown {
+    let channels = maps.channels();
+    let mut shown = Shown { values: vec![0.0; points.len() * channels], weights: vec![0.0; points.len()] };
+    let side = view.side();
+    for (i, (point, normal)) in points.iter().zip(normals).enumerate() {
+        let Some(([x, y], cosine)) = view.see(point, normal) else { continue };
+        let at = (y.round() as usize).min(side - 1) * side + (x.round() as usize).min(side - 1);
+        let weight = cosine * allowed[at];
+        if weight > 0.0 {
+            maps.sample(x, y, &mut shown.values[i * channels..(i + 1) * channels]);
+            shown.weights[i] = weight;
+        }
+    }
+    shown
+}
+
+/// Gain and offset per channel that bring a photograph's values to the common ones: light and exposure differ.
+#[derive(Debug, Clone)]
+pub(super) struct Light {
+    pub gain: Vec<f32>,
+    pub offset: Vec<f32>,
+}
+
+impl Light {
+    pub fn neutral(channels: usize) -> Self {
+        Light { gain: vec![1.0; channels], offset: vec![0.0; channels] }
+    }
+
+    /// Least squares of `common` on `shown`, drawn towards no change.
+    pub fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
+        let mut light = Light::neutral(channels);
+        for c in 0..channels {
+            // Sums over points: weight, x, y, xx, xy.
+            let mut s = [0.0f64; 5];
+            for (i, w) in shown.weights.iter().enumerate() {
+                if *w <= 0.0 || common_weights[i] <= 0.0 {
+                    continue;
+                }
+                let (x, y) = (f64::from(shown.values[i * channels + c]), f64::from(common[i * channels + c]));
+                let robust = 1.0 / (1.0 + ((x - y) / 0.1).powi(2));
+                let w = f64::from(*w) * robust;
+                for (sum, v) in s.iter_mut().zip([1.0, x, y, x * x, x * y]) {
+                    *sum += w * v;
+                }
+            }
+            if s[0] < 20.0 {
+                continue;
+            }
+            let (mx, my) = (s[1] / s[0], s[2] / s[0]);
+            let (xx, xy) = (s[3] / s[0] - mx * mx, s[4] / s[0] - mx * my);
+            // As if a variance of 0.002 more said that the gain is one.
+            let gain = ((xy + 0.002) / (xx + 0.002)).clamp(0.5, 2.0);
+            light.gain[c] = gain as f32;
+            light.offset[c] = (my - gain * mx) as f32;
+        }
+        light
+    }
+
+    pub fn apply(&self, values: &mut [f32]) {
+        let channels = self.gain.len();
+        for (k, v) in values.iter_mut().enumerate() {
+            *v = self.gain[k % channels] * *v + self.offset[k % channels];
+        }
+    }
+}
+
+/// The common appearance: a mean over photographs in which those far from the mean count less.
+#[derive(Debug, Clone)]
+pub(super) struct Common {
+    /// Sums of weighted values, `points * channels`.
+    sums: Vec<f32>,
+    /// Sums of weights.
+    weights: Vec<f32>,
+    /// What each photograph has added: its weight at every point.
+    parts: Vec<Vec<f32>>,
+    channels: usize,
+}
+
+/// Difference in colour (of 0 to 1, root of the mean square over channels) at which a photograph counts half.
+const FAR: f32 = 0.08;
+
+impl Common {
+    /// `shown` after their light was made alike.
+    pub fn new(shown: &[Shown], channels: usize) -> Self {
+        let points = shown.first().map_or(0, |s| s.weights.len());
+        let mut common = Common {
+            sums: vec![0.0; points * channels],
+            weights: vec![0.0; points],
+            parts: shown.iter().map(|s| s.weights.clone()).collect(),
+            channels,
+        };
+        // Twice: the second mean knows who is far from the first.
+        for round in 0..3 {
+            if round > 0 {
+                let mean = common.mean();
+                for (part, shown) in common.parts.iter_mut().zip(shown) {
+                    for (i, part) in part.iter_mut().enumerate() {
+                        if shown.weights[i] <= 0.0 {
+                            continue;
+                        }
+                        let range = i * channels..(i + 1) * channels;
+                        let square: f32 = shown.values[range.clone()]
+                            .iter()
+                            .zip(&mean[range])
+                            .map(|(a, b)| (a - b) * (a - b))
+                            .sum::<f32>()
+                            / channels as f32;
+                        *part = shown.weights[i] / (1.0 + square / (FAR * FAR)).powi(2);
+                    }
+                }
+            }
+            common.sums.fill(0.0);
+            common.weights.fill(0.0);
+            for (part, shown) in common.parts.iter().zip(shown) {
+                for (i, w) in part.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+                    common.weights[i] += w;
+                    for c in 0..channels {
+                        common.sums[i * channels + c] += w * shown.values[i * channels + c];
+                    }
+                }
+            }
+        }
+        common
+    }
+
+    /// The mean at every point; 0 where nothing is known.
+    pub fn mean(&self) -> Vec<f32> {
+        let mut mean = self.sums.clone();
+        for (values, w) in mean.chunks_exact_mut(self.channels.max(1)).zip(&self.weights) {
+            values.iter_mut().for_each(|v| *v = if *w > 0.0 { *v / w } else { 0.0 });
+        }
+        mean
+    }
+
+    /// The mean of all photographs but one, and the weight behind it.
+    pub fn without(&self, k: usize, shown: &Shown) -> (Vec<f32>, Vec<f32>) {
+        let mut mean = self.sums.clone();
+        let mut weights = self.weights.clone();
+        for (i, part) in self.parts[k].iter().enumerate() {
+            let left = (weights[i] - part).max(0.0);
+            // What remains of a difference of nearly equal sums is not to be trusted.
+            let left = if left > 1e-3 { left } else { 0.0 };
+            for c in 0..self.channels {
+                let at = i * self.channels + c;
+                mean[at] = if left > 0.0 { (mean[at] - part * shown.values[at]) / left } else { 0.0 };
+            }
+            weights[i] = left;
+        }
+        (mean, weights)
+    }
+}

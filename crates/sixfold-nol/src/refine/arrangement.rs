@@ -1,0 +1,123 @@
+//! One camera pose per image and one place per object instead of a pose for every pair of them: the normal equations of all
+//! pairs in one system (bundle adjustment; Triggs et al. 2000, with the dense solver that a few dozen poses allow).
+//!
+//! An object in an image by itself is the special case of an image with one object.
+
+use sixfold_geometry::nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector6};
+use sixfold_geometry::{NormalEquations, Pose, Vec3};
+
+/// Poses of cameras and objects in one scene.
+#[derive(Debug, Clone)]
+pub(super) struct Arrangement {
+    camera_from_scene: Vec<Pose>,
+    scene_from_object: Vec<Pose>,
+    /// Image and object of every source.
+    pairs: Vec<[usize; 2]>,
+}
+
+/// A pose by which one source should move.
+pub(super) struct Wanted {
+    /// Normal equations of a twist about `centre`.
+    pub equations: NormalEquations,
+    /// The object's centre in the camera's frame.
+    pub centre: Vec3,
+}
+
+impl Arrangement {
+    /// An arrangement of given poses, exact for a part of them that hangs together.
+    pub fn new(pairs: Vec<[usize; 2]>, poses: &[Pose], images: usize, objects: usize) -> Self {
+        let mut cameras: Vec<Option<Pose>> = vec![None; images];
+        let mut places: Vec<Option<Pose>> = vec![None; objects];
+        while let Some(first) = (0..objects).find(|o| places[*o].is_none()) {
+            places[first] = Some(Pose::identity());
+            // From objects to the images that show them and back.
+            loop {
+                let mut changed = false;
+                for ([image, object], pose) in pairs.iter().zip(poses) {
+                    match (cameras[*image], places[*object]) {
+                        (None, Some(place)) => cameras[*image] = Some(*pose * place.inverse()),
+                        (Some(camera), None) => places[*object] = Some(camera.inverse() * *pose),
+                        _ => continue,
+                    }
+                    changed = true;
+                }
+                if !changed {
+                    break;
+                }
+            }
+        }
+        let known = |list: Vec<Option<Pose>>| list.into_iter().map(Option::unwrap_or_default).collect();
+        Arrangement { camera_from_scene: known(cameras), scene_from_object: known(places), pairs }
+    }
+
+    /// The pose of a source's object in its image.
+    pub fn camera_from_object(&self, source: usize) -> Pose {
+        let [image, object] = self.pairs[source];
+        self.camera_from_scene[image] * self.scene_from_object[object]
+    }
+
+    /// Moves all cameras and objects by one Gauss-Newton step. `false` where the system cannot be solved; nothing moves then.
+    pub fn step(&mut self, wanted: &[Wanted], damping: f64) -> bool {
+        let (images, objects) = (self.camera_from_scene.len(), self.scene_from_object.len());
+        let size = 6 * (images + objects);
+        let mut h = DMatrix::<f64>::zeros(size, size);
+        let mut g = DVector::<f64>::zeros(size);
+        // Cameras turn about the middle of what their image shows: turns and shifts are then hardly coupled.
+        let mut middles = vec![(Vec3::zeros(), 0.0); images];
+        for (wanted, [image, _]) in wanted.iter().zip(&self.pairs) {
+            middles[*image].0 += wanted.centre;
+            middles[*image].1 += 1.0;
+        }
+        let middles: Vec<Vec3> = middles.into_iter().map(|(sum, n)| sum / f64::max(n, 1.0)).collect();
+        let mut centres = vec![Vec3::zeros(); objects];
+        for (wanted, &[image, object]) in wanted.iter().zip(&self.pairs) {
+            centres[object] = self.camera_from_scene[image].inverse().transform_point(&wanted.centre);
+        }
+        for (wanted, &[image, object]) in wanted.iter().zip(&self.pairs) {
+            let (hessian, gradient) = wanted.equations.parts();
+            let camera = &self.camera_from_scene[image];
+            // A turn of the camera about its middle carries the object's centre along.
+            let mut by_camera = Matrix6::identity();
+            let arm = (wanted.centre - middles[image]).cross_matrix();
+            by_camera.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm);
+            let rotation: Matrix3<f64> = camera.rotation_matrix();
+            let mut by_object = Matrix6::zeros();
+            by_object.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
+            by_object.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+            // The centre in the scene is that of the last image which shows the object: the same place up to what they
+            // disagree by.
+            let there = camera.transform_point(&centres[object]);
+            by_object
+                .fixed_view_mut::<3, 3>(0, 3)
+                .copy_from(&(-(wanted.centre - there).cross_matrix() * rotation));
+            let blocks = [(6 * image, by_camera), (6 * (images + object), by_object)];
+            for (row, left) in &blocks {
+                let mut part = g.fixed_rows_mut::<6>(*row);
+                part += left.transpose() * gradient;
+                for (column, right) in &blocks {
+                    let mut part = h.fixed_view_mut::<6, 6>(*row, *column);
+                    part += left.transpose() * hessian * right;
+                }
+            }
+        }
+        for i in 0..size {
+            h[(i, i)] += damping * h[(i, i)] + 1e-9;
+        }
+        let Some(step) = h.cholesky().map(|c| c.solve(&-g)) else { return false };
+        if !step.iter().all(|v| v.is_finite()) {
+            return false;
+        }
+        let twist = |at: usize| -> Vector6<f64> { step.fixed_rows::<6>(at).into_owned() };
+        let turned = |pose: &Pose, about: Vec3, twist: Vector6<f64>| {
+            let about = Pose::from_translation(about);
+            about * Pose::exp(&twist) * about.inverse() * *pose
+        };
+        for (i, (camera, middle)) in self.camera_from_scene.iter_mut().zip(middles).enumerate() {
+            *camera = turned(camera, middle, twist(6 * i));
+        }
+        for (o, (place, centre)) in self.scene_from_object.iter_mut().zip(centres).enumerate() {
+            *place = turned(place, centre, twist(6 * (images + o)));
+        }
+        true
+    }
+}

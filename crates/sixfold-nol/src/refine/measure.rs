@@ -1,0 +1,196 @@
+//! What one photograph says about the pose of its object: colours against those of the others, the outline, the given pose.
+
+use sixfold_augment::Coverage;
+use sixfold_geometry::{NormalEquations, Pose, Vec3};
+use sixfold_outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
+use sixfold_render::Frame;
+
+use super::appearance::Light;
+use super::arrangement::Wanted;
+use super::options::{RefineOptions, SourceReport};
+use crate::maps::Maps;
+use crate::source::SourceView;
+
+/// One photograph of one object while its pose is refined.
+pub(super) struct Working<'a> {
+    pub view: SourceView,
+    pub given: Pose,
+    /// The present pose; the view's geometry follows it step by step.
+    pub pose: Pose,
+    /// Where colours may be compared, 0 or 1.
+    pub allowed: Vec<f32>,
+    pub outline: Option<Outline<'a>>,
+    pub light: Light,
+    pub frame: Frame,
+    pub lines: usize,
+}
+
+/// What one step of one photograph is made of.
+pub(super) struct Terms<'a> {
+    pub maps: &'a Maps,
+    pub points: &'a [Vec3],
+    pub normals: &'a [Vec3],
+    /// Colours of the other photographs.
+    pub target: &'a [f32],
+    pub known: &'a [f32],
+    pub centre: &'a Vec3,
+    pub reach: f64,
+}
+
+impl Working<'_> {
+    /// Colours are compared inside the silhouette only, as far from its border as the blur carries what lies beside it.
+    pub fn allow(&mut self, blur: f32) {
+        let side = self.view.side();
+        let mut inside = Coverage::from_fn(side, side, |x, y| {
+            let i = y * side + x;
+            f32::from(u8::from(self.view.depth()[i] > 0.0)) * self.view.visible.data[i]
+        });
+        inside.blur(blur);
+        self.allowed.clear();
+        self.allowed.extend(inside.data.iter().map(|v| f32::from(u8::from(*v > 0.9))));
+    }
+
+    /// What the photograph says about its pose: colours and outline, as normal equations of a twist about the object's centre.
+    pub fn measure(&mut self, terms: &Terms<'_>, options: &RefineOptions) -> Wanted {
+        let pose = self.pose;
+        let centre = pose.transform_point(terms.centre);
+        let mut equations = NormalEquations::default();
+        if options.colors > 0.0 {
+            self.add_colors(&mut equations, terms, &centre, options);
+        }
+        let lines: Vec<Line> =
+            self.outline.as_mut().map(|outline| outline.lines(terms.reach, &pose)).unwrap_or_default();
+        self.lines = lines.len();
+        if lines.len() >= LEAST_LINES {
+            add_lines(&mut equations, &lines, &self.view.camera, &centre, terms.reach, options.line, 1.0);
+        }
+        self.add_given(&mut equations, terms.centre, options);
+        Wanted { equations, centre }
+    }
+
+    /// The given pose alone.
+    pub fn measure_given(&self, centre: &Vec3, options: &RefineOptions) -> Wanted {
+        let mut equations = NormalEquations::default();
+        self.add_given(&mut equations, centre, options);
+        Wanted { equations, centre: self.pose.transform_point(centre) }
+    }
+
+    /// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are
+    /// taken by themselves.
+    fn add_given(&self, equations: &mut NormalEquations, centre: &Vec3, options: &RefineOptions) {
+        let offset = self.from_given(centre);
+        let trust = 1.0 / (1.0 + self.off(centre, options).powi(2) / 6.0);
+        for (k, offset) in offset.iter().enumerate() {
+            let mut row = [0.0; 6];
+            row[k] = 1.0;
+            let deviation = options.rough[k / 3];
+            equations.add(&row, *offset, trust / (deviation * deviation));
+        }
+    }
+
+    /// How far the present pose is from the given one: root of the mean square over six numbers in units of their deviation.
+    pub fn off(&self, centre: &Vec3, options: &RefineOptions) -> f64 {
+        let offset = self.from_given(centre);
+        let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / options.rough[k / 3]).powi(2)).sum();
+        (square / 6.0).sqrt()
+    }
+
+    /// Shift of the object's centre and rotation vector since the given pose, in the camera's frame.
+    fn from_given(&self, centre: &Vec3) -> [f64; 6] {
+        let pose = &self.pose;
+        let shift = pose.transform_point(centre) - self.given.transform_point(centre);
+        let turn = (pose.rotation() * self.given.rotation().inverse()).scaled_axis();
+        [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
+    }
+
+    fn add_colors(
+        &self,
+        equations: &mut NormalEquations,
+        terms: &Terms<'_>,
+        centre: &Vec3,
+        options: &RefineOptions,
+    ) {
+        struct Row {
+            jacobian: [f64; 6],
+            residual: f64,
+            weight: f64,
+        }
+        let side = self.view.side();
+        let pose = self.view.camera_from_object();
+        let mut rows: Vec<Row> = Vec::with_capacity(terms.points.len());
+        let (mut value, mut dx, mut dy) = ([0.0f32; 3], [0.0f32; 3], [0.0f32; 3]);
+        for (i, (point, normal)) in terms.points.iter().zip(terms.normals).enumerate() {
+            if terms.known[i] <= 0.0 {
+                continue;
+            }
+            let Some(([x, y], cosine)) = self.view.see(point, normal) else { continue };
+            let at = (y.round() as usize).min(side - 1) * side + (x.round() as usize).min(side - 1);
+            let weight = f64::from(cosine * self.allowed[at]) * f64::from(terms.known[i].min(1.0));
+            if weight <= 0.0 {
+                continue;
+            }
+            terms.maps.sample_with_gradient(x, y, &mut value, &mut dx, &mut dy);
+            let in_camera = pose.transform_point(point);
+            let [along_x, along_y] = motion(&self.view.camera, &in_camera, centre);
+            for c in 0..3 {
+                let gain = f64::from(self.light.gain[c]);
+                let residual = gain * f64::from(value[c]) + f64::from(self.light.offset[c])
+                    - f64::from(terms.target[3 * i + c]);
+                let (gx, gy) = (gain * f64::from(dx[c]), gain * f64::from(dy[c]));
+                rows.push(Row {
+                    jacobian: std::array::from_fn(|k| gx * along_x[k] + gy * along_y[k]),
+                    residual,
+                    weight,
+                });
+            }
+        }
+        if rows.len() < 60 {
+            return;
+        }
+        let mut sizes: Vec<f64> = rows.iter().map(|r| r.residual.abs()).collect();
+        let middle = sizes.len() / 2;
+        let noise = (1.4826 * *sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.01);
+        let total: f64 = rows.iter().map(|r| r.weight).sum();
+        let scale = options.colors / total / (noise * noise);
+        for row in &rows {
+            equations.add(&row.jacobian, row.residual, row.weight * tukey(row.residual / noise) * scale);
+        }
+    }
+
+    pub fn report(&self, centre: &Vec3, difference: [f64; 2], options: &RefineOptions) -> SourceReport {
+        let pose = &self.pose;
+        let offset = self.from_given(centre);
+        let far = |range: std::ops::Range<usize>, deviation: f64| {
+            offset[range].iter().map(|v| v * v).sum::<f64>().sqrt() / deviation
+        };
+        let (shift, turn) = (far(0..3, options.rough[0]), far(3..6, options.rough[1]));
+        let dropped = if shift > options.most_moved || turn > options.most_moved {
+            Some(format!(
+                "the pose that fits is {:.0} mm and {:.1} degrees from the given one",
+                shift * options.rough[0] * 1e3,
+                (turn * options.rough[1]).to_degrees()
+            ))
+        } else {
+            None
+        };
+        SourceReport {
+            camera_from_object: if dropped.is_some() { self.given } else { *pose },
+            moved: shift * options.rough[0],
+            turned: turn * options.rough[1],
+            difference,
+            lines: self.lines,
+            dropped,
+        }
+    }
+}
+
+/// Where the object is, by the present pose and the mask: certain inside and outside, open near the border.
+pub(super) fn prior(view: &SourceView) -> Vec<f32> {
+    let side = view.side();
+    let mut inside = Coverage::from_fn(side, side, |x, y| {
+        let i = y * side + x;
+        f32::from(u8::from(view.depth()[i] > 0.0 && view.visible.data[i] > 0.5))
+    });
+    inside.blur(0.03 * side as f32);
+    inside.data
+}

@@ -1,0 +1,18 @@
+//! Makes the poses of photographs better by what they show (dissertation, section 4.2.3).
+//!
+//! [`refine_scene`] is the default: robust Gauss-Newton on SE(3) over the difference between what one photograph shows
+//! on the surface and what the others show there, with the outline as a second measurement, and one camera for all objects of
+//! an image where they stood still. [`printed_rule`] is the dissertation's gradient step over the same difference.
+
+mod appearance;
+mod arrangement;
+mod gauss_newton;
+mod measure;
+mod options;
+mod printed;
+#[cfg(test)]
+mod tests;
+
+pub use gauss_newton::{SceneSource, refine_poses, refine_scene};
+pub use options::{RefineOptions, Refinement, SceneKind, SourceReport};
+pub use printed::{PrintedOptions, printed_rule};

@@ -1,0 +1,131 @@
+//! How poses are refined, and what comes of it.
+
+use sixfold_geometry::Pose;
+
+use crate::photograph::NolError;
+
+/// How poses are made better.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RefineOptions {
+    /// Pixels along a side of the crops that are compared.
+    pub side: usize,
+    /// Points of the surface that are compared.
+    pub points: usize,
+    /// Blur of the colours from coarse to fine, crop pixels.
+    pub blurs: Vec<f32>,
+    /// How far from the outline the border is looked for at each blur, crop pixels.
+    pub reaches: Vec<f64>,
+    /// Steps at each blur; the common appearance is made anew before each.
+    pub steps: usize,
+    /// Weight of the colours' differences as a whole, in independent measurements; 0 leaves them out.
+    pub colors: f64,
+    /// Weight of a line of the outline, in independent measurements; 0 leaves the outline out.
+    pub line: f64,
+    /// Whether the objects stood still while the photographs were taken. Their places relative to each other are then the same
+    /// in all of them, which says more about a pose than its own pixels do.
+    pub scene: SceneKind,
+    /// Standard deviation of the given poses: metres along each axis, radians about each.
+    pub rough: [f64; 2],
+    /// A photograph whose pose moved by more than this many standard deviations is dropped.
+    pub most_moved: f64,
+    /// Seed of the points.
+    pub seed: u64,
+}
+
+impl Default for RefineOptions {
+    fn default() -> Self {
+        RefineOptions {
+            side: 128,
+            points: 4000,
+            blurs: vec![4.0, 2.5, 1.5, 1.0],
+            reaches: vec![12.0, 8.0, 5.0, 4.0],
+            steps: 5,
+            colors: 100.0,
+            line: 0.3,
+            scene: SceneKind::Judge,
+            rough: [0.006, 0.03],
+            most_moved: 6.0,
+            seed: 0,
+        }
+    }
+}
+
+/// Whether objects moved between photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SceneKind {
+    /// By the given poses: whether they agree with one arrangement as well as poses of their roughness would.
+    #[default]
+    Judge,
+    /// Nothing moved but the camera.
+    Still,
+    /// Every object in every photograph by itself.
+    Moving,
+}
+
+/// What became of one photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SourceReport {
+    /// The new pose; the given one where the photograph was dropped.
+    pub camera_from_object: Pose,
+    /// How far the object's origin moved, metres.
+    pub moved: f64,
+    /// How far it was turned, radians.
+    pub turned: f64,
+    /// Mean difference in colour to the other photographs (0 to 1) before and after.
+    pub difference: [f64; 2],
+    /// Lines of the outline on which the border was found at the end.
+    pub lines: usize,
+    /// Why the photograph should not be used.
+    pub dropped: Option<String>,
+}
+
+/// The refined poses.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Refinement {
+    /// One report per source, in their order.
+    pub sources: Vec<SourceReport>,
+    /// Whether the objects were taken to have stood still.
+    pub still: bool,
+    /// How far the given poses are from one common arrangement, in units of what their roughness explains (1: as expected);
+    /// `None` where there is nothing to compare.
+    pub disagreement: Option<f64>,
+}
+
+impl RefineOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`NolError::Option`].
+    pub fn check(&self) -> Result<(), NolError> {
+        let wrong = |field, expected, found: String| Err(NolError::Option { field, expected, found });
+        if !(16..=1024).contains(&self.side) {
+            return wrong("refine.side", "16 to 1024 pixels", self.side.to_string());
+        }
+        if !(100..=1_000_000).contains(&self.points) {
+            return wrong("refine.points", "100 to 1000000", self.points.to_string());
+        }
+        if self.blurs.is_empty() || !self.blurs.iter().all(|b| (0.0..=64.0).contains(b)) {
+            return wrong(
+                "refine.blurs",
+                "one number or more of 0 to 64 pixels",
+                format!("{:?}", self.blurs),
+            );
+        }
+        if self.reaches.is_empty() || !self.reaches.iter().all(|b| (1.0..=256.0).contains(b)) {
+            return wrong(
+                "refine.reaches",
+                "one number or more of 1 to 256 pixels",
+                format!("{:?}", self.reaches),
+            );
+        }
+        for (field, value) in [("refine.colors", self.colors), ("refine.line", self.line)] {
+            if !(value >= 0.0 && value.is_finite()) {
+                return wrong(field, "0 or more", value.to_string());
+            }
+        }
+        if !self.rough.iter().all(|v| *v > 0.0 && v.is_finite()) {
+            return wrong("refine.rough", "metres and radians above 0", format!("{:?}", self.rough));
+        }
+        Ok(())
+    }
+}

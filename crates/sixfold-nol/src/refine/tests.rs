@@ -1,0 +1,96 @@
+//! Photographs of a painted block made by the tests themselves.
+
+use std::sync::Arc;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec3, sphere_directions};
+use sixfold_mesh::Mesh;
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+use super::*;
+use crate::photograph::Photograph;
+
+fn block() -> Mesh {
+    let corner = |i: usize| {
+        Vec3::from_fn(|axis, _| [0.06, 0.04, 0.05][axis] * if i >> axis & 1 == 0 { -1.0 } else { 1.0 })
+    };
+    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = quads.iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect();
+    Mesh::new((0..8).map(corner).collect(), faces).unwrap()
+}
+
+/// Paint at a place of the surface.
+fn paint(p: &[f32; 3]) -> [u8; 3] {
+    let wave =
+        |f: f32, k: usize, shift: f32| ((p[k] * f + shift).sin() * (p[(k + 1) % 3] * f * 0.7).cos()) * 60.0;
+    [
+        (150.0 + wave(160.0, 0, 0.3)) as u8,
+        (120.0 + wave(130.0, 1, 1.1)) as u8,
+        (110.0 + wave(190.0, 2, 2.0)) as u8,
+    ]
+}
+
+/// Photographs with exact poses, and the same with disturbed ones.
+fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Vec<Pose>, Vec<Photograph>) {
+    let mesh = block();
+    let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut poses = vec![];
+    let mut list = vec![];
+    for direction in sphere_directions(count) {
+        let z = -direction;
+        let x = z.cross(&Vec3::new(0.3, 0.2, 0.9)).normalize();
+        let rotation =
+            sixfold_geometry::Mat3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
+        let mut draw = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
+        let truth = Pose::from_parts(&rotation, Vec3::new(draw(0.05), draw(0.03), 0.7 + draw(0.1))).unwrap();
+        let mut frame = Frame::new(&camera);
+        let objects = [SceneObject { mesh: &mesh, camera_from_object: truth }];
+        frame.render(&objects, &RenderOptions::default());
+        let seen = frame.object_coordinates(&objects);
+        let image = RgbImage::from_fn(320, 240, |x, y| {
+            let p = seen[(x, y)];
+            if p[0].is_nan() { [(40 + x % 23) as u8, (60 + y % 31) as u8, 70] } else { paint(&p) }
+        });
+        let shift = Vec3::new(draw(reach[0]), draw(reach[0]), draw(reach[0]));
+        let turn = UnitQuaternion::from_euler_angles(draw(reach[1]), draw(reach[1]), draw(reach[1]));
+        let rough = Pose::new(turn * truth.rotation(), truth.translation() + shift);
+        poses.push(truth);
+        list.push(Photograph::new(format!("{}", list.len()), Arc::new(image), camera, rough, None).unwrap());
+    }
+    (mesh, poses, list)
+}
+
+/// Median errors, metres and radians.
+fn errors(poses: &[Pose], truth: &[Pose]) -> [f64; 2] {
+    let median = |f: &dyn Fn(&Pose, &Pose) -> f64| {
+        let mut v: Vec<f64> = poses.iter().zip(truth).map(|(a, b)| f(a, b)).collect();
+        v.sort_by(f64::total_cmp);
+        v[v.len() / 2]
+    };
+    [median(&|a, b| a.distance_to(b)), median(&|a, b| a.rotation_angle_to(b))]
+}
+
+#[test]
+fn rough_poses_of_a_painted_block_become_exact() {
+    let (mesh, truth, photographs) = photographs(14, [0.01, 0.05], 3);
+    let given: Vec<Pose> = photographs.iter().map(|p| *p.camera_from_object()).collect();
+    for (colors, line, most) in
+        [(true, true, [0.001, 0.005]), (true, false, [0.002, 0.01]), (false, true, [0.003, 0.02])]
+    {
+        let mut options = RefineOptions::default();
+        if !colors {
+            options.colors = 0.0;
+        }
+        if !line {
+            options.line = 0.0;
+        }
+        let refined = refine_poses(&photographs, &mesh, &options, |_| true).unwrap();
+        let after: Vec<Pose> = refined.sources.iter().map(|s| s.camera_from_object).collect();
+        let (before, after) = (errors(&given, &truth), errors(&after, &truth));
+        println!("{colors} {line}: {before:.4?} {after:.4?}");
+        assert!(after[0] < most[0] && after[1] < most[1], "{colors} {line}: {before:?} {after:?}");
+    }
+}

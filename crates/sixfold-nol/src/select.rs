@@ -1,0 +1,142 @@
+//! Which photographs to use (dissertation, section 4.3.3): by the surface they show that is not seen yet, by the distance of
+//! their poses, and for one new view.
+//!
+//! The dissertation counts vertices. Points spread evenly over the surface take their place: a scan has its vertices where its
+//! shape is complicated, not where there is much to see.
+
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::{Pose, Vec3};
+
+use crate::source::SourceView;
+
+/// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times
+/// the share of its mask there; 0 where it does not.
+pub fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> Vec<f32> {
+    let side = source.side();
+    points
+        .iter()
+        .zip(normals)
+        .map(|(point, normal)| {
+            source.see(point, normal).map_or(0.0, |([x, y], cosine)| {
+                let (x, y) = ((x.round() as usize).min(side - 1), (y.round() as usize).min(side - 1));
+                cosine * source.visible.data[y * side + x]
+            })
+        })
+        .collect()
+}
+
+/// Chooses photographs one by one, each time the one that adds most: the sum over points of `tanh(1.5 s)`, where `s` is how well
+/// the chosen ones show a point together (the author's code; the text counts points that were not seen). Ends after `most`, or
+/// when the best one adds less than `least_gain` points.
+///
+/// `shown` has [`shown_points`] of every photograph; `only` says which points count, all if `None`.
+pub fn choose_by_surface(
+    shown: &[Vec<f32>],
+    only: Option<&[bool]>,
+    most: usize,
+    least_gain: f64,
+) -> Vec<usize> {
+    let points = shown.first().map_or(0, Vec::len);
+    let counts = |i: usize| only.is_none_or(|only| only[i]);
+    let mut sums = vec![0.0f32; points];
+    let mut chosen: Vec<usize> = vec![];
+    while chosen.len() < most {
+        let gain = |k: usize| -> f64 {
+            let pairs = shown[k].iter().zip(&sums).enumerate();
+            pairs
+                .filter(|(i, (new, _))| **new > 0.0 && counts(*i))
+                .map(|(_, (new, sum))| f64::from((1.5 * (sum + new)).tanh() - (1.5 * sum).tanh()))
+                .sum()
+        };
+        let left = (0..shown.len()).filter(|k| !chosen.contains(k));
+        // The first of equals: the result does not depend on how it is computed.
+        let best = left.map(|k| (k, gain(k))).fold(None, |best: Option<(usize, f64)>, next| match best {
+            Some(best) if best.1 >= next.1 => Some(best),
+            _ => Some(next),
+        });
+        let Some((k, gain)) = best else { break };
+        if gain < least_gain || gain <= 0.0 {
+            break;
+        }
+        sums.iter_mut().zip(&shown[k]).for_each(|(sum, new)| *sum += new);
+        chosen.push(k);
+    }
+    chosen
+}
+
+/// Chooses photographs at random such that no two have poses nearer than `apart` (metres between cameras in the object's frame
+/// and radians between their directions; both must be undercut for a photograph to be left out). The dissertation's numbers
+/// are 0.3 m and 45 degrees.
+pub fn choose_by_pose(camera_from_object: &[Pose], apart: [f64; 2], most: usize, seed: u64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..camera_from_object.len()).collect();
+    order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
+    let mut chosen: Vec<usize> = vec![];
+    for k in order {
+        if chosen.len() == most {
+            break;
+        }
+        let pose = &camera_from_object[k];
+        let near = |other: &usize| {
+            let other = &camera_from_object[*other];
+            let between = pose.inverse().translation() - other.inverse().translation();
+            between.norm() < apart[0] && pose.rotation_angle_to(other) < apart[1]
+        };
+        if !chosen.iter().any(near) {
+            chosen.push(k);
+        }
+    }
+    chosen
+}
+
+/// Share of the surface (evenly spread points) that no photograph shows, 0 to 1.
+pub fn unseen_share(shown: &[Vec<f32>]) -> f64 {
+    let points = shown.first().map_or(0, Vec::len);
+    if points == 0 {
+        return 1.0;
+    }
+    let unseen = (0..points).filter(|i| shown.iter().all(|s| s[*i] <= 0.0)).count();
+    unseen as f64 / points as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use sixfold_geometry::nalgebra::UnitQuaternion;
+
+    #[test]
+    fn the_one_that_shows_what_is_missing_comes_next() {
+        let shown = vec![vec![1.0, 1.0, 1.0, 0.0], vec![1.0, 1.0, 0.0, 0.0], vec![0.0, 0.0, 0.0, 0.8]];
+        assert_eq!(choose_by_surface(&shown, None, 2, 0.0), vec![0, 2]);
+        assert_eq!(choose_by_surface(&shown, Some(&[true, true, false, false]), 1, 0.0), vec![0]);
+        assert_eq!(choose_by_surface(&shown, Some(&[false, false, false, true]), 3, 0.0), vec![2]);
+        // A gain of less than half a point is not worth a photograph.
+        assert_eq!(choose_by_surface(&shown, None, 3, 0.5), vec![0, 2]);
+        assert_eq!(unseen_share(&shown), 0.0);
+        assert_eq!(unseen_share(&shown[..2]), 0.25);
+        assert_eq!(unseen_share(&[]), 1.0);
+        assert!(choose_by_surface(&[], None, 3, 0.0).is_empty());
+    }
+
+    proptest! {
+        #[test]
+        fn chosen_poses_are_apart(seed in 0u64..50, count in 1usize..30) {
+            let poses: Vec<Pose> = (0..count)
+                .map(|k| {
+                    let turn = UnitQuaternion::from_euler_angles(0.1 * k as f64, 0.7 * (k % 5) as f64, 0.0);
+                    Pose::new(turn, Vec3::new(0.0, 0.0, 0.6 + 0.05 * (k % 7) as f64))
+                })
+                .collect();
+            let chosen = choose_by_pose(&poses, [0.3, 0.8], 16, seed);
+            prop_assert!(!chosen.is_empty());
+            for (i, a) in chosen.iter().enumerate() {
+                for b in &chosen[..i] {
+                    let cameras = poses[*a].inverse().translation() - poses[*b].inverse().translation();
+                    prop_assert!(cameras.norm() >= 0.3 || poses[*a].rotation_angle_to(&poses[*b]) >= 0.8);
+                }
+            }
+        }
+    }
+}
