@@ -57,6 +57,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     let d = RefineOptions::default();
     let options = RefineOptions {
+        wide: number("WIDE", f64::from(d.wide)) as f32,
         colors: number("COLORS", d.colors),
         line: number("LINE", d.line),
         steps: number("STEPS", d.steps as f64) as usize,
@@ -110,7 +111,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let m = own.map(|o| o.map(|mut v| median(&mut v)));
         println!(
             "object {id:2} ({:2}): {:.1} mm {:.2} deg -> {:.2} mm {:.2} deg (across {:.2}, depth {:.2})",
-            given.len(),
+            list.len(),
             m[0][0],
             m[0][1],
             m[1][0],

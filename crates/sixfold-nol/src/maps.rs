@@ -35,6 +35,30 @@ impl Maps {
         Maps::from_planes(&patch.data, 3, patch.width)
     }
 
+    /// The colours of a square patch without what changes slowly: blurred by `sigma` pixels, less the mean over a wide
+    /// neighbourhood (`wide` pixels) of what lies `inside` (0 to 1 per pixel). Shading and shadows change slowly, paint does
+    /// not; and what lies beside the object has no part in either mean.
+    pub fn of_detail(patch: &Patch, inside: &[f32], sigma: f32, wide: f32) -> Self {
+        let area = patch.width * patch.height;
+        let mean = |sigma: f32| {
+            let mut masked = patch.clone();
+            for plane in masked.data.chunks_exact_mut(area) {
+                plane.iter_mut().zip(inside).for_each(|(v, m)| *v *= m);
+            }
+            masked.blur(sigma);
+            let mut weight = Patch::filled(patch.width, patch.height, [0.0; 3]);
+            weight.data[..area].copy_from_slice(inside);
+            weight.blur(sigma);
+            for plane in masked.data.chunks_exact_mut(area) {
+                plane.iter_mut().zip(&weight.data[..area]).for_each(|(v, w)| *v /= w.max(0.02));
+            }
+            masked
+        };
+        let (mut fine, coarse) = (mean(sigma), mean(wide));
+        fine.data.iter_mut().zip(&coarse.data).for_each(|(v, c)| *v -= c);
+        Maps::from_planes(&fine.data, 3, patch.width)
+    }
+
     /// Channels.
     pub fn channels(&self) -> usize {
         self.channels

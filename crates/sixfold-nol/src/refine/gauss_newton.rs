@@ -115,7 +115,7 @@ pub fn refine_scene(
     }
     let all = (options.blurs.len() * options.steps).max(1) as f64;
     'levels: for (level, blur) in options.blurs.iter().enumerate() {
-        let maps: Vec<Maps> = working.par_iter().map(|w| Maps::of_patch(&w.view.patch, *blur)).collect();
+        let maps: Vec<Maps> = working.par_iter().map(|w| w.maps(*blur, options)).collect();
         if options.line > 0.0 {
             working.par_iter_mut().zip(sources).for_each(|(w, source)| {
                 let odds = color_odds(&w.view.patch, &prior(&w.view));

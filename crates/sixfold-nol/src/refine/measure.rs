@@ -50,6 +50,21 @@ impl Working<'_> {
         self.allowed.extend(inside.data.iter().map(|v| f32::from(u8::from(*v > 0.9))));
     }
 
+    /// The colours to be compared.
+    pub fn maps(&self, blur: f32, options: &RefineOptions) -> Maps {
+        if options.wide <= 0.0 {
+            return Maps::of_patch(&self.view.patch, blur);
+        }
+        let inside: Vec<f32> = self
+            .view
+            .depth()
+            .iter()
+            .zip(&self.view.visible.data)
+            .map(|(z, visible)| if *z > 0.0 { *visible } else { 0.0 })
+            .collect();
+        Maps::of_detail(&self.view.patch, &inside, blur, options.wide * blur)
+    }
+
     /// What the photograph says about its pose: colours and outline, as normal equations of a twist about the object's centre.
     pub fn measure(&mut self, terms: &Terms<'_>, options: &RefineOptions) -> Wanted {
         let pose = self.pose;

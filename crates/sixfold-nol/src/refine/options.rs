@@ -17,6 +17,8 @@ pub struct RefineOptions {
     pub reaches: Vec<f64>,
     /// Steps at each blur; the common appearance is made anew before each.
     pub steps: usize,
+    /// Slow changes of colour are taken out: means over this many times the blur; 0 compares the colours as they are.
+    pub wide: f32,
     /// Weight of the colours' differences as a whole, in independent measurements; 0 leaves them out.
     pub colors: f64,
     /// Weight of a line of the outline, in independent measurements; 0 leaves the outline out.
@@ -37,11 +39,12 @@ impl Default for RefineOptions {
         RefineOptions {
             side: 128,
             points: 4000,
-            blurs: vec![4.0, 2.5, 1.5, 1.0],
+            blurs: vec![3.0, 2.0, 1.4, 1.0],
             reaches: vec![12.0, 8.0, 5.0, 4.0],
             steps: 5,
-            colors: 100.0,
-            line: 0.3,
+            wide: 4.0,
+            colors: 40.0,
+            line: 0.01,
             scene: SceneKind::Judge,
             rough: [0.006, 0.03],
             most_moved: 6.0,
