@@ -63,6 +63,9 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold simulate-depth --dataset lmo --split test --out lmo-simulated"
     )]
     SimulateDepth(SimulateArguments),
+    /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
+    #[command(after_help = crate::commands::synthesize::arguments::AFTER_HELP)]
+    Synthesize(Box<crate::commands::synthesize::arguments::SynthesizeArguments>),
     /// Train a network on a few posed photographs and renders
     #[command(
         after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo"

@@ -59,6 +59,7 @@ fn main() -> ExitCode {
         Command::Eval(a) => commands::eval::run(a),
         Command::Grasp(a) => commands::grasp::run(a),
         Command::Render(a) => commands::render::run(a),
+        Command::Synthesize(a) => commands::synthesize::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),
         Command::Train(a) => commands::train::run(a),
         Command::Reproduce(a) => commands::reproduce::run(a),

@@ -15,8 +15,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let image = Arc::new(scene.rgb(im_id)?.expect("rgb"));
     let camera = scene.camera(im_id)?;
     let truth = &scene.image(im_id)?.ground_truth;
-    let meshes: Vec<Mesh> = truth.iter().map(|g| dataset.model(g.obj_id, Models::Rendering).expect("model")).collect();
-    let placed: Vec<(&Mesh, Pose)> = truth.iter().zip(&meshes).map(|(g, m)| (m, g.camera_from_object)).collect();
+    let meshes: Vec<Mesh> =
+        truth.iter().map(|g| dataset.model(g.obj_id, Models::Rendering).expect("model")).collect();
+    let placed: Vec<(&Mesh, Pose)> =
+        truth.iter().zip(&meshes).map(|(g, m)| (m, g.camera_from_object)).collect();
     let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
     let side = 192;
     let mut sheet = RgbImage::filled(side * truth.len(), side * 3, [0, 0, 0]);
@@ -58,7 +60,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 }
             }
         }
-        println!("object {} lines {} mean offset {:.2}", g.obj_id, lines.len(), sum / lines.len().max(1) as f64);
+        println!(
+            "object {} lines {} mean offset {:.2}",
+            g.obj_id,
+            lines.len(),
+            sum / lines.len().max(1) as f64
+        );
     }
     write_rgb(std::path::Path::new(&a[4]), &sheet)?;
     Ok(())

@@ -19,6 +19,9 @@ use crate::source::SourceView;
 /// Pixels about what is seen that take part, so that its edge lies among zeros as in the training.
 const BORDER: usize = 8;
 
+/// Compact weights for all objects; see the card beside the file.
+static SHIPPED: &[u8] = include_bytes!("../weights/nol-compact.safetensors");
+
 /// Why a model could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
@@ -93,6 +96,14 @@ impl NolModel {
             .unwrap_or_else(|| unreachable!("the compact network is known"));
         let (network, card) = load_weights_from_bytes(network, name, bytes, compact)?;
         Ok(NolModel { network: network.valid(), card, device })
+    }
+
+    /// The network that comes with the program.
+    ///
+    /// # Errors
+    /// [`ModelError`] if the program carries weights of another version than its own.
+    pub fn shipped() -> Result<Self, ModelError> {
+        Self::from_bytes(Path::new("nol-compact.safetensors"), SHIPPED)
     }
 
     fn described(path: &Path, card: &ModelCard) -> Result<Network, ModelError> {

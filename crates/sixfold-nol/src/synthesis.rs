@@ -151,7 +151,8 @@ impl<'a> ViewMaker<'a> {
         let (colors, seen) = match self.weighting {
             Weighting::Network(model) => {
                 let sources: Vec<SourceView> = chosen.iter().map(|k| self.sources[*k].clone()).collect();
-                let features: Vec<SourceFeatures> = chosen.iter().map(|k| self.features[*k].clone()).collect();
+                let features: Vec<SourceFeatures> =
+                    chosen.iter().map(|k| self.features[*k].clone()).collect();
                 let rendering = model.render(&target, &sources, &features);
                 (rendering.colours, rendering.seen)
             }
@@ -222,6 +223,9 @@ impl<'a> ViewMaker<'a> {
     }
 }
 
+/// Rounds in which filled pixels become the mean of themselves and their neighbours.
+const SMOOTHINGS: usize = 40;
+
 /// Gives unseen pixels of the object the colours of seen ones nearby: means over ever larger neighbourhoods, from halved images.
 fn fill(view: &mut NewView, mean: [f32; 3]) {
     let (width, height) = view.mask.size();
@@ -252,10 +256,8 @@ fn fill(view: &mut NewView, mean: [f32; 3]) {
         }
         levels.push((half_w, half_h, coarse));
     }
-    for at in 0..area {
-        if !view.unseen.as_slice()[at] {
-            continue;
-        }
+    let unseen: Vec<usize> = (0..area).filter(|at| view.unseen.as_slice()[*at]).collect();
+    for &at in &unseen {
         let (x, y) = (at % width, at / width);
         let color = levels
             .iter()
@@ -265,5 +267,23 @@ fn fill(view: &mut NewView, mean: [f32; 3]) {
             .find(|sum| sum[3] > 0.0)
             .map_or(mean, |sum| [sum[0] / sum[3], sum[1] / sum[3], sum[2] / sum[3]]);
         (0..3).for_each(|c| view.patch.data[c * area + at] = color[c]);
+    }
+    // The blocks of the halved images melt into each other and into what is seen.
+    for _ in 0..SMOOTHINGS {
+        let before = view.patch.data.clone();
+        for &at in &unseen {
+            let (x, y) = (at % width, at / width);
+            let near = [
+                (x > 0).then(|| at - 1),
+                (x + 1 < width).then(|| at + 1),
+                (y > 0).then(|| at - width),
+                (y + 1 < height).then(|| at + width),
+            ];
+            let near: Vec<usize> = near.into_iter().flatten().filter(|n| view.mask.as_slice()[*n]).collect();
+            for c in 0..3 {
+                let sum: f32 = near.iter().map(|n| before[c * area + n]).sum();
+                view.patch.data[c * area + at] = (before[c * area + at] + sum) / (near.len() + 1) as f32;
+            }
+        }
     }
 }

@@ -17,6 +17,7 @@ pub(crate) mod pix2pose;
 pub(crate) mod render;
 pub(crate) mod reproduce;
 pub(crate) mod simulate;
+pub(crate) mod synthesize;
 pub(crate) mod train;
 pub(crate) mod train_detector;
 #[cfg(feature = "experience")]

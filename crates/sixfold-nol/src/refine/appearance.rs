@@ -10,14 +10,14 @@ use crate::source::SourceView;
 
 /// What one photograph shows at every point: channels, and how much it counts (0: not seen).
 #[derive(Debug, Clone, Default)]
-pub(super) struct Shown {
+pub(crate) struct Shown {
     /// `points * channels` numbers.
     pub values: Vec<f32>,
     pub weights: Vec<f32>,
 }
 
-/// Looks all points up in one photograph at its present pose. `reach` grows the photograph's mask, in units of its blur.
-pub(super) fn look(
+/// Looks all points up in one photograph at its present pose, where `allowed` (0 to 1 per pixel of the crop) lets it.
+pub(crate) fn look(
     view: &SourceView,
     maps: &Maps,
     allowed: &[f32],
@@ -41,7 +41,7 @@ pub(super) fn look(
 
 /// Gain and offset per channel that bring a photograph's values to the common ones: light and exposure differ.
 #[derive(Debug, Clone)]
-pub(super) struct Light {
+pub(crate) struct Light {
     pub gain: Vec<f32>,
     pub offset: Vec<f32>,
 }
@@ -91,7 +91,7 @@ impl Light {
 
 /// The common appearance: a mean over photographs in which those far from the mean count less.
 #[derive(Debug, Clone)]
-pub(super) struct Common {
+pub(crate) struct Common {
     /// Sums of weighted values, `points * channels`.
     sums: Vec<f32>,
     /// Sums of weights.

@@ -13,6 +13,7 @@ mod printed;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use appearance::{Common, Light, Shown, look};
 pub use gauss_newton::{SceneSource, refine_poses, refine_scene};
 pub use options::{RefineOptions, Refinement, SceneKind, SourceReport};
 pub use printed::{PrintedOptions, printed_rule};

@@ -1,0 +1,114 @@
+//! What `sixfold synthesize` is told.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use crate::arguments::JsonArguments;
+
+/// How colours of several photographs become one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum WeightingKind {
+    /// The network of NOL
+    Network,
+    /// All photographs alike
+    Average,
+    /// The photograph that looks at the place most directly
+    Best,
+}
+
+/// Whether objects moved between photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum SceneArgument {
+    /// Decided by how well the given poses agree with one arrangement
+    Judge,
+    /// Only the camera moved
+    Still,
+    /// Objects may have moved
+    Moving,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SynthesizeArguments {
+    /// BOP dataset folder with models and posed photographs
+    #[arg(long, value_name = "DIR", required_unless_present = "photographs")]
+    pub dataset: Option<PathBuf>,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub frames: Option<PathBuf>,
+    /// Object ids of the dataset (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
+    pub ids: Vec<u32>,
+    /// In place of a dataset: a JSON file that names a mesh and its photographs (see below)
+    #[arg(long, value_name = "FILE.json", conflicts_with = "dataset")]
+    pub photographs: Option<PathBuf>,
+    /// Folder for the new dataset, the refined poses and the pictures
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Name of the new dataset's split
+    #[arg(long, value_name = "NAME", default_value = "train_nol")]
+    pub new_split: String,
+    /// Most photographs of an object; those that add most of its surface are taken
+    #[arg(long, value_name = "N", default_value = "16")]
+    pub sources: usize,
+    /// Photographs behind each new view
+    #[arg(long, value_name = "N", default_value = "6")]
+    pub per_view: usize,
+    /// Photographs that show less of the object than this share are left out
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub least_visible: f64,
+    /// How colours of several photographs become one
+    #[arg(long, value_enum, default_value = "network")]
+    pub weighting: WeightingKind,
+    /// Another NOL network than the one that comes with the program
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: Option<PathBuf>,
+    /// Take the poses as they are
+    #[arg(long)]
+    pub no_refine: bool,
+    /// Whether objects moved between the photographs
+    #[arg(long, value_enum, default_value = "judge")]
+    pub scene: SceneArgument,
+    /// How rough the given poses are: standard deviation in millimetres along each axis and degrees about each
+    #[arg(long, value_name = "MM,DEGREES", value_delimiter = ',', default_values_t = [6.0, 1.7])]
+    pub rough: Vec<f64>,
+    /// For experiments: disturb the given poses by up to so many millimetres along and degrees about each axis
+    #[arg(long, value_name = "MM,DEGREES", value_delimiter = ',')]
+    pub disturb: Vec<f64>,
+    /// Degrees between views, in azimuth and elevation
+    #[arg(long, value_name = "DEGREES", default_value = "5")]
+    pub step: f64,
+    /// Elevation of the camera over the object's xy plane, lowest and highest, degrees
+    #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [0.0, 85.0], allow_hyphen_values = true)]
+    pub elevation: Vec<f64>,
+    /// Images of each view, each with a turn of its own in the image plane (up to 45 degrees)
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub turns: usize,
+    /// Side of the new images in pixels
+    #[arg(long, value_name = "PIXELS", default_value = "192")]
+    pub size: usize,
+    /// Folder of photographs for backgrounds (default: made-up textures)
+    #[arg(long, value_name = "DIR")]
+    pub backgrounds: Option<PathBuf>,
+    /// Put the photographs themselves, cut to the object, into the new dataset too
+    #[arg(long)]
+    pub with_photographs: bool,
+    /// Seed of turns, distances, backgrounds and disturbances
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+/// Shown under `sixfold synthesize --help`.
+pub(crate) const AFTER_HELP: &str = "Examples:\n  \
+    sixfold synthesize --dataset lmo --frames frames.json --out out/nol\n  \
+    sixfold synthesize --photographs mug/photographs.json --out out/mug\n  \
+    sixfold train pix2pose --dataset out/nol --split train_nol --render-share 0 --out out/mug-model\n\n\
+    A file for --photographs (paths are relative to it; poses as in BOP, object to camera, millimetres; mask may be left out):\n  \
+    {\"mesh\": \"mug.ply\", \"unit\": \"mm\", \"photographs\": [{\"image\": \"1.png\", \"camera\": \"camera.json\",\n    \
+    \"cam_R_m2c\": [1,0,0, 0,1,0, 0,0,1], \"cam_t_m2c\": [0, 0, 600], \"mask\": \"1-mask.png\"}]}\n\n\
+    Stopped, the same command goes on.";

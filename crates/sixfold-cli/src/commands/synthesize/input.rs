@@ -1,0 +1,268 @@
+//! Photographs with rough poses: from a BOP dataset, or from a file that names them.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Deserialize;
+use sixfold_bop::{BopDataset, MaskKind, Models, ground_truth_visibility, read_mask, read_rgb};
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
+use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
+use sixfold_nol::Photograph;
+
+use super::arguments::SynthesizeArguments;
+use crate::camera_file;
+
+/// All that is given.
+pub(super) struct Input {
+    pub subjects: Vec<Subject>,
+    /// Objects that are not looked for but may hide others.
+    others: BTreeMap<u32, Mesh>,
+    /// Camera, objects and poses of every image whose masks were drawn from poses.
+    drawn: BTreeMap<usize, (Camera, Vec<(u32, Pose)>)>,
+}
+
+impl Input {
+    /// Draws the masks that came from poses again, now that the poses of the subjects are better. `refined` has image, object
+    /// and pose.
+    pub fn redraw_masks(&mut self, refined: &[(usize, u32, Pose)]) -> Result<()> {
+        let mut masks: BTreeMap<(usize, u32), Mask> = BTreeMap::new();
+        for (image, (camera, objects)) in &mut self.drawn {
+            for (id, pose) in objects.iter_mut() {
+                let better = refined.iter().find(|(i, object, _)| i == image && object == id);
+                if let Some((_, _, better)) = better {
+                    *pose = *better;
+                }
+            }
+            let mesh_of = |id: u32| {
+                let subject = self.subjects.iter().find(|s| s.id == id).map(|s| &s.mesh);
+                subject.or_else(|| self.others.get(&id))
+            };
+            let placed: Vec<(u32, &Mesh, Pose)> =
+                objects.iter().filter_map(|(id, pose)| Some((*id, mesh_of(*id)?, *pose))).collect();
+            let scene: Vec<(&Mesh, Pose)> = placed.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
+            let visible = ground_truth_visibility(&scene, camera, None, 0.015);
+            for ((id, _, _), visible) in placed.iter().zip(visible) {
+                masks.insert((*image, *id), visible.mask_visible);
+            }
+        }
+        for subject in &mut self.subjects {
+            for source in &mut subject.photographs {
+                if let Some(mask) = masks.remove(&(source.image, subject.id)) {
+                    let p = &source.photograph;
+                    let (image, camera) = (p.image().clone(), *p.camera());
+                    source.photograph =
+                        Photograph::new(p.name(), image, camera, *p.camera_from_object(), Some(mask))?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An object and its photographs.
+pub(super) struct Subject {
+    pub id: u32,
+    pub mesh: Mesh,
+    pub info: ModelInfo,
+    pub photographs: Vec<Source>,
+}
+
+/// A photograph of one object, and of which image it is.
+pub(super) struct Source {
+    pub image: usize,
+    /// Scene and image of a dataset.
+    pub frame: Option<(u32, u32)>,
+    pub photograph: Photograph,
+    /// The pose as it was given, before any disturbance.
+    pub given: Pose,
+}
+
+pub(super) fn read(a: &SynthesizeArguments) -> Result<Input> {
+    match (&a.dataset, &a.photographs) {
+        (Some(root), _) => from_dataset(a, root),
+        (None, Some(file)) => {
+            let subjects = vec![from_file(a, file)?];
+            Ok(Input { subjects, others: BTreeMap::new(), drawn: BTreeMap::new() })
+        }
+        (None, None) => bail!("what is to be seen anew? Give --dataset DIR or --photographs FILE.json"),
+    }
+}
+
+/// Moves poses at random for experiments.
+struct Disturber {
+    random: ChaCha8Rng,
+    reach: Option<[f64; 2]>,
+}
+
+impl Disturber {
+    fn new(a: &SynthesizeArguments) -> Result<Self> {
+        let reach = match a.disturb.as_slice() {
+            [] => None,
+            [mm, degrees] if *mm >= 0.0 && *degrees >= 0.0 && mm.is_finite() && degrees.is_finite() => {
+                Some([mm * 1e-3, degrees.to_radians()])
+            }
+            other => bail!("--disturb: found {other:?}, expected millimetres and degrees, 0 or more"),
+        };
+        Ok(Disturber { random: ChaCha8Rng::seed_from_u64(a.seed), reach })
+    }
+
+    fn disturb(&mut self, pose: &Pose) -> Pose {
+        let Some([shift, turn]) = self.reach else { return *pose };
+        let mut draw = |reach: f64| reach * (2.0 * self.random.random::<f64>() - 1.0);
+        let moved = Vec3::new(draw(shift), draw(shift), draw(shift));
+        let turned = UnitQuaternion::from_euler_angles(draw(turn), draw(turn), draw(turn));
+        Pose::new(turned * pose.rotation(), pose.translation() + moved)
+    }
+}
+
+fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
+    let dataset = BopDataset::open(root, &a.split)?;
+    let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
+    let ids: Vec<u32> = if a.ids.is_empty() { infos.0.keys().copied().collect() } else { a.ids.clone() };
+    if ids.is_empty() {
+        bail!("{}: no objects: its models have no models_info.json; name them with --ids", root.display());
+    }
+    let mut frames: Vec<(u32, u32)> = match &a.frames {
+        Some(file) => dataset.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id)).collect(),
+        None => {
+            let mut all = vec![];
+            for scene_id in dataset.scene_ids() {
+                let scene = dataset.scene(scene_id)?;
+                let shown = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
+                all.extend(shown.map(|im_id| (scene_id, im_id)));
+            }
+            all
+        }
+    };
+    frames.sort_unstable();
+    frames.dedup();
+    let mut disturber = Disturber::new(a)?;
+    let mut subjects = BTreeMap::new();
+    for id in ids {
+        let mesh = dataset.model(id, Models::Rendering)?;
+        let info = infos.0.get(&id).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
+        subjects.insert(id, Subject { id, mesh, info, photographs: vec![] });
+    }
+    let mut others: BTreeMap<u32, Mesh> = BTreeMap::new();
+    let mut drawn = BTreeMap::new();
+    for (number, (scene_id, im_id)) in frames.iter().enumerate() {
+        let scene = dataset.scene(*scene_id)?;
+        let truth = &scene.image(*im_id)?.ground_truth;
+        if !truth.iter().any(|g| subjects.contains_key(&g.obj_id)) {
+            continue;
+        }
+        let Some(image) = scene.rgb(*im_id)? else {
+            bail!("{}: image {im_id} has no colour image; choose other --frames", scene.dir().display());
+        };
+        let image = Arc::new(image);
+        let camera = scene.camera(*im_id)?;
+        for g in truth {
+            if !subjects.contains_key(&g.obj_id) && !others.contains_key(&g.obj_id) {
+                others.insert(g.obj_id, dataset.model(g.obj_id, Models::Rendering)?);
+            }
+        }
+        let poses: Vec<Pose> = truth.iter().map(|g| disturber.disturb(&g.camera_from_object)).collect();
+        let mesh_of = |id: u32| subjects.get(&id).map(|s| &s.mesh).or_else(|| others.get(&id));
+        let placed: Vec<(&Mesh, Pose)> =
+            truth.iter().zip(&poses).filter_map(|(g, pose)| Some((mesh_of(g.obj_id)?, *pose))).collect();
+        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        for (index, ((g, pose), visible)) in truth.iter().zip(&poses).zip(visible).enumerate() {
+            if visible.info.visib_fract < a.least_visible {
+                continue;
+            }
+            // Masks of the dataset fit its own poses, not disturbed ones.
+            let own = if a.disturb.is_empty() { scene.mask(*im_id, index, MaskKind::Visible)? } else { None };
+            if own.is_none() {
+                let objects = truth.iter().zip(&poses).map(|(g, pose)| (g.obj_id, *pose)).collect();
+                drawn.entry(number).or_insert((camera, objects));
+            }
+            let mask: Mask = own.unwrap_or(visible.mask_visible);
+            let Some(subject) = subjects.get_mut(&g.obj_id) else { continue };
+            let name = format!("{scene_id}/{im_id} of object {}", g.obj_id);
+            let photograph = Photograph::new(name, image.clone(), camera, *pose, Some(mask))?;
+            subject.photographs.push(Source {
+                image: number,
+                frame: Some((*scene_id, *im_id)),
+                photograph,
+                given: g.camera_from_object,
+            });
+        }
+    }
+    for subject in subjects.values().filter(|s| s.photographs.is_empty()) {
+        eprintln!(
+            "note: object {}: none of the {} frames shows at least {:.0} % of it; left out",
+            subject.id,
+            frames.len(),
+            100.0 * a.least_visible
+        );
+    }
+    let (subjects, without): (Vec<Subject>, Vec<Subject>) =
+        subjects.into_values().partition(|s| !s.photographs.is_empty());
+    others.extend(without.into_iter().map(|s| (s.id, s.mesh)));
+    Ok(Input { subjects, others, drawn })
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    mesh: String,
+    unit: String,
+    photographs: Vec<Entry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(non_snake_case)]
+struct Entry {
+    image: String,
+    camera: String,
+    cam_R_m2c: [f64; 9],
+    cam_t_m2c: [f64; 3],
+    mask: Option<String>,
+}
+
+fn from_file(a: &SynthesizeArguments, path: &Path) -> Result<Subject> {
+    let shown = path.display();
+    let text = std::fs::read_to_string(path).with_context(|| format!("--photographs {shown}"))?;
+    let file: File = serde_json::from_str(&text).with_context(|| {
+        format!("{shown}: expected {{\"mesh\", \"unit\", \"photographs\": [{{\"image\", \"camera\", \"cam_R_m2c\", \"cam_t_m2c\", \"mask\"}}]}}")
+    })?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let unit: Unit = file.unit.parse().with_context(|| format!("{shown}: unit"))?;
+    let mesh = read_mesh(folder.join(&file.mesh), unit)?;
+    if file.photographs.is_empty() {
+        bail!("{shown}: photographs: found none, expected at least one");
+    }
+    let mut disturber = Disturber::new(a)?;
+    let mut photographs = vec![];
+    for (number, entry) in file.photographs.iter().enumerate() {
+        let (image, camera) = picture(folder, entry)?;
+        let rotation = Mat3::from_row_slice(&entry.cam_R_m2c);
+        let given = Pose::from_parts(&rotation, Vec3::from(entry.cam_t_m2c) * 1e-3)
+            .with_context(|| format!("{shown}: photographs[{number}].cam_R_m2c"))?;
+        let mask = match &entry.mask {
+            Some(mask) => Some(read_mask(&folder.join(mask))?),
+            None => None,
+        };
+        let pose = disturber.disturb(&given);
+        let photograph = Photograph::new(&entry.image, Arc::new(image), camera, pose, mask)?;
+        photographs.push(Source { image: number, frame: None, photograph, given });
+    }
+    let info = ModelInfo::of_mesh(&mesh);
+    Ok(Subject { id: 1, mesh, info, photographs })
+}
+
+/// An image without distortion, and its camera.
+fn picture(folder: &Path, entry: &Entry) -> Result<(RgbImage, Camera)> {
+    let image = read_rgb(&folder.join(&entry.image))?;
+    let file = folder.join(&entry.camera);
+    let (width, height) = image.size();
+    let camera = camera_file::read(&file)?.for_image(width, height, &file)?;
+    let image = if camera.distortion.is_some() { undistort_rgb(&image, &camera)? } else { image };
+    Ok((image, camera.without_distortion()))
+}

@@ -1,0 +1,89 @@
+//! Pictures of what was done: outlines at the poses before and after, and a sheet of new views.
+
+use std::path::Path;
+
+use anyhow::Result;
+use sixfold_bop::write_rgb;
+use sixfold_geometry::{Camera, Pose, RgbImage};
+use sixfold_mesh::Mesh;
+use sixfold_nol::{Photograph, SourceView};
+use sixfold_render::{Frame, RenderOptions, SceneObject};
+
+use crate::overlay;
+
+/// Side of a picture in a sheet.
+const SIDE: usize = 160;
+const BEFORE: [u8; 3] = [255, 220, 0];
+const AFTER: [u8; 3] = [0, 255, 120];
+
+/// Draws the outline of a mesh into a square crop.
+fn outline(image: &mut RgbImage, mesh: &Mesh, camera: &Camera, pose: &Pose, color: [u8; 3]) {
+    let mut frame = Frame::new(camera);
+    frame.render(&[SceneObject { mesh, camera_from_object: *pose }], &RenderOptions::default());
+    let (width, height) = image.size();
+    let covered = |x: usize, y: usize| frame.inverse_depth()[y * width + x] > 0.0;
+    for y in 1..height - 1 {
+        for x in 1..width - 1 {
+            let inner = covered(x, y);
+            let border = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
+            if inner && border.iter().any(|(x, y)| !covered(*x, *y)) {
+                image[(x, y)] = color;
+            }
+        }
+    }
+}
+
+/// One row per object, one column per photograph: above the outline at the given pose, below at the refined one.
+pub(super) fn refinement(path: &Path, rows: &[(&Mesh, Vec<(Photograph, Pose)>)]) -> Result<()> {
+    let columns = rows.iter().map(|(_, list)| list.len()).max().unwrap_or(0);
+    if columns == 0 {
+        return Ok(());
+    }
+    let mut sheet = RgbImage::filled(columns * SIDE, rows.len() * 2 * SIDE, [24; 3]);
+    for (row, (mesh, list)) in rows.iter().enumerate() {
+        for (column, (given, refined)) in list.iter().enumerate() {
+            let view = SourceView::new(given, mesh, SIDE)?;
+            for (below, pose, color) in [(0, given.camera_from_object(), BEFORE), (1, refined, AFTER)] {
+                let mut picture = view.patch.to_rgb();
+                outline(&mut picture, mesh, &view.camera, pose, color);
+                paste(&mut sheet, &picture, column * SIDE, (2 * row + below) * SIDE);
+            }
+        }
+        overlay::label(&mut sheet, [2.0, (2 * row * SIDE + 12) as f64], "given", BEFORE);
+        overlay::label(&mut sheet, [2.0, ((2 * row + 1) * SIDE + 12) as f64], "refined", AFTER);
+    }
+    Ok(write_rgb(path, &sheet)?)
+}
+
+/// A sheet of pictures, row by row, each with a text.
+pub(super) fn sheet(path: &Path, rows: &[Vec<(RgbImage, String)>]) -> Result<()> {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let side = rows.iter().flatten().map(|(p, _)| p.width()).max().unwrap_or(0);
+    if columns == 0 || side == 0 {
+        return Ok(());
+    }
+    let mut sheet = RgbImage::filled(columns * side, rows.len() * side, [24; 3]);
+    for (row, list) in rows.iter().enumerate() {
+        for (column, (picture, text)) in list.iter().enumerate() {
+            paste(&mut sheet, picture, column * side, row * side);
+            if !text.is_empty() {
+                overlay::label(
+                    &mut sheet,
+                    [(column * side + 2) as f64, (row * side + 12) as f64],
+                    text,
+                    [255; 3],
+                );
+            }
+        }
+    }
+    Ok(write_rgb(path, &sheet)?)
+}
+
+fn paste(sheet: &mut RgbImage, picture: &RgbImage, left: usize, top: usize) {
+    let (width, height) = picture.size();
+    for y in 0..height {
+        for x in 0..width {
+            sheet[(left + x, top + y)] = picture[(x, y)];
+        }
+    }
+}

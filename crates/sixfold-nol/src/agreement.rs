@@ -1,0 +1,90 @@
+//! What lies in front of the object in some photographs and no mask knows of: places where one photograph shows another colour
+//! than the others agree on are taken out of its visible part.
+//!
+//! It goes beyond the dissertation, whose network has to weigh such pixels down by itself.
+
+use rayon::prelude::*;
+use sixfold_mesh::Mesh;
+
+use crate::maps::Maps;
+use crate::refine::{Common, Light, Shown, look};
+use crate::source::SourceView;
+use crate::surface::outwards;
+
+/// Points of the surface that are compared.
+const POINTS: usize = 6000;
+/// Blur of the colours, crop pixels.
+const BLUR: f32 = 2.0;
+/// Difference in colour (root of the mean square over channels, 0 to 1) from which a photograph shows something else.
+const OTHER: f32 = 0.13;
+/// Fewer photographs' weight of opinion does not outvote one.
+const LEAST_OPINION: f32 = 1.2;
+
+/// Takes what does not agree with the other sources out of the visible parts of `sources`, whose poses should be good already.
+/// Returns the share of each source's visible points that was taken out.
+pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f64> {
+    let surface = mesh.sample_surface(POINTS, 1);
+    let normals = outwards(mesh, &surface.normals);
+    let raw: Vec<Shown> = sources
+        .par_iter()
+        .map(|source| {
+            let maps = Maps::of_patch(&source.patch, BLUR);
+            let allowed: Vec<f32> =
+                source.visible.data.iter().map(|v| f32::from(u8::from(*v > 0.5))).collect();
+            look(source, &maps, &allowed, &surface.points, &normals)
+        })
+        .collect();
+    let mut lit = raw.clone();
+    for _ in 0..2 {
+        let common = Common::new(&lit, 3);
+        let lights: Vec<Light> = (0..raw.len())
+            .into_par_iter()
+            .map(|k| {
+                let (target, known) = common.without(k, &lit[k]);
+                Light::fit(&raw[k], &target, &known, 3)
+            })
+            .collect();
+        for ((lit, raw), light) in lit.iter_mut().zip(&raw).zip(&lights) {
+            lit.values.clone_from(&raw.values);
+            light.apply(&mut lit.values);
+        }
+    }
+    let common = Common::new(&lit, 3);
+    sources
+        .iter_mut()
+        .enumerate()
+        .map(|(k, source)| {
+            let (target, known) = common.without(k, &lit[k]);
+            let side = source.side();
+            let (mut seen, mut out) = (0usize, 0usize);
+            // Votes of the points around every pixel, for and against.
+            let mut votes = vec![[0.0f32; 2]; side * side];
+            let reach = (side as f32 / 40.0).ceil() as isize;
+            for (i, (point, normal)) in surface.points.iter().zip(&normals).enumerate() {
+                if lit[k].weights[i] <= 0.0 || known[i] < LEAST_OPINION {
+                    continue;
+                }
+                let Some(([x, y], _)) = source.see(point, normal) else { continue };
+                let square: f32 =
+                    (0..3).map(|c| (lit[k].values[3 * i + c] - target[3 * i + c]).powi(2)).sum();
+                let other = (square / 3.0).sqrt() > OTHER;
+                seen += 1;
+                out += usize::from(other);
+                let (x, y) = (x.round() as isize, y.round() as isize);
+                for v in (y - reach).max(0)..=(y + reach).min(side as isize - 1) {
+                    for u in (x - reach).max(0)..=(x + reach).min(side as isize - 1) {
+                        let square = ((u - x).pow(2) + (v - y).pow(2)) as f32;
+                        let weight = (-2.0 * square / (reach * reach) as f32).exp();
+                        votes[v as usize * side + u as usize][usize::from(other)] += weight;
+                    }
+                }
+            }
+            for (visible, [same, other]) in source.visible.data.iter_mut().zip(&votes) {
+                if *other > *same {
+                    *visible = 0.0;
+                }
+            }
+            out as f64 / seen.max(1) as f64
+        })
+        .collect()
+}
