@@ -83,6 +83,16 @@ impl SourceView {
         view
     }
 
+    /// Share of the mesh's silhouette at the present pose that the mask leaves visible, 0 to 1.
+    pub fn visible_share(&self) -> f64 {
+        let (mut all, mut seen) = (0usize, 0usize);
+        for (z, visible) in self.depth.iter().zip(&self.visible.data) {
+            all += usize::from(*z > 0.0);
+            seen += usize::from(*z > 0.0 && *visible > 0.5);
+        }
+        seen as f64 / all.max(1) as f64
+    }
+
     /// The present pose.
     pub fn camera_from_object(&self) -> &Pose {
         &self.camera_from_object

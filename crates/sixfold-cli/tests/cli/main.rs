@@ -13,3 +13,4 @@ mod objects;
 mod pix2pose;
 mod simulate;
 mod support;
+mod synthesize;

@@ -14,7 +14,7 @@ use sixfold_render::Frame;
 use super::appearance::{Common, Light, Shown, look};
 use super::arrangement::{Arrangement, Wanted};
 use super::measure::{Terms, Working, prior};
-use super::options::{RefineOptions, Refinement, SceneKind};
+use super::options::{RefineOptions, Refinement, SceneKind, SourceReport};
 use crate::maps::Maps;
 use crate::photograph::{NolError, Photograph};
 use crate::source::SourceView;
@@ -51,6 +51,9 @@ pub fn refine_poses(
 
 /// Disagreement of poses, in units of what their roughness explains, from which objects are taken to have moved.
 const MOVED: f64 = 2.0;
+
+/// Four fifths of the means of six squared unit normal numbers are below this.
+const EXPECTED: f64 = 1.43;
 
 /// What belongs to an object.
 struct Object {
@@ -157,13 +160,43 @@ pub fn refine_scene(
     }
     progress(1.0);
     let after = differences(&mut working, &objects, options);
-    let reports = working
+    let mut reports: Vec<SourceReport> = working
         .iter()
         .enumerate()
         .map(|(k, w)| w.report(&objects[sources[k].object].centre, [before[k], after[k]], options))
         .collect();
+    for object in &objects {
+        drop_strangers(&mut reports, &object.sources, options);
+    }
     Ok(Refinement { sources: reports, still, disagreement })
 }
+
+/// Drops photographs that show something else than the others where the object should be: their poses are wrong by more than
+/// refinement can mend. Needs three others to say so.
+fn drop_strangers(reports: &mut [SourceReport], sources: &[usize], options: &RefineOptions) {
+    let mut differences: Vec<f64> =
+        sources.iter().map(|k| reports[*k].difference[1]).filter(|d| d.is_finite()).collect();
+    if differences.len() < 4 {
+        return;
+    }
+    let middle = differences.len() / 2;
+    let median = *differences.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let most = (options.most_different * median).max(LEAST_STRANGE);
+    for k in sources {
+        let report = &mut reports[*k];
+        if report.dropped.is_none() && report.difference[1] > most {
+            report.dropped = Some(format!(
+                "where the object should be it differs from the other photographs by {:.0} % of the full range of colours \
+                 (theirs: {:.0} %); is its pose right?",
+                100.0 * report.difference[1],
+                100.0 * median
+            ));
+        }
+    }
+}
+
+/// Differences in colour below this are light, not another object.
+const LEAST_STRANGE: f64 = 0.12;
 
 /// The arrangement to start from, by the given poses alone; whether the objects stood still, and by how much the poses
 /// disagree with that.
@@ -205,9 +238,10 @@ fn arrange(
         w.pose = arrangement.camera_from_object(k);
         off.push(w.off(&objects[sources[k].object].centre, options).powi(2));
     }
-    let middle = off.len() / 2;
-    let median = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let disagreement = (median * 6.0 * pairs.len() as f64 / free).sqrt();
+    // Nearly all poses must agree: with few of them, some always do.
+    let most = (off.len() * 4 / 5).min(off.len() - 1);
+    let usual = *off.select_nth_unstable_by(most, f64::total_cmp).1 / EXPECTED;
+    let disagreement = (usual * 6.0 * pairs.len() as f64 / free).sqrt();
     if options.scene == SceneKind::Judge && disagreement > MOVED {
         for w in working.iter_mut() {
             w.pose = w.given;

@@ -93,7 +93,7 @@ impl Working<'_> {
     /// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are
     /// taken by themselves.
     fn add_given(&self, equations: &mut NormalEquations, centre: &Vec3, options: &RefineOptions) {
-        let offset = self.from_given(centre);
+        let offset = self.since_given(centre);
         let trust = 1.0 / (1.0 + self.off(centre, options).powi(2) / 6.0);
         for (k, offset) in offset.iter().enumerate() {
             let mut row = [0.0; 6];
@@ -105,13 +105,13 @@ impl Working<'_> {
 
     /// How far the present pose is from the given one: root of the mean square over six numbers in units of their deviation.
     pub fn off(&self, centre: &Vec3, options: &RefineOptions) -> f64 {
-        let offset = self.from_given(centre);
+        let offset = self.since_given(centre);
         let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / options.rough[k / 3]).powi(2)).sum();
         (square / 6.0).sqrt()
     }
 
     /// Shift of the object's centre and rotation vector since the given pose, in the camera's frame.
-    fn from_given(&self, centre: &Vec3) -> [f64; 6] {
+    fn since_given(&self, centre: &Vec3) -> [f64; 6] {
         let pose = &self.pose;
         let shift = pose.transform_point(centre) - self.given.transform_point(centre);
         let turn = (pose.rotation() * self.given.rotation().inverse()).scaled_axis();
@@ -174,7 +174,7 @@ impl Working<'_> {
 
     pub fn report(&self, centre: &Vec3, difference: [f64; 2], options: &RefineOptions) -> SourceReport {
         let pose = &self.pose;
-        let offset = self.from_given(centre);
+        let offset = self.since_given(centre);
         let far = |range: std::ops::Range<usize>, deviation: f64| {
             offset[range].iter().map(|v| v * v).sum::<f64>().sqrt() / deviation
         };

@@ -30,6 +30,8 @@ pub struct RefineOptions {
     pub rough: [f64; 2],
     /// A photograph whose pose moved by more than this many standard deviations is dropped.
     pub most_moved: f64,
+    /// A photograph whose colours differ from the others' by more than this many times what is usual among them is dropped.
+    pub most_different: f64,
     /// Seed of the points.
     pub seed: u64,
 }
@@ -48,6 +50,7 @@ impl Default for RefineOptions {
             scene: SceneKind::Judge,
             rough: [0.006, 0.03],
             most_moved: 6.0,
+            most_different: 2.5,
             seed: 0,
         }
     }

@@ -94,3 +94,56 @@ fn rough_poses_of_a_painted_block_become_exact() {
         assert!(after[0] < most[0] && after[1] < most[1], "{colors} {line}: {before:?} {after:?}");
     }
 }
+
+#[test]
+fn a_photograph_with_a_wrong_pose_is_dropped() {
+    let (mesh, _, mut photographs) = photographs(12, [0.004, 0.02], 5);
+    let wrong = photographs[4].camera_from_object();
+    let moved = wrong.with_translation(wrong.translation() + Vec3::new(0.07, 0.03, 0.0));
+    photographs[4] = photographs[4].with_pose(moved).unwrap();
+    let refined = refine_poses(&photographs, &mesh, &RefineOptions::default(), |_| true).unwrap();
+    for (k, source) in refined.sources.iter().enumerate() {
+        assert_eq!(source.dropped.is_some(), k == 4, "{k}: {source:?}");
+    }
+    assert_eq!(refined.sources[4].camera_from_object, moved);
+}
+
+#[test]
+fn objects_that_stood_still_share_their_cameras() {
+    // Two blocks in every photograph, at the same place relative to each other; and one pose of one of them far off.
+    let (mesh, truth, photographs) = photographs(10, [0.008, 0.04], 9);
+    let between = Pose::new(UnitQuaternion::from_euler_angles(0.3, 0.0, 1.0), Vec3::new(0.15, 0.05, 0.0));
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let mut draw = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
+    let second: Vec<Photograph> = photographs
+        .iter()
+        .zip(&truth)
+        .map(|(p, truth)| {
+            let pose = *truth * between;
+            let shift = Vec3::new(draw(0.008), draw(0.008), draw(0.008));
+            let turn = UnitQuaternion::from_euler_angles(draw(0.04), draw(0.04), draw(0.04));
+            p.with_pose(Pose::new(turn * pose.rotation(), pose.translation() + shift)).unwrap()
+        })
+        .collect();
+    let sources: Vec<SceneSource<'_>> = (photographs.iter().enumerate())
+        .map(|(image, photograph)| SceneSource { object: 0, image, photograph })
+        .chain(second.iter().enumerate().map(|(image, photograph)| SceneSource {
+            object: 1,
+            image,
+            photograph,
+        }))
+        .collect();
+    // The second block is painted nowhere: what is left is the common arrangement.
+    let options = RefineOptions { colors: 0.0, line: 0.0, ..RefineOptions::default() };
+    let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, |_| true).unwrap();
+    assert!(refined.still && refined.disagreement.unwrap() < 2.0, "{:?}", refined.disagreement);
+    let all: Vec<Pose> = truth.iter().copied().chain(truth.iter().map(|t| *t * between)).collect();
+    let given: Vec<Pose> = sources.iter().map(|s| *s.photograph.camera_from_object()).collect();
+    let after: Vec<Pose> = refined.sources.iter().map(|s| s.camera_from_object).collect();
+    let (before, after) = (errors(&given, &all), errors(&after, &all));
+    assert!(after[0] < 0.85 * before[0] && after[1] < 0.85 * before[1], "{before:?} {after:?}");
+    // Moved between photographs, nothing is shared: the given poses stay.
+    let options = RefineOptions { scene: SceneKind::Moving, ..options };
+    let moving = refine_scene(&sources, &[block(), block()], &options, |_| true).unwrap();
+    assert!(moving.sources.iter().zip(&given).all(|(s, g)| s.camera_from_object.distance_to(g) < 1e-6));
+}

@@ -16,11 +16,11 @@ use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::write_camera;
 use sixfold_geometry::Camera;
 use sixfold_mesh::{PlyFormat, Unit, write_ply};
-use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::select::{choose_by_surface, shown_points};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
+use sixfold_nol::{NolError, SourceView};
 
 use self::arguments::{SynthesizeArguments, WeightingKind};
 use self::input::{Input, Subject};
@@ -30,6 +30,8 @@ use crate::progress::Progress;
 
 /// Side of the crops that new views take their colours from, pixels.
 const CROP: usize = 256;
+/// A photograph is left out where its mask covers less of the object's outline.
+const LEAST_MASK: f64 = 0.1;
 /// A further photograph of an object must add so many of its 3000 points.
 const LEAST_GAIN: f64 = 15.0;
 
@@ -183,7 +185,7 @@ fn check(a: &SynthesizeArguments) -> Result<()> {
     for (option, values) in [("--elevation", &a.elevation), ("--rough", &a.rough), ("--disturb", &a.disturb)]
     {
         if values.len() != 2 && !(values.is_empty() && option == "--disturb") {
-            bail!("{option}: found {} numbers, expected two with a comma between them", values.len());
+            bail!("{option}: found {}, expected two numbers with a comma between them", values.len());
         }
     }
     if !(1.0..=90.0).contains(&a.step) {
@@ -251,8 +253,18 @@ fn choose_sources(a: &SynthesizeArguments, subject: &mut Subject) -> Result<()> 
     let mut shown = vec![];
     for source in &subject.photographs {
         let view = SourceView::new(&source.photograph, &subject.mesh, 96)?;
+        let share = view.visible_share();
+        if share < LEAST_MASK {
+            let name = source.photograph.name().to_owned();
+            let wrong = NolError::Mask { name, share: 100.0 * share, least: 100.0 * LEAST_MASK };
+            eprintln!("note: {wrong}; left out");
+            shown.push(vec![]);
+            continue;
+        }
         shown.push(shown_points(&view, &surface.points, &surface.normals));
     }
+    let points = surface.points.len();
+    shown.iter_mut().for_each(|s| s.resize(points, 0.0));
     let least = if subject.photographs.len() > a.sources { 0.0 } else { LEAST_GAIN * 0.01 };
     let mut chosen = choose_by_surface(&shown, None, a.sources, least);
     chosen.sort_unstable();
