@@ -257,3 +257,7 @@ impl Area {
 fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
+
+#[cfg(test)]
+#[path = "model_tests.rs"]
+mod tests;

@@ -266,3 +266,90 @@ pub fn last_checkpoint(folder: &Path, network: Network) -> Result<Option<(Networ
     let Some(checkpoint) = Checkpoint::latest(folder)? else { return Ok(None) };
     Ok(Some((checkpoint.module("network", network)?.valid(), checkpoint.step())))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::network::{CHANNELS, CompactConfig, Parts};
+    use std::sync::atomic::Ordering;
+
+    fn options(steps: u64) -> TrainingOptions {
+        TrainingOptions {
+            steps,
+            warm_up: 2,
+            batch: BatchOptions { sides: vec![48, 64], most_sources: 3, sources: 4, most_samples: 2 },
+            ..TrainingOptions::default()
+        }
+    }
+
+    fn network(device: &Device) -> Network {
+        Network::Compact(CompactConfig::default().init(3, device).unwrap())
+    }
+
+    #[test]
+    fn on_one_batch_the_loss_falls() {
+        let device = Device::flex().autodiff();
+        let textures = Backgrounds::procedural();
+        let options = options(1);
+        let network = network(&device);
+        let perceptual = Perceptual::of(&network, &device).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let preview = Preview::new(&textures, &options.samples, 0, folder.path());
+        let optimiser = AdamWConfig::new().init();
+        let mut state = State {
+            network,
+            optimiser,
+            perceptual: &perceptual,
+            preview: &preview,
+            options: &options,
+            device: &device,
+        };
+        let batch = Batch::of_step(&textures, &options.samples, &options.batch, 0, 4);
+        let losses: Vec<f64> = (0..12)
+            .map(|_| {
+                let losses = state.step(batch.clone(), 2e-3);
+                options.weights[0] * losses["colours"] + options.weights[1] * losses["features"]
+            })
+            .collect();
+        assert!(losses[11] < 0.95 * losses[0], "{losses:?}");
+    }
+
+    #[test]
+    fn it_goes_on_where_it_stopped() {
+        let device = Device::flex().autodiff();
+        let textures = Backgrounds::procedural();
+        let options = options(6);
+        let go = |folder: &Path, stop_at: Option<u64>, sample_threads: usize| {
+            let stop = AtomicBool::new(false);
+            let network = network(&device);
+            let perceptual = Perceptual::of(&network, &device).unwrap();
+            let pace = TrainingPace { checkpoint_every: 4, log_every: 1, sample_threads };
+            let parts = Parts::default();
+            train(&textures, network, parts, &perceptual, &device, folder, &options, &pace, &stop, |r| {
+                stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
+            })
+            .unwrap()
+        };
+        let numbers = |n: &Network| -> Vec<f32> {
+            let device = Device::flex();
+            let maps = n.encode(Tensor::<4>::ones([1, 3, 32, 32], &device) * 0.3);
+            let x = Tensor::<4>::ones([2, CHANNELS, 8, 8], &device) * 0.2;
+            let blend = n.blend(x, Tensor::ones([2, 1, 8, 8], &device), 2);
+            let mut out: Vec<f32> = maps[3].clone().into_data().try_to_vec().unwrap();
+            out.extend(n.decode(blend.sum).unwrap().into_data().try_to_vec::<f32>().unwrap());
+            out
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let Ending::Finished(straight) = go(&folder.path().join("a"), None, 1) else { panic!() };
+        let b = folder.path().join("b");
+        assert!(matches!(go(&b, Some(3), 2), Ending::Interrupted { step: 3 }));
+        let Ending::Finished(resumed) = go(&b, None, 1) else { panic!() };
+        assert_eq!(numbers(&straight), numbers(&resumed));
+        assert!(b.join("preview.png").exists());
+        let wrong = TrainingOptions {
+            batch: BatchOptions { sides: vec![50], ..options.batch.clone() },
+            ..options.clone()
+        };
+        assert!(check(&wrong).unwrap_err().to_string().contains("batch.sides"));
+    }
+}
