@@ -41,7 +41,7 @@ impl CompactConfig {
             .zip(REDUCED)
             .map(|(&(_, inputs), outputs)| BareConvConfig::new([inputs, outputs], 3).init(rng, device));
         let reduce = reduce.collect();
-        let norm = REDUCED.iter().map(|&c| BatchNormConfig::new(c).init(device)).collect();
+        let norm = REDUCED.iter().map(|&c| unit_norm(c, device)).collect();
         let head = HeadConfig {
             integrator: IntegratorConfig { kind: self.parts.integrator, hidden: &[16] },
             weighting: WeightingConfig { channels: [16, 16, 8] },
@@ -60,6 +60,15 @@ impl CompactConfig {
             head: head.init(rng, device),
         })
     }
+}
+
+/// A normalisation whose factor and offset stay 1 and 0: the smoothness of equation 4.2 would have them make the features small,
+/// which is smooth and says nothing.
+fn unit_norm(channels: usize, device: &Device) -> BatchNorm {
+    let mut norm = BatchNormConfig::new(channels).init(device);
+    norm.weight = norm.weight.set_require_grad(false);
+    norm.bias = norm.bias.set_require_grad(false);
+    norm
 }
 
 /// The compact network, made by [`CompactConfig`].

@@ -8,8 +8,8 @@ use sixfold_nn::layers::{Conv, ConvConfig};
 
 use super::{Blend, CHANNELS, INTEGRATED};
 
-/// Taken off the score of a source that does not see a pixel: enough to leave no weight, too little to upset single precision.
-const NOT_SEEN: f64 = 40.0;
+/// Taken off the score of a source that does not see a pixel: more than any two scores differ by.
+const NOT_SEEN: f64 = 1e4;
 
 /// Channels of the block's convolutions; the last has one.
 #[derive(Debug, Clone, Copy)]
