@@ -48,7 +48,7 @@ pub struct TrainingOptions {
 impl Default for TrainingOptions {
     fn default() -> Self {
         TrainingOptions {
-            steps: 7500,
+            steps: 5000,
             learning_rate: 2e-3,
             warm_up: 100,
             weight_decay: 1e-4,

@@ -56,7 +56,7 @@ pub(crate) struct TrainNolArguments {
     /// Folder of photographs (PNG, JPEG) for textures, backgrounds and clutter (default: procedural textures only)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
-    /// Training steps (default: 7500; the dissertation's network: 350000)
+    /// Training steps (default: 5000; the dissertation's network: 350000)
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
     /// Highest learning rate (default: 0.002; the dissertation's network: 0.001)
