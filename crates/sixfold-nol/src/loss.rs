@@ -144,7 +144,7 @@ mod tests {
         // Second difference 2 in rows, at 6 of 8 pixels of a row.
         let bent = number(smooth_loss(plane(&|x, _| x * x), all));
         assert!((bent - 2.0 * 48.0 / 64.0).abs() < 1e-3, "{bent}");
-        let holes = plane(&|x, _| f32::from(u8::from(x as usize % 3 != 0)));
+        let holes = plane(&|x, _| f32::from(u8::from(!(x as usize).is_multiple_of(3))));
         assert!(number(smooth_loss(plane(&|x, _| x * x), holes)) < 1e-4);
     }
 }

@@ -123,12 +123,16 @@ fn what_no_source_sees_is_said() {
     let behind = SourceView::new(&photograph(&mesh, std::f64::consts::PI, None), &mesh, 128).unwrap();
     let hidden =
         SourceView::new(&photograph(&mesh, 0.0, Some(Mask::filled(320, 240, false))), &mesh, 128).unwrap();
-    let rendering = model.render(&target, std::slice::from_ref(&behind), &model.encode(&[behind.clone()]));
+    let alone = |source: &SourceView| {
+        let sources = std::slice::from_ref(source);
+        model.render(&target, sources, &model.encode(sources))
+    };
+    let rendering = alone(&behind);
     let seen = rendering.seen.iter().filter(|s| **s).count();
     assert!(seen > 0 && seen < target.pixels.len() * 2 / 3, "{seen} of {}", target.pixels.len());
     let unseen = rendering.seen.iter().position(|s| !s).unwrap();
     assert_eq!((rendering.colours[unseen], rendering.weights[unseen]), ([0.5; 3], 0.0));
-    let rendering = model.render(&target, std::slice::from_ref(&hidden), &model.encode(&[hidden.clone()]));
+    let rendering = alone(&hidden);
     assert!(rendering.seen.iter().all(|s| !s));
     assert!(model.render(&target, &[], &[]).weights.is_empty());
 }
