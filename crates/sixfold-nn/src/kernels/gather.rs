@@ -107,12 +107,12 @@ mod tests {
             out.iter().zip(&weights).map(|(a, b)| f64::from(a * b)).sum()
         };
         let gradient = gather_backward(&weights, 2, size, &places);
-        for i in 0..map.len() {
+        for (i, expected) in gradient.iter().enumerate() {
             let (mut up, mut down) = (map.clone(), map.clone());
             up[i] += 0.1;
             down[i] -= 0.1;
             let slope = (value(&up) - value(&down)) / 0.2;
-            assert!((slope - f64::from(gradient[i])).abs() < 1e-4, "{i}: {slope} {}", gradient[i]);
+            assert!((slope - f64::from(*expected)).abs() < 1e-4, "{i}: {slope} {expected}");
         }
     }
 }

@@ -142,15 +142,15 @@ mod tests {
             v[i] += by;
             v
         };
-        for i in 0..gates.len() {
+        for (i, gradient) in dgates.iter().enumerate() {
             let slope = (value(&moved(&gates, i, step), &before) - value(&moved(&gates, i, -step), &before))
                 / f64::from(2.0 * step);
-            assert!((slope - f64::from(dgates[i])).abs() < 1e-3, "gate {i}: {slope} {}", dgates[i]);
+            assert!((slope - f64::from(*gradient)).abs() < 1e-3, "gate {i}: {slope} {gradient}");
         }
-        for i in 0..before.len() {
+        for (i, gradient) in dbefore.iter().enumerate() {
             let slope = (value(&gates, &moved(&before, i, step)) - value(&gates, &moved(&before, i, -step)))
                 / f64::from(2.0 * step);
-            assert!((slope - f64::from(dbefore[i])).abs() < 1e-3, "state {i}");
+            assert!((slope - f64::from(*gradient)).abs() < 1e-3, "state {i}");
         }
     }
 }
