@@ -12,7 +12,6 @@
 
 pub mod crop;
 mod crop_turn;
-pub mod families;
 pub mod loss;
 pub mod model;
 pub mod networks;

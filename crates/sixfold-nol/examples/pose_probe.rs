@@ -58,6 +58,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let d = RefineOptions::default();
     let options = RefineOptions {
         wide: number("WIDE", f64::from(d.wide)) as f32,
+        shared: number("SHARED", d.shared as f64) as usize,
         colors: number("COLORS", d.colors),
         line: number("LINE", d.line),
         steps: number("STEPS", d.steps as f64) as usize,
@@ -120,6 +121,29 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             m[1][3]
         );
     }
+    let mut shifts = [vec![], vec![]];
+    let mut reports = refined.sources.iter();
+    for (id, list) in &photographs {
+        let (low, high) = meshes[id].bounding_box();
+        let centre = (low + high) * 0.5;
+        for ((p, truth), r) in list.iter().zip(reports.by_ref()) {
+            let a = p.camera().project(&r.camera_from_object.transform_point(&centre)).expect("in front");
+            let b = p.camera().project(&truth.transform_point(&centre)).expect("in front");
+            shifts[0].push(a.x - b.x);
+            shifts[1].push(a.y - b.y);
+        }
+    }
+    let spread = |v: &Vec<f64>| {
+        let mut v = v.clone();
+        let m = median(&mut v);
+        let mut d: Vec<f64> = v.iter().map(|x| (x - m).abs()).collect();
+        (m, median(&mut d))
+    };
+    println!(
+        "shift in pixels, median and median deviation: x {:.2?} y {:.2?}",
+        spread(&shifts[0]),
+        spread(&shifts[1])
+    );
     let b = before.map(|mut v| median(&mut v));
     let a = after.map(|mut v| median(&mut v));
     println!(

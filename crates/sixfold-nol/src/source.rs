@@ -123,8 +123,14 @@ impl SourceView {
     /// hides it, `visible` says.
     #[inline]
     pub fn see(&self, point: &Vec3, normal: &Vec3) -> Option<([f32; 2], f32)> {
-        let p = self.camera_from_object.transform_point(point);
-        let n = self.camera_from_object.transform_direction(normal);
+        self.see_at(&self.camera_from_object, point, normal)
+    }
+
+    /// The same with another pose near the present one, whose depth decides about what hides what.
+    #[inline]
+    pub(crate) fn see_at(&self, pose: &Pose, point: &Vec3, normal: &Vec3) -> Option<([f32; 2], f32)> {
+        let p = pose.transform_point(point);
+        let n = pose.transform_direction(normal);
         let cosine = -n.dot(&p) / p.norm();
         if cosine <= 0.0 || p.z <= 0.0 {
             return None;

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use sixfold_nn::layers::normal;
 
 use super::pool::{Pool, View};
-use crate::families::Family;
+use sixfold_shapes::Family;
 
 /// How pairs are drawn and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

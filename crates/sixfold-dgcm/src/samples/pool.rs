@@ -13,8 +13,8 @@ use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
 use crate::crop::{Crop, CropOptions};
-use crate::families::{Family, Rest, member};
 use crate::vd_noc::Extent;
+use sixfold_shapes::{Family, Rest, member};
 
 /// How views are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -3,7 +3,7 @@
 //! The dissertation takes the first rendering of its network as the common appearance, in one target view. Points spread over
 //! the whole surface make all target views at once.
 
-use sixfold_geometry::Vec3;
+use sixfold_geometry::{Pose, Vec3};
 
 use crate::maps::Maps;
 use crate::source::SourceView;
@@ -24,11 +24,23 @@ pub(crate) fn look(
     points: &[Vec3],
     normals: &[Vec3],
 ) -> Shown {
+    look_at(view, view.camera_from_object(), maps, allowed, points, normals)
+}
+
+/// The same with a pose near the present one.
+pub(crate) fn look_at(
+    view: &SourceView,
+    pose: &Pose,
+    maps: &Maps,
+    allowed: &[f32],
+    points: &[Vec3],
+    normals: &[Vec3],
+) -> Shown {
     let channels = maps.channels();
     let mut shown = Shown { values: vec![0.0; points.len() * channels], weights: vec![0.0; points.len()] };
     let side = view.side();
     for (i, (point, normal)) in points.iter().zip(normals).enumerate() {
-        let Some(([x, y], cosine)) = view.see(point, normal) else { continue };
+        let Some(([x, y], cosine)) = view.see_at(pose, point, normal) else { continue };
         let at = (y.round() as usize).min(side - 1) * side + (x.round() as usize).min(side - 1);
         let weight = cosine * allowed[at];
         if weight > 0.0 {
@@ -38,6 +50,9 @@ pub(crate) fn look(
     }
     shown
 }
+
+/// Largest difference in mean brightness that is put down to light, of 0 to 1.
+const BRIGHTER: f64 = 0.15;
 
 /// Gain and offset per channel that bring a photograph's values to the common ones: light and exposure differ.
 #[derive(Debug, Clone)]
@@ -75,8 +90,10 @@ impl Light {
             let (xx, xy) = (s[3] / s[0] - mx * mx, s[4] / s[0] - mx * my);
             // As if a variance of 0.002 more said that the gain is one.
             let gain = ((xy + 0.002) / (xx + 0.002)).clamp(0.5, 2.0);
+            // More than this is no other light but another thing.
+            let shift = (my - mx).clamp(-BRIGHTER, BRIGHTER);
             light.gain[c] = gain as f32;
-            light.offset[c] = (my - gain * mx) as f32;
+            light.offset[c] = (shift + (1.0 - gain) * mx) as f32;
         }
         light
     }

@@ -56,6 +56,11 @@ impl Arrangement {
         self.camera_from_scene[image] * self.scene_from_object[object]
     }
 
+    /// Moves an object in its own frame, in all images alike.
+    pub fn move_object(&mut self, object: usize, motion: &Pose) {
+        self.scene_from_object[object] = self.scene_from_object[object] * *motion;
+    }
+
     /// Moves all cameras and objects by one Gauss-Newton step. `false` where the system cannot be solved; nothing moves then.
     pub fn step(&mut self, wanted: &[Wanted], damping: f64) -> bool {
         let (images, objects) = (self.camera_from_scene.len(), self.scene_from_object.len());

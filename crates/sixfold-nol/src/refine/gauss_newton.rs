@@ -6,13 +6,14 @@
 //! still share the poses of the cameras.
 
 use rayon::prelude::*;
-use sixfold_geometry::Vec3;
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_outline::{Outline, color_odds, outline_mesh};
 use sixfold_render::Frame;
 
 use super::appearance::{Common, Light, Shown, look};
 use super::arrangement::{Arrangement, Wanted};
+use super::common_error::Shared;
 use super::measure::{Terms, Working, prior};
 use super::options::{RefineOptions, Refinement, SceneKind, SourceReport};
 use crate::maps::Maps;
@@ -149,13 +150,15 @@ pub fn refine_scene(
             if !arrangement.step(&wanted, 1e-3) {
                 break;
             }
-            working.par_iter_mut().enumerate().for_each(|(k, w)| {
-                let pose = arrangement.camera_from_object(k);
-                if pose.translation().z > 0.01 {
-                    w.pose = pose;
-                    w.view.set_pose(&meshes[sources[k].object], pose, &mut w.frame);
+            follow(&mut working, &arrangement, sources, meshes);
+            if step + options.shared >= options.steps && options.colors > 0.0 {
+                for (number, object) in objects.iter().enumerate() {
+                    if let Some(motion) = shared_motion(object, &mut working, &maps, reach, *blur, options) {
+                        arrangement.move_object(number, &motion);
+                    }
                 }
-            });
+                follow(&mut working, &arrangement, sources, meshes);
+            }
         }
     }
     progress(1.0);
@@ -166,14 +169,70 @@ pub fn refine_scene(
         .map(|(k, w)| w.report(&objects[sources[k].object].centre, [before[k], after[k]], options))
         .collect();
     for object in &objects {
-        drop_strangers(&mut reports, &object.sources, options);
+        drop_strangers(&mut reports, &working, &object.sources, options);
     }
     Ok(Refinement { sources: reports, still, disagreement })
 }
 
+/// Takes the poses of the arrangement over.
+fn follow(
+    working: &mut [Working<'_>],
+    arrangement: &Arrangement,
+    sources: &[SceneSource<'_>],
+    meshes: &[Mesh],
+) {
+    working.par_iter_mut().enumerate().for_each(|(k, w)| {
+        let pose = arrangement.camera_from_object(k);
+        if pose.translation().z > 0.01 {
+            w.pose = pose;
+            w.view.set_pose(&meshes[sources[k].object], pose, &mut w.frame);
+        }
+    });
+}
+
+/// The motion of one object that all its photographs ask for.
+fn shared_motion(
+    object: &Object,
+    working: &mut [Working<'_>],
+    maps: &[Maps],
+    reach: f64,
+    blur: f32,
+    options: &RefineOptions,
+) -> Option<Pose> {
+    if object.sources.len() < 3 {
+        return None;
+    }
+    let anchors = object
+        .sources
+        .iter()
+        .map(|k| working[*k].measure_anchors(&object.centre, reach, options).equations.parts())
+        .collect();
+    let working: Vec<&Working<'_>> = object.sources.iter().map(|k| &working[*k]).collect();
+    // A blur's width on the surface, seen from the usual distance.
+    let mut pixels: Vec<f64> = working.iter().map(|w| w.pose.translation().z / w.view.camera.fx).collect();
+    pixels.sort_by(f64::total_cmp);
+    let step = f64::from(blur) * pixels[pixels.len() / 2];
+    let radius = object.points.iter().map(|p| (p - object.centre).norm()).fold(1e-6, f64::max);
+    let shared = Shared {
+        working,
+        maps: object.sources.iter().map(|k| &maps[*k]).collect(),
+        points: &object.points,
+        normals: &object.normals,
+        centre: object.centre,
+        reach: [step, step / (0.6 * radius)],
+        anchors,
+    };
+    shared.solve(options)
+}
+
 /// Drops photographs that show something else than the others where the object should be: their poses are wrong by more than
 /// refinement can mend. Needs three others to say so.
-fn drop_strangers(reports: &mut [SourceReport], sources: &[usize], options: &RefineOptions) {
+fn drop_strangers(
+    reports: &mut [SourceReport],
+    working: &[Working<'_>],
+    sources: &[usize],
+    options: &RefineOptions,
+) {
     let mut differences: Vec<f64> =
         sources.iter().map(|k| reports[*k].difference[1]).filter(|d| d.is_finite()).collect();
     if differences.len() < 4 {
@@ -185,6 +244,7 @@ fn drop_strangers(reports: &mut [SourceReport], sources: &[usize], options: &Ref
     for k in sources {
         let report = &mut reports[*k];
         if report.dropped.is_none() && report.difference[1] > most {
+            report.camera_from_object = working[*k].given;
             report.dropped = Some(format!(
                 "where the object should be it differs from the other photographs by {:.0} % of the full range of colours \
                  (theirs: {:.0} %); is its pose right?",
@@ -196,7 +256,7 @@ fn drop_strangers(reports: &mut [SourceReport], sources: &[usize], options: &Ref
 }
 
 /// Differences in colour below this are light, not another object.
-const LEAST_STRANGE: f64 = 0.12;
+const LEAST_STRANGE: f64 = 0.08;
 
 /// The arrangement to start from, by the given poses alone; whether the objects stood still, and by how much the poses
 /// disagree with that.

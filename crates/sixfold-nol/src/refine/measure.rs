@@ -83,6 +83,18 @@ impl Working<'_> {
         Wanted { equations, centre }
     }
 
+    /// Outline and given pose without the colours.
+    pub fn measure_anchors(&mut self, centre: &Vec3, reach: f64, options: &RefineOptions) -> Wanted {
+        let mut wanted = self.measure_given(centre, options);
+        let pose = self.pose;
+        let lines = self.outline.as_mut().map(|outline| outline.lines(reach, &pose)).unwrap_or_default();
+        if lines.len() >= LEAST_LINES {
+            let camera = &self.view.camera;
+            add_lines(&mut wanted.equations, &lines, camera, &wanted.centre, reach, options.line, 1.0);
+        }
+        wanted
+    }
+
     /// The given pose alone.
     pub fn measure_given(&self, centre: &Vec3, options: &RefineOptions) -> Wanted {
         let mut equations = NormalEquations::default();

@@ -6,6 +6,7 @@
 
 mod appearance;
 mod arrangement;
+mod common_error;
 mod gauss_newton;
 mod measure;
 mod options;

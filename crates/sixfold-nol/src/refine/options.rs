@@ -19,6 +19,8 @@ pub struct RefineOptions {
     pub steps: usize,
     /// Slow changes of colour are taken out: means over this many times the blur; 0 compares the colours as they are.
     pub wide: f32,
+    /// Rounds at each blur in which the error that all poses of an object share is looked for.
+    pub shared: usize,
     /// Weight of the colours' differences as a whole, in independent measurements; 0 leaves them out.
     pub colors: f64,
     /// Weight of a line of the outline, in independent measurements; 0 leaves the outline out.
@@ -45,6 +47,7 @@ impl Default for RefineOptions {
             reaches: vec![12.0, 8.0, 5.0, 4.0],
             steps: 5,
             wide: 4.0,
+            shared: 2,
             colors: 40.0,
             line: 0.01,
             scene: SceneKind::Judge,

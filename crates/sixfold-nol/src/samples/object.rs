@@ -2,11 +2,11 @@
 
 use rand::RngExt;
 use sixfold_augment::{Backgrounds, Coverage, Patch, Random, procedural_texture};
-use sixfold_dgcm::families::{Family, member};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_shapes::{Family, member};
 
 /// Pixels along a texture's side.
 const TEXTURE: usize = 160;

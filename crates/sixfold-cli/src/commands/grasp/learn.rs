@@ -9,13 +9,13 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
-use sixfold_dgcm::families::{Family, Member, Rest, member};
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::store::Experience;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, Gripper, antipodal_grasps};
 use sixfold_mesh::Mesh;
+use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
     AttemptOptions, ConvexParts, PartsOptions, Scene, scene, try_grasp, wilson_interval,
 };

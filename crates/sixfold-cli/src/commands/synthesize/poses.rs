@@ -80,13 +80,10 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
     };
     if a.no_refine {
         write(file, &poses)?;
-        return Ok(Some(poses));
+        return read(file).map(Some);
     }
     if file.exists() {
-        let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
-        let kept: PoseFile = serde_json::from_str(&text)
-            .with_context(|| format!("{}: not the poses of this command; remove it", file.display()))?;
-        return Ok(Some(kept));
+        return read(file).map(Some);
     }
     let meshes: Vec<Mesh> = input.subjects.iter().map(|s| s.mesh.clone()).collect();
     // Images are numbered without gaps.
@@ -133,7 +130,15 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
         record.dropped.clone_from(&report.dropped);
     }
     write(file, &poses)?;
-    Ok(Some(poses))
+    read(file).map(Some)
+}
+
+/// The poses as they were written: numbers in text may lose their last digit, and a run that goes on must not differ from one
+/// that was never stopped.
+fn read(file: &Path) -> Result<PoseFile> {
+    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+    serde_json::from_str(&text)
+        .with_context(|| format!("{}: not the poses of this command; remove it", file.display()))
 }
 
 fn write(file: &Path, poses: &PoseFile) -> Result<()> {

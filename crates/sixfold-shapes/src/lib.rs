@@ -1,5 +1,5 @@
-//! Families of objects made by a procedure: can, mug, cup, bottle, bowl, box, clamp and drill. The network learns from
-//! them and from nothing else, and a simulated robot collects its first experience on them.
+//! Families of objects made by a procedure: can, mug, cup, bottle, bowl, box, clamp and drill. DGCM-Net learns from
+//! them and from nothing else, NOL paints them, and a simulated robot collects its first experience on them.
 //!
 //! The dissertation trains on scanned objects whose axes are stretched at random (section 6.2.2). Here the members of a
 //! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
