@@ -221,6 +221,21 @@ pub fn upsample(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch()))
 }
 
+/// Channels become pixels: `batch x (factor * factor * c) x h x w` to `batch x c x (factor * h) x (factor * w)` (Shi et al. 2016).
+///
+/// # Panics
+/// When the channels are no multiple of `factor * factor`.
+pub fn pixel_shuffle(x: Tensor<4>, factor: usize) -> Tensor<4> {
+    let [batch, channels, height, width] = x.dims();
+    let c = channels / (factor * factor);
+    x.reshape([batch, c, factor, factor, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
+        batch,
+        c,
+        factor * height,
+        factor * width,
+    ])
+}
+
 /// The activation as a tensor operation, for reference in tests.
 pub fn apply_activation(x: Tensor<4>, activation: Activation) -> Tensor<4> {
     match activation {

@@ -25,6 +25,6 @@ pub mod training;
 
 pub use features::SourceFeatures;
 pub use maps::Maps;
-pub use photograph::{NolError, Photograph};
+pub use photograph::{NolError, Photograph, object_window};
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;

@@ -1,11 +1,11 @@
 //! A photograph cut to the object, with what is known of its geometry at the present pose.
 
-use sixfold_augment::{Coverage, Patch, Window};
+use sixfold_augment::{Coverage, Patch};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
-use crate::photograph::{NolError, Photograph};
+use crate::photograph::{NolError, Photograph, object_window};
 use crate::projection::{Projection, TargetSurface};
 
 /// Colour where the crop reaches out of the image.
@@ -39,14 +39,13 @@ impl SourceView {
     /// [`NolError::OutsideImage`] where the mesh reaches behind the camera.
     pub fn new(photograph: &Photograph, mesh: &Mesh, side: usize) -> Result<Self, NolError> {
         let (camera, pose) = (photograph.camera(), photograph.camera_from_object());
-        let Some((centre, longest)) = Photograph::box_of(camera, mesh, pose) else {
+        let Some(window) = object_window(camera, mesh, pose, MARGIN) else {
             let t = pose.translation();
             return Err(NolError::OutsideImage {
                 name: photograph.name().to_owned(),
                 translation: [t.x, t.y, t.z],
             });
         };
-        let window = Window { centre, side: longest.max(4.0) * MARGIN };
         let map = window.map(camera, side, 0.0);
         let (patch, mut visible) = Patch::warp(photograph.image(), &map, side, side, [OUTSIDE; 3]);
         if let Some(mask) = photograph.mask() {

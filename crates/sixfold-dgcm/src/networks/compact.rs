@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use sixfold_nn::dense::dense;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
-use sixfold_nn::ops::upsample;
+use sixfold_nn::ops::{pixel_shuffle, upsample};
 
 use super::{Encoded, FEATURE, half};
 
@@ -129,19 +129,6 @@ impl Compact {
             let skips = vec![upsample(x), half(&input.maps[3 - k]), half(&code.maps[3 - k])];
             x = conv.forward(Tensor::cat(skips, 1));
         }
-        pixel_shuffle(self.head.forward(x))
+        pixel_shuffle(self.head.forward(x), 4)
     }
-}
-
-/// `batch x 16c x h x w` to `batch x c x 4h x 4w`: sixteen channels become a block of 4x4 pixels. Coordinates change little from
-/// pixel to pixel, and where the object ends the input's own mask says.
-fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
-    let [batch, channels, height, width] = x.dims();
-    let c = channels / 16;
-    x.reshape([batch, c, 4, 4, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
-        batch,
-        c,
-        4 * height,
-        4 * width,
-    ])
 }

@@ -10,6 +10,7 @@ use burn::tensor::{Device, Tensor};
 use rand_chacha::ChaCha8Rng;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig, Padding};
+use sixfold_nn::ops::pixel_shuffle;
 
 use super::{CHANNELS, COLOURS};
 
@@ -84,21 +85,9 @@ impl Decoder {
         }
         let (body, skip) = (self.tail.forward(x), self.skip.forward(sum));
         if self.half {
-            return pixel_shuffle(body) + skip;
+            return pixel_shuffle(body, 2) + skip;
         }
         // Bilinear halving with pixel centres at halves is the mean of 2x2 pixels.
-        avg_pool2d(pixel_shuffle(body + skip), AvgPoolOptions::new([2, 2]))
+        avg_pool2d(pixel_shuffle(body + skip, 2), AvgPoolOptions::new([2, 2]))
     }
-}
-
-/// `batch x 4c x h x w` to `batch x c x 2h x 2w`: four channels become 2x2 pixels.
-fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
-    let [batch, channels, height, width] = x.dims();
-    let c = channels / 4;
-    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
-        batch,
-        c,
-        2 * height,
-        2 * width,
-    ])
 }

@@ -11,7 +11,7 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
 
 use super::object::{Lamp, PaintedObject, between, random_direction};
-use crate::photograph::Photograph;
+use crate::photograph::object_window;
 use crate::projection::TargetSurface;
 use crate::source::{MARGIN, SourceView};
 
@@ -153,10 +153,8 @@ fn perturbed(pose: &Pose, options: &SampleOptions, share: f64, random: &mut Rand
 }
 
 fn window_of(camera: &Camera, object: &PaintedObject, pose: &Pose, margin: f64) -> Window {
-    let Some((centre, longest)) = Photograph::box_of(camera, &object.mesh, pose) else {
-        unreachable!("an object of 30 cm at 40 cm lies before the camera")
-    };
-    Window { centre, side: longest.max(4.0) * margin }
+    object_window(camera, &object.mesh, pose, margin)
+        .unwrap_or_else(|| unreachable!("an object of 30 cm at 40 cm lies before the camera"))
 }
 
 #[allow(clippy::too_many_arguments)]

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig, Padding};
 use sixfold_nn::lite0::{Lite0, Lite0Config};
-use sixfold_nn::ops::upsample;
+use sixfold_nn::ops::{pixel_shuffle, upsample};
 
 /// Channels of the output: three coordinates, the error's logit, the visibility's logit.
 pub const CHANNELS: usize = 5;
@@ -99,20 +99,8 @@ impl Decoder {
         let detail = self.detail.forward(maps[0].clone());
         let x = self.quarter.forward(Tensor::cat(vec![x, maps[1].clone(), detail], 1));
         let x = self.refine.forward(x);
-        pixel_shuffle(self.head.forward(x))
+        pixel_shuffle(self.head.forward(x), 2)
     }
-}
-
-/// `batch x 4c x h x w` to `batch x c x 2h x 2w`: four channels become a block of 2x2 pixels.
-fn pixel_shuffle(x: Tensor<4>) -> Tensor<4> {
-    let [batch, channels, height, width] = x.dims();
-    let c = channels / 4;
-    x.reshape([batch, c, 2, 2, height, width]).permute([0, 1, 4, 2, 5, 3]).reshape([
-        batch,
-        c,
-        2 * height,
-        2 * width,
-    ])
 }
 
 impl Compact {

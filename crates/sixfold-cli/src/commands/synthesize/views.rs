@@ -4,13 +4,13 @@ use std::f64::consts::{FRAC_PI_4, TAU};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use sixfold_augment::{Backgrounds, Coverage, Patch, Window, stream, uniform};
+use sixfold_augment::{Backgrounds, Coverage, Patch, stream, uniform};
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
 use sixfold_geometry::nalgebra::UnitQuaternion;
-use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;
-use sixfold_nol::{Photograph, SourceView};
+use sixfold_nol::{Photograph, SourceView, object_window};
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
 
 use super::arguments::SynthesizeArguments;
@@ -85,20 +85,7 @@ fn placed(a: &SynthesizeArguments, subject: &Subject, aim: &Aim, number: u32) ->
     };
     let pose = looking_at(&centre, aim, distance, roll);
     let camera = *subject.photographs.first()?.photograph.camera();
-    Some((window_camera(&camera, &subject.mesh, &pose, a.size)?, pose))
-}
-
-/// The camera of a square image about the object.
-fn window_camera(camera: &Camera, mesh: &Mesh, pose: &Pose, size: usize) -> Option<Camera> {
-    let mut low = Vec2::repeat(f64::INFINITY);
-    let mut high = Vec2::repeat(f64::NEG_INFINITY);
-    for v in mesh.vertices() {
-        let p = camera.project(&pose.transform_point(v))?;
-        low = low.inf(&p);
-        high = high.sup(&p);
-    }
-    let window = Window { centre: (low + high) * 0.5, side: (high - low).amax() * ROOM };
-    Some(window.camera(camera, size))
+    Some((object_window(&camera, &subject.mesh, &pose, ROOM)?.camera(&camera, a.size), pose))
 }
 
 /// The folder of the object's scene.
