@@ -8,6 +8,7 @@ use sixfold_mesh::Unit;
 
 use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::mttm::arguments::{DepthViewArguments, ReproduceMttmArguments, TemplateViews};
+use crate::commands::reproduce::nol::arguments::{AFTER_HELP as NOL_HELP, ReproduceNolArguments};
 
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]
@@ -662,6 +663,9 @@ pub(crate) enum ReproduceCommand {
         sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
         Every image is kept; interrupted, it goes on when the same command is given again.")]
     Mttm(ReproduceMttmArguments),
+    /// Poses and views of Neural Object Learning beside truth and real pixels, wrong meshes, another lamp, and times
+    #[command(after_help = NOL_HELP)]
+    Nol(ReproduceNolArguments),
 }
 
 #[derive(Debug, Args)]

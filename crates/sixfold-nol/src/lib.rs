@@ -18,6 +18,7 @@ pub mod quality;
 pub mod refine;
 pub mod samples;
 pub mod select;
+pub mod similarity;
 mod source;
 mod surface;
 pub mod synthesis;

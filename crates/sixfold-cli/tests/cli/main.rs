@@ -9,6 +9,7 @@ mod experience;
 mod grasp;
 mod image;
 mod mttm;
+mod nol;
 mod objects;
 mod pix2pose;
 mod simulate;

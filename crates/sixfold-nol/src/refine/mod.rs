@@ -11,6 +11,7 @@ mod gauss_newton;
 mod measure;
 mod options;
 mod printed;
+mod printed_poses;
 #[cfg(test)]
 mod tests;
 
@@ -18,3 +19,4 @@ pub(crate) use appearance::{Common, Light, Shown, look};
 pub use gauss_newton::{SceneSource, refine_poses, refine_scene};
 pub use options::{RefineOptions, Refinement, SceneKind, SourceReport};
 pub use printed::{PrintedOptions, printed_rule};
+pub use printed_poses::printed_poses;

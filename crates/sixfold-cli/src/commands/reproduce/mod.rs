@@ -5,6 +5,7 @@
 //! computed again.
 
 mod fourfold;
+pub(crate) mod nol;
 mod row;
 mod table;
 mod trainings;
@@ -32,6 +33,7 @@ pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
     match &a.command {
         ReproduceCommand::Pix2pose(pix2pose) => run_pix2pose(pix2pose, a),
         ReproduceCommand::Mttm(mttm) => super::mttm::reproduce::run(mttm, &a.json),
+        ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),
     }
 }
 
@@ -275,7 +277,7 @@ fn test_targets(
 }
 
 /// An error if the folder holds rows of something else.
-fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
+fn same_inputs(folder: &Path, inputs: &impl Serialize) -> Result<()> {
     let path = folder.join("inputs.json");
     let now = serde_json::to_value(inputs)?;
     if let Ok(text) = std::fs::read_to_string(&path) {

@@ -7,6 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{Estimate, EvalOptions, Target, evaluate, write_results};
 use sixfold_geometry::Rect;
@@ -94,7 +95,11 @@ pub(super) struct Times {
 }
 
 /// The row of an earlier run, or a new one, which is kept.
-pub(super) fn kept_or_made(folder: &Path, key: &str, make: impl FnOnce() -> Result<Row>) -> Result<Row> {
+pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
+    folder: &Path,
+    key: &str,
+    make: impl FnOnce() -> Result<T>,
+) -> Result<T> {
     let path = folder.join("rows").join(format!("{key}.json"));
     if let Ok(text) = std::fs::read_to_string(&path) {
         return serde_json::from_str(&text).with_context(|| {
@@ -102,9 +107,10 @@ pub(super) fn kept_or_made(folder: &Path, key: &str, make: impl FnOnce() -> Resu
         });
     }
     eprintln!("row {key}");
-    let row = make()?;
-    write_atomically(&path, serde_json::to_string_pretty(&row)?.as_bytes())?;
-    Ok(row)
+    let text = serde_json::to_string_pretty(&make()?)?;
+    write_atomically(&path, text.as_bytes())?;
+    // As a later run will read it: numbers as text may lose their last digit.
+    serde_json::from_str(&text).with_context(|| format!("row {key}"))
 }
 
 impl Setting {

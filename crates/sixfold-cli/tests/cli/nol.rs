@@ -1,0 +1,52 @@
+//! `sixfold reproduce nol`.
+
+use crate::support::*;
+
+#[test]
+fn the_tables_of_neural_object_learning_are_made_and_kept() {
+    let tiny = Tiny::coloured();
+    let dir = tiny.path();
+    std::fs::write(dir.join("frames.json"), r#"[{"scene_id": 7, "im_id": 0}, {"scene_id": 7, "im_id": 11}]"#)
+        .unwrap();
+    let reproduce = "reproduce nol --dataset tiny --frames frames.json --quick --json --out reproduced";
+    let whole = sixfold(dir, reproduce).expect(0).json();
+    let poses = whole["poses"].as_array().unwrap();
+    // The disturbed poses, the printed rule without a network, and three of ours.
+    assert_eq!(poses.len(), 5, "{whole}");
+    let of = |k: usize, field: &str| poses[k]["all"][field].as_f64().unwrap();
+    assert_eq!(of(0, "sources"), 4.0);
+    assert!(of(0, "millimetres") > 2.0 && of(0, "degrees") > 0.5, "{whole}");
+    assert!(of(4, "millimetres") < of(0, "millimetres"), "{whole}");
+    assert_eq!(whole["targets_of_views"][0], 2, "{whole}");
+    let views = whole["views"].as_array().unwrap();
+    // Plain texturing and averaging, from three sets of poses and with two wrong meshes.
+    assert_eq!(views.len(), 10, "{whole}");
+    for view in views {
+        assert!(view["plain"]["psnr"].as_f64().unwrap() > 10.0, "{view}");
+        assert!((-1.0..=1.0).contains(&view["plain"]["ssim"].as_f64().unwrap()), "{view}");
+    }
+    assert!(whole["speed"]["refinement"].as_f64().unwrap() > 0.0);
+    let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
+    assert!(table.contains("vertices 1 mm off") && table.contains("ours, both"), "{table}");
+    for picture in ["views.png", "geometry.png"] {
+        assert!(dir.join("reproduced").join(picture).is_file(), "{picture}");
+    }
+    // Kept rows are not made again: nor is the time that they took.
+    let again = sixfold(dir, reproduce).expect(0);
+    assert_eq!(again.json(), whole);
+    assert!(!again.stderr.contains("row "), "{}", again.stderr);
+    fails(dir, &format!("{reproduce} --seed 1"), &["reproduced", "other inputs", "seed"]);
+}
+
+#[test]
+fn what_cannot_be_reproduced_says_why() {
+    let tiny = Tiny::coloured();
+    let dir = tiny.path();
+    let all = r#"[{"scene_id": 7, "im_id": 0}, {"scene_id": 7, "im_id": 4}, {"scene_id": 7, "im_id": 11}]"#;
+    std::fs::write(dir.join("frames.json"), all).unwrap();
+    let reproduce = "reproduce nol --dataset tiny --frames frames.json --out reproduced";
+    fails(dir, reproduce, &["3 frames to learn from", "0 others", "frames.json"]);
+    fails(dir, &format!("{reproduce} --weights none.safetensors"), &["none.safetensors"]);
+    fails(dir, &format!("{reproduce} --compare bare"), &["--compare", "NAME=FILE"]);
+    fails(dir, &format!("{reproduce} --compare best=x.safetensors"), &["best", "taken"]);
+}
