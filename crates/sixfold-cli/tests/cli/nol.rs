@@ -35,6 +35,9 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     let again = sixfold(dir, reproduce).expect(0);
     assert_eq!(again.json(), whole);
     assert!(!again.stderr.contains("row "), "{}", again.stderr);
+    // Without --quick the rows stay, and others are added.
+    let more = sixfold(dir, &reproduce.replace(" --quick", "")).expect(0);
+    assert!(more.stderr.contains("row poses-both-2") && !more.stderr.contains("row poses-both-0"));
     fails(dir, &format!("{reproduce} --seed 1"), &["reproduced", "other inputs", "seed"]);
 }
 

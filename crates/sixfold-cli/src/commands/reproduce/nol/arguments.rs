@@ -32,7 +32,7 @@ pub(crate) struct ReproduceNolArguments {
     /// Folder for the table, its JSON, the pictures, and the rows done so far
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// One disturbance instead of three, and a quarter of the views
+    /// One disturbance instead of three, and a quarter of the views; the same command without it goes on with the others
     #[arg(long)]
     pub quick: bool,
     /// Seed of the disturbances

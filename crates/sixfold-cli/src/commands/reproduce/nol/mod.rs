@@ -60,13 +60,14 @@ struct Inputs {
     /// Networks and the FNV-1a of their files.
     networks: Vec<(String, String)>,
     hope: Option<String>,
-    quick: bool,
     seed: u64,
 }
 
 #[derive(Serialize)]
 struct Whole {
     inputs: Inputs,
+    /// Whether only some rows were made. They are the same ones: without `--quick` the run goes on with the others.
+    quick: bool,
     disturbances: u64,
     poses: Vec<PosesSummary>,
     /// Targets that were compared, and that were left out.
@@ -107,7 +108,6 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         frames: material.sources.iter().map(|f| format!("{}/{}", f.id.0, f.id.1)).collect(),
         networks: hashes,
         hope: a.hope.as_ref().map(|f| f.display().to_string()),
-        quick: a.quick,
         seed: a.seed,
     };
     same_inputs(&a.out, &inputs)?;
@@ -130,6 +130,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
     let left_out = view_rows.iter().filter(|r| r.cells.is_empty()).count();
     let result = Whole {
         inputs,
+        quick: a.quick,
         disturbances,
         poses: poses::summaries(&rows),
         targets_of_views: [view_rows.len() - left_out, left_out],

@@ -15,7 +15,7 @@ pub(super) fn markdown(whole: &Whole) -> String {
         1e3 * super::material::REACH[0],
         super::material::REACH[1],
         whole.disturbances,
-        if i.quick { " **Quick: one disturbance, a quarter of the views.**" } else { "" }
+        if whole.quick { " **Quick: one disturbance, a quarter of the views.**" } else { "" }
     );
     poses(&mut out, &whole.poses);
     views(&mut out, &whole.views, &whole.targets_of_views);
