@@ -54,7 +54,7 @@ pub(super) fn rows(
             rows.push(kept_or_made(out, &key, || {
                 let mut others = thing.photographs.clone();
                 let target = others.remove(k);
-                let ways = ways(SET, &thing.mesh, &others, networks, SIDE);
+                let ways = ways(SET, &thing.mesh, &others, networks, SIDE, false);
                 let target = Target {
                     key: &key,
                     frame: (0, *lamp),

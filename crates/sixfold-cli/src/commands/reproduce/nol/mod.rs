@@ -37,10 +37,11 @@ const GO_ON: &str = "the rows done so far are kept; run the same command again t
 /// Side of the views that are compared, pixels.
 const SIDE: usize = 128;
 /// What the views are rendered from, in the order of the table.
-const SETS: [&str; 7] = [
+const SETS: [&str; 8] = [
     views::MODEL,
     "disturbed poses",
     "refined poses",
+    "refined, agreeing",
     "true poses",
     "500 faces",
     "vertices 1 mm off",
@@ -185,7 +186,7 @@ impl Bench<'_> {
         let mut used = dropped.iter().map(|dropped| !dropped);
         refined.retain(|_| used.next().unwrap_or(true));
         let exact = self.material.at_poses(&disturbed, &self.material.true_poses())?;
-        let sets = [(SETS[1], disturbed), (SETS[2], refined), (SETS[3], exact)];
+        let sets = [(SETS[1], disturbed), (SETS[2], refined), (SETS[4], exact)];
         let mut all = vec![];
         let mut progress = Progress::new("objects", self.material.meshes.len());
         let ids: Vec<u32> = self.material.meshes.keys().copied().collect();
@@ -218,11 +219,12 @@ impl Bench<'_> {
                 sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect()
             };
             for (set, sources) in sets {
-                ways.extend(views::ways(set, mesh, &of(sources), self.networks(), SIDE));
+                ways.extend(views::ways(set, mesh, &of(sources), self.networks(), SIDE, false));
             }
+            ways.extend(views::ways(SETS[3], mesh, &of(&sets[1].1), self.networks(), SIDE, true));
             let exact = of(&sets[2].1);
-            for (set, mesh) in [(SETS[4], &coarse), (SETS[5], &rough)] {
-                ways.extend(views::ways(set, mesh, &exact, self.networks(), SIDE));
+            for (set, mesh) in [(SETS[5], &coarse), (SETS[6], &rough)] {
+                ways.extend(views::ways(set, mesh, &exact, self.networks(), SIDE, false));
             }
         }
         let mut rows = vec![];
@@ -249,8 +251,8 @@ impl Bench<'_> {
 
     /// One picture per part.
     fn sheets(&self, views: &[ViewRow], lamps: &[ViewRow]) -> Result<()> {
-        self.strips.sheet(&self.a.out.join("views.png"), views, &SETS[..4])?;
-        self.strips.sheet(&self.a.out.join("geometry.png"), views, &SETS[3..6])?;
+        self.strips.sheet(&self.a.out.join("views.png"), views, &SETS[..5])?;
+        self.strips.sheet(&self.a.out.join("geometry.png"), views, &SETS[4..7])?;
         self.strips.sheet(&self.a.out.join("lamps.png"), lamps, &[views::MODEL, lamps::SET])
     }
 }

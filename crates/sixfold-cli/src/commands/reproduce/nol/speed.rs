@@ -52,7 +52,7 @@ pub(super) fn measure(material: &Material, sources: &[Source], networks: &Networ
     refine_poses(&photographs, mesh, &RefineOptions::default(), |_| true)?;
     let refinement = start.elapsed().as_secs_f64();
     let start = Instant::now();
-    let ways = ways("", mesh, &photographs, &networks[..networks.len().min(1)], SIDE);
+    let ways = ways("", mesh, &photographs, &networks[..networks.len().min(1)], SIDE, false);
     let preparation = start.elapsed().as_secs_f64();
     let views = ways
         .iter()

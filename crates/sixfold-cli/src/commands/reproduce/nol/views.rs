@@ -8,6 +8,7 @@ use sixfold_augment::Patch;
 use sixfold_geometry::{Mask, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_nn::layers::normal;
+use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::similarity::{Judge, Similarity, in_light_of};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
@@ -58,16 +59,22 @@ pub(super) struct ViewRow {
     pub cells: Vec<Cell>,
 }
 
-/// Plain texturing, averaging and every network with these sources.
+/// Plain texturing, averaging and every network with these sources; `judged` takes out of each photograph what the others do
+/// not agree with.
 pub(super) fn ways<'a>(
     set: &'static str,
     mesh: &'a Mesh,
     sources: &[Photograph],
     networks: &'a Networks,
     side: usize,
+    judged: bool,
 ) -> Vec<Way<'a>> {
     // A photograph that cannot be cut out shows nothing.
-    let views: Vec<SourceView> = sources.iter().filter_map(|p| SourceView::new(p, mesh, side).ok()).collect();
+    let mut views: Vec<SourceView> =
+        sources.iter().filter_map(|p| SourceView::new(p, mesh, side).ok()).collect();
+    if judged {
+        leave_out_what_differs(&mut views, mesh);
+    }
     let plain = [("best", Weighting::Best), ("average", Weighting::Average)];
     let weightings = plain
         .into_iter()
