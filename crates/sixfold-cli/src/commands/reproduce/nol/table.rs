@@ -80,7 +80,7 @@ fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
     let _ = writeln!(
         out,
         "\n## Views\n\n{} targets in frames that are no sources, at their true poses, beside the real pixels ({} more were left out: too little of \
-         them is shown by all). Compared where the object is visible and every way shows it. PSNR in dB; SSIM; perceptual: mean squared \
+         them is shown by all). Compared where the object is visible and every way shows it. Things in front of the object that the ground truth does not name count against all. PSNR in dB; SSIM; perceptual: mean squared \
          difference of the first three EfficientNet-Lite0 features, each of length 1 at every place, without learned weights. \
          *In its light*: after the gain and offset per channel that fit best. *Better*: share of the targets on which the perceptual distance \
          is smaller than averaging's from the same photographs. *Unseen*: share of the object that no photograph behind the view shows. \
