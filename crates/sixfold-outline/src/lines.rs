@@ -11,7 +11,7 @@ pub const LEAST_LINES: usize = 12;
 /// Faces of a mesh that is drawn for its outline alone.
 const OUTLINE_FACES: usize = 4000;
 
-/// The mesh with no more faces than its outline needs, for [`refine`]: scans have tens of thousands, and drawing them takes
+/// The mesh with no more faces than its outline needs: scans have tens of thousands, and drawing them takes
 /// longer than all the rest.
 pub fn outline_mesh(mesh: &Mesh) -> Mesh {
     if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }

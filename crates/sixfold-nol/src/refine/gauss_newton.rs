@@ -256,7 +256,7 @@ fn drop_strangers(
 }
 
 /// Differences in colour below this are light, not another object.
-const LEAST_STRANGE: f64 = 0.08;
+const LEAST_STRANGE: f64 = 0.09;
 
 /// The arrangement to start from, by the given poses alone; whether the objects stood still, and by how much the poses
 /// disagree with that.
