@@ -11,11 +11,11 @@ use pyo3::types::{PyDict, PyList, PyType};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
+use sixfold_outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found, estimate};
 use sixfold_pix2pose::model::{ModelError, Pix2PoseModel};
-use sixfold_outline::outline_mesh;
 
 use crate::arrays::{self, about, bad, positive, seed};
 use crate::camera::PyCamera;
