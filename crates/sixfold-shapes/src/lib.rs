@@ -3,9 +3,11 @@
 //!
 //! The dissertation trains on scanned objects whose axes are stretched at random (section 6.2.2). Here the members of a
 //! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
-//! another (`solids.rs`). Real objects are thereby all held out.
+//! another (`solids.rs`). Real objects are thereby all held out. [`toy`] draws what belongs to no family.
 
 mod solids;
+mod sweep;
+mod toy;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -16,6 +18,8 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 
 use solids::Builder;
+
+pub use toy::{TOY_DIAMETER, TOY_LEAST_SIDE, toy};
 
 /// Sides of turned solids.
 const SIDES: usize = 40;
