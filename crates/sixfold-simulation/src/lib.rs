@@ -26,6 +26,7 @@
 mod attempt;
 mod error;
 mod parts;
+mod pile;
 mod settle;
 pub mod shapes;
 mod statistics;
@@ -36,6 +37,7 @@ mod world;
 pub use attempt::{Attempt, AttemptOptions, Ending, Scene, attempt, scene};
 pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
+pub use pile::{PileOptions, drop_objects};
 pub use settle::settle;
 pub use statistics::wilson_interval;
 pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};

@@ -5,7 +5,7 @@ use rapier3d::math::Vector;
 use rapier3d::parry::transformation::vhacd::{VHACD, VHACDParameters};
 use rapier3d::parry::transformation::voxelization::FillMode;
 use rapier3d::prelude::{Pose as RapierPose, SharedShape};
-use sixfold_geometry::Vec3;
+use sixfold_geometry::{Vec3, sphere_directions};
 use sixfold_mesh::{Mesh, simplify};
 
 use crate::SimulationError;
@@ -125,6 +125,23 @@ impl ConvexParts {
     /// The corners of each part, metres, in the object's frame.
     pub fn parts(&self) -> &[Vec<Vec3>] {
         &self.parts
+    }
+
+    /// The same with at most so many corners a part: those that stand out most in directions spread evenly over the sphere.
+    pub(crate) fn thinned(&self, most: usize) -> ConvexParts {
+        let thin = |part: &Vec<Vec3>| -> Vec<Vec3> {
+            if part.len() <= most {
+                return part.clone();
+            }
+            let farthest = |d: &Vec3| {
+                (0..part.len()).max_by(|a, b| part[*a].dot(d).total_cmp(&part[*b].dot(d))).unwrap_or(0)
+            };
+            let mut kept: Vec<usize> = sphere_directions(most).iter().map(farthest).collect();
+            kept.sort_unstable();
+            kept.dedup();
+            kept.into_iter().map(|i| part[i]).collect()
+        };
+        ConvexParts { parts: self.parts.iter().map(thin).collect() }
     }
 
     /// The engine's shape.
