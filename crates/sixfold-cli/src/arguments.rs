@@ -391,6 +391,11 @@ pub(crate) enum TrainCommand {
     #[command(after_help = "Example:\n  sixfold train dgcm --out out/dgcm\n\n\
         Stopped, the same command goes on.")]
     Dgcm(Box<crate::commands::train_dgcm::TrainDgcmArguments>),
+    /// Train the network that finds objects by their templates in depth, on made-up objects
+    #[cfg(feature = "physics")]
+    #[command(after_help = "Example:\n  sixfold train mttm --out out/mttm\n\n\
+        Stopped, the same command goes on.")]
+    Mttm(Box<crate::commands::train_mttm::TrainMttmArguments>),
     /// Train the network that renders new views of an object from few photographs, on made-up objects
     #[command(after_help = "Example:\n  sixfold train nol --backgrounds photographs --out out/nol\n\n\
         Stopped, the same command goes on.")]

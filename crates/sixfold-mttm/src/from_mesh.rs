@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use rayon::prelude::*;
+use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
@@ -89,9 +90,18 @@ fn fingerprint(mesh: &Mesh, options: &TemplateOptions) -> u64 {
 
 /// One view; `None` when nothing of the mesh is seen from there (a sheet seen edge-on).
 fn draw(mesh: &Mesh, direction: &Vec3, size: f64, distance: f64) -> Option<Template> {
+    draw_rotated(mesh, view_rotation(direction), size, distance)
+}
+
+/// The view in which the object is turned by `rotation` (view from object).
+pub(crate) fn draw_rotated(
+    mesh: &Mesh,
+    rotation: UnitQuaternion<f64>,
+    size: f64,
+    distance: f64,
+) -> Option<Template> {
     let camera = patch_camera(size, distance);
     let mut frame = Frame::new(&camera);
-    let rotation = view_rotation(direction);
     let (low, high) = mesh.bounding_box();
     // The middle of the box on the axis at first, then the middle of what is seen.
     let mut pose = Pose::new(rotation, Vec3::z() * distance - rotation * ((low + high) * 0.5));

@@ -40,16 +40,21 @@ impl Roi {
     /// The cells, row by row. `size` is the region's side in metres; pixels (numbers in the image) that `seen` refuses are
     /// unknown.
     pub fn cells(&self, scene: &Scene, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
+        self.look(scene, size, GRID, seen)
+    }
+
+    /// The same on a grid of `grid x grid` cells.
+    pub fn look(&self, scene: &Scene, size: f64, grid: usize, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
         let camera = scene.camera();
         let rotation = ray_rotation(&self.centre);
         let (axis, back) = (self.centre.normalize(), rotation.inverse().to_rotation_matrix().cast::<f32>());
         let distance = self.centre.norm();
         let (right, down) = (rotation * Vec3::x(), rotation * Vec3::y());
-        let step = size / GRID as f64;
-        let first = -0.5 * (GRID as f64 - 1.0);
-        (0..GRID * GRID)
+        let step = size / grid as f64;
+        let first = -0.5 * (grid as f64 - 1.0);
+        (0..grid * grid)
             .map(|i| {
-                let (u, v) = (first + (i % GRID) as f64, first + (i / GRID) as f64);
+                let (u, v) = (first + (i % grid) as f64, first + (i / grid) as f64);
                 let point = self.centre + right * (u * step) + down * (v * step);
                 let Some(pixel) = camera.project(&point) else { return UNKNOWN };
                 let (x, y) = (pixel.x.round(), pixel.y.round());

@@ -22,4 +22,6 @@ pub(crate) mod train;
 pub(crate) mod train_detector;
 #[cfg(feature = "experience")]
 pub(crate) mod train_dgcm;
+#[cfg(feature = "physics")]
+pub(crate) mod train_mttm;
 pub(crate) mod train_nol;

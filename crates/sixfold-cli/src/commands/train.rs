@@ -70,6 +70,24 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })?;
             Ok(Outcome::Found)
         }
+        #[cfg(feature = "physics")]
+        TrainCommand::Mttm(mttm) => {
+            let summary = super::train_mttm::train_mttm(mttm)?;
+            report(&a.json, &summary, || {
+                match summary.seconds {
+                    Some(seconds) => {
+                        println!("{} steps in {seconds:.0} s: {}", summary.steps, summary.model);
+                        println!("learning curves: {}", mttm.out.join("training/curves.png").display());
+                    }
+                    None => println!("the model after {} steps: {}", summary.steps, summary.model),
+                }
+                println!("on {} regions of made-up objects it was not trained on:", summary.quality.regions);
+                for (name, score) in summary.quality.scores() {
+                    println!("  {name}: {score:.3}");
+                }
+            })?;
+            Ok(Outcome::Found)
+        }
         #[cfg(feature = "experience")]
         TrainCommand::Dgcm(dgcm) => {
             let summary = super::train_dgcm::train_dgcm(dgcm)?;

@@ -1,0 +1,276 @@
+//! A trained network as one file, and what it is asked: descriptors of regions and templates, and what pairs of them say.
+
+use std::path::{Path, PathBuf};
+
+use burn::module::Module;
+use burn::tensor::activation::sigmoid;
+use burn::tensor::{Device, Tensor, TensorData};
+use rayon::prelude::*;
+use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_nn::weights::{
+    ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
+    write_card_markdown,
+};
+
+use crate::network::{DESCRIPTOR, MAP, Network, masked};
+use crate::patch::{PLANES, Patch};
+
+/// Patches that go through the network at a time.
+const AT_A_TIME: usize = 64;
+
+/// Why a model could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The weight file.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The card does not describe a network of template matching.
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is no network of template matching of this version", file.display())]
+    Card {
+        /// The file.
+        file: PathBuf,
+        /// Field of the card.
+        field: &'static str,
+        /// What it should hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+}
+
+/// A descriptor: regions and templates of the same object in about the same pose have near ones (Euclidean).
+pub type Descriptor = [f32; DESCRIPTOR];
+
+/// What the network says of a region and a template.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PairSays {
+    /// How likely each of 14 x 14 cells of the region is the object's, row by row.
+    pub mask: Vec<f32>,
+    /// Region from template.
+    pub rotation: UnitQuaternion<f64>,
+    /// Where the template's reference point lies, from the region's centre, as a share of the patch's size.
+    pub offset: [f64; 3],
+    /// How likely both show the same object in about the same pose.
+    pub matching: f32,
+}
+
+/// A network and its card.
+#[derive(Debug, Clone)]
+pub struct MttmModel {
+    network: Network,
+    card: ModelCard,
+    device: Device,
+}
+
+impl MttmModel {
+    /// A model of a trained network. `card` gets the architecture filled in.
+    pub fn new(network: Network, card: ModelCard) -> Self {
+        let card = ModelCard { architecture: network.architecture().to_owned(), ..card };
+        MttmModel { network: network.valid(), card, device: Device::flex() }
+    }
+
+    /// Reads a weight file.
+    ///
+    /// # Errors
+    /// [`ModelError`] for a file that cannot be read or holds another network.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let card = read_card(path)?;
+        let device = Device::flex();
+        let network =
+            Network::of_architecture(&card.architecture, &device).ok_or_else(|| ModelError::Card {
+                file: path.to_path_buf(),
+                field: "architecture",
+                expected: "mttm-compact or mttm-paper",
+                found: card.architecture.clone(),
+            })?;
+        let (network, card) = load_weights(network, path, &card.architecture)?;
+        Ok(MttmModel { network: network.valid(), card, device })
+    }
+
+    /// Reads a compact model from the bytes of a weight file; `name` stands for it in messages.
+    ///
+    /// # Errors
+    /// [`ModelError`].
+    pub fn from_bytes(name: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
+        let (device, compact) = (Device::flex(), "mttm-compact");
+        let network = Network::of_architecture(compact, &device)
+            .unwrap_or_else(|| unreachable!("the compact network is known"));
+        let (network, card) = load_weights_from_bytes(network, name, bytes, compact)?;
+        Ok(MttmModel { network: network.valid(), card, device })
+    }
+
+    /// Writes the weight file and, beside it, the card as text.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`].
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        save_weights(&self.network, &self.card, path)?;
+        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+    }
+
+    /// The card.
+    pub fn card(&self) -> &ModelCard {
+        &self.card
+    }
+
+    /// Side of the patches it takes, pixels.
+    pub fn side(&self) -> usize {
+        self.network.side()
+    }
+
+    /// A number that tells this network's descriptors from those of another: FNV-1a over its card.
+    pub fn fingerprint(&self) -> u64 {
+        let text = serde_json::to_string(&self.card).unwrap_or_default();
+        text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+        })
+    }
+
+    /// Descriptors of regions (`masks` none: as they are; else 14 x 14 numbers each, what is not the object's is left
+    /// out) or of templates ([`template_mask`] for each).
+    ///
+    /// # Panics
+    /// For patches of another side than the network's.
+    pub fn describe(
+        &self,
+        count: usize,
+        patch: impl Fn(usize) -> Patch + Sync,
+        mask: Option<&(dyn Fn(usize, &Patch) -> Vec<f32> + Sync)>,
+    ) -> Vec<Descriptor> {
+        let parts: Vec<Vec<Descriptor>> = (0..count.div_ceil(AT_A_TIME))
+            .into_par_iter()
+            .map(|part| {
+                let range = part * AT_A_TIME..((part + 1) * AT_A_TIME).min(count);
+                let patches: Vec<Patch> = range.clone().map(&patch).collect();
+                let mut maps = self.network.maps(self.tensor(&patches));
+                if let Some(mask) = mask {
+                    let cells: Vec<f32> = range.zip(&patches).flat_map(|(i, p)| mask(i, p)).collect();
+                    maps = masked(maps, self.cells(cells));
+                }
+                let numbers = numbers(self.network.descriptor(maps));
+                numbers.chunks_exact(DESCRIPTOR).map(|row| std::array::from_fn(|k| row[k])).collect()
+            })
+            .collect();
+        parts.concat()
+    }
+
+    /// What the network says of pairs of a region and a template.
+    ///
+    /// # Panics
+    /// For patches of another side than the network's.
+    pub fn compare(&self, pairs: &[(&Patch, &Patch)]) -> Vec<PairSays> {
+        let parts: Vec<Vec<PairSays>> = pairs
+            .par_chunks(AT_A_TIME / 2)
+            .map(|part| {
+                let regions: Vec<&Patch> = part.iter().map(|p| p.0).collect();
+                let templates: Vec<&Patch> = part.iter().map(|p| p.1).collect();
+                let masks: Vec<f32> = templates.iter().flat_map(|p| template_mask(p)).collect();
+                let both: Vec<&Patch> = [&regions[..], &templates[..]].concat();
+                let maps = self.network.maps(self.tensor_of(&both));
+                let count = part.len();
+                let templates = masked(maps.clone().narrow(0, count, count), self.cells(masks));
+                let compared = self.network.compare(maps.narrow(0, 0, count), templates);
+                let masks = numbers(sigmoid(compared.mask));
+                let rotations = numbers(compared.rotation);
+                let offsets = numbers(compared.offset);
+                let matching = numbers(sigmoid(compared.matching));
+                (0..count)
+                    .map(|i| {
+                        let q: [f64; 4] = std::array::from_fn(|k| f64::from(rotations[4 * i + k]));
+                        let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
+                        PairSays {
+                            mask: masks[i * MAP * MAP..(i + 1) * MAP * MAP].to_vec(),
+                            rotation: UnitQuaternion::try_new(quaternion, 1e-3)
+                                .unwrap_or_else(UnitQuaternion::identity),
+                            offset: std::array::from_fn(|k| f64::from(offsets[3 * i + k])),
+                            matching: matching[i],
+                        }
+                    })
+                    .collect()
+            })
+            .collect();
+        parts.into_iter().flatten().collect()
+    }
+
+    fn tensor(&self, patches: &[Patch]) -> Tensor<4> {
+        self.tensor_of(&patches.iter().collect::<Vec<_>>())
+    }
+
+    fn tensor_of(&self, patches: &[&Patch]) -> Tensor<4> {
+        let side = self.side();
+        assert!(patches.iter().all(|p| p.side == side), "patches of another side than the network's");
+        let values: Vec<f32> = patches.iter().flat_map(|p| p.values.iter().copied()).collect();
+        Tensor::from_data(TensorData::new(values, [patches.len(), PLANES, side, side]), &self.device)
+    }
+
+    fn cells(&self, values: Vec<f32>) -> Tensor<4> {
+        let count = values.len() / (MAP * MAP);
+        Tensor::from_data(TensorData::new(values, [count, 1, MAP, MAP]), &self.device)
+    }
+}
+
+/// The share of every one of 14 x 14 cells in which a patch has anything: for a template, the object.
+pub fn template_mask(patch: &Patch) -> Vec<f32> {
+    let (side, step) = (patch.side, patch.side / MAP);
+    let known = &patch.values[4 * side * side..];
+    (0..MAP * MAP)
+        .map(|i| {
+            let (x, y) = (i % MAP * step, i / MAP * step);
+            let sum: f32 = (0..step * step).map(|k| known[(y + k / step) * side + x + k % step]).sum();
+            sum / (step * step) as f32
+        })
+        .collect()
+}
+
+fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::network::CompactConfig;
+
+    fn model() -> MttmModel {
+        let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
+        MttmModel::new(network, ModelCard::new("", "test"))
+    }
+
+    fn patch(k: usize) -> Patch {
+        let values = (0..PLANES * 28 * 28).map(|i| ((i * (k + 3)) as f32 * 0.01).sin().max(0.0)).collect();
+        Patch { side: 28, values }
+    }
+
+    #[test]
+    fn what_is_asked_together_is_answered_as_if_alone() {
+        let model = model();
+        let many = model.describe(70, patch, None);
+        let alone = model.describe(1, |_| patch(69), None);
+        assert!(many[69].iter().zip(&alone[0]).all(|(a, b)| (a - b).abs() < 1e-5));
+        let hidden = model.describe(1, |_| patch(69), Some(&|_, _| vec![0.0; MAP * MAP]));
+        assert_ne!(hidden, alone);
+        let patches: Vec<Patch> = (0..40).map(patch).collect();
+        let pairs: Vec<(&Patch, &Patch)> = patches.iter().zip(&patches).collect();
+        let (all, one) = (model.compare(&pairs), model.compare(&pairs[39..]));
+        assert_eq!(all.len(), 40);
+        assert!((all[39].matching - one[0].matching).abs() < 1e-5);
+        assert!(one[0].mask.iter().all(|v| (0.0..=1.0).contains(v)) && one[0].mask.len() == 196);
+    }
+
+    #[test]
+    fn a_model_survives_its_file_and_other_files_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("mttm.safetensors");
+        model().save(&file).unwrap();
+        let again = MttmModel::load(&file).unwrap();
+        let bytes = std::fs::read(&file).unwrap();
+        let third = MttmModel::from_bytes(&file, &bytes).unwrap();
+        assert_eq!(again.describe(1, patch, None), third.describe(1, patch, None));
+        assert_eq!(again.fingerprint(), third.fingerprint());
+        assert!(folder.path().join("mttm.md").exists());
+        let missing = MttmModel::load(&folder.path().join("none.safetensors")).unwrap_err().to_string();
+        assert!(missing.contains("none.safetensors"), "{missing}");
+        let error = MttmModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
+        assert!(error.contains("mttm.safetensors"), "{error}");
+    }
+}

@@ -1,0 +1,10 @@
+//! Training material (dissertation, sections 5.2.1, 5.2.3 and 5.3.1): cluttered scenes of made-up objects as depth cameras see
+//! them, cut into regions with their templates once, and augmented anew in every step.
+
+mod anchor;
+mod batch;
+mod pool;
+
+pub use anchor::{Anchor, AnchorOptions, SeenPatch};
+pub use batch::{Augmentation, Batch, BatchOptions};
+pub use pool::{Arrangement, Pool, PoolOptions};
