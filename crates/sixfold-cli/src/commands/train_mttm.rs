@@ -11,11 +11,12 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;
+use sixfold_bop::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::network::{CompactConfig, Network, PaperConfig};
 use sixfold_mttm::quality::{Quality, quality};
-use sixfold_mttm::samples::{Arrangement, Pool, PoolOptions};
+use sixfold_mttm::samples::{Arrangement, Batch, Pool, PoolOptions, preview};
 use sixfold_mttm::training::{Ending, TrainingOptions, TrainingPace, last_checkpoint, train};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
@@ -26,7 +27,7 @@ use super::material::command_line;
 use crate::progress::{Progress, interrupted};
 
 /// Objects of a scene, fewest and most.
-const OBJECTS: (usize, usize) = (4, 9);
+const OBJECTS: (usize, usize) = (5, 12);
 /// Scenes with objects of their own, for the card: one for so many of the training's, at least so many.
 const TEST_SCENES: (usize, usize) = (12, 4);
 
@@ -153,6 +154,8 @@ pub(super) fn train_mttm(a: &TrainMttmArguments) -> Result<MttmSummary> {
         return finished(card, network, step, None, Default::default());
     }
     let pool = make_pool("scenes", a.objects, a.scenes, &pool_options)?;
+    let first = Batch::of_step(&pool, &options.batch, options.seed, 0);
+    write_rgb(&a.out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))?;
     let mut progress = Progress::new("steps", options.steps as usize);
     let mut last = TrainingRecord::default();
     let shown = |record: &TrainingRecord| {

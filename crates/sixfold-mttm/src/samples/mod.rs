@@ -4,7 +4,9 @@
 mod anchor;
 mod batch;
 mod pool;
+mod preview;
 
 pub use anchor::{Anchor, AnchorOptions, SeenPatch};
 pub use batch::{Augmentation, Batch, BatchOptions};
 pub use pool::{Arrangement, Pool, PoolOptions};
+pub use preview::preview;
