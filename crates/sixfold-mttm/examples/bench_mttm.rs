@@ -1,5 +1,5 @@
 //! Template matching on frames of a BOP dataset, with ablations and times:
-//! `cargo run --release -p sixfold-mttm --example bench_mttm -- DATASET TARGETS.json EVERY`.
+//! `cargo run --release -p sixfold-mttm --example bench_mttm -- DATASET TARGETS.json EVERY [WEIGHTS]`. WEIGHTS adds the network.
 //! Every EVERY-th image of the targets. Prints for each object the share of targets whose mask overlaps the visible truth by more
 //! than half, and whose pose is right within a tenth of the diameter (ADD, ADI for symmetric objects).
 
@@ -9,12 +9,21 @@ use std::path::Path;
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{KdTree, Pose, Vec3};
 use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
-use sixfold_mttm::{EstimateOptions, KnownObject, ObjectTemplates, Stages, TemplateOptions, estimate};
+use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::{
+    EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Stages, TemplateOptions, estimate,
+};
 use sixfold_render::render_depth;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
-    let [_, root, targets, every] = &arguments[..] else { return Err("DATASET TARGETS.json EVERY".into()) };
+    let [_, root, targets, every, weights @ ..] = &arguments[..] else {
+        return Err("DATASET TARGETS.json EVERY [WEIGHTS]".into());
+    };
+    let network = match weights {
+        [file, ..] => Some(std::sync::Arc::new(MttmModel::load(Path::new(file))?)),
+        [] => None,
+    };
     let dataset = BopDataset::open(Path::new(root), "test")?;
     let targets = dataset.object_targets(&dataset.targets(Some(Path::new(targets)))?)?;
     let infos = dataset.models_info(Models::Rendering)?.ok_or("no models_info.json")?;
@@ -29,16 +38,36 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let mesh = dataset.model(id, Models::Rendering)?;
             let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default())?;
             let model = ObjectModel::new(&mesh, &infos.0[&id].symmetry_poses(0.1), &ModelOptions::default())?;
-            place.insert(KnownObject::new(templates, Some(model)));
+            let mut object = KnownObject::new(templates, Some(model));
+            if let Some(network) = &network {
+                object = object.with_network(network.clone());
+            }
+            place.insert(object);
         }
     }
     println!("{:.1} s for {} objects", started.elapsed().as_secs_f64(), known.len());
-    let plain = EstimateOptions::default();
-    let variants: Vec<(&str, bool, EstimateOptions)> = vec![
-        ("mesh", true, plain),
-        ("templates", false, plain),
-        ("nearest", false, EstimateOptions { align: false, ..plain }),
+    let plain = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
+    let by = |matched_by, predicted_pose| EstimateOptions { matched_by, predicted_pose, ..plain };
+    let all: Vec<(&str, bool, EstimateOptions)> = vec![
+        ("points", true, by(MatchedBy::Points, true)),
+        ("points, no mesh", false, by(MatchedBy::Points, true)),
+        ("nearest", false, EstimateOptions { align: false, ..by(MatchedBy::Points, true) }),
+        ("network", true, by(MatchedBy::Network, true)),
+        ("network, template's pose", true, by(MatchedBy::Network, false)),
+        ("network, no mesh", false, by(MatchedBy::Network, true)),
+        ("network's nearest", false, EstimateOptions { align: false, ..by(MatchedBy::Network, false) }),
+        ("both", true, by(MatchedBy::Both, true)),
+        ("both, template's pose", true, by(MatchedBy::Both, false)),
+        ("both, no mesh", false, by(MatchedBy::Both, true)),
     ];
+    let only = std::env::var("ONLY").unwrap_or_default();
+    let variants: Vec<_> = all
+        .into_iter()
+        .filter(|(name, _, o)| {
+            (network.is_some() || o.matched_by == MatchedBy::Points)
+                && (only.is_empty() || only.split(';').any(|part| part == *name))
+        })
+        .collect();
     let mut counts: BTreeMap<(usize, u32), [usize; 3]> = BTreeMap::new();
     let mut sums: Vec<Stages> = vec![Stages::default(); variants.len()];
     let mut done = 0;
@@ -88,7 +117,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     for (v, (name, ..)) in variants.iter().enumerate() {
         let mut all = [0; 3];
-        print!("{name:<10}");
+        print!("{name:<26}");
         for ((_, id), c) in counts.iter().filter(|((w, _), _)| *w == v) {
             print!(
                 " {id}: {:.0}/{:.0}",

@@ -103,4 +103,10 @@ pub enum StoreError {
         /// Format expected.
         expected: u32,
     },
+    /// Whole and of this version, but made from something else.
+    #[error("{}: made from other templates or by another network", path.display())]
+    OtherInput {
+        /// The file.
+        path: PathBuf,
+    },
 }

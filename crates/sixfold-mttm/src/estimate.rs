@@ -1,6 +1,8 @@
 //! From a prepared scene and an object's templates to poses: sample regions, match, mask, merge, match again, align, verify
 //! (dissertation, sections 5.2.4 and 5.2.5).
 
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -11,15 +13,35 @@ use sixfold_match::voting::Hypothesis as Candidate;
 use sixfold_match::{ObjectModel, Scene, VerificationOptions, VerificationScore};
 
 use crate::align::{align, camera_from_view};
+use crate::by_network;
+use crate::error::StoreError;
 use crate::judge::{Surface, judge};
+use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
-use crate::matching::{MatchOptions, Matcher};
+use crate::matching::{Match, MatchOptions, Matcher};
+use crate::model::MttmModel;
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::ObjectTemplates;
+
+/// Who matches regions with templates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MatchedBy {
+    /// [`Matcher`]: templates and regions point by point.
+    Points,
+    /// The network's descriptors alone (dissertation, section 5.2.4).
+    Network,
+    /// Points first, then both: the network proposes other templates, turns and shifts them, and says which pairs match.
+    Both,
+}
 
 /// How objects are searched.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EstimateOptions {
+    /// Who matches; without a network it is points alone.
+    pub matched_by: MatchedBy,
+    /// Take the rotation and the place that the network predicts for a matched template (dissertation, table 5.2: with and
+    /// without).
+    pub predicted_pose: bool,
     /// Where regions are sampled.
     pub proposals: ProposalOptions,
     /// Regions of the first matching that are laid on the scene.
@@ -45,6 +67,8 @@ pub struct EstimateOptions {
 impl Default for EstimateOptions {
     fn default() -> Self {
         EstimateOptions {
+            matched_by: MatchedBy::Both,
+            predicted_pose: true,
             proposals: ProposalOptions::default(),
             placed: 160,
             masked: 50,
@@ -62,10 +86,11 @@ impl Default for EstimateOptions {
 /// An object ready to be searched: its templates prepared, and its mesh, if there is one.
 #[derive(Debug, Clone)]
 pub struct KnownObject {
-    templates: ObjectTemplates,
-    matcher: Matcher,
-    surfaces: Vec<Surface>,
+    pub(crate) templates: ObjectTemplates,
+    pub(crate) matcher: Matcher,
+    pub(crate) surfaces: Vec<Surface>,
     model: Option<ObjectModel>,
+    pub(crate) learned: Option<Learned>,
 }
 
 /// Points of a template that ICP uses.
@@ -77,7 +102,35 @@ impl KnownObject {
         let matcher = Matcher::new(&templates, &MatchOptions::default());
         let surfaces =
             templates.templates.par_iter().map(|t| Surface::new(t, templates.size, ICP_POINTS)).collect();
-        KnownObject { templates, matcher, surfaces, model }
+        KnownObject { templates, matcher, surfaces, model, learned: None }
+    }
+
+    /// The same object as a network knows it too.
+    pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
+        self.learned = Some(Learned::new(model, &self.templates, self.matcher.entries()));
+        self
+    }
+
+    /// The same, with the network's descriptors kept in a file. The second value tells why a file that was there could not be
+    /// used, or that the new one could not be written.
+    pub fn with_network_cached(
+        mut self,
+        model: Arc<MttmModel>,
+        path: &Path,
+    ) -> (KnownObject, Option<StoreError>) {
+        let (learned, note) = Learned::cached(path, model, &self.templates, self.matcher.entries());
+        self.learned = Some(learned);
+        (self, note)
+    }
+
+    /// Whether a network knows it.
+    pub fn has_network(&self) -> bool {
+        self.learned.is_some()
+    }
+
+    /// The pose of the object's frame when a template lies at a pose.
+    pub(crate) fn object_pose(&self, camera_from_view: &Pose, template: usize) -> Pose {
+        *camera_from_view * self.templates.templates[template].view_from_object
     }
 
     /// The templates.
@@ -138,12 +191,12 @@ impl Stages {
 
 /// A template somewhere in the scene.
 #[derive(Debug, Clone)]
-struct Placed {
-    template: usize,
-    camera_from_view: Pose,
-    score: VerificationScore,
+pub(crate) struct Placed {
+    pub template: usize,
+    pub camera_from_view: Pose,
+    pub score: VerificationScore,
     /// What decides: agreement of the surface, and of the match it came from.
-    support: f64,
+    pub support: f64,
 }
 
 /// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives the same output at
@@ -156,13 +209,33 @@ pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) 
         clock = Instant::now();
         seconds
     };
-    let placed = first_matching(scene, object, options, &mut stages);
+    let network = match options.matched_by {
+        MatchedBy::Points => None,
+        MatchedBy::Network | MatchedBy::Both => object.learned.as_ref(),
+    };
+    let placed = match (network, options.matched_by) {
+        (Some(learned), MatchedBy::Network) => {
+            by_network::first_matching(scene, object, learned, options, &mut stages)
+        }
+        _ => first_matching(scene, object, network, options, &mut stages),
+    };
     stages.matching = lap();
     let regions = merge(scene, object, &placed, options);
     stages.regions = regions.len();
     stages.masks = lap();
-    let hypotheses: Vec<Vec<Placed>> =
-        regions.par_iter().map(|(seed, mask)| second_matching(scene, object, seed, mask, options)).collect();
+    let hypotheses: Vec<Vec<Placed>> = regions
+        .par_iter()
+        .map(|(seed, mask)| {
+            let mut found = vec![seed.clone()];
+            if network.is_none() || options.matched_by == MatchedBy::Both {
+                second_matching(scene, object, mask, options, &mut found);
+            }
+            if let Some(learned) = network {
+                by_network::second_matching(scene, object, learned, options, &mut found);
+            }
+            found
+        })
+        .collect();
     let mut hypotheses = hypotheses.concat();
     // A stable sort: equal ones stay in the order of their regions.
     hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
@@ -176,6 +249,7 @@ pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) 
 fn first_matching(
     scene: &Scene,
     object: &KnownObject,
+    network: Option<&Learned>,
     options: &EstimateOptions,
     stages: &mut Stages,
 ) -> Vec<Placed> {
@@ -185,38 +259,69 @@ fn first_matching(
     let matches = object.matcher.best(rois.len(), |i| rois[i].cells(scene, size, |_| true));
     let mut order: Vec<usize> = (0..rois.len()).filter(|&i| matches[i].score > 0.0).collect();
     order.sort_by(|&a, &b| matches[b].score.total_cmp(&matches[a].score).then(a.cmp(&b)));
-    // Of neighbours the best one.
-    let apart = 0.15 * object.templates.diameter;
-    let mut chosen: Vec<usize> = vec![];
-    for i in order {
-        if chosen.len() >= options.placed {
-            break;
-        }
-        if chosen.iter().all(|&k| (rois[k].centre - rois[i].centre).norm() > apart) {
-            chosen.push(i);
-        }
+    let chosen = apart(&rois, order, 0.15 * object.templates.diameter, options.placed);
+    if let Some(learned) = network {
+        let chosen: Vec<_> = chosen.iter().map(|&i| (rois[i], matches[i])).collect();
+        return by_network::choose_and_place(scene, object, learned, &chosen, options);
     }
     chosen.par_iter().map(|&i| place(scene, object, &rois[i], matches[i], options)).collect()
 }
 
+/// The first of `order` that lie further apart than `distance` metres, at most `most` of them.
+pub(crate) fn apart(rois: &[Roi], order: Vec<usize>, distance: f64, most: usize) -> Vec<usize> {
+    let mut chosen: Vec<usize> = vec![];
+    for i in order {
+        if chosen.len() >= most {
+            break;
+        }
+        if chosen.iter().all(|&k| (rois[k].centre - rois[i].centre).norm() > distance) {
+            chosen.push(i);
+        }
+    }
+    chosen
+}
+
 /// Lays a matched template on the scene.
-fn place(
+pub(crate) fn place(
     scene: &Scene,
     object: &KnownObject,
     roi: &Roi,
-    matched: crate::matching::Match,
+    matched: Match,
     options: &EstimateOptions,
 ) -> Placed {
     let entry = object.matcher.entries()[matched.entry];
-    let surface = &object.surfaces[entry.template];
-    let mut pose = camera_from_view(&roi.camera_from_roi(), entry.turn);
+    let start = camera_from_view(&roi.camera_from_roi(), entry.turn);
+    place_at(scene, object, entry.template, start, f64::from(matched.score).max(0.0).sqrt(), options)
+}
+
+/// Lays a template on the scene from a pose that is about right; `trust` (0 to 1) is in the match it came from.
+pub(crate) fn place_at(
+    scene: &Scene,
+    object: &KnownObject,
+    template: usize,
+    start: Pose,
+    trust: f64,
+    options: &EstimateOptions,
+) -> Placed {
+    let surface = &object.surfaces[template];
+    let mut pose = start;
     if options.align {
         pose = align(scene, &surface.sparse, &pose, object.matcher.tolerance());
     }
     let threshold = options.verification.threshold_for(object.templates.diameter);
     let score = judge(scene, surface, &pose, threshold, &options.verification);
-    let support = score.ranking() * f64::from(matched.score).max(0.0).sqrt();
-    Placed { template: entry.template, camera_from_view: pose, score, support }
+    let support = score.ranking() * trust;
+    Placed { template, camera_from_view: pose, score, support }
+}
+
+/// Whether a template at a pose says the same as one of those found. Views without poses have frames of their own: only the
+/// view itself can be compared.
+pub(crate) fn is_known(object: &KnownObject, found: &[Placed], template: usize, start: &Pose) -> bool {
+    let new = object.object_pose(start, template);
+    found.iter().any(|f| {
+        object.object_pose(&f.camera_from_view, f.template).rotation_angle_to(&new) < 0.3
+            && (object.templates.source != crate::Source::Depth || f.template == template)
+    })
 }
 
 /// Masks on every so many-th pixel while regions are merged.
@@ -259,10 +364,11 @@ fn merge(
 fn second_matching(
     scene: &Scene,
     object: &KnownObject,
-    seed: &Placed,
     mask: &Pixels,
     options: &EstimateOptions,
-) -> Vec<Placed> {
+    found: &mut Vec<Placed>,
+) {
+    let Some(seed) = found.first().cloned() else { return };
     let (width, height) = scene.depth().size();
     let (columns, rows) = (width.div_ceil(STRIDE), height.div_ceil(STRIDE));
     let mut inside = vec![false; columns * rows];
@@ -289,25 +395,16 @@ fn second_matching(
     ];
     let rois = shifts.map(|s| Roi { centre: centre + s });
     let cells: Vec<_> = rois.iter().map(|r| r.cells(scene, object.templates.size, seen)).collect();
-    let mut found = vec![seed.clone()];
     for (matched, region) in object.matcher.ranked(&cells).into_iter().take(40 * options.hypotheses) {
         if found.len() > options.hypotheses {
             break;
         }
         let entry = object.matcher.entries()[matched.entry];
         let start = camera_from_view(&rois[region].camera_from_roi(), entry.turn);
-        // Views without poses have frames of their own: only the view itself can be compared.
-        let object_pose = |p: &Pose, t: usize| *p * object.templates.templates[t].view_from_object;
-        let new = object_pose(&start, entry.template);
-        let same = found.iter().any(|f| {
-            object_pose(&f.camera_from_view, f.template).rotation_angle_to(&new) < 0.3
-                && (object.templates.source != crate::Source::Depth || f.template == entry.template)
-        });
-        if !same {
+        if !is_known(object, found, entry.template, &start) {
             found.push(place(scene, object, &rois[region], matched, options));
         }
     }
-    found
 }
 
 /// The last word, by the mesh where there is one, and no two estimates of the same pixels.

@@ -11,11 +11,14 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod align;
+mod by_network;
+mod descriptor_file;
 mod error;
 pub mod estimate;
 pub mod from_depth;
 pub mod from_mesh;
 pub mod judge;
+pub mod learned;
 pub mod loss;
 pub mod mask;
 pub mod matching;
@@ -32,7 +35,7 @@ pub mod training;
 mod views;
 
 pub use error::{StoreError, TemplateError};
-pub use estimate::{Estimate, EstimateOptions, KnownObject, Stages, estimate};
+pub use estimate::{Estimate, EstimateOptions, KnownObject, MatchedBy, Stages, estimate};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
 pub use views::{Coverage, view_directions, view_rotation};

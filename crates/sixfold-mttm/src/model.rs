@@ -54,6 +54,28 @@ pub struct PairSays {
     pub matching: f32,
 }
 
+/// Maps of patches, `count x channels x 14 x 14`.
+#[derive(Debug, Clone)]
+pub struct Encoded {
+    maps: Tensor<4>,
+}
+
+impl Encoded {
+    /// Those of some of the patches, in the order of the numbers.
+    pub fn select(&self, numbers: &[usize]) -> Encoded {
+        let rows = numbers.iter().map(|&i| self.maps.clone().narrow(0, i, 1)).collect();
+        Encoded { maps: Tensor::cat(rows, 0) }
+    }
+
+    /// Several in turn.
+    ///
+    /// # Panics
+    /// For none.
+    pub fn joined(parts: &[Encoded]) -> Encoded {
+        Encoded { maps: Tensor::cat(parts.iter().map(|p| p.maps.clone()).collect(), 0) }
+    }
+}
+
 /// A network and its card.
 #[derive(Debug, Clone)]
 pub struct MttmModel {
@@ -126,77 +148,73 @@ impl MttmModel {
         })
     }
 
-    /// Descriptors of regions (`masks` none: as they are; else 14 x 14 numbers each, what is not the object's is left
-    /// out) or of templates ([`template_mask`] for each).
+    /// Maps of patches: what everything else is asked with.
     ///
     /// # Panics
     /// For patches of another side than the network's.
-    pub fn describe(
-        &self,
-        count: usize,
-        patch: impl Fn(usize) -> Patch + Sync,
-        mask: Option<&(dyn Fn(usize, &Patch) -> Vec<f32> + Sync)>,
-    ) -> Vec<Descriptor> {
+    pub fn encode(&self, patches: &[Patch]) -> Encoded {
+        Encoded { maps: self.network.maps(self.tensor(patches)) }
+    }
+
+    /// Maps of templates: zeros where the object is not.
+    ///
+    /// # Panics
+    /// As [`MttmModel::encode`].
+    pub fn encode_templates(&self, patches: &[Patch]) -> Encoded {
+        let masks = patches.iter().flat_map(template_mask).collect();
+        self.without_background(&self.encode(patches), masks)
+    }
+
+    /// Maps with zeros where `masks` (14 x 14 numbers for each patch, 0 to 1) has zeros.
+    pub fn without_background(&self, encoded: &Encoded, masks: Vec<f32>) -> Encoded {
+        Encoded { maps: masked(encoded.maps.clone(), self.cells(masks)) }
+    }
+
+    /// The descriptor of each.
+    pub fn describe(&self, encoded: &Encoded) -> Vec<Descriptor> {
+        let numbers = numbers(self.network.descriptor(encoded.maps.clone()));
+        numbers.chunks_exact(DESCRIPTOR).map(|row| std::array::from_fn(|k| row[k])).collect()
+    }
+
+    /// Descriptors of many templates, some at a time: `patch` gives the one of a number.
+    ///
+    /// # Panics
+    /// As [`MttmModel::encode`].
+    pub fn describe_templates(&self, count: usize, patch: impl Fn(usize) -> Patch + Sync) -> Vec<Descriptor> {
         let parts: Vec<Vec<Descriptor>> = (0..count.div_ceil(AT_A_TIME))
             .into_par_iter()
             .map(|part| {
                 let range = part * AT_A_TIME..((part + 1) * AT_A_TIME).min(count);
-                let patches: Vec<Patch> = range.clone().map(&patch).collect();
-                let mut maps = self.network.maps(self.tensor(&patches));
-                if let Some(mask) = mask {
-                    let cells: Vec<f32> = range.zip(&patches).flat_map(|(i, p)| mask(i, p)).collect();
-                    maps = masked(maps, self.cells(cells));
-                }
-                let numbers = numbers(self.network.descriptor(maps));
-                numbers.chunks_exact(DESCRIPTOR).map(|row| std::array::from_fn(|k| row[k])).collect()
+                let patches: Vec<Patch> = range.map(&patch).collect();
+                self.describe(&self.encode_templates(&patches))
             })
             .collect();
         parts.concat()
     }
 
-    /// What the network says of pairs of a region and a template.
-    ///
-    /// # Panics
-    /// For patches of another side than the network's.
-    pub fn compare(&self, pairs: &[(&Patch, &Patch)]) -> Vec<PairSays> {
-        let parts: Vec<Vec<PairSays>> = pairs
-            .par_chunks(AT_A_TIME / 2)
-            .map(|part| {
-                let regions: Vec<&Patch> = part.iter().map(|p| p.0).collect();
-                let templates: Vec<&Patch> = part.iter().map(|p| p.1).collect();
-                let masks: Vec<f32> = templates.iter().flat_map(|p| template_mask(p)).collect();
-                let both: Vec<&Patch> = [&regions[..], &templates[..]].concat();
-                let maps = self.network.maps(self.tensor_of(&both));
-                let count = part.len();
-                let templates = masked(maps.clone().narrow(0, count, count), self.cells(masks));
-                let compared = self.network.compare(maps.narrow(0, 0, count), templates);
-                let masks = numbers(sigmoid(compared.mask));
-                let rotations = numbers(compared.rotation);
-                let offsets = numbers(compared.offset);
-                let matching = numbers(sigmoid(compared.matching));
-                (0..count)
-                    .map(|i| {
-                        let q: [f64; 4] = std::array::from_fn(|k| f64::from(rotations[4 * i + k]));
-                        let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-                        PairSays {
-                            mask: masks[i * MAP * MAP..(i + 1) * MAP * MAP].to_vec(),
-                            rotation: UnitQuaternion::try_new(quaternion, 1e-3)
-                                .unwrap_or_else(UnitQuaternion::identity),
-                            offset: std::array::from_fn(|k| f64::from(offsets[3 * i + k])),
-                            matching: matching[i],
-                        }
-                    })
-                    .collect()
+    /// What the network says of pairs of a region and a template, each the same row of both.
+    pub fn compare(&self, regions: &Encoded, templates: &Encoded) -> Vec<PairSays> {
+        let compared = self.network.compare(regions.maps.clone(), templates.maps.clone());
+        let masks = numbers(sigmoid(compared.mask));
+        let rotations = numbers(compared.rotation);
+        let offsets = numbers(compared.offset);
+        let matching = numbers(sigmoid(compared.matching));
+        (0..matching.len())
+            .map(|i| {
+                let q: [f64; 4] = std::array::from_fn(|k| f64::from(rotations[4 * i + k]));
+                let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
+                PairSays {
+                    mask: masks[i * MAP * MAP..(i + 1) * MAP * MAP].to_vec(),
+                    rotation: UnitQuaternion::try_new(quaternion, 1e-3)
+                        .unwrap_or_else(UnitQuaternion::identity),
+                    offset: std::array::from_fn(|k| f64::from(offsets[3 * i + k])),
+                    matching: matching[i],
+                }
             })
-            .collect();
-        parts.into_iter().flatten().collect()
+            .collect()
     }
 
     fn tensor(&self, patches: &[Patch]) -> Tensor<4> {
-        self.tensor_of(&patches.iter().collect::<Vec<_>>())
-    }
-
-    fn tensor_of(&self, patches: &[&Patch]) -> Tensor<4> {
         let side = self.side();
         assert!(patches.iter().all(|p| p.side == side), "patches of another side than the network's");
         let values: Vec<f32> = patches.iter().flat_map(|p| p.values.iter().copied()).collect();
@@ -244,17 +262,21 @@ mod tests {
     #[test]
     fn what_is_asked_together_is_answered_as_if_alone() {
         let model = model();
-        let many = model.describe(70, patch, None);
-        let alone = model.describe(1, |_| patch(69), None);
+        let patches: Vec<Patch> = (0..70).map(patch).collect();
+        let encoded = model.encode(&patches);
+        let last = encoded.select(&[69]);
+        let (many, alone) = (model.describe(&encoded), model.describe(&last));
         assert!(many[69].iter().zip(&alone[0]).all(|(a, b)| (a - b).abs() < 1e-5));
-        let hidden = model.describe(1, |_| patch(69), Some(&|_, _| vec![0.0; MAP * MAP]));
-        assert_ne!(hidden, alone);
-        let patches: Vec<Patch> = (0..40).map(patch).collect();
-        let pairs: Vec<(&Patch, &Patch)> = patches.iter().zip(&patches).collect();
-        let (all, one) = (model.compare(&pairs), model.compare(&pairs[39..]));
-        assert_eq!(all.len(), 40);
-        assert!((all[39].matching - one[0].matching).abs() < 1e-5);
+        let hidden = model.without_background(&last, vec![0.0; MAP * MAP]);
+        assert_ne!(model.describe(&hidden), alone);
+        let templates = model.encode_templates(&patches);
+        let (all, one) =
+            (model.compare(&encoded, &templates), model.compare(&last, &templates.select(&[69])));
+        assert_eq!(all.len(), 70);
+        assert!((all[69].matching - one[0].matching).abs() < 1e-5);
         assert!(one[0].mask.iter().all(|v| (0.0..=1.0).contains(v)) && one[0].mask.len() == 196);
+        let described = model.describe_templates(70, patch);
+        assert!(described[3].iter().zip(&model.describe(&templates)[3]).all(|(a, b)| (a - b).abs() < 1e-5));
     }
 
     #[test]
@@ -265,7 +287,8 @@ mod tests {
         let again = MttmModel::load(&file).unwrap();
         let bytes = std::fs::read(&file).unwrap();
         let third = MttmModel::from_bytes(&file, &bytes).unwrap();
-        assert_eq!(again.describe(1, patch, None), third.describe(1, patch, None));
+        let described = |m: &MttmModel| m.describe(&m.encode(&[patch(1)]));
+        assert_eq!(described(&again), described(&third));
         assert_eq!(again.fingerprint(), third.fingerprint());
         assert!(folder.path().join("mttm.md").exists());
         let missing = MttmModel::load(&folder.path().join("none.safetensors")).unwrap_err().to_string();

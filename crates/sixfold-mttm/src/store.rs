@@ -22,8 +22,29 @@ const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
 const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 
 /// FNV-1a (Fowler, Noll, Vo).
-fn checksum(bytes: &[u8]) -> u64 {
+pub(crate) fn checksum(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+/// Puts a whole file in its place.
+pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+    let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
+    let written = (|| -> io::Result<()> {
+        let mut file = File::create(&temporary)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        drop(file);
+        std::fs::rename(&temporary, path)?;
+        // The new name must be on the disk as well. Not every system lets a folder be opened.
+        if let Some(Ok(folder)) = path.parent().map(File::open) {
+            let _ = folder.sync_all();
+        }
+        Ok(())
+    })();
+    if written.is_err() {
+        let _ = std::fs::remove_file(&temporary);
+    }
+    written.map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
 }
 
 impl ObjectTemplates {
@@ -64,24 +85,7 @@ impl ObjectTemplates {
     /// # Errors
     /// [`StoreError::Io`].
     pub fn write(&self, path: &Path) -> Result<(), StoreError> {
-        let error = |source| StoreError::Io { path: path.to_path_buf(), source };
-        let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
-        let written = (|| -> io::Result<()> {
-            let mut file = File::create(&temporary)?;
-            file.write_all(&self.to_bytes())?;
-            file.sync_all()?;
-            drop(file);
-            std::fs::rename(&temporary, path)?;
-            // The new name must be on the disk as well. Not every system lets a folder be opened.
-            if let Some(Ok(folder)) = path.parent().map(File::open) {
-                let _ = folder.sync_all();
-            }
-            Ok(())
-        })();
-        if written.is_err() {
-            let _ = std::fs::remove_file(&temporary);
-        }
-        written.map_err(error)
+        write_bytes(path, &self.to_bytes())
     }
 
     /// Reads a file that [`ObjectTemplates::write`] wrote.
