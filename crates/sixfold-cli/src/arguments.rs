@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
+use sixfold_render::DepthSensor;
 
 use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::mttm::arguments::{DepthViewArguments, ReproduceMttmArguments, TemplateViews};
@@ -64,6 +65,13 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold simulate-depth --dataset lmo --split test --out lmo-simulated"
     )]
     SimulateDepth(SimulateArguments),
+    /// Drop objects on a plane and write images of them from all around as a BOP dataset with ground truth
+    #[cfg(feature = "physics")]
+    #[command(
+        name = "simulate-scenes",
+        after_help = crate::commands::simulate_scenes::arguments::AFTER_HELP
+    )]
+    SimulateScenes(Box<crate::commands::simulate_scenes::arguments::SimulateScenesArguments>),
     /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
     #[command(after_help = crate::commands::synthesize::arguments::AFTER_HELP)]
     Synthesize(Box<crate::commands::synthesize::arguments::SynthesizeArguments>),
@@ -328,7 +336,20 @@ pub(crate) enum Sensor {
     /// An active stereo camera of the RealSense D400 class
     Realsense,
     /// No noise
+    #[value(alias = "none")]
     Ideal,
+}
+
+impl Sensor {
+    /// Its noise; none for an ideal camera.
+    pub fn model(self) -> Option<DepthSensor> {
+        match self {
+            Sensor::Ideal => None,
+            Sensor::Kinect => Some(DepthSensor::kinect()),
+            Sensor::Xtion => Some(DepthSensor::xtion()),
+            Sensor::Realsense => Some(DepthSensor::realsense()),
+        }
+    }
 }
 
 #[derive(Debug, Args)]

@@ -61,6 +61,8 @@ fn main() -> ExitCode {
         Command::Render(a) => commands::render::run(a),
         Command::Synthesize(a) => commands::synthesize::run(a),
         Command::SimulateDepth(a) => commands::simulate::run(a),
+        #[cfg(feature = "physics")]
+        Command::SimulateScenes(a) => commands::simulate_scenes::run(a),
         Command::Train(a) => commands::train::run(a),
         Command::Reproduce(a) => commands::reproduce::run(a),
         Command::Object(a) => commands::object::run(a),

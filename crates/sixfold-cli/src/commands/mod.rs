@@ -17,6 +17,8 @@ pub(crate) mod pix2pose;
 pub(crate) mod render;
 pub(crate) mod reproduce;
 pub(crate) mod simulate;
+#[cfg(feature = "physics")]
+pub(crate) mod simulate_scenes;
 pub(crate) mod synthesize;
 pub(crate) mod train;
 pub(crate) mod train_detector;

@@ -11,12 +11,10 @@ use sixfold_bop::{
 };
 use sixfold_geometry::Pose;
 use sixfold_mesh::Mesh;
-use sixfold_render::{
-    DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane,
-};
+use sixfold_render::{Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
 
 use crate::Outcome;
-use crate::arguments::{Sensor, SimulateArguments};
+use crate::arguments::SimulateArguments;
 use crate::output::report;
 use crate::overlay;
 use crate::progress::{Progress, check_interrupt};
@@ -65,16 +63,10 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             let mut frame = Frame::new(&camera);
             frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
             let ideal = frame.depth();
-            let sensor = match a.sensor {
-                Sensor::Ideal => None,
-                Sensor::Kinect => Some(DepthSensor::kinect()),
-                Sensor::Xtion => Some(DepthSensor::xtion()),
-                Sensor::Realsense => Some(DepthSensor::realsense()),
-            };
             let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
-            let depth = match &sensor {
+            let depth = match a.sensor.model() {
                 None => ideal.clone(),
-                Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), sensor, seed),
+                Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), &sensor, seed),
             };
             if let Some(folder) = &a.pictures {
                 let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));

@@ -13,5 +13,7 @@ mod nol;
 mod objects;
 mod pix2pose;
 mod simulate;
+#[cfg(feature = "physics")]
+mod simulate_scenes;
 mod support;
 mod synthesize;

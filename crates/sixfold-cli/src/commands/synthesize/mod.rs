@@ -25,7 +25,7 @@ use sixfold_nol::{NolError, SourceView};
 use self::arguments::{SynthesizeArguments, WeightingKind};
 use self::input::{Input, Subject};
 use crate::Outcome;
-use crate::output::{report, write_atomically};
+use crate::output::{go_on_with, report};
 use crate::progress::Progress;
 
 /// Side of the crops that new views take their colours from, pixels.
@@ -229,22 +229,7 @@ fn keep_options(a: &SynthesizeArguments) -> Result<()> {
         "step": a.step, "elevation": a.elevation, "turns": a.turns, "size": a.size,
         "backgrounds": a.backgrounds, "with_photographs": a.with_photographs, "seed": a.seed,
     });
-    let file = a.out.join("options.json");
-    if file.exists() {
-        let text = std::fs::read_to_string(&file).with_context(|| file.display().to_string())?;
-        let before: Value = serde_json::from_str(&text).with_context(|| file.display().to_string())?;
-        let differs = |key: &&String| before.get(key.as_str()) != options.get(key.as_str());
-        if let Some(key) = options.as_object().into_iter().flat_map(|o| o.keys()).find(differs) {
-            bail!(
-                "{}: made with another {key} (there {}, now {}); give the same options to go on, or another --out",
-                file.display(),
-                before[key],
-                options[key]
-            );
-        }
-        return Ok(());
-    }
-    write_atomically(&file, format!("{options:#}\n").as_bytes())
+    go_on_with(&a.out.join("options.json"), &options)
 }
 
 /// Leaves the photographs that add most of the surface, at most `--sources` of them.

@@ -1,0 +1,208 @@
+//! What `sixfold simulate-scenes` is told, and whether it makes sense.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+use clap::Args;
+use serde_json::{Value, json};
+use sixfold_geometry::Camera;
+use sixfold_mesh::Unit;
+use sixfold_shapes::Family;
+use sixfold_simulation::PileOptions;
+
+use crate::arguments::{JsonArguments, Sensor};
+use crate::camera_file;
+
+/// Shown under `sixfold simulate-scenes --help`.
+pub(crate) const AFTER_HELP: &str = "Examples:\n  \
+    sixfold simulate-scenes --object mug.ply drill.ply --unit mm --scenes 5 --out out/scenes\n  \
+    sixfold simulate-scenes --families can,mug --toys 40 --scenes 100 --views 10 --out out/toys\n  \
+    sixfold simulate-scenes --dataset lmo --sensor xtion --out out/lmo-scenes\n\n\
+    The folder is a BOP dataset, for `sixfold estimate --dataset` and `sixfold eval`. preview.png shows its first scenes.\n\
+    Stopped, the same command goes on.";
+
+#[derive(Debug, Args)]
+pub(crate) struct SimulateScenesArguments {
+    /// Objects: mesh files, or names given with `sixfold object add`
+    #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1..)]
+    pub objects: Vec<String>,
+    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    /// BOP dataset folder: its models, which keep their ids
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// Object ids of the dataset (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
+    pub ids: Vec<u32>,
+    /// Made-up household objects: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    pub families: Vec<String>,
+    /// Made-up objects of each family
+    #[arg(long, value_name = "N", default_value = "1", requires = "families")]
+    pub members: usize,
+    /// Made-up objects of no family: figures, machine parts and heaps of solids
+    #[arg(long, value_name = "N", default_value = "0")]
+    pub toys: usize,
+    /// Scenes: each drops other objects
+    #[arg(long, value_name = "N", default_value = "10")]
+    pub scenes: usize,
+    /// Images of each scene
+    #[arg(long, value_name = "N", default_value = "4")]
+    pub views: usize,
+    /// Objects dropped in a scene, fewest and most; none twice while there are enough of them
+    #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [6, 10])]
+    pub objects_per_scene: Vec<usize>,
+    /// Objects are dropped over a disc of this radius, metres
+    #[arg(long, value_name = "METRES", default_value = "0.22")]
+    pub radius: f64,
+    /// Share of the objects that start upright, the z axis of their mesh up; the others fall in any orientation
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub upright: f64,
+    /// Share of the objects that fall wherever they fall, also on others; the rest look for a free place
+    #[arg(long, value_name = "SHARE", default_value = "0.3")]
+    pub stacked: f64,
+    /// Let objects collide as they are (hollow things stay hollow) and not as their convex hulls; takes seconds an object
+    #[arg(long)]
+    pub exact: bool,
+    /// Distance of the camera from the objects, smallest and largest, metres
+    #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [0.6, 1.2])]
+    pub distance: Vec<f64>,
+    /// Elevation of the camera over the plane, lowest and highest, degrees
+    #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [20.0, 80.0], allow_hyphen_values = true)]
+    pub elevation: Vec<f64>,
+    /// Depth camera
+    #[arg(long, value_enum, default_value = "kinect")]
+    pub sensor: Sensor,
+    /// Camera file (default: 640x480, focal length 575 pixels, as a Kinect)
+    #[arg(long, value_name = "FILE")]
+    pub camera: Option<PathBuf>,
+    /// Leave out the colour images (and the preview, which is made of them)
+    #[arg(long)]
+    pub no_rgb: bool,
+    /// New dataset folder
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Name of the new dataset's split
+    #[arg(long, value_name = "NAME", default_value = "test")]
+    pub split: String,
+    /// Seed of objects, poses, cameras and noise
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+impl SimulateScenesArguments {
+    /// Tests every option that is a number or a name.
+    pub fn check(&self) -> Result<()> {
+        if self.objects.is_empty() && self.dataset.is_none() && self.families.is_empty() && self.toys == 0 {
+            bail!(
+                "no objects: give --object MESH, --dataset DIR, --families all or --toys N (or several of them)"
+            );
+        }
+        let pairs = [
+            ("--objects-per-scene", self.objects_per_scene.len()),
+            ("--distance", self.distance.len()),
+            ("--elevation", self.elevation.len()),
+        ];
+        for (option, found) in pairs {
+            if found != 2 {
+                bail!("{option}: found {found} numbers, expected two with a comma between them");
+            }
+        }
+        for (option, value) in
+            [("--scenes", self.scenes), ("--views", self.views), ("--members", self.members)]
+        {
+            if !(1..=1_000_000).contains(&value) {
+                bail!("{option}: found {value}, expected 1 to 1000000");
+            }
+        }
+        let [low, high] = [self.objects_per_scene[0], self.objects_per_scene[1]];
+        if low < 1 || low > high || high > 100 {
+            bail!(
+                "--objects-per-scene: found {low},{high}, expected two numbers from 1 to 100, the lower one first"
+            );
+        }
+        let [low, high] = [self.distance[0], self.distance[1]];
+        if !(0.1 <= low && low <= high && high <= 6.0) {
+            bail!(
+                "--distance: found {low},{high}, expected two distances from 0.1 to 6 metres, the lower one first"
+            );
+        }
+        let [low, high] = [self.elevation[0], self.elevation[1]];
+        if !(1.0 <= low && low <= high && high <= 90.0) {
+            bail!(
+                "--elevation: found {low},{high}, expected two angles from 1 to 90 degrees, the lower one first"
+            );
+        }
+        self.pile().check()?;
+        let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+        if self.split.is_empty() || !self.split.chars().all(plain) {
+            bail!("--split: found {:?}, expected letters, digits, _ and -", self.split);
+        }
+        self.chosen_families()?;
+        Ok(())
+    }
+
+    /// How objects are dropped.
+    pub fn pile(&self) -> PileOptions {
+        PileOptions {
+            radius: self.radius,
+            reach: (self.radius + 0.13).min(0.9),
+            upright: self.upright,
+            stacked: self.stacked,
+        }
+    }
+
+    /// The families that --families names.
+    pub fn chosen_families(&self) -> Result<Vec<Family>> {
+        if self.families == ["all"] {
+            return Ok(Family::ALL.to_vec());
+        }
+        let known = || Family::ALL.map(Family::name).join(", ");
+        self.families
+            .iter()
+            .map(|name| match Family::ALL.into_iter().find(|f| f.name() == name) {
+                Some(family) => Ok(family),
+                None => bail!("--families: found {name:?}, expected all, or some of {}", known()),
+            })
+            .collect()
+    }
+
+    /// The camera without its place.
+    pub fn pinhole(&self) -> Result<Camera> {
+        let Some(file) = &self.camera else {
+            return Ok(Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480)?);
+        };
+        let read = camera_file::read(file)?;
+        let (width, height) = if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
+        let camera = read.for_image(width, height, file)?;
+        if camera.distortion.is_some() {
+            bail!(
+                "{}: field distortion: rendered images have none; give a camera file without it",
+                file.display()
+            );
+        }
+        Ok(camera)
+    }
+
+    /// The options that decide about the result.
+    pub fn deciding(&self) -> Value {
+        let path = |path: &Path| path.display().to_string();
+        json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "object": self.objects, "unit": self.unit.map(|u| u.to_string()), "store": path(&self.store),
+            "dataset": self.dataset.as_deref().map(path), "ids": self.ids, "families": self.families,
+            "members": self.members, "toys": self.toys, "scenes": self.scenes, "views": self.views,
+            "objects-per-scene": self.objects_per_scene, "radius": self.radius, "upright": self.upright,
+            "stacked": self.stacked, "exact": self.exact, "distance": self.distance,
+            "elevation": self.elevation, "sensor": format!("{:?}", self.sensor),
+            "camera": self.camera.as_deref().map(path), "no-rgb": self.no_rgb, "split": self.split,
+            "seed": self.seed,
+        })
+    }
+}
