@@ -42,7 +42,7 @@ pub struct PileOptions {
 
 impl Default for PileOptions {
     fn default() -> Self {
-        PileOptions { radius: 0.22, reach: 0.35, upright: 0.5, stacked: 0.3 }
+        PileOptions { radius: 0.18, reach: 0.31, upright: 0.5, stacked: 0.4 }
     }
 }
 

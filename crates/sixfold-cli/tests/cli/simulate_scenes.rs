@@ -94,13 +94,14 @@ fn scenes_are_a_dataset_of_their_own() {
 #[test]
 fn models_of_a_dataset_keep_their_ids() {
     let tiny = Tiny::new(false);
-    let run = "simulate-scenes --dataset tiny --ids 2 --scenes 1 --views 1 --objects-per-scene 3,3 --camera tiny/camera.json --sensor none --no-rgb --out new --json";
+    let run = "simulate-scenes --dataset tiny --ids 2 --scenes 1 --views 1 --objects-per-scene 3,3 --camera tiny/camera.json --sensor none --no-rgb --no-masks --out new --json";
     sixfold(tiny.path(), run).expect(0);
     let dataset = BopDataset::open(&tiny.path().join("new"), "test").unwrap();
     let image = dataset.scene(0).unwrap();
     let image = image.image(0).unwrap();
     assert!(!image.ground_truth.is_empty() && image.ground_truth.iter().all(|g| g.obj_id == 2));
     assert!(!tiny.path().join("new/preview.png").exists());
+    assert!(!tiny.path().join("new/test/000000/mask").exists());
     fails(tiny.path(), "simulate-scenes --dataset tiny --ids 7 --out other", &["--ids", "found 7", "1, 2"]);
     // Another dataset is not written over.
     fails(tiny.path(), "simulate-scenes --dataset tiny --out tiny", &["tiny", "another dataset", "--out"]);

@@ -57,13 +57,13 @@ pub(crate) struct SimulateScenesArguments {
     #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [6, 10])]
     pub objects_per_scene: Vec<usize>,
     /// Objects are dropped over a disc of this radius, metres
-    #[arg(long, value_name = "METRES", default_value = "0.22")]
+    #[arg(long, value_name = "METRES", default_value = "0.18")]
     pub radius: f64,
     /// Share of the objects that start upright, the z axis of their mesh up; the others fall in any orientation
     #[arg(long, value_name = "SHARE", default_value = "0.5")]
     pub upright: f64,
     /// Share of the objects that fall wherever they fall, also on others; the rest look for a free place
-    #[arg(long, value_name = "SHARE", default_value = "0.3")]
+    #[arg(long, value_name = "SHARE", default_value = "0.4")]
     pub stacked: f64,
     /// Let objects collide as they are (hollow things stay hollow) and not as their convex hulls; takes seconds an object
     #[arg(long)]
@@ -83,6 +83,9 @@ pub(crate) struct SimulateScenesArguments {
     /// Leave out the colour images (and the preview, which is made of them)
     #[arg(long)]
     pub no_rgb: bool,
+    /// Leave out the masks, which are most of the files; poses, boxes and visibility are written all the same
+    #[arg(long)]
+    pub no_masks: bool,
     /// New dataset folder
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -201,7 +204,8 @@ impl SimulateScenesArguments {
             "objects-per-scene": self.objects_per_scene, "radius": self.radius, "upright": self.upright,
             "stacked": self.stacked, "exact": self.exact, "distance": self.distance,
             "elevation": self.elevation, "sensor": format!("{:?}", self.sensor),
-            "camera": self.camera.as_deref().map(path), "no-rgb": self.no_rgb, "split": self.split,
+            "camera": self.camera.as_deref().map(path), "no-rgb": self.no_rgb, "no-masks": self.no_masks,
+            "split": self.split,
             "seed": self.seed,
         })
     }

@@ -43,13 +43,15 @@ struct Summary {
 pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     a.check()?;
     let camera = a.pinhole()?;
-    let things = objects::collect(a)?;
-    if !a.out.join("options.json").exists()
-        && (a.out.join(&a.split).exists() || a.out.join("models").exists())
-    {
+    let options = a.out.join("options.json");
+    if options.exists() {
+        // Other options are refused before the objects take their time.
+        go_on_with(&options, &a.deciding())?;
+    } else if a.out.join(&a.split).exists() || a.out.join("models").exists() {
         bail!("{} holds another dataset: choose another --out", a.out.display());
     }
-    go_on_with(&a.out.join("options.json"), &a.deciding())?;
+    let things = objects::collect(a)?;
+    go_on_with(&options, &a.deciding())?;
     objects::write(&a.out, &things)?;
     write_camera(&a.out, &camera, scene::DEPTH_SCALE)?;
     let start = std::time::Instant::now();

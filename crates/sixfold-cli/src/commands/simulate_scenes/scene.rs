@@ -185,8 +185,8 @@ impl Scene<'_> {
             depth: Some(&depth),
             ground_truth: &truth,
             info: Some(&infos),
-            masks: Some(&masks),
-            masks_visible: Some(&masks_visible),
+            masks: (!a.no_masks).then_some(&masks[..]),
+            masks_visible: (!a.no_masks).then_some(&masks_visible[..]),
             ..NewImage::new(im_id, camera)
         })?;
         Ok(())
