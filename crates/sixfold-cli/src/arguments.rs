@@ -8,7 +8,7 @@ use sixfold_mesh::Unit;
 use sixfold_render::DepthSensor;
 
 use crate::commands::grasp::arguments::GraspArguments;
-use crate::commands::mttm::arguments::{DepthViewArguments, ReproduceMttmArguments, TemplateViews};
+use crate::commands::mttm::arguments::{DepthViewArguments, Matcher, ReproduceMttmArguments, TemplateViews};
 use crate::commands::reproduce::nol::arguments::{AFTER_HELP as NOL_HELP, ReproduceNolArguments};
 
 /// 6D object pose and grasp transfer from little data.
@@ -159,7 +159,8 @@ pub(crate) struct EstimateArguments {
     /// How poses are found
     #[arg(long, value_enum, default_value = "ppf")]
     pub method: Method,
-    /// Trained model for --method pix2pose: a file that `sixfold train pix2pose` wrote
+    /// Trained model for --method pix2pose: a file that `sixfold train pix2pose` wrote; for --method mttm another network than
+    /// that within the program
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: Option<PathBuf>,
     /// Leave out the last step of --method pix2pose, which aligns the rendered mesh with the image
@@ -175,6 +176,9 @@ pub(crate) struct EstimateArguments {
     /// Align the poses of --method pix2pose with the depth image (ICP)
     #[arg(long)]
     pub icp: bool,
+    /// Who matches regions with templates in --method mttm
+    #[arg(long, value_enum, default_value = "both")]
+    pub matcher: Matcher,
     /// Judge the poses of --method mttm by its templates alone, as if there were no mesh
     #[arg(long)]
     pub templates_only: bool,

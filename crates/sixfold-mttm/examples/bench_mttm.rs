@@ -11,7 +11,7 @@ use sixfold_geometry::{KdTree, Pose, Vec3};
 use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Stages, TemplateOptions, estimate,
+    EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, Stages, TemplateOptions,
 };
 use sixfold_render::render_depth;
 
@@ -78,10 +78,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let prepared = Scene::new(&depth, &camera, None, &SceneOptions::default())?;
         done += 1;
         for (v, (name, with_mesh, options)) in variants.iter().enumerate() {
+            let search = Search::new(&prepared);
             for id in ids {
                 let object = known[id].clone();
                 let object = if *with_mesh { object } else { object.without_mesh() };
-                let (found, stages) = estimate(&prepared, &object, options);
+                let (found, stages) = search.estimate(&object, options);
                 let s = &mut sums[v];
                 s.matching += stages.matching;
                 s.masks += stages.masks;

@@ -2,99 +2,84 @@
 //! section 5.2.4).
 
 use rayon::prelude::*;
-use sixfold_geometry::Pose;
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_match::Scene;
 
 use crate::align::camera_from_view;
-use crate::estimate::{EstimateOptions, KnownObject, Placed, Stages, apart, is_known, place_at};
+use crate::estimate::{EstimateOptions, KnownObject, MatchedBy, Placed, Stages, apart, is_known, place_at};
 use crate::learned::Learned;
-use crate::matching::{Entry, Match};
+use crate::matching::Entry;
 use crate::model::{Encoded, PairSays};
 use crate::patch::Patch;
-use crate::roi::{ProposalOptions, Roi, propose};
+use crate::regions::RegionCache;
+use crate::roi::Roi;
 
-/// Distance of sampled centres as a share of the diameter: the network was trained with regions that are off by as much.
-const STEP: f64 = 0.2;
-/// Regions that go through the network at a time.
-const AT_A_TIME: usize = 64;
-/// Candidates of points whose pairs are looked at.
-const LOOKED_AT: usize = 48;
+/// Regions of which pairs are looked at, and those of them that are laid on the scene.
+const LOOKED_AT: usize = 96;
+/// Pairs that go through the network at a time.
+const AT_A_TIME: usize = 32;
+const PLACED: usize = 64;
 /// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several.
 const LEAST_TRUST: f64 = 0.1;
 
-/// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene.
+/// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene where the network
+/// says. With `MatchedBy::Both` each is also matched by points there, and what agrees better with the scene is kept.
 pub(crate) fn first_matching(
     scene: &Scene,
     object: &KnownObject,
     learned: &Learned,
+    cache: &RegionCache,
     options: &EstimateOptions,
     stages: &mut Stages,
 ) -> Vec<Placed> {
-    let proposals = ProposalOptions { step: STEP, layer: STEP, ..options.proposals };
-    let rois = propose(scene, object.templates.diameter, &proposals);
-    stages.sampled = rois.len();
-    let encoded: Vec<Encoded> = rois.par_chunks(AT_A_TIME).map(|part| encode(scene, learned, part)).collect();
-    let descriptors: Vec<_> = encoded.par_iter().map(|e| learned.model().describe(e)).collect();
-    let nearest = learned.nearest(&descriptors.concat());
+    let diameter = object.templates.diameter;
+    let size = learned.size();
+    let regions = cache.of(scene, learned);
+    let rois = &regions.rois;
+    stages.sampled = regions.sampled;
+    let nearest = learned.nearest(&regions.descriptors);
     let mut order: Vec<usize> = (0..rois.len()).collect();
     order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
-    let chosen = apart(&rois, order, 0.15 * object.templates.diameter, options.placed);
+    let chosen = apart(rois, order, 0.15 * diameter, LOOKED_AT);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
-    let parts: Vec<Vec<Placed>> = chosen
-        .par_chunks(AT_A_TIME / 2)
-        .zip(entries.par_chunks(AT_A_TIME / 2))
+    let says: Vec<Vec<PairSays>> = chosen
+        .par_chunks(AT_A_TIME)
+        .zip(entries.par_chunks(AT_A_TIME))
         .map(|(chosen, entries)| {
-            let regions: Vec<Encoded> =
-                chosen.iter().map(|&i| encoded[i / AT_A_TIME].select(&[i % AT_A_TIME])).collect();
-            let says = learned.model().compare(&Encoded::joined(&regions), &learned.templates(entries));
-            let all = chosen.iter().zip(entries).zip(&says);
-            all.map(|((&i, entry), says)| {
-                let start = start(learned, &rois[i].camera_from_roi(), entry, says, options);
-                place_at(scene, object, entry.template, start, trust(says), options)
+            learned.model().compare(&regions.encoded(chosen), &learned.templates(entries))
+        })
+        .collect();
+    let says = says.concat();
+    let mut order: Vec<usize> = (0..chosen.len()).collect();
+    order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
+    order.truncate(PLACED);
+    let by_points = (options.matched_by == MatchedBy::Both).then(|| {
+        // Where the network sees the middle of the object.
+        let centred: Vec<Roi> = order
+            .iter()
+            .map(|&k| {
+                let place = Vec3::from(says[k].offset) * size;
+                Roi { centre: rois[chosen[k]].camera_from_roi().transform_point(&place) }
             })
-            .collect()
+            .collect();
+        let template_size = object.templates.size;
+        let found = object.matcher.best(centred.len(), |i| centred[i].cells(scene, template_size, |_| true));
+        centred.into_iter().zip(found).collect::<Vec<_>>()
+    });
+    order
+        .par_iter()
+        .enumerate()
+        .map(|(n, &k)| {
+            let (says, entry) = (&says[k], &entries[k]);
+            let start = start(learned, &rois[chosen[k]].camera_from_roi(), entry, says, options);
+            let placed = place_at(scene, object, entry.template, start, trust(says), options);
+            let Some((roi, found)) = by_points.as_ref().map(|all| &all[n]) else { return placed };
+            let entry = object.matcher.entries()[found.entry];
+            let start = camera_from_view(&roi.camera_from_roi(), entry.turn);
+            let other = place_at(scene, object, entry.template, start, trust(says), options);
+            if other.support > placed.support { other } else { placed }
         })
-        .collect();
-    parts.concat()
-}
-
-/// Regions with the template that points match best: the network looks at the best of them, each with its own template and the
-/// nearest by descriptor, and the pair that matches better is laid on the scene.
-pub(crate) fn choose_and_place(
-    scene: &Scene,
-    object: &KnownObject,
-    learned: &Learned,
-    candidates: &[(Roi, Match)],
-    options: &EstimateOptions,
-) -> Vec<Placed> {
-    let candidates = &candidates[..candidates.len().min(LOOKED_AT)];
-    let parts: Vec<Vec<Placed>> = candidates
-        .par_chunks(LOOKED_AT / 2)
-        .map(|part| {
-            let rois: Vec<Roi> = part.iter().map(|c| c.0).collect();
-            let regions = encode(scene, learned, &rois);
-            let nearest = learned.nearest(&learned.model().describe(&regions));
-            let entries = object.matcher.entries();
-            let by_points: Vec<Entry> = part.iter().map(|c| entries[c.1.entry]).collect();
-            let by_descriptor: Vec<Entry> = nearest.iter().map(|n| entries[n.1]).collect();
-            let first = learned.model().compare(&regions, &learned.templates(&by_points));
-            let second = learned.model().compare(&regions, &learned.templates(&by_descriptor));
-            let place = |roi: &Roi, entry: &Entry, says: &PairSays, score: f32| {
-                let start = start(learned, &roi.camera_from_roi(), entry, says, options);
-                let trust = trust(says) * f64::from(score).max(0.0).sqrt();
-                place_at(scene, object, entry.template, start, trust, options)
-            };
-            (0..part.len())
-                .map(|i| {
-                    let (roi, matched) = &part[i];
-                    let a = place(roi, &by_points[i], &first[i], matched.score);
-                    let b = place(roi, &by_descriptor[i], &second[i], matched.score);
-                    if b.support > a.support { b } else { a }
-                })
-                .collect()
-        })
-        .collect();
-    parts.concat()
+        .collect()
 }
 
 /// Matches a region again, centred where its template says and without its background, and adds the nearest templates that
@@ -112,7 +97,7 @@ pub(crate) fn second_matching(
     // The seed's own template at the nearest turn, for a mask.
     let in_roi = roi.camera_from_roi().inverse() * seed.camera_from_view;
     let turn = {
-        let right = in_roi.transform_direction(&sixfold_geometry::Vec3::x());
+        let right = in_roi.transform_direction(&Vec3::x());
         right.y.atan2(right.x)
     };
     let own = Entry { template: seed.template, turn };
@@ -156,7 +141,7 @@ fn encode(scene: &Scene, learned: &Learned, rois: &[Roi]) -> Encoded {
     let (size, side) = (learned.size(), learned.model().side());
     let patches: Vec<Patch> =
         rois.iter().map(|roi| Patch::of_scene(scene, roi, size, side, |_| true)).collect();
-    learned.model().encode(&patches)
+    learned.model().encode(&patches.iter().collect::<Vec<_>>())
 }
 
 /// From where a template is aligned.

@@ -20,6 +20,7 @@ use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
 use crate::matching::{Match, MatchOptions, Matcher};
 use crate::model::MttmModel;
+use crate::regions::RegionCache;
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::ObjectTemplates;
 
@@ -30,7 +31,7 @@ pub enum MatchedBy {
     Points,
     /// The network's descriptors alone (dissertation, section 5.2.4).
     Network,
-    /// Points first, then both: the network proposes other templates, turns and shifts them, and says which pairs match.
+    /// The network's descriptors say where to look, and points and network with which templates.
     Both,
 }
 
@@ -199,9 +200,38 @@ pub(crate) struct Placed {
     pub support: f64,
 }
 
+/// A scene in which several objects are searched: what the network says of its regions is kept for objects of about the same
+/// size.
+#[derive(Debug)]
+pub struct Search<'a> {
+    scene: &'a Scene,
+    regions: RegionCache,
+}
+
+impl<'a> Search<'a> {
+    /// Nothing is searched yet.
+    pub fn new(scene: &'a Scene) -> Search<'a> {
+        Search { scene, regions: RegionCache::default() }
+    }
+
+    /// Finds an object, as [`estimate`] does and with the same outcome.
+    pub fn estimate(&self, object: &KnownObject, options: &EstimateOptions) -> (Vec<Estimate>, Stages) {
+        search(self.scene, &self.regions, object, options)
+    }
+}
+
 /// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives the same output at
-/// any number of threads.
+/// any number of threads. For several objects in one scene [`Search`] is faster.
 pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) -> (Vec<Estimate>, Stages) {
+    Search::new(scene).estimate(object, options)
+}
+
+fn search(
+    scene: &Scene,
+    regions: &RegionCache,
+    object: &KnownObject,
+    options: &EstimateOptions,
+) -> (Vec<Estimate>, Stages) {
     let mut stages = Stages::default();
     let mut clock = Instant::now();
     let mut lap = || {
@@ -213,11 +243,9 @@ pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) 
         MatchedBy::Points => None,
         MatchedBy::Network | MatchedBy::Both => object.learned.as_ref(),
     };
-    let placed = match (network, options.matched_by) {
-        (Some(learned), MatchedBy::Network) => {
-            by_network::first_matching(scene, object, learned, options, &mut stages)
-        }
-        _ => first_matching(scene, object, network, options, &mut stages),
+    let placed = match network {
+        Some(learned) => by_network::first_matching(scene, object, learned, regions, options, &mut stages),
+        None => first_matching(scene, object, options, &mut stages),
     };
     stages.matching = lap();
     let regions = merge(scene, object, &placed, options);
@@ -249,7 +277,6 @@ pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) 
 fn first_matching(
     scene: &Scene,
     object: &KnownObject,
-    network: Option<&Learned>,
     options: &EstimateOptions,
     stages: &mut Stages,
 ) -> Vec<Placed> {
@@ -260,10 +287,6 @@ fn first_matching(
     let mut order: Vec<usize> = (0..rois.len()).filter(|&i| matches[i].score > 0.0).collect();
     order.sort_by(|&a, &b| matches[b].score.total_cmp(&matches[a].score).then(a.cmp(&b)));
     let chosen = apart(&rois, order, 0.15 * object.templates.diameter, options.placed);
-    if let Some(learned) = network {
-        let chosen: Vec<_> = chosen.iter().map(|&i| (rois[i], matches[i])).collect();
-        return by_network::choose_and_place(scene, object, learned, &chosen, options);
-    }
     chosen.par_iter().map(|&i| place(scene, object, &rois[i], matches[i], options)).collect()
 }
 

@@ -13,6 +13,7 @@ use crate::matching::Entry;
 use crate::model::{Descriptor, Encoded, MttmModel, PairSays};
 use crate::network::DESCRIPTOR;
 use crate::patch::{Patch, REACH, TemplateSurface};
+use crate::regions::shared_diameter;
 use crate::store::checksum;
 use crate::template::ObjectTemplates;
 
@@ -62,7 +63,7 @@ impl Learned {
 
     fn without_descriptors(model: Arc<MttmModel>, object: &ObjectTemplates) -> Learned {
         let surfaces = object.templates.par_iter().map(|t| TemplateSurface::new(t, object.size)).collect();
-        Learned { model, surfaces, descriptors: vec![], size: REACH * object.diameter }
+        Learned { model, surfaces, descriptors: vec![], size: REACH * shared_diameter(object.diameter) }
     }
 
     /// The network.

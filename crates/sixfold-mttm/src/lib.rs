@@ -27,6 +27,7 @@ pub mod network;
 pub mod patch;
 pub mod pose_distance;
 pub mod quality;
+mod regions;
 pub mod roi;
 pub mod samples;
 mod store;
@@ -35,7 +36,7 @@ pub mod training;
 mod views;
 
 pub use error::{StoreError, TemplateError};
-pub use estimate::{Estimate, EstimateOptions, KnownObject, MatchedBy, Stages, estimate};
+pub use estimate::{Estimate, EstimateOptions, KnownObject, MatchedBy, Search, Stages, estimate};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
 pub use views::{Coverage, view_directions, view_rotation};

@@ -18,6 +18,9 @@ use crate::patch::{PLANES, Patch};
 /// Patches that go through the network at a time.
 const AT_A_TIME: usize = 64;
 
+/// Compact weights for all objects; see the card beside the file.
+static SHIPPED: &[u8] = include_bytes!("../weights/mttm-compact.safetensors");
+
 /// Why a model could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
@@ -121,6 +124,14 @@ impl MttmModel {
         Ok(MttmModel { network: network.valid(), card, device })
     }
 
+    /// The network that comes with the program.
+    ///
+    /// # Errors
+    /// [`ModelError`] if the program carries weights of another version than its own.
+    pub fn shipped() -> Result<Self, ModelError> {
+        Self::from_bytes(Path::new("mttm-compact.safetensors"), SHIPPED)
+    }
+
     /// Writes the weight file and, beside it, the card as text.
     ///
     /// # Errors
@@ -152,7 +163,7 @@ impl MttmModel {
     ///
     /// # Panics
     /// For patches of another side than the network's.
-    pub fn encode(&self, patches: &[Patch]) -> Encoded {
+    pub fn encode(&self, patches: &[&Patch]) -> Encoded {
         Encoded { maps: self.network.maps(self.tensor(patches)) }
     }
 
@@ -162,7 +173,7 @@ impl MttmModel {
     /// As [`MttmModel::encode`].
     pub fn encode_templates(&self, patches: &[Patch]) -> Encoded {
         let masks = patches.iter().flat_map(template_mask).collect();
-        self.without_background(&self.encode(patches), masks)
+        self.without_background(&self.encode(&patches.iter().collect::<Vec<_>>()), masks)
     }
 
     /// Maps with zeros where `masks` (14 x 14 numbers for each patch, 0 to 1) has zeros.
@@ -214,7 +225,7 @@ impl MttmModel {
             .collect()
     }
 
-    fn tensor(&self, patches: &[Patch]) -> Tensor<4> {
+    fn tensor(&self, patches: &[&Patch]) -> Tensor<4> {
         let side = self.side();
         assert!(patches.iter().all(|p| p.side == side), "patches of another side than the network's");
         let values: Vec<f32> = patches.iter().flat_map(|p| p.values.iter().copied()).collect();
@@ -263,7 +274,7 @@ mod tests {
     fn what_is_asked_together_is_answered_as_if_alone() {
         let model = model();
         let patches: Vec<Patch> = (0..70).map(patch).collect();
-        let encoded = model.encode(&patches);
+        let encoded = model.encode(&patches.iter().collect::<Vec<_>>());
         let last = encoded.select(&[69]);
         let (many, alone) = (model.describe(&encoded), model.describe(&last));
         assert!(many[69].iter().zip(&alone[0]).all(|(a, b)| (a - b).abs() < 1e-5));
@@ -287,7 +298,7 @@ mod tests {
         let again = MttmModel::load(&file).unwrap();
         let bytes = std::fs::read(&file).unwrap();
         let third = MttmModel::from_bytes(&file, &bytes).unwrap();
-        let described = |m: &MttmModel| m.describe(&m.encode(&[patch(1)]));
+        let described = |m: &MttmModel| m.describe(&m.encode(&[&patch(1)]));
         assert_eq!(described(&again), described(&third));
         assert_eq!(again.fingerprint(), third.fingerprint());
         assert!(folder.path().join("mttm.md").exists());

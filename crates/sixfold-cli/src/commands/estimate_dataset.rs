@@ -39,6 +39,9 @@ struct RunRecord {
     icp: bool,
     #[serde(default)]
     templates_only: bool,
+    /// Of template matching only.
+    #[serde(default)]
+    matcher: Option<String>,
     dataset: String,
     split: String,
     targets: Option<String>,
@@ -106,6 +109,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             boxes
         }
     };
+    let mut model = None;
     let pix2pose = match a.method {
         Method::Pix2pose if matches!(boxes, Boxes::Anywhere) => {
             bail!(
@@ -120,6 +124,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         }
         Method::Mttm => {
             mttm::check(a)?;
+            model = mttm::network::network(a.matcher, a.weights.as_deref())?;
             None
         }
         Method::Ppf => None,
@@ -140,6 +145,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
         looks: pix2pose.as_ref().map(Pix2Pose::looks),
         icp: a.icp,
         templates_only: a.templates_only,
+        matcher: (a.method == Method::Mttm).then(|| format!("{:?}", a.matcher).to_lowercase()),
         dataset: root.display().to_string(),
         split: a.split.clone(),
         targets: a.targets.as_ref().map(|t| t.display().to_string()),
@@ -226,8 +232,9 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                     Method::Pix2pose => Known { mesh: object.mesh, ppf: None, mttm: None },
                     Method::Mttm => {
                         let mesh = object.mesh.clone();
+                        let templates = mttm::templates_beside(&file);
                         let known =
-                            mttm::known_by_mesh(object, &mttm::templates_beside(&file), a.templates_only)?;
+                            mttm::known_by_mesh(object, &templates, a.templates_only, model.as_ref())?;
                         Known { mesh, ppf: None, mttm: Some(known.object) }
                     }
                 });
@@ -403,6 +410,7 @@ fn by_depth(
         Boxes::Anywhere => Some(Scene::new(&depth, &camera, None, &options).context("depth image")?),
         _ => None,
     };
+    let shared = whole.as_ref().map(sixfold_mttm::Search::new);
     let mut found = vec![];
     for target in targets {
         let Some(o) = target.object else { continue };
@@ -415,7 +423,11 @@ fn by_depth(
         };
         let search = |scene: &Scene, instances: usize| -> Vec<Posed> {
             if let Some(object) = &k.mttm {
-                let found = sixfold_mttm::estimate(scene, object, &mttm::options(a, instances, 0.05)).0;
+                let options = mttm::options(a, instances, 0.05);
+                let found = match &shared {
+                    Some(shared) => shared.estimate(object, &options).0,
+                    None => sixfold_mttm::estimate(scene, object, &options).0,
+                };
                 return found.into_iter().map(|e| posed(e.camera_from_object, e.confidence)).collect();
             }
             let found = k.ppf.iter().flat_map(|ppf| estimate(scene, ppf, &estimate_options(a, instances)));

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use sixfold_mttm::Coverage;
+use sixfold_mttm::{Coverage, MatchedBy};
 
 /// From which sides templates are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -19,6 +19,27 @@ impl TemplateViews {
         match self {
             TemplateViews::Above => Coverage::Above,
             TemplateViews::Around => Coverage::Around,
+        }
+    }
+}
+
+/// Who matches regions with templates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Matcher {
+    /// Template and region point by point, without a network
+    Points,
+    /// The network's descriptors alone, as in the dissertation
+    Network,
+    /// Points first, then both
+    Both,
+}
+
+impl Matcher {
+    pub fn matched_by(self) -> MatchedBy {
+        match self {
+            Matcher::Points => MatchedBy::Points,
+            Matcher::Network => MatchedBy::Network,
+            Matcher::Both => MatchedBy::Both,
         }
     }
 }
@@ -62,6 +83,9 @@ pub(crate) struct ReproduceMttmArguments {
     /// Take every N-th image
     #[arg(long, value_name = "N", default_value = "1")]
     pub every: std::num::NonZeroUsize,
+    /// Another network than that within the program: a file that `sixfold train mttm` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: Option<PathBuf>,
     /// Leave out point pair features, for comparison on the same images
     #[arg(long)]
     pub no_ppf: bool,

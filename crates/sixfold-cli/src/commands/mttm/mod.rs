@@ -1,10 +1,12 @@
 //! `sixfold estimate --method mttm`: poses by templates, in one image here, in a dataset through `estimate_dataset`.
 
 pub(crate) mod arguments;
+pub(crate) mod network;
 pub(crate) mod onboard;
 pub(crate) mod reproduce;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
@@ -12,10 +14,12 @@ use sixfold_bop::{write_mask, write_rgb};
 use sixfold_match::{Scene, VerificationScore};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::mask::to_image;
+use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    Estimate, EstimateOptions, KnownObject, ObjectTemplates, Source, Stages, TemplateOptions, estimate,
+    Estimate, EstimateOptions, KnownObject, ObjectTemplates, Search, Source, Stages, TemplateOptions,
 };
 
+use self::network::{network, with_network};
 use super::estimate::Input;
 use crate::Outcome;
 use crate::arguments::EstimateArguments;
@@ -36,24 +40,31 @@ pub(crate) struct Known {
 }
 
 /// Templates and mesh of an object with a mesh: templates from `file`, or made and kept there.
-pub(crate) fn known_by_mesh(object: Object, file: &Path, templates_only: bool) -> Result<Known> {
+pub(crate) fn known_by_mesh(
+    object: Object,
+    file: &Path,
+    templates_only: bool,
+    model: Option<&Arc<MttmModel>>,
+) -> Result<Known> {
     let (templates, note) = ObjectTemplates::cached(file, &object.mesh, &TemplateOptions::default())
         .with_context(|| format!("object {}", object.name))?;
     if let Some(note) = note {
         eprintln!("note: templates of {} not kept or renewed: {note}", object.name);
     }
-    let model = if templates_only { None } else { Some(object.ppf_model()?) };
-    Ok(Known { name: object.name, object: KnownObject::new(templates, model), mesh: Some(object.mesh) })
+    let mesh = if templates_only { None } else { Some(object.ppf_model()?) };
+    let known = with_network(KnownObject::new(templates, mesh), model, file, &object.name);
+    Ok(Known { name: object.name, object: known, mesh: Some(object.mesh) })
 }
 
 /// A mesh file, a stored object with a mesh, or one that is stored as templates alone.
-fn find(a: &EstimateArguments, name: &str) -> Result<Known> {
+fn find(a: &EstimateArguments, name: &str, model: Option<&Arc<MttmModel>>) -> Result<Known> {
     let store = Store { folder: &a.store };
     if store.contains(name) {
         let file = store.templates_file(name)?;
         if store.record(name)?.without_mesh {
             let templates = ObjectTemplates::read(&file).with_context(|| format!("object {name}"))?;
-            return Ok(Known { name: name.into(), object: KnownObject::new(templates, None), mesh: None });
+            let object = with_network(KnownObject::new(templates, None), model, &file, name);
+            return Ok(Known { name: name.into(), object, mesh: None });
         }
         // Templates that were asked for with other views stay as they are.
         if let Ok(templates) = ObjectTemplates::read(&file) {
@@ -63,15 +74,15 @@ fn find(a: &EstimateArguments, name: &str) -> Result<Known> {
             if let Some(note) = note {
                 eprintln!("note: templates of {name} not kept or renewed: {note}");
             }
-            let model = if a.templates_only { None } else { Some(object.ppf_model()?) };
-            let object_with = KnownObject::new(templates, model);
+            let mesh = if a.templates_only { None } else { Some(object.ppf_model()?) };
+            let object_with = with_network(KnownObject::new(templates, mesh), model, &file, name);
             return Ok(Known { name: object.name, object: object_with, mesh: Some(object.mesh) });
         }
-        return known_by_mesh(store.load(name)?, &file, a.templates_only);
+        return known_by_mesh(store.load(name)?, &file, a.templates_only, model);
     }
     let object = objects::find(name, a.unit, &a.store)?;
     let file = templates_beside(Path::new(name));
-    known_by_mesh(object, &file, a.templates_only)
+    known_by_mesh(object, &file, a.templates_only, model)
 }
 
 /// `mug.ply` keeps its templates in `mug.sixfold-templates`.
@@ -82,6 +93,7 @@ pub(crate) fn templates_beside(mesh: &Path) -> PathBuf {
 /// The options that the command line sets.
 pub(crate) fn options(a: &EstimateArguments, instances: usize, min_score: f64) -> EstimateOptions {
     EstimateOptions {
+        matched_by: a.matcher.matched_by(),
         max_instances: instances,
         min_score: a.min_score.unwrap_or(min_score),
         ..EstimateOptions::default()
@@ -90,11 +102,10 @@ pub(crate) fn options(a: &EstimateArguments, instances: usize, min_score: f64) -
 
 /// What template matching has no use for.
 pub(crate) fn check(a: &EstimateArguments) -> Result<()> {
-    let pix2pose = a.weights.is_some() || a.object_id.is_some() || a.icp || a.no_refine || a.looks.is_some();
+    let pix2pose = a.object_id.is_some() || a.icp || a.no_refine || a.looks.is_some();
     if pix2pose || a.detector.is_some() {
         bail!(
-            "--weights, --object-id, --icp, --no-refine, --looks and --detector belong to --method pix2pose; template matching needs \
-             none of them"
+            "--object-id, --icp, --no-refine, --looks and --detector belong to --method pix2pose; template matching needs none of them"
         );
     }
     Ok(())
@@ -106,13 +117,15 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let Input { depth, rgb, camera, scene } = Input::read(a)?;
     let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
     warn_about(&scene, a.keep_plane);
+    let model = network(a.matcher, a.weights.as_deref())?;
     let options = options(a, a.instances.get(), SURE_ENOUGH);
     let mut progress = Progress::new("objects", a.objects.len());
     let mut found: Vec<(Known, Vec<Estimate>, Stages)> = vec![];
+    let search = Search::new(&scene);
     for name in &a.objects {
         check_interrupt("nothing was written")?;
-        let known = find(a, name)?;
-        let (estimates, stages) = estimate(&scene, &known.object, &options);
+        let known = find(a, name, model.as_ref())?;
+        let (estimates, stages) = search.estimate(&known.object, &options);
         progress.step(known.name.clone());
         found.push((known, estimates, stages));
     }

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
@@ -13,10 +14,12 @@ use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, Vec3};
 use sixfold_match::{Scene, SceneOptions};
 use sixfold_mesh::{Mesh, ModelInfo};
-use sixfold_mttm::{EstimateOptions, KnownObject, ObjectTemplates, TemplateOptions, estimate};
+use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::{EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions};
 use sixfold_render::render_depth;
 
 use super::arguments::ReproduceMttmArguments;
+use super::network::with_network;
 use super::templates_beside;
 use crate::Outcome;
 use crate::arguments::JsonArguments;
@@ -27,13 +30,56 @@ use crate::progress::{Progress, check_interrupt};
 /// Pixels whose depth lies this near to the drawn truth are the object's, metres (dissertation, section 5.3.2).
 const TRUTH_DEPTH: f32 = 0.02;
 
-/// The rows of the table: key and what it says.
-const ROWS: [(&str, &str); 4] = [
-    ("mesh", "templates, aligned, verified with the mesh (default)"),
-    ("templates", "templates, aligned, judged by the templates alone"),
-    ("nearest", "the nearest template as it was matched, no alignment, no mesh"),
-    ("ppf", "point pair features (`sixfold estimate`'s default)"),
+/// A row of the table.
+struct Way {
+    key: &'static str,
+    title: &'static str,
+    by: MatchedBy,
+    predicted_pose: bool,
+    align: bool,
+    mesh: bool,
+}
+
+const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
+    Way { key, title, by, predicted_pose: true, align: true, mesh: true }
+}
+
+/// Ways of template matching, the default first.
+const WAYS: [Way; 9] = [
+    way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
+    Way {
+        predicted_pose: false,
+        ..way("both-template-pose", "the same without the predicted rotation and place", MatchedBy::Both)
+    },
+    Way { mesh: false, ..way("both-templates", "the same judged by the templates alone", MatchedBy::Both) },
+    way("network", "network alone, aligned, verified with the mesh", MatchedBy::Network),
+    Way {
+        predicted_pose: false,
+        ..way(
+            "network-template-pose",
+            "the same without the predicted rotation and place",
+            MatchedBy::Network,
+        )
+    },
+    Way {
+        predicted_pose: false,
+        align: false,
+        mesh: false,
+        ..way("network-nearest", "the network's nearest template as it was matched", MatchedBy::Network)
+    },
+    way("points", "points alone (no network), aligned, verified with the mesh", MatchedBy::Points),
+    Way {
+        mesh: false,
+        ..way("points-templates", "the same judged by the templates alone", MatchedBy::Points)
+    },
+    Way {
+        align: false,
+        mesh: false,
+        ..way("points-nearest", "the nearest template by points as it was matched", MatchedBy::Points)
+    },
 ];
+/// The row of another method.
+const PPF: (&str, &str) = ("ppf", "point pair features (`sixfold estimate`'s default)");
 
 /// What was measured of one target in one way.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
@@ -86,6 +132,8 @@ struct Inputs {
     dataset: String,
     split: String,
     ppf: bool,
+    /// Fingerprint of the network.
+    network: String,
 }
 
 struct Known {
@@ -99,11 +147,17 @@ struct Known {
 pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Outcome> {
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
+    let model = match &a.weights {
+        Some(file) => MttmModel::load(file).context("--weights")?,
+        None => MttmModel::shipped().context("the network within the program")?,
+    };
+    let model = Arc::new(model);
     let inputs = Inputs {
         version: env!("CARGO_PKG_VERSION").into(),
         dataset: a.dataset.display().to_string(),
         split: a.split.clone(),
         ppf: !a.no_ppf,
+        network: format!("{:016x}", model.fingerprint()),
     };
     same_inputs(&a.out, &inputs)?;
     let mut images: BTreeMap<(u32, u32), Vec<u32>> = BTreeMap::new();
@@ -126,7 +180,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
         }
         for id in ids {
             if let std::collections::btree_map::Entry::Vacant(place) = known.entry(*id) {
-                place.insert(know(&dataset, *id)?);
+                place.insert(know(&dataset, *id, &model)?);
             }
         }
         let scene = dataset.scene(*scene_id)?;
@@ -143,8 +197,10 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
         progress.step(format!("{scene_id}/{im_id}"));
     }
     progress.finish();
-    let rows: Vec<Row> = ROWS
-        .into_iter()
+    let rows: Vec<Row> = WAYS
+        .iter()
+        .map(|w| (w.key, w.title))
+        .chain([PPF])
         .filter(|(key, _)| measured.iter().any(|m| m.contains_key(*key)))
         .map(|(key, title)| row(key, title, &measured))
         .collect();
@@ -185,7 +241,7 @@ fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
     write_atomically(&path, serde_json::to_string_pretty(inputs)?.as_bytes())
 }
 
-fn know(dataset: &BopDataset, id: u32) -> Result<Known> {
+fn know(dataset: &BopDataset, id: u32, model: &Arc<MttmModel>) -> Result<Known> {
     let mesh = dataset.model(id, Models::Rendering)?;
     let info = dataset
         .models_info(Models::Rendering)?
@@ -193,12 +249,13 @@ fn know(dataset: &BopDataset, id: u32) -> Result<Known> {
         .unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
     let folder = dataset.models_dir(Models::Rendering).unwrap_or_default();
     let file = folder.join(format!("obj_{id:06}.ply"));
-    let (templates, _) =
-        ObjectTemplates::cached(&templates_beside(&file), &mesh, &TemplateOptions::default())
-            .with_context(|| format!("object {id}"))?;
+    let kept = templates_beside(&file);
+    let (templates, _) = ObjectTemplates::cached(&kept, &mesh, &TemplateOptions::default())
+        .with_context(|| format!("object {id}"))?;
     let object = Object { name: format!("object {id}"), mesh, info, description: description_beside(&file) };
     let ppf = object.ppf_model()?;
     let with_mesh = KnownObject::new(templates, Some(ppf.clone()));
+    let with_mesh = with_network(with_mesh, Some(model), &kept, &object.name);
     let alone = with_mesh.clone().without_mesh();
     Ok(Known { mesh: object.mesh, info: object.info, with_mesh, alone, ppf })
 }
@@ -213,6 +270,8 @@ fn measure(
 ) -> Result<Measured> {
     let scene = Scene::new(depth, camera, None, &SceneOptions::default())?;
     let mut measured = Measured::new();
+    // Each way by itself, so that times are its own.
+    let searches: Vec<Search<'_>> = WAYS.iter().map(|_| Search::new(&scene)).collect();
     for id in ids {
         let (Some(k), Some(truth)) = (known.get(id), truths.get(id)) else { continue };
         let drawn = render_depth(&k.mesh, truth, camera);
@@ -223,18 +282,17 @@ fn measure(
         let of_truth = (0..drawn.as_slice().len()).filter(|&i| visible(i)).count();
         let error = |pose: &Pose| pose_error(&k.mesh, &k.info, truth, pose);
         let plain = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
-        for (key, object, options) in [
-            ("mesh", &k.with_mesh, plain),
-            ("templates", &k.alone, plain),
-            ("nearest", &k.alone, EstimateOptions { align: false, ..plain }),
-        ] {
-            let (found, stages) = estimate(&scene, object, &options);
+        for (way, search) in WAYS.iter().zip(&searches) {
+            let object = if way.mesh { &k.with_mesh } else { &k.alone };
+            let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
+            let options = EstimateOptions { matched_by, predicted_pose, align, ..plain };
+            let (found, stages) = search.estimate(object, &options);
             let best = found.first();
             let iou = best.map(|e| {
                 let common = e.mask.iter().filter(|&&p| visible(p as usize)).count();
                 common as f64 / (of_truth + e.mask.len() - common).max(1) as f64
             });
-            measured.entry(key.into()).or_default().push(Outcomes {
+            measured.entry(way.key.into()).or_default().push(Outcomes {
                 object: *id,
                 iou,
                 error: best.map(|e| error(&e.camera_from_object)),
@@ -247,7 +305,7 @@ fn measure(
             let options = sixfold_match::EstimateOptions { min_score: 0.0, ..Default::default() };
             let found = sixfold_match::estimate(&scene, &k.ppf, &options);
             let best = found.first();
-            measured.entry("ppf".into()).or_default().push(Outcomes {
+            measured.entry(PPF.0.into()).or_default().push(Outcomes {
                 object: *id,
                 iou: None,
                 error: best.map(|e| error(&e.camera_from_object)),
@@ -279,7 +337,7 @@ fn row(key: &'static str, title: &'static str, measured: &[Measured]) -> Row {
         let share = |count: usize| count as f64 / of.len().max(1) as f64;
         Score {
             targets: of.len(),
-            iou: (key != "ppf").then(|| share(of.iter().filter(|o| o.iou.is_some_and(|v| v > 0.5)).count())),
+            iou: (key != PPF.0).then(|| share(of.iter().filter(|o| o.iou.is_some_and(|v| v > 0.5)).count())),
             add_s: share(of.iter().filter(|o| o.error.is_some_and(|e| e < 0.1)).count()),
         }
     };
@@ -343,12 +401,12 @@ mod tests {
     fn a_row_counts_what_was_not_found_as_wrong() {
         let outcome =
             |object, iou, error| Outcomes { object, iou, error, confidence: None, seconds: [1.0, 0.5] };
-        let image = |all: Vec<Outcomes>| Measured::from([("mesh".to_string(), all)]);
+        let image = |all: Vec<Outcomes>| Measured::from([("both".to_string(), all)]);
         let measured = [
             image(vec![outcome(1, Some(0.8), Some(0.05)), outcome(2, None, None)]),
             image(vec![outcome(1, Some(0.4), Some(0.2))]),
         ];
-        let r = row("mesh", "", &measured);
+        let r = row("both", "", &measured);
         assert_eq!((r.all.targets, r.all.iou, r.all.add_s), (3, Some(1.0 / 3.0), 1.0 / 3.0));
         assert_eq!((r.objects[&1].add_s, r.objects[&2].add_s), (0.5, 0.0));
         assert_eq!(r.seconds, [1.5, 0.75]);
