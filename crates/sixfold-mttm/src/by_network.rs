@@ -16,6 +16,8 @@ use crate::roi::Roi;
 
 /// Regions of which pairs are looked at, and those of them that are laid on the scene.
 const LOOKED_AT: usize = 96;
+/// Hypotheses that the network adds to a region's.
+const HYPOTHESES: usize = 4;
 /// Pairs that go through the network at a time.
 const AT_A_TIME: usize = 32;
 const PLACED: usize = 64;
@@ -82,58 +84,78 @@ pub(crate) fn first_matching(
         .collect()
 }
 
-/// Matches a region again, centred where its template says and without its background, and adds the nearest templates that
-/// differ, laid on the scene.
+/// Matches regions again, centred where their seeds (the first of `found` of each) say and without their background, and
+/// adds the nearest templates that differ, laid on the scene.
 pub(crate) fn second_matching(
     scene: &Scene,
     object: &KnownObject,
     learned: &Learned,
     options: &EstimateOptions,
-    found: &mut Vec<Placed>,
+    found: &mut [Vec<Placed>],
 ) {
-    let Some(seed) = found.first().cloned() else { return };
-    let roi = Roi { centre: seed.camera_from_view.translation() };
-    let region = encode(scene, learned, std::slice::from_ref(&roi));
-    // The seed's own template at the nearest turn, for a mask.
-    let in_roi = roi.camera_from_roi().inverse() * seed.camera_from_view;
-    let turn = {
-        let right = in_roi.transform_direction(&Vec3::x());
-        right.y.atan2(right.x)
-    };
-    let own = Entry { template: seed.template, turn };
-    let model = learned.model();
-    let Some(says) = model.compare(&region, &learned.templates(&[own])).pop() else { return };
-    let alone = model.without_background(&region, says.mask);
-    let Some(descriptor) = model.describe(&alone).pop() else { return };
-    let camera_from_roi = roi.camera_from_roi();
-    let mut chosen: Vec<Entry> = vec![];
-    let most = options.hypotheses;
-    for (_, entry) in learned.ranked(&descriptor).into_iter().take(60 * most) {
-        if chosen.len() >= most {
-            break;
-        }
-        let entry = object.matcher.entries()[entry];
-        let start = camera_from_view(&camera_from_roi, entry.turn);
-        let new = object.object_pose(&start, entry.template);
-        let same = chosen.iter().any(|c| {
-            let other = object.object_pose(&camera_from_view(&camera_from_roi, c.turn), c.template);
-            other.rotation_angle_to(&new) < 0.3
-        });
-        if !same {
-            chosen.push(entry);
-        }
-    }
-    if chosen.is_empty() {
+    let seeds: Vec<Placed> = found.iter().filter_map(|f| f.first().cloned()).collect();
+    if seeds.is_empty() || seeds.len() != found.len() {
         return;
     }
-    let regions = region.select(&vec![0; chosen.len()]);
-    let says = model.compare(&regions, &learned.templates(&chosen));
-    for (entry, says) in chosen.iter().zip(&says) {
-        let start = start(learned, &camera_from_roi, entry, says, options);
-        // The seed itself may start better here.
-        if found.len() == 1 || !is_known(object, &found[1..], entry.template, &start) {
-            found.push(place_at(scene, object, entry.template, start, trust(says), options));
-        }
+    let model = learned.model();
+    let rois: Vec<Roi> = seeds.iter().map(|s| Roi { centre: s.camera_from_view.translation() }).collect();
+    // Each seed's own template as it lies there, for a mask.
+    let own: Vec<Entry> = seeds
+        .iter()
+        .zip(&rois)
+        .map(|(seed, roi)| {
+            let roi_from_view = roi.camera_from_roi().inverse() * seed.camera_from_view;
+            let right = roi_from_view.transform_direction(&Vec3::x());
+            Entry { template: seed.template, turn: right.y.atan2(right.x) }
+        })
+        .collect();
+    let regions = encode(scene, learned, &rois);
+    let masks = model.compare(&regions, &learned.templates(&own)).into_iter().flat_map(|s| s.mask).collect();
+    let descriptors = model.describe(&model.without_background(&regions, masks));
+    let chosen: Vec<(usize, Entry)> = rois
+        .par_iter()
+        .zip(&descriptors)
+        .enumerate()
+        .map(|(region, (roi, descriptor))| {
+            let camera_from_roi = roi.camera_from_roi();
+            let pose =
+                |e: &Entry| object.object_pose(&camera_from_view(&camera_from_roi, e.turn), e.template);
+            let mut chosen: Vec<(usize, Entry)> = vec![];
+            for (_, entry) in learned.ranked(descriptor).into_iter().take(60 * HYPOTHESES) {
+                if chosen.len() >= HYPOTHESES {
+                    break;
+                }
+                let entry = object.matcher.entries()[entry];
+                let new = pose(&entry);
+                if !chosen.iter().any(|c| pose(&c.1).rotation_angle_to(&new) < 0.3) {
+                    chosen.push((region, entry));
+                }
+            }
+            chosen
+        })
+        .collect::<Vec<_>>()
+        .concat();
+    let says: Vec<Vec<PairSays>> = chosen
+        .par_chunks(AT_A_TIME)
+        .map(|part| {
+            let numbers: Vec<usize> = part.iter().map(|c| c.0).collect();
+            let entries: Vec<Entry> = part.iter().map(|c| c.1).collect();
+            model.compare(&regions.select(&numbers), &learned.templates(&entries))
+        })
+        .collect();
+    let says = says.concat();
+    let placed: Vec<Option<Placed>> = chosen
+        .par_iter()
+        .zip(&says)
+        .map(|((region, entry), says)| {
+            let start = start(learned, &rois[*region].camera_from_roi(), entry, says, options);
+            // The seed itself may start better here.
+            let known = is_known(object, &found[*region][1..], entry.template, &start);
+            (!known).then(|| place_at(scene, object, entry.template, start, trust(says), options))
+        })
+        .collect();
+    for ((region, _), placed) in chosen.iter().zip(placed) {
+        found[*region].extend(placed);
     }
 }
 

@@ -251,19 +251,19 @@ fn search(
     let regions = merge(scene, object, &placed, options);
     stages.regions = regions.len();
     stages.masks = lap();
-    let hypotheses: Vec<Vec<Placed>> = regions
+    let mut hypotheses: Vec<Vec<Placed>> = regions
         .par_iter()
         .map(|(seed, mask)| {
             let mut found = vec![seed.clone()];
             if network.is_none() || options.matched_by == MatchedBy::Both {
                 second_matching(scene, object, mask, options, &mut found);
             }
-            if let Some(learned) = network {
-                by_network::second_matching(scene, object, learned, options, &mut found);
-            }
             found
         })
         .collect();
+    if let Some(learned) = network {
+        by_network::second_matching(scene, object, learned, options, &mut hypotheses);
+    }
     let mut hypotheses = hypotheses.concat();
     // A stable sort: equal ones stay in the order of their regions.
     hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
