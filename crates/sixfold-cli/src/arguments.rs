@@ -436,11 +436,11 @@ pub(crate) enum DetectorKind {
 }
 
 impl DetectorKind {
-    /// As it is typed.
-    pub fn name(self) -> &'static str {
+    /// As the library has it.
+    pub fn kind(self) -> sixfold_detect::recipe::DetectorKind {
         match self {
-            DetectorKind::Compact => "compact",
-            DetectorKind::Retinanet => "retinanet",
+            DetectorKind::Compact => sixfold_detect::recipe::DetectorKind::Compact,
+            DetectorKind::Retinanet => sixfold_detect::recipe::DetectorKind::Retinanet,
         }
     }
 }
@@ -565,12 +565,12 @@ pub(crate) enum NetworkKind {
 }
 
 impl NetworkKind {
-    /// As it is typed.
-    pub fn name(self) -> &'static str {
+    /// As the library has it.
+    pub fn kind(self) -> sixfold_pix2pose::recipe::NetworkKind {
         match self {
-            NetworkKind::Compact => "compact",
-            NetworkKind::Paper => "paper",
-            NetworkKind::Resnet50 => "resnet50",
+            NetworkKind::Compact => sixfold_pix2pose::recipe::NetworkKind::Compact,
+            NetworkKind::Paper => sixfold_pix2pose::recipe::NetworkKind::Paper,
+            NetworkKind::Resnet50 => sixfold_pix2pose::recipe::NetworkKind::ResNet50,
         }
     }
 }

@@ -6,6 +6,7 @@ pub mod detect;
 pub mod loss;
 pub mod model;
 pub mod network;
+pub mod recipe;
 pub mod samples;
 mod solids;
 pub mod targets;

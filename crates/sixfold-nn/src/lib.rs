@@ -14,6 +14,7 @@ pub mod dense;
 pub mod densenet;
 mod files;
 pub mod pretrained;
+pub mod recipe;
 pub mod resnet;
 pub mod schedule;
 pub mod training;

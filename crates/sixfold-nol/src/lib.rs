@@ -15,6 +15,7 @@ mod photograph;
 mod preview;
 mod projection;
 pub mod quality;
+pub mod recipe;
 pub mod refine;
 pub mod samples;
 pub mod select;

@@ -13,8 +13,8 @@ use sixfold_mesh::Mesh;
 use sixfold_render::DepthSensor;
 
 use crate::{
-    ConvexParts, Outcome, SimulatedView, SimulationError, TrialOptions, TrialReport, ViewPoint, settle,
-    simulate_view, try_grasp,
+    ConvexParts, Outcome, SimulatedView, SimulationError, TrialOptions, TrialReport, ViewPoint,
+    settle_in_middle, simulate_view, try_grasp,
 };
 
 /// What is drawn anew in every attempt, and with what it is tried.
@@ -138,11 +138,8 @@ pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u
         noise,
         seconds: 0.0,
     };
-    let Some(rest) = settle(parts, &start) else { return result };
-    // Back to the middle of the table, wherever it rolled.
+    let Some(rest) = settle_in_middle(mesh, parts, &start) else { return result };
     let (low, high) = mesh.transformed(&rest).bounding_box();
-    let middle = (low + high) * 0.5;
-    let rest = rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0));
     result.world_from_object = rest;
     let point =
         ViewPoint { azimuth, elevation, distance, target: offset + Vec3::z() * (0.5 * (high.z - low.z)) };

@@ -38,7 +38,7 @@ pub use attempt::{Attempt, AttemptOptions, Ending, Scene, attempt, scene};
 pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
 pub use pile::{PileOptions, drop_objects};
-pub use settle::settle;
+pub use settle::{settle, settle_in_middle};
 pub use statistics::wilson_interval;
 pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};
 pub use view::{SimulatedView, ViewPoint, simulate_view};

@@ -1,6 +1,7 @@
 //! Where an object comes to rest on the table.
 
 use sixfold_geometry::{Pose, Vec3};
+use sixfold_mesh::Mesh;
 
 use crate::ConvexParts;
 use crate::world::{body_pose, insert_object, world};
@@ -35,6 +36,15 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
         last = pose;
     }
     None
+}
+
+/// As [`settle`], with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
+/// it rolled.
+pub fn settle_in_middle(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
+    let rest = settle(parts, world_from_object)?;
+    let (low, high) = mesh.transformed(&rest).bounding_box();
+    let middle = (low + high) * 0.5;
+    Some(rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0)))
 }
 
 #[cfg(test)]

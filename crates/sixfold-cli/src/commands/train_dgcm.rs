@@ -2,20 +2,15 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
-use burn::tensor::Device;
+use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
-use sixfold_dgcm::crop::CropOptions;
-use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::networks::{CompactConfig, Network, PaperConfig};
-use sixfold_dgcm::samples::{Pool, PoolOptions};
-use sixfold_dgcm::training::{Ending, TrainingOptions, TrainingPace, last_checkpoint, train};
-use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::ModelCard;
+use sixfold_dgcm::recipe::{self, Recipe};
+use sixfold_nn::recipe::Trained;
+use sixfold_nn::training::Ending;
 
-use super::material::command_line;
-use crate::progress::{Progress, interrupted};
+use super::material::{Shown, command_line, interrupted_after, loss};
+use crate::progress::interrupted;
 
 /// Which network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -79,85 +74,41 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<DgcmSummary> {
     if a.encoder.is_some() && a.network == DgcmKind::Compact {
         bail!("--encoder: the compact network starts from random weights; it belongs to --network paper");
     }
-    let device = Device::flex().autodiff();
-    let (network, crop, default) = match a.network {
-        DgcmKind::Compact => {
-            let network = Network::Compact(CompactConfig.init(a.seed, &device));
-            (network, CropOptions::compact(), TrainingOptions::default())
-        }
-        DgcmKind::Paper => {
-            let network = match &a.encoder {
-                Some(file) => PaperConfig.from_imagenet(file, a.seed, &device).context("--encoder")?,
-                None => PaperConfig.init(a.seed, &device),
-            };
-            (Network::Paper(network), CropOptions::paper(), TrainingOptions::paper())
-        }
-    };
-    let options = TrainingOptions {
-        steps: a.steps.unwrap_or(default.steps),
-        pairs: a.pairs.unwrap_or(default.pairs),
-        lambda: a.lambda.unwrap_or(default.lambda),
-        learning_rate: a.learning_rate.unwrap_or(default.learning_rate),
-        seed: a.seed,
-        ..default
-    };
-    let pool_options = PoolOptions { views: a.views, crop, seed: a.seed, ..PoolOptions::default() };
-    let folder = a.out.join("training");
-    let path = a.out.join("model.safetensors");
-    let mut card = ModelCard::new("", "DGCM-Net, grasps from experience");
-    card.data = format!(
-        "{} simulated depth views of procedural families (can, mug, cup, bottle, bowl, box, clamp, drill) with random axis scales; no scanned object and no photograph",
-        a.views
-    );
-    card.seed = a.seed;
-    card.command = command_line();
-    card.extra = serde_json::json!({ "training": options, "pool": pool_options });
-    let summary = |steps, seconds, losses| DgcmSummary {
-        model: path.display().to_string(),
+    let recipe = Recipe {
+        network: match a.network {
+            DgcmKind::Compact => recipe::DgcmKind::Compact,
+            DgcmKind::Paper => recipe::DgcmKind::Paper,
+        },
+        encoder: a.encoder.clone(),
+        steps: a.steps,
+        pairs: a.pairs,
+        learning_rate: a.learning_rate,
+        lambda: a.lambda,
         views: a.views,
-        steps,
-        seconds,
-        losses,
+        seed: a.seed,
+        command: command_line(),
     };
-    if a.export {
-        let Some((network, step)) = last_checkpoint(&folder, network)? else {
-            bail!("{}: holds no checkpoint; train first", folder.display());
-        };
-        card.steps = step;
-        DgcmModel::new(network, crop, card).save(&path)?;
-        return Ok(summary(step, None, Default::default()));
-    }
-    eprintln!("making {} views", a.views);
-    let pool = Pool::new(&pool_options, |done| {
-        if done % 1000 < 4 {
-            eprintln!("  {done} of {}", a.views);
-        }
-    });
-    let mut progress = Progress::new("steps", options.steps as usize);
-    let mut last = TrainingRecord::default();
-    let shown = |record: &TrainingRecord| {
-        progress.set(record.step as usize);
-        let loss = |name: &str| record.losses.get(name).copied().unwrap_or(f64::NAN);
-        progress.message(format!(
+    let mut shown = Shown::new(|record| {
+        format!(
             "metric {:.2}, distance {:.2} of similar and {:.2} of different pairs, coordinates off by {:.3}, {:.0} pairs/s",
-            loss("metric"),
-            loss("positive distance"),
-            loss("negative distance"),
-            loss("error on the object"),
+            loss(record, "metric"),
+            loss(record, "positive distance"),
+            loss(record, "negative distance"),
+            loss(record, "error on the object"),
             record.samples_per_second
-        ));
-        last = record.clone();
+        )
+    });
+    let ending = if a.export {
+        Ending::Finished(recipe.export(&a.out)?)
+    } else {
+        recipe.train(&a.out, interrupted(), &mut |news| shown.hear(news))?
     };
-    let pace = TrainingPace::default();
-    let ending = train(&pool, network, &device, &folder, &options, &pace, interrupted(), shown)?;
-    progress.finish();
-    let network = match ending {
-        Ending::Finished(network) => network,
-        Ending::Interrupted { step } => {
-            bail!("interrupted after step {step}, which is kept; run the same command again to go on")
+    shown.finish();
+    match ending {
+        Ending::Finished(Trained { model, steps, seconds, losses }) => {
+            let model = model.display().to_string();
+            Ok(DgcmSummary { model, views: a.views, steps, seconds, losses })
         }
-    };
-    card.steps = options.steps;
-    DgcmModel::new(network, crop, card).save(&path)?;
-    Ok(summary(options.steps, Some(last.seconds), last.losses))
+        Ending::Interrupted { step } => Err(interrupted_after(step)),
+    }
 }

@@ -2,24 +2,18 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
-use burn::tensor::Device;
+use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
-use sixfold_augment::{Backgrounds, PhotographOptions};
-use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::ModelCard;
-use sixfold_nol::loss::{Perceptual, psnr};
-use sixfold_nol::model::NolModel;
-use sixfold_nol::network::{CompactConfig, IntegratorKind, Network, PaperConfig, Parts};
-use sixfold_nol::quality::{Quality, QualityOptions, quality};
-use sixfold_nol::training::{Ending, TrainingOptions, TrainingPace, last_checkpoint, train};
+use sixfold_nn::recipe::Trained;
+use sixfold_nn::training::Ending;
+use sixfold_nol::loss::psnr;
+use sixfold_nol::network::{IntegratorKind, Parts};
+use sixfold_nol::quality::Quality;
+use sixfold_nol::recipe::{self, Recipe};
 
-use super::material::command_line;
-use crate::progress::{Progress, interrupted};
-
-/// Share of procedural textures between the photographs.
-const PROCEDURAL_SHARE: f32 = 0.2;
+use super::material::{Shown, command_line, interrupted_after, loss};
+use crate::progress::interrupted;
 
 /// Which network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -92,105 +86,46 @@ pub(super) fn train_nol(a: &TrainNolArguments) -> Result<NolSummary> {
             "--encoder: the compact network has its encoder within the program; it belongs to --network paper"
         );
     }
-    let parts = Parts {
-        integrator: match a.integrator {
-            NolIntegrator::Lstm => IntegratorKind::Lstm,
-            NolIntegrator::Average => IntegratorKind::Average,
+    let recipe = Recipe {
+        network: match a.network {
+            NolKind::Compact => recipe::NolKind::Compact,
+            NolKind::Paper => recipe::NolKind::Paper,
         },
-        decoder: !a.no_decoder,
-    };
-    let device = Device::flex().autodiff();
-    let (network, default) = match a.network {
-        NolKind::Compact => {
-            let network = CompactConfig { parts }.init(a.seed, &device)?;
-            (Network::Compact(network), TrainingOptions::default())
-        }
-        NolKind::Paper => {
-            let config = PaperConfig { parts };
-            let network = match &a.encoder {
-                Some(file) => config.from_imagenet(file, a.seed, &device).context("--encoder")?,
-                None => config.init(a.seed, &device),
-            };
-            (Network::Paper(network), TrainingOptions::paper())
-        }
-    };
-    let options = TrainingOptions {
-        steps: a.steps.unwrap_or(default.steps),
-        learning_rate: a.learning_rate.unwrap_or(default.learning_rate),
+        encoder: a.encoder.clone(),
+        parts: Parts {
+            integrator: match a.integrator {
+                NolIntegrator::Lstm => IntegratorKind::Lstm,
+                NolIntegrator::Average => IntegratorKind::Average,
+            },
+            decoder: !a.no_decoder,
+        },
+        backgrounds: a.backgrounds.clone(),
+        steps: a.steps,
+        learning_rate: a.learning_rate,
         seed: a.seed,
-        ..default
+        command: command_line(),
     };
-    let textures = match &a.backgrounds {
-        Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())
-            .context("--backgrounds")?
-            .with_procedural_share(PROCEDURAL_SHARE),
-        None => Backgrounds::procedural(),
-    };
-    let perceptual = Perceptual::of(&network, &device)?;
-    let folder = a.out.join("training");
-    let path = a.out.join("model.safetensors");
-    let mut card = ModelCard::new("", "Neural Object Learning, new views from few photographs");
-    card.data = format!(
-        "made-up household shapes (procedural families, alone and grown together) with textures from {}; no scanned object",
-        match textures.images() {
-            0 => "noise".to_owned(),
-            n => format!("{n} photographs and noise"),
-        }
-    );
-    card.seed = a.seed;
-    card.command = command_line();
-    card.extra = serde_json::json!({ "training": options });
-    let finish = |network: Network, steps: u64, seconds, losses| -> Result<NolSummary> {
-        card.steps = steps;
-        let mut model = NolModel::new(network, parts, card);
-        // First without scores: nothing that was trained may be lost.
-        model.save(&path)?;
-        let quality = quality(&model, &textures, &options.samples, &QualityOptions::default())?;
-        model.card_mut().scores = quality.scores();
-        model.save(&path)?;
-        Ok(NolSummary { model: path.display().to_string(), steps, seconds, losses, quality })
-    };
-    if a.export {
-        let Some((network, step)) = last_checkpoint(&folder, network)? else {
-            bail!("{}: holds no checkpoint; train first", folder.display());
-        };
-        return finish(network, step, None, Default::default());
-    }
-    let mut progress = Progress::new("steps", options.steps as usize);
-    let mut last = TrainingRecord::default();
-    let shown = |record: &TrainingRecord| {
-        progress.set(record.step as usize);
-        let loss = |name: &str| record.losses.get(name).copied().unwrap_or(f64::NAN);
-        progress.message(format!(
+    let mut shown = Shown::new(|record| {
+        format!(
             "colours {:.3}, features {:.3}, PSNR {:.2} dB (decoded {:.2}, averaging {:.2}), {:.2} steps/s",
-            loss("colours"),
-            loss("features"),
-            psnr(loss("squared error")),
-            psnr(loss("squared error decoded")),
-            psnr(loss("squared error of averaging")),
+            loss(record, "colours"),
+            loss(record, "features"),
+            psnr(loss(record, "squared error")),
+            psnr(loss(record, "squared error decoded")),
+            psnr(loss(record, "squared error of averaging")),
             record.samples_per_second
-        ));
-        last = record.clone();
+        )
+    });
+    let ending = if a.export {
+        Ending::Finished(recipe.export(&a.out, &mut |news| shown.hear(news))?)
+    } else {
+        recipe.train(&a.out, interrupted(), &mut |news| shown.hear(news))?
     };
-    let pace = TrainingPace::default();
-    let ending = train(
-        &textures,
-        network,
-        parts,
-        &perceptual,
-        &device,
-        &folder,
-        &options,
-        &pace,
-        interrupted(),
-        shown,
-    )?;
-    progress.finish();
-    let network = match ending {
-        Ending::Finished(network) => network,
-        Ending::Interrupted { step } => {
-            bail!("interrupted after step {step}, which is kept; run the same command again to go on")
+    shown.finish();
+    match ending {
+        Ending::Finished((Trained { model, steps, seconds, losses }, quality)) => {
+            Ok(NolSummary { model: model.display().to_string(), steps, seconds, losses, quality })
         }
-    };
-    finish(network, options.steps, Some(last.seconds), last.losses)
+        Ending::Interrupted { step } => Err(interrupted_after(step)),
+    }
 }

@@ -90,9 +90,20 @@ impl Experience {
     }
 
     /// The same with the features of another network.
-    pub fn encoded(&self, model: &DgcmModel) -> Experience {
+    ///
+    /// # Errors
+    /// [`StoreError::Field`] for a crop of another size than the network's.
+    pub fn encoded(&self, model: &DgcmModel) -> Result<Experience, StoreError> {
+        if self.crop.side != model.crop_options().side {
+            return Err(StoreError::Field {
+                id: 0,
+                field: "crop",
+                expected: "as many pixels a side as the network wants; it has to be recorded again",
+                found: format!("{}, the network wants {}", self.crop.side, model.crop_options().side),
+            });
+        }
         let copies = copies(model, &self.crop);
-        Experience { copies, network: model.fingerprint(), ..self.clone() }
+        Ok(Experience { copies, network: model.fingerprint(), ..self.clone() })
     }
 
     /// Tests what a store relies on.

@@ -4,6 +4,7 @@
 //! has the same interface. Searching is not the store's task: [`FeatureIndex`] holds all features in memory, asks the store
 //! only for what has changed, and finds the nearest exactly.
 
+mod describe;
 mod encode;
 mod experience;
 mod index;
@@ -14,6 +15,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+pub use describe::Description;
 pub use experience::{COPIES, Copy, Experience, Stored, region};
 pub use index::{FeatureIndex, Match};
 #[cfg(feature = "sqlite")]

@@ -8,7 +8,7 @@ use crate::store::{ExperienceStore, FeatureIndex, Match, StoreError, Stored, Sum
 
 /// Experiences of one store for one network.
 pub struct Memory {
-    store: Box<dyn ExperienceStore>,
+    store: Box<dyn ExperienceStore + Send>,
     index: FeatureIndex,
     /// By number; what is known for steering.
     labels: HashMap<i64, Summary>,
@@ -20,7 +20,7 @@ impl Memory {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn new(store: Box<dyn ExperienceStore>, model: &DgcmModel) -> Result<Memory, StoreError> {
+    pub fn new(store: Box<dyn ExperienceStore + Send>, model: &DgcmModel) -> Result<Memory, StoreError> {
         let mut memory = Memory {
             store,
             index: FeatureIndex::new(&model.fingerprint()),

@@ -7,17 +7,17 @@ use clap::{Args, Subcommand};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::crop::Crop;
-use sixfold_dgcm::store::{Experience, ExperienceStore, SqliteStore, Stored, Summary};
+use sixfold_dgcm::store::{Description, Experience, ExperienceStore, SqliteStore, Stored};
+use sixfold_geometry::Pose;
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Image, Pose, RgbImage};
-use sixfold_grasp::{AntipodalQuality, DrawnGrasp, Grasp, draw_grasps};
+use sixfold_grasp::{AntipodalQuality, Grasp};
 
 use super::arguments::InputArguments;
 use super::experience::{NetworkArguments, model, now};
 use super::input;
 use crate::Outcome;
 use crate::arguments::JsonArguments;
-use crate::output::{pose_rows, report, write_atomically};
+use crate::output::{report, write_atomically};
 use crate::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Args)]
@@ -232,50 +232,6 @@ fn list(file: &Path, json: &JsonArguments) -> Result<Outcome> {
     Ok(if all.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
 
-/// An experience without its images.
-#[derive(Serialize)]
-struct Shown {
-    #[serde(flatten)]
-    summary: Summary,
-    camera_from_gripper: [[f64; 4]; 4],
-    opening: f64,
-    /// Focal lengths and principal point of the crop, pixels.
-    camera: [f64; 4],
-    side: usize,
-    object_pixels: usize,
-    region_pixels: usize,
-    copies: usize,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    feature: Option<Vec<f32>>,
-}
-
-impl Shown {
-    fn new(stored: &Stored) -> Shown {
-        let e = &stored.experience;
-        let c = &e.crop.camera;
-        Shown {
-            summary: Summary {
-                id: stored.id,
-                time: e.time,
-                object: e.object.clone(),
-                part: e.part.clone(),
-                gripper: e.gripper.name.clone(),
-                width: e.width,
-                network: e.network.clone(),
-                provenance: e.provenance.clone(),
-            },
-            camera_from_gripper: pose_rows(&e.camera_from_gripper),
-            opening: e.opening,
-            camera: [c.fx, c.fy, c.cx, c.cy],
-            side: e.crop.side,
-            object_pixels: e.crop.pixels().count(),
-            region_pixels: e.region.iter().filter(|r| **r).count(),
-            copies: e.copies.len(),
-            feature: None,
-        }
-    }
-}
-
 fn found(store: &SqliteStore, file: &Path, id: i64) -> Result<Stored> {
     match store.get(id)? {
         Some(stored) => Ok(stored),
@@ -289,9 +245,9 @@ fn found(store: &SqliteStore, file: &Path, id: i64) -> Result<Stored> {
 fn show(file: &Path, id: i64, picture: Option<&Path>, json: &JsonArguments) -> Result<Outcome> {
     let stored = found(&SqliteStore::open(file)?, file, id)?;
     if let Some(path) = picture {
-        write_rgb(path, &self::picture(&stored.experience)?)?;
+        write_rgb(path, &stored.experience.picture()?)?;
     }
-    let shown = Shown::new(&stored);
+    let shown = Description::new(&stored, false);
     report(json, &shown, || {
         let s = &shown.summary;
         println!("experience {}: {} ({})", s.id, s.object, s.part.as_deref().unwrap_or("no part"));
@@ -303,38 +259,6 @@ fn show(file: &Path, id: i64, picture: Option<&Path>, json: &JsonArguments) -> R
         println!("network {}, {} features, from: {}", s.network, shown.copies, s.provenance);
     })?;
     Ok(Outcome::Found)
-}
-
-/// Three squares side by side, each pixel four times as large: normals with the gripper, VD-NOC, and the region of
-/// interest over the normals.
-fn picture(e: &Experience) -> Result<RgbImage> {
-    const ZOOM: usize = 4;
-    let side = e.crop.side * ZOOM;
-    let color = |values: &[[f32; 3]]| -> RgbImage {
-        Image::from_fn(side, side, |x, y| {
-            let i = (y / ZOOM) * e.crop.side + x / ZOOM;
-            if e.crop.mask[i] {
-                values[i].map(|v| (127.5 + 127.5 * v).clamp(0.0, 255.0) as u8)
-            } else {
-                [24; 3]
-            }
-        })
-    };
-    let normals = color(&e.crop.normals);
-    let camera = e.crop.camera.resize(side, side);
-    let drawn =
-        [DrawnGrasp { camera_from_gripper: e.camera_from_gripper, opening: e.opening, color: [60, 220, 80] }];
-    let with_gripper = draw_grasps(&normals, None, &camera, &e.gripper, &drawn)?;
-    let vd_noc = color(&e.crop.vd_noc);
-    let region = Image::from_fn(side, side, |x, y| {
-        let i = (y / ZOOM) * e.crop.side + x / ZOOM;
-        if e.region[i] { [240, 170, 40] } else { normals[(x, y)] }
-    });
-    Ok(Image::from_fn(3 * side, side, |x, y| match x / side {
-        0 => with_gripper[(x, y)],
-        1 => vd_noc[(x - side, y)],
-        _ => region[(x - 2 * side, y)],
-    }))
 }
 
 #[derive(Serialize)]
@@ -396,9 +320,8 @@ fn export(file: &Path, out: &Path, json: &JsonArguments) -> Result<Outcome> {
         match store.get(summary.id) {
             Ok(Some(stored)) => {
                 let name = format!("{:06}", stored.id);
-                write_rgb(&out.join(format!("{name}.png")), &picture(&stored.experience)?)?;
-                let feature = stored.experience.copies.first().map(|c| c.feature.clone());
-                let shown = Shown { feature, ..Shown::new(&stored) };
+                write_rgb(&out.join(format!("{name}.png")), &stored.experience.picture()?)?;
+                let shown = Description::new(&stored, true);
                 let text = serde_json::to_string_pretty(&shown)?;
                 write_atomically(&out.join(format!("{name}.json")), text.as_bytes())?;
                 done.experiences += 1;
@@ -433,15 +356,9 @@ fn refresh(file: &Path, out: &Path, network: &NetworkArguments, json: &JsonArgum
     for summary in &all {
         check_interrupt("what was encoded is kept; the same command goes on")?;
         let Some(stored) = source.get(summary.id)? else { continue };
-        if stored.experience.crop.side != network.crop_options().side {
-            bail!(
-                "experience {}: its crop has {} pixels a side, the network wants {}; it has to be recorded again",
-                stored.id,
-                stored.experience.crop.side,
-                network.crop_options().side
-            );
-        }
-        added += usize::from(target.add(&stored.experience.encoded(&network))?.1);
+        let encoded = stored.experience.encoded(&network);
+        let encoded = encoded.with_context(|| format!("experience {}", stored.id))?;
+        added += usize::from(target.add(&encoded)?.1);
         progress.step(summary.object.clone());
     }
     progress.finish();

@@ -8,7 +8,7 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{Gripper, gripper_pose};
 use sixfold_simulation::{
-    ConvexParts, Outcome as Trial, PartsOptions, TrialOptions, TrialReport, settle, try_grasp,
+    ConvexParts, Outcome as Trial, PartsOptions, TrialOptions, TrialReport, settle_in_middle, try_grasp,
 };
 
 use super::arguments::{PhysicsArguments, TryArguments};
@@ -35,11 +35,8 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     let (world_from_object, world_from_gripper, opening) = match &a.grasp {
         Some(path) => read_grasp(path)?,
         None => {
-            let rest = settle(&parts, &Pose::identity())
+            let rest = settle_in_middle(&object.mesh, &parts, &Pose::identity())
                 .ok_or_else(|| anyhow!("{}: the object does not come to rest on the table", a.object))?;
-            let (low, high) = object.mesh.transformed(&rest).bounding_box();
-            let middle = (low + high) * 0.5;
-            let rest = rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0));
             let tip = a.tip.as_deref().ok_or_else(|| anyhow!("--tip X,Y,Z is missing"))?;
             let pose = gripper_pose(
                 &three("--tip", tip)?,

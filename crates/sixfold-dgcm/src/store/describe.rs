@@ -1,0 +1,103 @@
+//! An experience for people: its numbers without the images, and a picture.
+
+use serde::Serialize;
+use sixfold_geometry::{Image, RgbImage};
+use sixfold_grasp::{DrawnGrasp, draw_grasps};
+use sixfold_mesh::MeshError;
+
+use super::{Experience, Stored, Summary};
+
+/// An experience without its images, as `sixfold grasp store export` writes it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Description {
+    /// What a list says of it.
+    #[serde(flatten)]
+    pub summary: Summary,
+    /// The gripper when it closed, row by row, metres.
+    pub camera_from_gripper: [[f64; 4]; 4],
+    /// Distance of the pads before closing, metres.
+    pub opening: f64,
+    /// Focal lengths and principal point of the crop, pixels.
+    pub camera: [f64; 4],
+    /// Side of the crop, pixels.
+    pub side: usize,
+    /// Pixels that show the object.
+    pub object_pixels: usize,
+    /// Those of them near the gripper.
+    pub region_pixels: usize,
+    /// The experience and its in-plane copies.
+    pub copies: usize,
+    /// The feature, 256 numbers, where it is wanted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub feature: Option<Vec<f32>>,
+}
+
+impl Description {
+    /// What is known of a stored experience.
+    pub fn new(stored: &Stored, with_feature: bool) -> Description {
+        let e = &stored.experience;
+        let c = &e.crop.camera;
+        let m = e.camera_from_gripper.to_matrix();
+        Description {
+            summary: Summary {
+                id: stored.id,
+                time: e.time,
+                object: e.object.clone(),
+                part: e.part.clone(),
+                gripper: e.gripper.name.clone(),
+                width: e.width,
+                network: e.network.clone(),
+                provenance: e.provenance.clone(),
+            },
+            camera_from_gripper: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])),
+            opening: e.opening,
+            camera: [c.fx, c.fy, c.cx, c.cy],
+            side: e.crop.side,
+            object_pixels: e.crop.pixels().count(),
+            region_pixels: e.region.iter().filter(|r| **r).count(),
+            copies: e.copies.len(),
+            feature: e.copies.first().filter(|_| with_feature).map(|c| c.feature.clone()),
+        }
+    }
+}
+
+impl Experience {
+    /// Three squares side by side, each pixel four times as large: normals with the gripper, VD-NOC, and the region of
+    /// interest over the normals.
+    ///
+    /// # Errors
+    /// [`MeshError`] for a gripper whose sizes are not finite.
+    pub fn picture(&self) -> Result<RgbImage, MeshError> {
+        const ZOOM: usize = 4;
+        let crop = &self.crop;
+        let side = crop.side * ZOOM;
+        let color = |values: &[[f32; 3]]| -> RgbImage {
+            Image::from_fn(side, side, |x, y| {
+                let i = (y / ZOOM) * crop.side + x / ZOOM;
+                if crop.mask[i] {
+                    values[i].map(|v| (127.5 + 127.5 * v).clamp(0.0, 255.0) as u8)
+                } else {
+                    [24; 3]
+                }
+            })
+        };
+        let normals = color(&crop.normals);
+        let camera = crop.camera.resize(side, side);
+        let drawn = [DrawnGrasp {
+            camera_from_gripper: self.camera_from_gripper,
+            opening: self.opening,
+            color: [60, 220, 80],
+        }];
+        let with_gripper = draw_grasps(&normals, None, &camera, &self.gripper, &drawn)?;
+        let vd_noc = color(&crop.vd_noc);
+        let region = Image::from_fn(side, side, |x, y| {
+            let i = (y / ZOOM) * crop.side + x / ZOOM;
+            if self.region[i] { [240, 170, 40] } else { normals[(x, y)] }
+        });
+        Ok(Image::from_fn(3 * side, side, |x, y| match x / side {
+            0 => with_gripper[(x, y)],
+            1 => vd_noc[(x - side, y)],
+            _ => region[(x - 2 * side, y)],
+        }))
+    }
+}
