@@ -190,7 +190,7 @@ fn pose_to_mm<'py>(
 /// >>> dataset.rgb(2, 3).shape  # doctest: +SKIP
 /// (480, 640, 3)
 #[pyclass(name = "Dataset", module = "sixfold.bop", frozen)]
-pub(crate) struct PyDataset(pub(crate) Arc<BopDataset>);
+pub(crate) struct PyDataset(pub(crate) Arc<BopDataset>, pub(crate) String);
 
 impl PyDataset {
     fn scene(&self, scene_id: i64) -> PyResult<Scene> {
@@ -204,7 +204,7 @@ impl PyDataset {
     #[pyo3(signature = (path, split="test"))]
     fn new(py: Python<'_>, path: PathBuf, split: &str) -> PyResult<Self> {
         let dataset = free(py, || BopDataset::open(&path, split))?.map_err(dataset_error)?;
-        Ok(PyDataset(Arc::new(dataset)))
+        Ok(PyDataset(Arc::new(dataset), split.to_owned()))
     }
 
     /// The dataset's folder.

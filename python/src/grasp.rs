@@ -1,103 +1,21 @@
 //! Grasps of a parallel-jaw gripper on what a depth image shows (`sixfold-grasp`).
 
-use std::path::PathBuf;
-
 use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank};
 use sixfold_geometry::Pose;
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, GraspCluster, GraspView, Gripper, GripperError, ViewError,
-    ViewOptions, antipodal_grasps, cluster_grasps, draw_grasps as draw, find_objects as find, read_gripper,
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspView, ViewError, ViewOptions, antipodal_grasps,
+    cluster_grasps, draw_grasps as draw, find_objects as find,
 };
 
 use crate::arrays::{self, about, bad, whole};
 use crate::camera::PyCamera;
-use crate::guard::{interruptible, os_error};
-use crate::mesh::PyMesh;
-
-/// A parallel-jaw gripper: sizes in metres, forces in newtons. Its frame: the origin midway between the finger tips, z the
-/// approach direction, x the closing direction. Made by `load` from a file or by `built_in` from a name.
-///
-/// >>> gripper = Gripper.built_in("jaws-85")
-/// >>> gripper.max_opening
-/// 0.085
-#[pyclass(name = "Gripper", module = "sixfold", frozen)]
-pub(crate) struct PyGripper(Gripper);
-
-#[pymethods]
-impl PyGripper {
-    /// Reads a gripper file (JSON, as crates/sixfold-grasp/grippers/jaws-85.json is one).
-    ///
-    /// Raises OSError when the file cannot be read, ValueError with the field for sizes that no gripper has.
-    #[staticmethod]
-    fn load(path: PathBuf) -> PyResult<Self> {
-        read_gripper(&path).map(PyGripper).map_err(|error| match &error {
-            GripperError::Io { source, .. } => os_error(source.kind(), error.to_string()),
-            _ => PyValueError::new_err(error.to_string()),
-        })
-    }
-
-    /// A gripper that comes along: "jaws-140" or "jaws-85".
-    ///
-    /// Raises ValueError for another name.
-    #[staticmethod]
-    fn built_in(name: &str) -> PyResult<Self> {
-        let gripper = Gripper::built_in(name);
-        gripper.map(PyGripper).ok_or_else(|| bad("name", Gripper::BUILT_IN.join(" or "), format!("{name:?}")))
-    }
-
-    /// What it is called.
-    #[getter]
-    fn name(&self) -> &str {
-        &self.0.name
-    }
-
-    /// Largest distance between the finger pads, metres.
-    #[getter]
-    fn max_opening(&self) -> f64 {
-        self.0.max_opening
-    }
-
-    /// From the palm to the finger tips, metres.
-    #[getter]
-    fn finger_length(&self) -> f64 {
-        self.0.finger_length
-    }
-
-    /// Width of the pads, metres.
-    #[getter]
-    fn finger_width(&self) -> f64 {
-        self.0.finger_width
-    }
-
-    /// Largest force of one finger, newtons.
-    #[getter]
-    fn force(&self) -> f64 {
-        self.0.force
-    }
-
-    /// Coulomb friction coefficient of the pads.
-    #[getter]
-    fn friction(&self) -> f64 {
-        self.0.friction
-    }
-
-    /// The gripper as a Mesh in its own frame, the pads `opening` metres apart, for pictures.
-    ///
-    /// Raises ValueError for an opening that it does not have.
-    fn mesh(&self, opening: f64) -> PyResult<PyMesh> {
-        if !(0.0..=self.0.max_opening).contains(&opening) {
-            let expected = format!("0 to {} m", self.0.max_opening);
-            return Err(bad("opening", expected, opening.to_string()));
-        }
-        self.0.mesh(opening).map(PyMesh::plain).map_err(about("opening"))
-    }
-
-    fn __repr__(&self) -> String {
-        format!("<Gripper: {}, opens {} m>", self.0.name, self.0.max_opening)
-    }
-}
+use crate::experience::{ExperienceStore, lock, store_error};
+use crate::gripper::gripper_of;
+use crate::guard::interruptible;
 
 /// A proposed grasp.
 #[pyclass(name = "Grasp", module = "sixfold", frozen)]
@@ -130,14 +48,32 @@ pub(crate) struct PyGrasp {
     /// How many proposals were joined into this one.
     #[pyo3(get)]
     members: usize,
-    /// The sum of their qualities, by which grasps are ordered.
+    /// By what grasps are ordered: the sum of their qualities; with experience the mean of quality and agreement, 0 to 1.
     #[pyo3(get)]
     score: f64,
+    /// What experience says of it, a dict, or None for grasps by geometry alone: kind ("geometry" or "experience", where
+    /// the grasp comes from), share (of experience that agrees with it, 0 to 1), id (of the experience that it was
+    /// transferred from, or None), distance (of the features), hypothesis (what was assumed about the size).
+    #[pyo3(get)]
+    experience: Option<Py<PyDict>>,
 }
 
 impl PyGrasp {
-    fn of(py: Python<'_>, cluster: &GraspCluster) -> PyResult<Self> {
-        let best = &cluster.best;
+    pub(crate) fn pose(&self) -> Pose {
+        self.pose
+    }
+
+    pub(crate) fn opening(&self) -> f64 {
+        self.opening
+    }
+
+    pub(crate) fn width(&self) -> f64 {
+        self.width
+    }
+
+    fn of(py: Python<'_>, proposed: &Proposed) -> PyResult<Self> {
+        let best = &proposed.grasp;
+        let experience = proposed.experience.map(|e| e.to_python(py)).transpose()?;
         Ok(PyGrasp {
             pose: best.camera_from_gripper,
             camera_from_gripper: arrays::from_pose(py, &best.camera_from_gripper)?.unbind(),
@@ -148,9 +84,39 @@ impl PyGrasp {
             support: best.quality.support,
             centring: best.quality.centring,
             observed: best.quality.observed,
-            members: cluster.members,
-            score: cluster.score,
+            members: proposed.members,
+            score: proposed.score,
+            experience,
         })
+    }
+}
+
+/// A grasp with its rank's numbers, before it becomes Python's.
+struct Proposed {
+    grasp: Grasp,
+    score: f64,
+    members: usize,
+    experience: Option<Experienced>,
+}
+
+/// What experience says of a grasp.
+#[derive(Clone, Copy)]
+struct Experienced {
+    kind: &'static str,
+    share: f64,
+    /// Number, distance and hypothesis of the experience that it was transferred from.
+    from: Option<(i64, f64, &'static str)>,
+}
+
+impl Experienced {
+    fn to_python(self, py: Python<'_>) -> PyResult<Py<PyDict>> {
+        let dict = PyDict::new(py);
+        dict.set_item("kind", self.kind)?;
+        dict.set_item("share", self.share)?;
+        dict.set_item("id", self.from.map(|f| f.0))?;
+        dict.set_item("distance", self.from.map(|f| f.1))?;
+        dict.set_item("hypothesis", self.from.map(|f| f.2))?;
+        Ok(dict.unbind())
     }
 }
 
@@ -161,7 +127,7 @@ impl PyGrasp {
     }
 }
 
-fn view_error(error: ViewError) -> PyErr {
+pub(crate) fn view_error(error: ViewError) -> PyErr {
     let argument = match error {
         ViewError::MaskSize { .. }
         | ViewError::EmptyMask
@@ -200,13 +166,18 @@ pub(crate) fn find_objects<'py>(
 ///
 /// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object, or None for the largest thing on the
 /// table; gripper: a Gripper or the name of one that comes along; most: so many at most; seen_only=True assumes nothing
-/// about the hidden side. The same input and seed give the same result. Ctrl-C is heard.
+/// about the hidden side. With `experiences`, an ExperienceStore, grasps that worked are transferred to the object and
+/// ranked together with the planner's (dissertation, sections 6.2.3 and 6.3.2); weights: a DgcmNet or the path of its file
+/// in place of the store's; part: only grasps from experience on parts of this name, such as "handle". The same input and
+/// seed give the same result. Ctrl-C is heard.
 ///
-/// Raises ValueError for a mask without depth or of several objects, no table, a depth in the wrong unit.
+/// Raises ValueError for a mask without depth or of several objects, no table, a depth in the wrong unit, a part without
+/// experiences.
 ///
 /// >>> best = propose_grasps(depth, camera, gripper="jaws-85")[0]  # doctest: +SKIP
+/// >>> learnt = propose_grasps(depth, camera, experiences=store)[0]  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (depth, camera, mask=None, *, gripper=None, most=5, seen_only=false, seed=0))]
+#[pyo3(signature = (depth, camera, mask=None, *, gripper=None, most=5, seen_only=false, experiences=None, weights=None, part=None, seed=0))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn propose_grasps(
     py: Python<'_>,
@@ -216,6 +187,9 @@ pub(crate) fn propose_grasps(
     gripper: Option<&Bound<'_, PyAny>>,
     most: i64,
     seen_only: bool,
+    experiences: Option<&Bound<'_, ExperienceStore>>,
+    weights: Option<&Bound<'_, PyAny>>,
+    part: Option<String>,
     seed: i64,
 ) -> PyResult<Vec<PyGrasp>> {
     let depth = arrays::depth("depth", depth)?;
@@ -227,7 +201,15 @@ pub(crate) fn propose_grasps(
     let view = ViewOptions { seed, ..ViewOptions::default() };
     let default = AntipodalOptions::default();
     let planner = AntipodalOptions { seed, completion: default.completion.filter(|_| !seen_only), ..default };
-    let clusters = interruptible(py, move |stop| {
+    let learnt = match experiences {
+        Some(store) => Some((store.get().network(py, weights)?, store.get().share())),
+        None if weights.is_some() || part.is_some() => {
+            let argument = if part.is_some() { "part" } else { "weights" };
+            return Err(bad(argument, "experiences, which it belongs to", "none"));
+        }
+        None => None,
+    };
+    let proposed = interruptible(py, move |stop| {
         let mask = match mask {
             Some(mask) => Some(mask),
             None => find(&depth, &camera, &view)?.into_iter().next(),
@@ -236,12 +218,73 @@ pub(crate) fn propose_grasps(
         let Some(mask) = mask else { return Ok(vec![]) };
         let view = GraspView::new(&depth, &camera, &mask, &view)?;
         stop.check();
-        let grasps = antipodal_grasps(&view, &gripper, &planner)
-            .unwrap_or_else(|error| unreachable!("default options: {error}"));
-        Ok(cluster_grasps(&grasps, &ClusterOptions::default()))
+        let planned = || {
+            antipodal_grasps(&view, &gripper, &planner)
+                .unwrap_or_else(|error| unreachable!("default options: {error}"))
+        };
+        let clusters = ClusterOptions::default();
+        let Some((model, store)) = learnt else {
+            let clusters = cluster_grasps(&planned(), &clusters);
+            let plain = clusters.iter().map(|c| Proposed {
+                grasp: c.best,
+                score: c.score,
+                members: c.members,
+                experience: None,
+            });
+            return Ok(plain.collect());
+        };
+        let only_experience = part.is_some();
+        let options = ProposeOptions { judge: planner, part, ..ProposeOptions::default() };
+        let found = {
+            let mut opened = lock(&store);
+            let memory = opened.memory(&model).map_err(ProposeError::Store)?;
+            propose(&view, &gripper, &model, memory, &options)?
+        };
+        stop.check();
+        let geometry = if only_experience { vec![] } else { planned() };
+        let ranked = rank(&geometry, &found.proposals, &clusters);
+        let learnt = ranked.iter().map(|r| {
+            let from = r.proposal.map(|i| &found.proposals[i]);
+            let kind = match r.kind {
+                Kind::Geometry => "geometry",
+                Kind::Experience => "experience",
+            };
+            let from = from.map(|p| (p.from.experience, p.from.distance, p.hypothesis.name()));
+            let experience = Some(Experienced { kind, share: r.experience, from });
+            Proposed { grasp: r.grasp, score: r.score, members: r.members, experience }
+        });
+        Ok::<Vec<Proposed>, GraspError>(learnt.collect())
     })?
-    .map_err(view_error)?;
-    clusters.iter().take(most).map(|cluster| PyGrasp::of(py, cluster)).collect()
+    .map_err(GraspError::into_python)?;
+    proposed.iter().take(most).map(|p| PyGrasp::of(py, p)).collect()
+}
+
+/// Why no grasps can be proposed.
+enum GraspError {
+    View(ViewError),
+    Experience(ProposeError),
+}
+
+impl From<ViewError> for GraspError {
+    fn from(error: ViewError) -> Self {
+        GraspError::View(error)
+    }
+}
+
+impl From<ProposeError> for GraspError {
+    fn from(error: ProposeError) -> Self {
+        GraspError::Experience(error)
+    }
+}
+
+impl GraspError {
+    fn into_python(self) -> PyErr {
+        match self {
+            GraspError::View(error) => view_error(error),
+            GraspError::Experience(ProposeError::Store(error)) => store_error(error),
+            GraspError::Experience(error) => about("mask")(error),
+        }
+    }
 }
 
 /// Grippers drawn over an image at their grasps, the first in green and on top: (H, W, 3) uint8.
@@ -280,22 +323,4 @@ pub(crate) fn draw_grasps<'py>(
         .collect();
     let picture = interruptible(py, move |_| draw(&image, depth.as_ref(), &camera, &gripper, &drawn))?;
     arrays::from_image_of(py, picture.map_err(about("gripper"))?)
-}
-
-/// A Gripper, the name of one that comes along, or the default one.
-fn gripper_of(argument: Option<&Bound<'_, PyAny>>) -> PyResult<Gripper> {
-    let name = match argument {
-        None => Gripper::BUILT_IN[0].to_owned(),
-        Some(argument) => {
-            if let Ok(gripper) = argument.cast::<PyGripper>() {
-                return Ok(gripper.get().0.clone());
-            }
-            argument
-                .extract::<String>()
-                .map_err(|_| bad("gripper", "a Gripper or a name", argument.get_type().to_string()))?
-        }
-    };
-    Gripper::built_in(&name).ok_or_else(|| {
-        bad("gripper", format!("a Gripper, {}", Gripper::BUILT_IN.join(" or ")), format!("{name:?}"))
-    })
 }

@@ -32,7 +32,7 @@ pub(crate) fn free<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> 
 /// What ends work that was asked to stop where it only has a callback.
 struct Stopped;
 
-/// Asked to stop: work calls [`Stop::check`] where it can be left.
+/// Asked to stop: work calls [`Stop::check`] where it can be left, or looks at [`Stop::flag`].
 #[derive(Clone)]
 pub(crate) struct Stop(Arc<AtomicBool>);
 
@@ -43,6 +43,11 @@ impl Stop {
             resume_unwind(Box::new(Stopped));
         }
     }
+
+    /// Set once Ctrl-C was pressed, for work that ends by itself then.
+    pub(crate) fn flag(&self) -> &AtomicBool {
+        &self.0
+    }
 }
 
 /// Runs long work on a thread of its own without the interpreter lock and raises what a signal handler raises
@@ -52,33 +57,81 @@ pub(crate) fn interruptible<T: Send + 'static>(
     py: Python<'_>,
     work: impl FnOnce(&Stop) -> T + Send + 'static,
 ) -> PyResult<T> {
+    reporting(py, Leave::AtOnce, move |stop, _: &Tell<()>| work(stop), |()| Ok(()))
+}
+
+/// When a call that was interrupted returns.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Leave {
+    /// At once; what cannot be stopped half-way ends in the background.
+    AtOnce,
+    /// When the work has ended, because it has something to put on the disk; at once when interrupted again.
+    WhenDone,
+}
+
+/// How work tells of its progress.
+pub(crate) struct Tell<U>(Box<dyn Fn(U) + Send + Sync>);
+
+impl<U> Tell<U> {
+    pub(crate) fn tell(&self, news: U) {
+        (self.0)(news);
+    }
+}
+
+enum Message<T, U> {
+    News(U),
+    Done(std::thread::Result<T>),
+}
+
+/// As [`interruptible`], for work that tells of its progress: `hear` gets it with the interpreter lock, and an error of it
+/// (what a user's callback raises) stops the work like Ctrl-C does.
+pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
+    py: Python<'_>,
+    leave: Leave,
+    work: impl FnOnce(&Stop, &Tell<U>) -> T + Send + 'static,
+    mut hear: impl FnMut(U) -> PyResult<()>,
+) -> PyResult<T> {
     let stop = Stop(Arc::new(AtomicBool::new(false)));
-    let (send, mut receive) = channel();
+    let (send, mut receive) = channel::<Message<T, U>>();
     let flag = stop.clone();
     std::thread::Builder::new()
         .name("sixfold".to_owned())
         .spawn(move || {
-            // The receiver is gone when the call was left; then nobody wants the result.
-            let _ = send.send(catch_unwind(AssertUnwindSafe(|| work(&flag))));
+            // The receiver is gone when the call was left; then nobody wants news or result.
+            let news = send.clone();
+            let tell = Tell(Box::new(move |value| drop(news.send(Message::News(value)))));
+            let result = catch_unwind(AssertUnwindSafe(|| work(&flag, &tell)));
+            let _ = send.send(Message::Done(result));
         })
         .map_err(|error| PyOSError::new_err(format!("no thread could be started: {error}")))?;
+    // What ends the call, once the work has ended.
+    let mut pending: Option<PyErr> = None;
     loop {
         let answer;
         (answer, receive) = py.detach(move || (receive.recv_timeout(LISTEN), receive));
-        match answer {
-            Ok(Ok(value)) => return Ok(value),
-            Ok(Err(payload)) => return Err(internal(payload.as_ref())),
-            Err(RecvTimeoutError::Timeout) => {
-                if let Err(error) = py.check_signals() {
-                    stop.0.store(true, Ordering::Relaxed);
-                    return Err(error);
-                }
+        let heard = match answer {
+            Ok(Message::Done(result)) => {
+                return match (pending, result) {
+                    (Some(error), _) => Err(error),
+                    (None, Ok(value)) => Ok(value),
+                    (None, Err(payload)) => Err(internal(payload.as_ref())),
+                };
             }
+            Ok(Message::News(_)) if pending.is_some() => Ok(()),
+            Ok(Message::News(news)) => hear(news),
+            Err(RecvTimeoutError::Timeout) => Ok(()),
             Err(RecvTimeoutError::Disconnected) => {
                 return Err(PyRuntimeError::new_err(
                     "internal error in sixfold: the work ended without an answer",
                 ));
             }
+        };
+        if let Err(error) = heard.and_then(|()| py.check_signals()) {
+            stop.0.store(true, Ordering::Relaxed);
+            if leave == Leave::AtOnce || pending.is_some() {
+                return Err(error);
+            }
+            pending = Some(error);
         }
     }
 }

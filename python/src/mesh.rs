@@ -85,6 +85,12 @@ impl PyMesh {
         }
     }
 
+    /// What is known of the object.
+    pub(crate) fn info(&self) -> ModelInfo {
+        let (symmetries_discrete, symmetries_continuous) = (self.discrete.clone(), self.continuous.clone());
+        ModelInfo { symmetries_discrete, symmetries_continuous, ..ModelInfo::of_mesh(&self.mesh) }
+    }
+
     /// The vertices as the pose errors need them.
     pub(crate) fn model_points(&self) -> PyResult<Arc<ModelPoints>> {
         if let Some(points) = self.points.get() {

@@ -50,5 +50,10 @@ def weights():
 
 
 @pytest.fixture(scope="session")
+def dgcm_weights():
+    return at_hand("weights/dgcm.safetensors", "weights")
+
+
+@pytest.fixture(scope="session")
 def detector_weights():
     return at_hand("weights/detector-lmo.safetensors", "weights")

@@ -1,5 +1,6 @@
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
+from pathlib import Path as PurePath
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,12 @@ Path = str | PathLike[str]
 Unit = Literal["m", "mm", "cm", "in"]
 Color = tuple[float, float, float] | Sequence[float]
 Light = AmbientLight | DirectionalLight | PointLight
+Dicts = list[dict[str, Any]]
+Texts = list[str]
+View = tuple[ArrayLike, Camera, ArrayLike] | tuple[ArrayLike, Camera, ArrayLike, ArrayLike]
+"""Depth, camera, mask, and the pose where it is known."""
+Progress = Callable[[dict[str, Any]], object]
+"""Called with stage, done, total, and while training seconds, learning_rate, samples_per_second, losses."""
 Levels = Iterable[tuple[float, int, int]]
 """Rejection distance in metres, iterations, stride."""
 
@@ -461,6 +468,8 @@ class Grasp:
     def members(self) -> int: ...
     @property
     def score(self) -> float: ...
+    @property
+    def experience(self) -> dict[str, Any] | None: ...
 
 def find_objects(depth: ArrayLike, camera: Camera, *, seed: int = 0) -> list[Bool]: ...
 def propose_grasps(
@@ -471,6 +480,9 @@ def propose_grasps(
     gripper: Gripper | str | None = None,
     most: int = 5,
     seen_only: bool = False,
+    experiences: ExperienceStore | None = None,
+    weights: DgcmNet | Path | None = None,
+    part: str | None = None,
     seed: int = 0,
 ) -> list[Grasp]: ...
 def draw_grasps(
@@ -481,3 +493,340 @@ def draw_grasps(
     gripper: Gripper | str | None = None,
     depth: ArrayLike | None = None,
 ) -> Bytes: ...
+
+class DgcmNet:
+    @classmethod
+    def load(cls, path: Path) -> DgcmNet: ...
+    @property
+    def card(self) -> dict[str, Any]: ...
+    @property
+    def fingerprint(self) -> str: ...
+    def feature(self, depth: ArrayLike, camera: Camera, mask: ArrayLike, *, seed: int = 0) -> Float32: ...
+
+class Experience:
+    @property
+    def id(self) -> int: ...
+    @property
+    def time(self) -> int: ...
+    @property
+    def object(self) -> str: ...
+    @property
+    def part(self) -> str | None: ...
+    @property
+    def gripper(self) -> str: ...
+    @property
+    def provenance(self) -> str: ...
+    @property
+    def network(self) -> str: ...
+    @property
+    def opening(self) -> float: ...
+    @property
+    def width(self) -> float: ...
+    @property
+    def camera_from_gripper(self) -> Float: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def mask(self) -> Bool: ...
+    @property
+    def region(self) -> Bool: ...
+    @property
+    def points(self) -> Float32: ...
+    @property
+    def normals(self) -> Float32: ...
+    @property
+    def coordinates(self) -> Float32: ...
+    @property
+    def feature(self) -> Float32: ...
+    def picture(self) -> Bytes: ...
+
+class ExperienceStore:
+    def __new__(cls, path: Path, weights: DgcmNet | Path | None = None, *, create: bool = True) -> ExperienceStore: ...
+    @property
+    def path(self) -> PurePath: ...
+    def __len__(self) -> int: ...
+    def add(
+        self,
+        depth: ArrayLike,
+        camera: Camera,
+        mask: ArrayLike,
+        grasp: Grasp | ArrayLike,
+        *,
+        object: str,
+        part: str | None = None,
+        gripper: Gripper | str | None = None,
+        opening: float | None = None,
+        width: float | None = None,
+        provenance: str = "added by hand",
+        weights: DgcmNet | Path | None = None,
+        seed: int = 0,
+    ) -> tuple[int, bool]: ...
+    # Before `list`, which hides the type of this name in the class.
+    def nearest(
+        self,
+        feature: ArrayLike,
+        count: int = 10,
+        *,
+        part: str | None = None,
+        without_object: str | None = None,
+        weights: DgcmNet | Path | None = None,
+    ) -> Dicts: ...
+    def list(self) -> Dicts: ...
+    def get(self, id: int) -> Experience | None: ...
+    def forget(self, id: int) -> bool: ...
+    def merge(self, other: Path) -> int: ...
+    def refresh(self, out: Path, weights: DgcmNet | Path) -> int: ...
+    def export(self, folder: Path) -> tuple[int, Texts]: ...
+
+class Templates:
+    @staticmethod
+    def from_mesh(mesh: Mesh, *, coverage: Literal["above", "around"] = "above") -> Templates: ...
+    @staticmethod
+    def from_depth(views: Sequence[View]) -> Templates: ...
+    @staticmethod
+    def load(path: Path) -> Templates: ...
+    def save(self, path: Path) -> None: ...
+    @property
+    def diameter(self) -> float: ...
+    @property
+    def size(self) -> float: ...
+    @property
+    def source(self) -> Literal["mesh", "posed depth", "depth"]: ...
+    @property
+    def view_from_object(self) -> Float: ...
+    @property
+    def patches(self) -> Float32: ...
+    def __len__(self) -> int: ...
+
+class Mttm:
+    def __new__(cls, templates: Templates | Mesh, mesh: Mesh | PpfModel | None = None) -> Mttm: ...
+    @property
+    def templates(self) -> Templates: ...
+    @property
+    def has_mesh(self) -> bool: ...
+
+class MttmEstimate:
+    @property
+    def camera_from_object(self) -> Float: ...
+    @property
+    def confidence(self) -> float: ...
+    @property
+    def template(self) -> int: ...
+    @property
+    def mask(self) -> Bool: ...
+    @property
+    def verification(self) -> dict[str, float]: ...
+
+def estimate_mttm(
+    scene: PpfScene | ArrayLike,
+    model: Mttm | Templates | Mesh,
+    camera: Camera | None = None,
+    mask: ArrayLike | None = None,
+    *,
+    instances: int = 1,
+    min_score: float = 0.45,
+    seed: int = 0,
+) -> list[MttmEstimate]: ...
+
+class Photograph:
+    def __new__(
+        cls,
+        rgb: ArrayLike,
+        camera: Camera,
+        camera_from_object: ArrayLike,
+        mask: ArrayLike | None = None,
+        *,
+        name: str = "unnamed",
+    ) -> Photograph: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def camera_from_object(self) -> Float: ...
+    @property
+    def rgb(self) -> Bytes: ...
+    @property
+    def mask(self) -> Bool | None: ...
+    def with_pose(self, camera_from_object: ArrayLike) -> Photograph: ...
+
+class RefinedPoses:
+    @property
+    def camera_from_object(self) -> Float: ...
+    @property
+    def moved(self) -> Float: ...
+    @property
+    def turned(self) -> Float: ...
+    @property
+    def differences(self) -> Float: ...
+    @property
+    def dropped(self) -> list[str | None]: ...
+    @property
+    def still(self) -> bool: ...
+    @property
+    def disagreement(self) -> float | None: ...
+    @property
+    def photographs(self) -> list[Photograph]: ...
+    def __len__(self) -> int: ...
+
+def refine_poses(
+    mesh: Mesh | Sequence[Mesh],
+    photographs: Sequence[Photograph],
+    *,
+    objects: ArrayLike | None = None,
+    images: ArrayLike | None = None,
+    scene: Literal["judge", "still", "moving"] = "judge",
+    rough: tuple[float, float] = (0.006, 0.03),
+    shared: int = 0,
+    progress: Callable[[float], object] | None = None,
+    seed: int = 0,
+) -> RefinedPoses: ...
+
+class SynthesizedView:
+    @property
+    def rgb(self) -> Bytes: ...
+    @property
+    def mask(self) -> Bool: ...
+    @property
+    def unseen(self) -> Bool: ...
+    @property
+    def unseen_share(self) -> float: ...
+    @property
+    def sources(self) -> list[int]: ...
+
+def synthesize(
+    mesh: Mesh,
+    photographs: Sequence[Photograph],
+    poses: ArrayLike,
+    camera: Camera,
+    *,
+    weighting: Literal["network", "average", "best"] = "network",
+    weights: Path | None = None,
+    per_view: int = 6,
+    leave_out: bool = True,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[SynthesizedView]: ...
+
+class Solid:
+    def __new__(cls, mesh: Mesh, *, convex: bool = False) -> Solid: ...
+    @property
+    def part_count(self) -> int: ...
+    def rest(self, start: ArrayLike | None = None) -> Float | None: ...
+
+class GraspTrial:
+    @property
+    def world_from_object(self) -> Float: ...
+    @property
+    def outcome(self) -> Literal["held", "blocked", "missed", "lost_in_lift", "lost_in_shake"]: ...
+    @property
+    def held(self) -> bool: ...
+    @property
+    def gap(self) -> float: ...
+    @property
+    def raised(self) -> float: ...
+    @property
+    def slip(self) -> float: ...
+    @property
+    def turn(self) -> float: ...
+    @property
+    def pushed(self) -> float: ...
+    @property
+    def time(self) -> float: ...
+    def __bool__(self) -> bool: ...
+
+def gripper_pose(tip: ArrayLike, approach: ArrayLike | None = None, closing: ArrayLike | None = None) -> Float: ...
+def try_grasp(
+    object: Solid | Mesh,
+    world_from_gripper: ArrayLike,
+    *,
+    world_from_object: ArrayLike | None = None,
+    gripper: Gripper | str | None = None,
+    opening: float | None = None,
+    friction: float | None = None,
+    force: float | None = None,
+    mass: float = 0.2,
+    table_friction: float = 0.5,
+    lift: float = 0.1,
+) -> GraspTrial: ...
+def train_pix2pose(
+    material: Path | bop.Dataset | Mapping[int, Mesh],
+    out: Path,
+    *,
+    ids: ArrayLike | None = None,
+    frames: Sequence[tuple[int, int]] | None = None,
+    split: str | None = None,
+    renders_only: bool = False,
+    network: Literal["compact", "paper", "resnet50"] = "compact",
+    steps: int | None = None,
+    per_object: int | None = None,
+    learning_rate: float | None = None,
+    adversarial: bool = True,
+    frozen_stages: int = 2,
+    render_share: float = 0.5,
+    near_photographs: float = 0.5,
+    rotation: float | None = None,
+    size: int = 128,
+    init: Path | None = None,
+    encoder: Path | None = None,
+    backgrounds: Path | None = None,
+    mesh_colors: bool = True,
+    convex_hull: bool = False,
+    transformer_loss: bool = True,
+    view_limits: bool = False,
+    lmo_thresholds: bool = False,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...
+def train_detector(
+    material: Path | bop.Dataset | Mapping[int, Mesh],
+    out: Path,
+    *,
+    ids: ArrayLike | None = None,
+    frames: Sequence[tuple[int, int]] | None = None,
+    split: str | None = None,
+    renders_only: bool = False,
+    network: Literal["compact", "retinanet"] = "compact",
+    steps: int = 8000,
+    batch: int = 4,
+    learning_rate: float = 0.002,
+    encoder_share: float = 0.3,
+    frozen_stages: int = 2,
+    size: int = 320,
+    photograph_share: float = 0.45,
+    render_share: float = 0.4,
+    rotation: float | None = None,
+    longest_side: int = 640,
+    threshold: float = 0.4,
+    init: Path | None = None,
+    encoder: Path | None = None,
+    backgrounds: Path | None = None,
+    mesh_colors: bool = True,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...
+def train_dgcm(
+    out: Path,
+    *,
+    network: Literal["compact", "paper"] = "compact",
+    steps: int | None = None,
+    pairs: int | None = None,
+    learning_rate: float | None = None,
+    lambda_: float | None = None,
+    views: int = 6000,
+    encoder: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...
+def train_nol(
+    out: Path,
+    *,
+    network: Literal["compact", "paper"] = "compact",
+    steps: int | None = None,
+    learning_rate: float | None = None,
+    backgrounds: Path | None = None,
+    lstm: bool = True,
+    decoder: bool = True,
+    encoder: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...

@@ -1,0 +1,126 @@
+//! `DgcmNet`: the network that compares what is seen with what was seen (`sixfold-dgcm`).
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::PyArray1;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyType;
+use sixfold_dgcm::crop::Crop;
+use sixfold_dgcm::model::{DgcmModel, ModelError};
+use sixfold_geometry::{Camera, DepthImage, Mask};
+use sixfold_grasp::{GraspView, ViewOptions};
+use sixfold_nn::weights::WeightsError;
+
+use crate::arrays::{self, about, bad};
+use crate::bop::json_to_python;
+use crate::camera::PyCamera;
+use crate::grasp::view_error;
+use crate::guard::{interruptible, os_error};
+
+fn model_error(error: ModelError) -> PyErr {
+    match &error {
+        ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// The network that grasps from experience need: it turns what is seen of an object into 256 numbers that are alike for
+/// objects of like shape, and finds the places of one object on another (dissertation, chapter 6). Made by `load`.
+///
+/// >>> network = DgcmNet.load("weights/dgcm.safetensors")  # doctest: +SKIP
+/// >>> network.feature(depth, camera, mask).shape  # doctest: +SKIP
+/// (256,)
+#[pyclass(name = "DgcmNet", module = "sixfold", frozen)]
+pub(crate) struct DgcmNet(Arc<DgcmModel>);
+
+#[pymethods]
+impl DgcmNet {
+    /// Reads a weight file (.safetensors) that `train_dgcm` or `sixfold train dgcm` wrote.
+    ///
+    /// Raises OSError when the file cannot be read, ValueError when it is no such model.
+    #[classmethod]
+    fn load(_class: &Bound<'_, PyType>, py: Python<'_>, path: PathBuf) -> PyResult<Self> {
+        read_network(py, path).map(DgcmNet)
+    }
+
+    /// The model's card: what it was trained on, how, with which scores.
+    #[getter]
+    fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        json_to_python(py, self.0.card())
+    }
+
+    /// A name that tells its features from those of another network; features of different networks cannot be compared.
+    #[getter]
+    fn fingerprint(&self) -> String {
+        self.0.fingerprint()
+    }
+
+    /// What the network makes of an object: (256,) float32.
+    ///
+    /// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object. Ctrl-C is heard.
+    ///
+    /// Raises ValueError for a mask without depth or of several objects, images of another size than the camera's.
+    #[pyo3(signature = (depth, camera, mask, *, seed=0))]
+    fn feature<'py>(
+        &self,
+        py: Python<'py>,
+        depth: &Bound<'py, PyAny>,
+        camera: PyCamera,
+        mask: &Bound<'py, PyAny>,
+        seed: i64,
+    ) -> PyResult<Bound<'py, PyArray1<f32>>> {
+        let look = Look::new(depth, camera, mask, seed)?;
+        let model = self.0.clone();
+        let feature = interruptible(py, move |_| look.crop(&model).map(|crop| model.encode(&crop).feature))?;
+        Ok(PyArray1::from_vec(py, feature?))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<DgcmNet: {}>", self.0.fingerprint())
+    }
+}
+
+fn read_network(py: Python<'_>, path: PathBuf) -> PyResult<Arc<DgcmModel>> {
+    Ok(Arc::new(interruptible(py, move |_| DgcmModel::load(&path))?.map_err(model_error)?))
+}
+
+/// A DgcmNet, or the network of a weight file.
+pub(crate) fn network_of(py: Python<'_>, weights: &Bound<'_, PyAny>) -> PyResult<Arc<DgcmModel>> {
+    if let Ok(network) = weights.cast::<DgcmNet>() {
+        return Ok(network.get().0.clone());
+    }
+    let path: PathBuf = weights
+        .extract()
+        .map_err(|_| bad("weights", "a DgcmNet or the path of its file", weights.get_type().to_string()))?;
+    read_network(py, path)
+}
+
+/// An object in a depth image, as it was handed in.
+pub(crate) struct Look {
+    depth: DepthImage,
+    camera: Camera,
+    mask: Mask,
+    options: ViewOptions,
+}
+
+impl Look {
+    pub(crate) fn new(
+        depth: &Bound<'_, PyAny>,
+        camera: PyCamera,
+        mask: &Bound<'_, PyAny>,
+        seed: i64,
+    ) -> PyResult<Look> {
+        let depth = arrays::depth("depth", depth)?;
+        let camera = camera.of_image("depth", depth.size())?;
+        let options = ViewOptions { seed: arrays::seed(seed)?, ..ViewOptions::default() };
+        Ok(Look { camera, mask: arrays::mask("mask", mask)?, depth, options })
+    }
+
+    pub(crate) fn crop(&self, model: &DgcmModel) -> PyResult<Crop> {
+        let view =
+            GraspView::new(&self.depth, &self.camera, &self.mask, &self.options).map_err(view_error)?;
+        Crop::new(&view.depth, &view.camera, &view.mask, model.crop_options()).map_err(about("mask"))
+    }
+}

@@ -1,0 +1,318 @@
+//! `Templates` and `estimate_mttm`: objects found in depth by templates, with or without a mesh, nothing trained
+//! (`sixfold-mttm`).
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
+use sixfold_mttm::mask::to_image;
+use sixfold_mttm::{
+    Coverage, DepthView, EstimateOptions, KnownObject, ObjectTemplates, SIDE, Source, StoreError,
+    TemplateError, TemplateOptions, estimate,
+};
+
+use crate::arrays::{self, bad, whole};
+use crate::camera::PyCamera;
+use crate::guard::{interruptible, os_error};
+use crate::mesh::PyMesh;
+use crate::ppf::{model_of, scene_of, verification_to_python};
+
+fn template_error(argument: &str, error: &TemplateError) -> PyErr {
+    PyValueError::new_err(format!("{argument}: {error}"))
+}
+
+fn file_error(error: StoreError) -> PyErr {
+    match &error {
+        StoreError::Io { source, .. } => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
+    }
+}
+
+/// What an object looks like in depth from many sides: patches of a fixed metric size. Made by `from_mesh`, `from_depth` or
+/// `load`; nothing is trained.
+///
+/// >>> cube = Mesh([[x, y, z] for x in (0, .06) for y in (0, .08) for z in (0, .1)]).convex_hull()
+/// >>> templates = Templates.from_mesh(cube)
+/// >>> len(templates), templates.source
+/// (305, 'mesh')
+#[pyclass(name = "Templates", module = "sixfold", frozen)]
+pub(crate) struct PyTemplates(Arc<ObjectTemplates>);
+
+/// A view as it was handed in.
+struct View {
+    depth: DepthImage,
+    camera: Camera,
+    mask: Mask,
+    pose: Option<Pose>,
+}
+
+#[pymethods]
+impl PyTemplates {
+    /// Draws a mesh from all sides.
+    ///
+    /// coverage: "above" for what stands on a table, its z axis up, seen by a camera held upright within 45 degrees (305
+    /// views); "around" for all directions and any turn of the camera (642 views). Ctrl-C is heard.
+    ///
+    /// Raises ValueError for a mesh without faces, another coverage.
+    #[staticmethod]
+    #[pyo3(signature = (mesh, *, coverage="above"))]
+    fn from_mesh(py: Python<'_>, mesh: &Bound<'_, PyMesh>, coverage: &str) -> PyResult<Self> {
+        let known = [Coverage::Above, Coverage::Around];
+        let coverage = known.into_iter().find(|c| c.name() == coverage).ok_or_else(|| {
+            bad("coverage", known.map(|c| format!("{:?}", c.name())).join(" or "), format!("{coverage:?}"))
+        })?;
+        let options = TemplateOptions { coverage, ..TemplateOptions::default() };
+        let mesh = mesh.get().mesh.clone();
+        let made = interruptible(py, move |_| ObjectTemplates::from_mesh(&mesh, &options))?;
+        made.map(|t| PyTemplates(Arc::new(t))).map_err(|error| template_error("mesh", &error))
+    }
+
+    /// Cuts an object without a mesh out of depth images; one view is enough to look for it.
+    ///
+    /// views: tuples (depth, camera, mask) or (depth, camera, mask, camera_from_object), the same kind for all: depth (H, W)
+    /// metres, without lens distortion; mask (H, W) bool; pose (4, 4). Without poses every view has a frame of its own,
+    /// parallel to its camera, the origin in the middle of what is seen, and poses found with it are that frame's.
+    ///
+    /// Raises ValueError for no view, a mask of another size or with too little depth, an object smaller than 1.5 cm or
+    /// larger than 60 cm, poses for some views only.
+    #[staticmethod]
+    fn from_depth(py: Python<'_>, views: Vec<Bound<'_, PyAny>>) -> PyResult<Self> {
+        let views = views.iter().enumerate().map(|(i, v)| view_of(i, v)).collect::<PyResult<Vec<_>>>()?;
+        let made = interruptible(py, move |_| {
+            let borrowed: Vec<DepthView<'_>> = views
+                .iter()
+                .map(|v| DepthView {
+                    depth: &v.depth,
+                    camera: &v.camera,
+                    mask: &v.mask,
+                    camera_from_object: v.pose,
+                })
+                .collect();
+            ObjectTemplates::from_depth(&borrowed, &TemplateOptions::default())
+        })?;
+        made.map(|t| PyTemplates(Arc::new(t))).map_err(|error| template_error("views", &error))
+    }
+
+    /// Reads a file that `save` or `sixfold object add` wrote.
+    ///
+    /// Raises OSError when it cannot be read, ValueError when it is damaged or of another version.
+    #[staticmethod]
+    fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
+        let read = interruptible(py, move |_| ObjectTemplates::read(&path))?;
+        read.map(|t| PyTemplates(Arc::new(t))).map_err(file_error)
+    }
+
+    /// Writes a file; one that was there stays until the new one is whole.
+    ///
+    /// Raises OSError when it cannot be written.
+    fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        let templates = self.0.clone();
+        interruptible(py, move |_| templates.write(&path))?.map_err(file_error)
+    }
+
+    /// Diameter of the object, or the largest extent seen, metres.
+    #[getter]
+    fn diameter(&self) -> f64 {
+        self.0.diameter
+    }
+
+    /// Side of a patch at the object's distance, metres.
+    #[getter]
+    fn size(&self) -> f64 {
+        self.0.size
+    }
+
+    /// What they were made from: "mesh", "posed depth", or "depth", where every view has a frame of its own.
+    #[getter]
+    fn source(&self) -> &'static str {
+        match self.0.source {
+            Source::Mesh => "mesh",
+            Source::PosedDepth => "posed depth",
+            Source::Depth => "depth",
+        }
+    }
+
+    /// From the object's frame to that of each view (origin at a point of the surface, z along its ray), (N, 4, 4) float64.
+    #[getter]
+    fn view_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        let poses: Vec<Pose> = self.0.templates.iter().map(|t| t.view_from_object).collect();
+        arrays::from_poses(py, &poses)
+    }
+
+    /// Depth relative to the view's origin, (N, 64, 64) float32, metres; NaN where the object is not seen.
+    #[getter]
+    fn patches<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
+        let relative = self.0.templates.iter().flat_map(|t| {
+            (0..SIDE * SIDE).map(|i| t.relative_depth(i % SIDE, i / SIDE).map_or(f32::NAN, |z| z as f32))
+        });
+        PyArray1::from_vec(py, relative.collect()).reshape([self.0.templates.len(), SIDE, SIDE])
+    }
+
+    fn __len__(&self) -> usize {
+        self.0.templates.len()
+    }
+
+    fn __repr__(&self) -> String {
+        format!(
+            "<Templates: {} views from {}, {:.3} m>",
+            self.0.templates.len(),
+            self.source(),
+            self.0.diameter
+        )
+    }
+}
+
+fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
+    let expected = "a tuple (depth, camera, mask) or (depth, camera, mask, camera_from_object)";
+    let name = format!("views[{number}]");
+    let wrong = |found: String| bad(&name, expected, found);
+    let parts = view.cast::<PyTuple>().map_err(|_| wrong(view.get_type().to_string()))?;
+    if !(3..=4).contains(&parts.len()) {
+        return Err(wrong(format!("{} things", parts.len())));
+    }
+    let depth = arrays::depth(&format!("{name}: depth"), &parts.get_item(0)?)?;
+    let camera = parts.get_item(1)?;
+    let camera: PyCamera =
+        camera.extract().map_err(|_| wrong(format!("{} in place of the camera", camera.get_type())))?;
+    let camera = camera.of_image("views", depth.size())?;
+    let mask = arrays::mask(&format!("{name}: mask"), &parts.get_item(2)?)?;
+    let pose = match parts.len() {
+        4 => Some(arrays::pose("views", &parts.get_item(3)?)?),
+        _ => None,
+    };
+    Ok(View { depth, camera, mask, pose })
+}
+
+/// An object ready to be looked for by its templates. Prepared once, used for any number of images.
+///
+/// templates: Templates, or a Mesh, whose templates from above are made first. mesh: a Mesh or PpfModel of the object, with
+/// which poses are refined and verified; without it (and with Templates) the templates alone decide.
+///
+/// Raises ValueError for a mesh without faces. Ctrl-C is heard.
+///
+/// >>> known = Mttm(Templates.load("mug.sixfold-templates"))  # doctest: +SKIP
+/// >>> estimate_mttm(depth, known, camera)[0].camera_from_object  # doctest: +SKIP
+#[pyclass(name = "Mttm", module = "sixfold", frozen)]
+pub(crate) struct Mttm(Arc<KnownObject>);
+
+#[pymethods]
+impl Mttm {
+    #[new]
+    #[pyo3(signature = (templates, mesh=None))]
+    fn new(py: Python<'_>, templates: &Bound<'_, PyAny>, mesh: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
+        let (templates, mesh) = if let Ok(templates) = templates.cast::<PyTemplates>() {
+            (templates.get().0.clone(), mesh)
+        } else if let Ok(own) = templates.cast::<PyMesh>() {
+            (PyTemplates::from_mesh(py, own, "above")?.0, Some(mesh.unwrap_or(templates)))
+        } else {
+            return Err(bad("templates", "Templates or a Mesh", templates.get_type().to_string()));
+        };
+        let model = mesh.map(|mesh| model_of(py, "mesh", mesh)).transpose()?;
+        let known = interruptible(py, move |_| {
+            KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()))
+        })?;
+        Ok(Mttm(Arc::new(known)))
+    }
+
+    /// The templates.
+    #[getter]
+    fn templates(&self) -> PyTemplates {
+        PyTemplates(Arc::new(self.0.templates().clone()))
+    }
+
+    /// Whether poses are refined and verified with a mesh.
+    #[getter]
+    fn has_mesh(&self) -> bool {
+        self.0.has_mesh()
+    }
+
+    fn __repr__(&self) -> String {
+        let verified = if self.0.has_mesh() { "a mesh" } else { "templates alone" };
+        format!("<Mttm: {} views, {verified}>", self.0.templates().templates.len())
+    }
+}
+
+/// A pose found by templates.
+#[pyclass(name = "MttmEstimate", module = "sixfold", frozen)]
+pub(crate) struct MttmEstimate {
+    /// The pose, (4, 4) float64, metres; with views without poses that of the matched view's own frame.
+    #[pyo3(get)]
+    camera_from_object: Py<PyArray2<f64>>,
+    /// What decides between estimates, 0 to 1.
+    #[pyo3(get)]
+    confidence: f64,
+    /// Number of the matched template.
+    #[pyo3(get)]
+    template: usize,
+    /// Pixels of the object by the matched template, (H, W) bool.
+    #[pyo3(get)]
+    mask: Py<PyArray2<bool>>,
+    /// By the mesh, or by the template where there is none: rendered, inliers, occluded, outliers (pixels), depth, boundary,
+    /// normals, total (0 to 1), visible_share.
+    #[pyo3(get)]
+    verification: Py<PyDict>,
+}
+
+#[pymethods]
+impl MttmEstimate {
+    fn __repr__(&self) -> String {
+        format!("<MttmEstimate: confidence {:.3}, template {}>", self.confidence, self.template)
+    }
+}
+
+/// Finds an object never trained on in a depth image by its templates (dissertation, chapter 5). A list of MttmEstimate,
+/// best first, empty when nothing scores min_score.
+///
+/// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool of where objects may be). model: an
+/// Mttm, or Templates or a Mesh, which are prepared first. instances: most poses returned. The same input gives the same
+/// result at any number of threads. Ctrl-C is heard.
+///
+/// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit or without any value.
+///
+/// >>> found = estimate_mttm(depth, Templates.from_depth([(seen, camera, mask)]), camera)  # doctest: +SKIP
+/// >>> found[0].mask.sum()  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (scene, model, camera=None, mask=None, *, instances=1, min_score=0.45, seed=0))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn estimate_mttm(
+    py: Python<'_>,
+    scene: &Bound<'_, PyAny>,
+    model: &Bound<'_, PyAny>,
+    camera: Option<PyCamera>,
+    mask: Option<&Bound<'_, PyAny>>,
+    instances: i64,
+    min_score: f64,
+    seed: i64,
+) -> PyResult<Vec<MttmEstimate>> {
+    if !(0.0..=1.0).contains(&min_score) {
+        return Err(bad("min_score", "a number from 0 to 1", min_score.to_string()));
+    }
+    let max_instances = whole("instances", instances, 1)?;
+    let options = EstimateOptions { max_instances, min_score, ..EstimateOptions::default() };
+    let scene = scene_of(py, scene, camera, mask, seed)?;
+    let known = match model.cast::<Mttm>() {
+        Ok(known) => known.get().0.clone(),
+        Err(_) if model.is_instance_of::<PyTemplates>() || model.is_instance_of::<PyMesh>() => {
+            Mttm::new(py, model, None)?.0
+        }
+        Err(_) => return Err(bad("model", "an Mttm, Templates or a Mesh", model.get_type().to_string())),
+    };
+    let size = scene.depth().size();
+    let found = interruptible(py, move |_| estimate(&scene, &known, &options).0)?;
+    found
+        .into_iter()
+        .map(|e| {
+            Ok(MttmEstimate {
+                camera_from_object: arrays::from_pose(py, &e.camera_from_object)?.unbind(),
+                confidence: e.confidence,
+                template: e.template,
+                mask: arrays::from_image(py, to_image(&e.mask, size.0, size.1))?.unbind(),
+                verification: verification_to_python(py, &e.score)?,
+            })
+        })
+        .collect()
+}

@@ -1,0 +1,435 @@
+//! Neural Object Learning: `Photograph`, `refine_poses` and `synthesize` (`sixfold-nol`; dissertation, chapter 4).
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use numpy::{PyArray1, PyArray2, PyArray3};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use sixfold_mesh::Mesh;
+use sixfold_nn::weights::WeightsError;
+use sixfold_nol::agreement::leave_out_what_differs;
+use sixfold_nol::model::{ModelError, NolModel};
+use sixfold_nol::refine::{RefineOptions, Refinement, SceneKind, SceneSource, refine_scene};
+use sixfold_nol::synthesis::{NewView, ViewMaker, Weighting};
+use sixfold_nol::{NolError, Photograph, SourceView};
+
+use crate::arrays::{self, about, bad, whole};
+use crate::camera::PyCamera;
+use crate::guard::{Leave, Tell, free, os_error, reporting};
+use crate::mesh::PyMesh;
+
+/// Side of the crops that new views take their colours from, pixels: as the command line has it.
+const CROP: usize = 256;
+
+fn model_error(error: ModelError) -> PyErr {
+    match &error {
+        ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(format!("weights: {error}")),
+    }
+}
+
+fn nol_error(error: NolError) -> PyErr {
+    match &error {
+        NolError::Option { field, expected, found } => {
+            let argument = match *field {
+                "sources per view" => "per_view",
+                field if field.starts_with("source") => "photographs",
+                field => field,
+            };
+            bad(argument, expected, found)
+        }
+        _ => PyValueError::new_err(format!("photographs: {error}")),
+    }
+}
+
+/// A photograph of an object with a rough pose, for refine_poses and synthesize. It cannot be changed.
+///
+/// rgb (H, W, 3) uint8, without lens distortion; camera_from_object (4, 4), off by a centimetre and some degrees at most;
+/// mask (H, W) bool: where the object is visible, None for all of its outline; name: what stands for it in messages.
+///
+/// Raises ValueError for images of another size than the camera's, a pose that puts the object outside the image.
+///
+/// >>> import numpy as np
+/// >>> pose = np.eye(4)
+/// >>> pose[2, 3] = 0.7
+/// >>> Photograph(np.zeros((480, 640, 3), np.uint8), Camera(500, 500, 320, 240, 640, 480), pose, name="first")
+/// <Photograph: first>
+#[pyclass(name = "Photograph", module = "sixfold", frozen)]
+pub(crate) struct PyPhotograph(Photograph);
+
+#[pymethods]
+impl PyPhotograph {
+    #[new]
+    #[pyo3(signature = (rgb, camera, camera_from_object, mask=None, *, name="unnamed"))]
+    fn new(
+        rgb: &Bound<'_, PyAny>,
+        camera: PyCamera,
+        camera_from_object: &Bound<'_, PyAny>,
+        mask: Option<&Bound<'_, PyAny>>,
+        name: &str,
+    ) -> PyResult<Self> {
+        let image = arrays::rgb("rgb", rgb)?;
+        let camera = camera.of_image("rgb", image.size())?;
+        let pose = arrays::pose("camera_from_object", camera_from_object)?;
+        let mask = mask.map(|mask| arrays::mask("mask", mask)).transpose()?;
+        let photograph = Photograph::new(name, Arc::new(image), camera, pose, mask);
+        photograph.map(PyPhotograph).map_err(|error| match &error {
+            NolError::Size { what: "mask", .. } => about("mask")(error),
+            _ => about("camera_from_object")(error),
+        })
+    }
+
+    /// What stands for it in messages.
+    #[getter]
+    fn name(&self) -> &str {
+        self.0.name()
+    }
+
+    /// Its camera.
+    #[getter]
+    fn camera(&self) -> PyCamera {
+        PyCamera(*self.0.camera())
+    }
+
+    /// Its pose, (4, 4) float64, metres.
+    #[getter]
+    fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::from_pose(py, self.0.camera_from_object())
+    }
+
+    /// The image, (H, W, 3) uint8.
+    #[getter]
+    fn rgb<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        arrays::from_image_of(py, self.0.image().as_ref().clone())
+    }
+
+    /// Where the object is visible, (H, W) bool, or None.
+    #[getter]
+    fn mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<bool>>>> {
+        self.0.mask().map(|mask| arrays::from_image(py, mask.clone())).transpose()
+    }
+
+    /// The same photograph with another pose (4, 4).
+    fn with_pose(&self, camera_from_object: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let pose = arrays::pose("camera_from_object", camera_from_object)?;
+        self.0.with_pose(pose).map(PyPhotograph).map_err(about("camera_from_object"))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Photograph: {}>", self.0.name())
+    }
+}
+
+/// The poses of photographs, made better.
+#[pyclass(name = "RefinedPoses", module = "sixfold", frozen)]
+pub(crate) struct RefinedPoses {
+    refinement: Refinement,
+    photographs: Vec<Photograph>,
+}
+
+impl RefinedPoses {
+    fn numbers<'py>(
+        &self,
+        py: Python<'py>,
+        of: impl Fn(&sixfold_nol::refine::SourceReport) -> f64,
+    ) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_iter(py, self.refinement.sources.iter().map(of))
+    }
+}
+
+#[pymethods]
+impl RefinedPoses {
+    /// The poses, (N, 4, 4) float64, metres, in the order of the photographs; the given one where one was dropped.
+    #[getter]
+    fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        let poses: Vec<_> = self.refinement.sources.iter().map(|s| s.camera_from_object).collect();
+        arrays::from_poses(py, &poses)
+    }
+
+    /// How far the object's origin moved, (N,) float64, metres.
+    #[getter]
+    fn moved<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.numbers(py, |s| s.moved)
+    }
+
+    /// How far the object was turned, (N,) float64, radians.
+    #[getter]
+    fn turned<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.numbers(py, |s| s.turned)
+    }
+
+    /// Mean difference in colour to the other photographs before and after, (N, 2) float64, 0 to 1; NaN where there is
+    /// nothing to compare.
+    #[getter]
+    fn differences<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::from_rows(py, self.refinement.sources.iter().map(|s| s.difference).collect())
+    }
+
+    /// For each photograph why it should not be used, or None.
+    #[getter]
+    fn dropped(&self) -> Vec<Option<String>> {
+        self.refinement.sources.iter().map(|s| s.dropped.clone()).collect()
+    }
+
+    /// Whether the objects were taken to have stood still.
+    #[getter]
+    fn still(&self) -> bool {
+        self.refinement.still
+    }
+
+    /// How far the given poses are from one common arrangement, 1 for what their roughness explains; None where there is
+    /// nothing to compare.
+    #[getter]
+    fn disagreement(&self) -> Option<f64> {
+        self.refinement.disagreement
+    }
+
+    /// The photographs that are not dropped, with their new poses: a list of Photograph.
+    #[getter]
+    fn photographs(&self) -> PyResult<Vec<PyPhotograph>> {
+        let kept = self.photographs.iter().zip(&self.refinement.sources).filter(|(_, s)| s.dropped.is_none());
+        kept.map(|(p, s)| p.with_pose(s.camera_from_object).map(PyPhotograph).map_err(nol_error)).collect()
+    }
+
+    fn __len__(&self) -> usize {
+        self.refinement.sources.len()
+    }
+
+    fn __repr__(&self) -> String {
+        let dropped = self.refinement.sources.iter().filter(|s| s.dropped.is_some()).count();
+        format!("<RefinedPoses: {} photographs, {dropped} dropped>", self.refinement.sources.len())
+    }
+}
+
+/// One mesh or several.
+#[derive(FromPyObject)]
+enum Meshes<'py> {
+    One(Bound<'py, PyMesh>),
+    Several(Vec<Bound<'py, PyMesh>>),
+}
+
+/// A whole number for every photograph, or the given default.
+fn numbering(
+    argument: &str,
+    given: Option<&Bound<'_, PyAny>>,
+    count: usize,
+    default: impl Fn(usize) -> usize,
+) -> PyResult<Vec<usize>> {
+    let Some(given) = given else { return Ok((0..count).map(default).collect()) };
+    let ids = arrays::ids(argument, given)?;
+    if ids.len() != count {
+        return Err(bad(argument, format!("{count} numbers, one a photograph"), ids.len().to_string()));
+    }
+    Ok(ids.into_iter().map(|id| id as usize).collect())
+}
+
+/// Makes rough poses of photographs better by what the photographs show of the object together: robust Gauss-Newton over
+/// the differences in colour and the outline (after the dissertation, section 4.2.3).
+///
+/// mesh: the object, or a list of meshes; then objects (N,) says for each photograph which one it shows. images (N,): equal
+/// numbers for photographs cut out of the same image, whose objects share its camera. scene: "still" where only the camera
+/// moved, "moving" where objects may have, "judge" to decide it by the poses. rough: standard deviation of the given poses,
+/// metres and radians. shared: rounds at each resolution in which the error that all poses of an object share is looked for,
+/// for evenly painted objects under even light. progress: called with the share that is done. Ctrl-C is heard.
+///
+/// Raises ValueError for no photograph, options out of range, a mesh that reaches behind a camera.
+///
+/// >>> better = refine_poses(mesh, photographs)  # doctest: +SKIP
+/// >>> views = synthesize(mesh, better.photographs, poses, camera)  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (mesh, photographs, *, objects=None, images=None, scene="judge", rough=(0.006, 0.03), shared=0, progress=None, seed=0))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn refine_poses(
+    py: Python<'_>,
+    mesh: &Bound<'_, PyAny>,
+    photographs: Vec<PyRef<'_, PyPhotograph>>,
+    objects: Option<&Bound<'_, PyAny>>,
+    images: Option<&Bound<'_, PyAny>>,
+    scene: &str,
+    rough: (f64, f64),
+    shared: i64,
+    progress: Option<Py<PyAny>>,
+    seed: i64,
+) -> PyResult<RefinedPoses> {
+    let meshes = match mesh.extract::<Meshes<'_>>() {
+        Ok(Meshes::One(mesh)) => vec![mesh.get().mesh.as_ref().clone()],
+        Ok(Meshes::Several(meshes)) => meshes.iter().map(|m| m.get().mesh.as_ref().clone()).collect(),
+        Err(_) => return Err(bad("mesh", "a Mesh or a list of them", mesh.get_type().to_string())),
+    };
+    meshes.iter().try_for_each(with_surface)?;
+    let photographs = given(&photographs)?;
+    let objects = numbering("objects", objects, photographs.len(), |_| 0)?;
+    if let Some(wrong) = objects.iter().find(|o| **o >= meshes.len()) {
+        return Err(bad("objects", format!("numbers below {}", meshes.len()), wrong.to_string()));
+    }
+    let images = numbering("images", images, photographs.len(), |number| number)?;
+    let kinds = [("judge", SceneKind::Judge), ("still", SceneKind::Still), ("moving", SceneKind::Moving)];
+    let kind = kinds.iter().find(|(name, _)| *name == scene);
+    let (_, scene) = kind.ok_or_else(|| bad("scene", "judge, still or moving", format!("{scene:?}")))?;
+    if !(rough.0 > 0.0 && rough.1 > 0.0 && rough.0.is_finite() && rough.1.is_finite()) {
+        return Err(bad("rough", "metres and radians above 0", format!("{rough:?}")));
+    }
+    let options = RefineOptions {
+        scene: *scene,
+        rough: [rough.0, rough.1],
+        shared: whole("shared", shared, 0)?,
+        seed: arrays::seed(seed)?,
+        ..RefineOptions::default()
+    };
+    let kept = photographs.clone();
+    let refinement = reporting(
+        py,
+        Leave::AtOnce,
+        move |stop, tell: &Tell<f64>| {
+            let sources: Vec<SceneSource<'_>> = photographs
+                .iter()
+                .zip(objects.iter().zip(&images))
+                .map(|(photograph, (object, image))| SceneSource {
+                    object: *object,
+                    image: *image,
+                    photograph,
+                })
+                .collect();
+            refine_scene(&sources, &meshes, &options, |done| {
+                tell.tell(done);
+                !stop.flag().load(Ordering::Relaxed)
+            })
+        },
+        |done| progress.as_ref().map_or(Ok(()), |call| call.call1(py, (done,)).map(drop)),
+    )?;
+    Ok(RefinedPoses { refinement: refinement.map_err(nol_error)?, photographs: kept })
+}
+
+fn with_surface(mesh: &Mesh) -> PyResult<()> {
+    if mesh.faces().is_empty() {
+        return Err(bad("mesh", "a mesh with faces", "a list of points"));
+    }
+    Ok(())
+}
+
+fn given(photographs: &[PyRef<'_, PyPhotograph>]) -> PyResult<Vec<Photograph>> {
+    if photographs.is_empty() {
+        return Err(bad("photographs", "at least one Photograph", "none"));
+    }
+    Ok(photographs.iter().map(|p| p.0.clone()).collect())
+}
+
+/// A new view of an object.
+#[pyclass(name = "SynthesizedView", module = "sixfold", frozen)]
+pub(crate) struct SynthesizedView {
+    /// Colours, (H, W, 3) uint8; black beside the object.
+    #[pyo3(get)]
+    rgb: Py<PyArray3<u8>>,
+    /// Where the object is, (H, W) bool.
+    #[pyo3(get)]
+    mask: Py<PyArray2<bool>>,
+    /// Where the object is but no photograph shows it, (H, W) bool: filled from what is near.
+    #[pyo3(get)]
+    unseen: Py<PyArray2<bool>>,
+    /// Share of the object's pixels that no photograph shows, 0 to 1.
+    #[pyo3(get)]
+    unseen_share: f64,
+    /// Numbers of the photographs that were used.
+    #[pyo3(get)]
+    sources: Vec<usize>,
+}
+
+impl SynthesizedView {
+    fn of(py: Python<'_>, view: NewView) -> PyResult<Self> {
+        Ok(SynthesizedView {
+            unseen_share: view.unseen_share(),
+            rgb: arrays::from_image_of(py, free(py, || view.patch.to_rgb())?)?.unbind(),
+            mask: arrays::from_image(py, view.mask)?.unbind(),
+            unseen: arrays::from_image(py, view.unseen)?.unbind(),
+            sources: view.sources,
+        })
+    }
+}
+
+#[pymethods]
+impl SynthesizedView {
+    fn __repr__(&self) -> String {
+        format!("<SynthesizedView: {:.0} % unseen>", 100.0 * self.unseen_share)
+    }
+}
+
+/// Renders an object at new poses from photographs of it (Neural Object Learning; dissertation, chapter 4): a list of
+/// SynthesizedView, one a pose.
+///
+/// photographs: as refine_poses leaves them; poses (N, 4, 4) camera_from_object, metres; camera: that of the new views.
+/// weighting: how colours of several photographs become one: "network", "average", or "best" for the one that looks at the
+/// place most directly; weights: a file that `train_nol` wrote, in place of the network that comes along; per_view: most
+/// photographs in a view; leave_out=False keeps what other photographs do not agree with. progress: called with the number
+/// of views that are done and their total. Ctrl-C is heard.
+///
+/// Raises ValueError for photographs that show nothing of the object, no photograph, another weighting; OSError when the
+/// weights cannot be read.
+///
+/// >>> [view] = synthesize(mesh, photographs, [pose], camera, weighting="best")  # doctest: +SKIP
+/// >>> view.rgb.shape  # doctest: +SKIP
+/// (480, 640, 3)
+#[pyfunction]
+#[pyo3(signature = (mesh, photographs, poses, camera, *, weighting="network", weights=None, per_view=6, leave_out=true, progress=None))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn synthesize(
+    py: Python<'_>,
+    mesh: &Bound<'_, PyMesh>,
+    photographs: Vec<PyRef<'_, PyPhotograph>>,
+    poses: &Bound<'_, PyAny>,
+    camera: PyCamera,
+    weighting: &str,
+    weights: Option<PathBuf>,
+    per_view: i64,
+    leave_out: bool,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Vec<SynthesizedView>> {
+    let mesh = mesh.get().mesh.clone();
+    with_surface(&mesh)?;
+    let photographs = given(&photographs)?;
+    let poses = arrays::poses("poses", poses)?;
+    camera.drawable()?;
+    let camera = camera.pinhole()?;
+    let per_view = whole("per_view", per_view, 1)?;
+    if !["network", "average", "best"].contains(&weighting) {
+        return Err(bad("weighting", "network, average or best", format!("{weighting:?}")));
+    }
+    if weights.is_some() && weighting != "network" {
+        return Err(bad("weights", "weighting network, which they belong to", weighting));
+    }
+    let weighting = weighting.to_owned();
+    let views = reporting(
+        py,
+        Leave::AtOnce,
+        move |stop, tell: &Tell<(usize, usize)>| {
+            let model = match (weighting.as_str(), weights) {
+                ("network", Some(file)) => Some(NolModel::load(&file).map_err(model_error)?),
+                ("network", None) => Some(NolModel::shipped().map_err(model_error)?),
+                _ => None,
+            };
+            let weighting = match (&model, weighting.as_str()) {
+                (Some(model), _) => Weighting::Network(model),
+                (None, "best") => Weighting::Best,
+                (None, _) => Weighting::Average,
+            };
+            let sources = photographs.iter().map(|p| SourceView::new(p, &mesh, CROP));
+            let mut sources = sources.collect::<Result<Vec<_>, _>>().map_err(nol_error)?;
+            stop.check();
+            if leave_out {
+                leave_out_what_differs(&mut sources, &mesh);
+                stop.check();
+            }
+            let maker = ViewMaker::new(&mesh, sources, weighting, per_view).map_err(nol_error)?;
+            let mut views = Vec::with_capacity(poses.len());
+            for pose in &poses {
+                stop.check();
+                views.push(maker.render(&camera, pose));
+                tell.tell((views.len(), poses.len()));
+            }
+            Ok::<_, PyErr>(views)
+        },
+        |done| progress.as_ref().map_or(Ok(()), |call| call.call1(py, done).map(drop)),
+    )??;
+    views.into_iter().map(|view| SynthesizedView::of(py, view)).collect()
+}

@@ -1,0 +1,260 @@
+//! `try_grasp`: one grasp in the physics engine (`sixfold-simulation`).
+
+use std::sync::Arc;
+
+use numpy::PyArray2;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use sixfold_geometry::Pose;
+use sixfold_mesh::Mesh;
+use sixfold_simulation::{
+    ConvexParts, Outcome, PartsOptions, SimulationError, TrialOptions, TrialReport, settle_in_middle,
+    try_grasp as try_one,
+};
+
+use crate::arrays::{self, about, bad, positive};
+use crate::gripper::gripper_of;
+use crate::guard::interruptible;
+use crate::mesh::PyMesh;
+
+/// An object for trials: its mesh cut into convex parts, so that what is hollow stays hollow. Takes seconds, keep it.
+///
+/// convex=True takes the hull of the mesh as it is.
+///
+/// Raises ValueError for a mesh without faces or without a volume. Ctrl-C is heard.
+///
+/// >>> cube = Mesh([[x, y, z] for x in (0, .05) for y in (0, .05) for z in (0, .05)]).convex_hull()
+/// >>> solid = Solid(cube, convex=True)
+/// >>> abs(solid.rest()[2, 3]) < 1e-3  # its origin is at the bottom
+/// True
+#[pyclass(name = "Solid", module = "sixfold", frozen)]
+pub(crate) struct PySolid {
+    mesh: Arc<Mesh>,
+    parts: Arc<ConvexParts>,
+}
+
+#[pymethods]
+impl PySolid {
+    #[new]
+    #[pyo3(signature = (mesh, *, convex=false))]
+    fn new(py: Python<'_>, mesh: &Bound<'_, PyMesh>, convex: bool) -> PyResult<Self> {
+        let mesh = mesh.get().mesh.clone();
+        let surface = mesh.clone();
+        let parts = interruptible(py, move |_| {
+            if convex {
+                ConvexParts::of_convex(&surface)
+            } else {
+                ConvexParts::of_mesh(&surface, &PartsOptions::default())
+            }
+        })?;
+        Ok(PySolid { mesh, parts: Arc::new(parts.map_err(about("mesh"))?) })
+    }
+
+    /// How many convex parts it has.
+    #[getter]
+    fn part_count(&self) -> usize {
+        self.parts.parts().len()
+    }
+
+    /// Where the object comes to rest on the table (z up, its top at z = 0) when it falls from just above it, over the
+    /// table's middle: (4, 4) world_from_object in metres, or None when it does not come to rest.
+    ///
+    /// start (4, 4): how it is turned when it falls; its own z axis up, if None. Ctrl-C is heard.
+    #[pyo3(signature = (start=None))]
+    fn rest<'py>(
+        &self,
+        py: Python<'py>,
+        start: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Option<Bound<'py, PyArray2<f64>>>> {
+        let start = start.map_or(Ok(Pose::identity()), |pose| arrays::pose("start", pose))?;
+        self.settled(py, start)?.map(|pose| arrays::from_pose(py, &pose)).transpose()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Solid: {} convex parts>", self.parts.parts().len())
+    }
+}
+
+impl PySolid {
+    fn settled(&self, py: Python<'_>, start: Pose) -> PyResult<Option<Pose>> {
+        let (mesh, parts) = (self.mesh.clone(), self.parts.clone());
+        interruptible(py, move |_| settle_in_middle(&mesh, &parts, &start))
+    }
+}
+
+/// What happened in a trial. True where the object was held.
+#[pyclass(name = "GraspTrial", module = "sixfold", frozen)]
+pub(crate) struct GraspTrial {
+    report: TrialReport,
+    /// Where the object stood, (4, 4) float64, metres.
+    #[pyo3(get)]
+    world_from_object: Py<PyArray2<f64>>,
+}
+
+#[pymethods]
+impl GraspTrial {
+    /// "held": lifted and shaken, the object is between both fingers; "blocked": the gripper cannot get there; "missed": it
+    /// closed on nothing; "lost_in_lift", "lost_in_shake".
+    #[getter]
+    fn outcome(&self) -> &'static str {
+        match self.report.outcome {
+            Outcome::Held => "held",
+            Outcome::Blocked => "blocked",
+            Outcome::Missed => "missed",
+            Outcome::LostInLift => "lost_in_lift",
+            Outcome::LostInShake => "lost_in_shake",
+        }
+    }
+
+    /// Whether the object was held to the end.
+    #[getter]
+    fn held(&self) -> bool {
+        self.report.outcome == Outcome::Held
+    }
+
+    /// Distance of the pads at the end, metres.
+    #[getter]
+    fn gap(&self) -> f64 {
+        self.report.gap
+    }
+
+    /// How much the object's origin rose, metres.
+    #[getter]
+    fn raised(&self) -> f64 {
+        self.report.raised
+    }
+
+    /// How far the object slid between the fingers, metres.
+    #[getter]
+    fn slip(&self) -> f64 {
+        self.report.slip
+    }
+
+    /// How far it turned between the fingers, radians.
+    #[getter]
+    fn turn(&self) -> f64 {
+        self.report.turn
+    }
+
+    /// How far the object was moved before the lift, metres.
+    #[getter]
+    fn pushed(&self) -> f64 {
+        self.report.pushed
+    }
+
+    /// Simulated time, seconds.
+    #[getter]
+    fn time(&self) -> f64 {
+        self.report.time
+    }
+
+    fn __bool__(&self) -> bool {
+        self.held()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<GraspTrial: {}>", self.outcome())
+    }
+}
+
+/// The pose of a gripper (4, 4) whose finger tips have their middle at tip (3,), metres, from approach and closing direction
+/// (3,), which need not be unit nor exactly perpendicular: the approach keeps its direction.
+///
+/// Raises ValueError when they are parallel or zero.
+///
+/// >>> gripper_pose([0, 0, 0.02])[:3, 2]
+/// array([ 0.,  0., -1.])
+#[pyfunction]
+#[pyo3(signature = (tip, approach=None, closing=None))]
+pub(crate) fn gripper_pose<'py>(
+    py: Python<'py>,
+    tip: &Bound<'py, PyAny>,
+    approach: Option<&Bound<'py, PyAny>>,
+    closing: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    use sixfold_geometry::Vec3;
+    let tip = arrays::vector3("tip", tip)?;
+    let approach = approach.map_or(Ok(-Vec3::z()), |d| arrays::vector3("approach", d))?;
+    let closing = closing.map_or(Ok(Vec3::x()), |d| arrays::vector3("closing", d))?;
+    let pose = sixfold_grasp::gripper_pose(&tip, &approach, &closing).ok_or_else(|| {
+        let found = format!("{:?} and {:?}", approach.as_slice(), closing.as_slice());
+        bad("approach, closing", "two different directions", found)
+    })?;
+    arrays::from_pose(py, &pose)
+}
+
+/// Tries one grasp in a physics engine: the gripper comes along its approach direction, closes with a limited force, lifts
+/// and shakes; nothing but Coulomb friction holds the object. The same arguments give the same result on every machine.
+///
+/// object: a Solid, or a Mesh, which is cut into convex parts first. world_from_gripper (4, 4): where the gripper closes, in
+/// the world's frame, z up, the table's top at z = 0, metres; that of a Grasp is world_from_camera @
+/// grasp.camera_from_gripper. world_from_object (4, 4): where the object stands, Solid.rest() if None. opening: distance of
+/// the pads before closing, metres, the gripper's largest if None. friction (of the pads) and force (of a finger, newtons)
+/// in place of the gripper's; mass of the object in kg; table_friction; lift in metres. Ctrl-C is heard.
+///
+/// Raises ValueError for a mesh without a volume, an object that does not come to rest, options out of range.
+///
+/// >>> cube = Mesh([[x, y, z] for x in (0, .05) for y in (0, .05) for z in (0, .05)]).convex_hull()
+/// >>> trial = try_grasp(Solid(cube, convex=True), gripper_pose([0, 0, 0.01]), gripper="jaws-85")
+/// >>> trial.outcome
+/// 'held'
+#[pyfunction]
+#[pyo3(signature = (object, world_from_gripper, *, world_from_object=None, gripper=None, opening=None, friction=None, force=None, mass=0.2, table_friction=0.5, lift=0.1))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn try_grasp(
+    py: Python<'_>,
+    object: &Bound<'_, PyAny>,
+    world_from_gripper: &Bound<'_, PyAny>,
+    world_from_object: Option<&Bound<'_, PyAny>>,
+    gripper: Option<&Bound<'_, PyAny>>,
+    opening: Option<f64>,
+    friction: Option<f64>,
+    force: Option<f64>,
+    mass: f64,
+    table_friction: f64,
+    lift: f64,
+) -> PyResult<GraspTrial> {
+    let world_from_gripper = arrays::pose("world_from_gripper", world_from_gripper)?;
+    let standing = world_from_object.map(|pose| arrays::pose("world_from_object", pose)).transpose()?;
+    let mut gripper = gripper_of(gripper)?;
+    if let Some(friction) = friction {
+        gripper.friction = friction;
+        gripper.check("").map_err(about("friction"))?;
+    }
+    if let Some(force) = force {
+        gripper.force = force;
+        gripper.check("").map_err(about("force"))?;
+    }
+    let opening = opening.map_or(Ok(gripper.max_opening), |o| positive("opening", o))?;
+    let options = TrialOptions { mass, table_friction, lift, ..TrialOptions::default() };
+    options.check().map_err(simulation_error)?;
+    let made;
+    let solid = match object.cast::<PySolid>() {
+        Ok(solid) => solid.get(),
+        Err(_) => {
+            let mesh = object.cast::<PyMesh>();
+            let mesh = mesh.map_err(|_| bad("object", "a Solid or a Mesh", object.get_type().to_string()))?;
+            made = PySolid::new(py, mesh, false)?;
+            &made
+        }
+    };
+    let world_from_object = match standing {
+        Some(pose) => pose,
+        None => solid.settled(py, Pose::identity())?.ok_or_else(|| {
+            bad("world_from_object", "where the object stands", "None, and it does not come to rest")
+        })?,
+    };
+    let parts = solid.parts.clone();
+    let report = interruptible(py, move |_| {
+        try_one(&parts, &world_from_object, &gripper, &world_from_gripper, opening, &options)
+    })?;
+    let report = report.map_err(simulation_error)?;
+    Ok(GraspTrial { report, world_from_object: arrays::from_pose(py, &world_from_object)?.unbind() })
+}
+
+fn simulation_error(error: SimulationError) -> PyErr {
+    match &error {
+        SimulationError::Option { field, found, expected } => bad(field, expected, found.to_string()),
+        _ => PyValueError::new_err(format!("object: {error}")),
+    }
+}
