@@ -162,9 +162,9 @@ pub fn drop_objects(
             break;
         }
     }
-    for number in 0..parts.len() {
+    for (number, pose) in poses.iter_mut().enumerate() {
         if !falling.iter().any(|(_, o)| o.number == number) {
-            poses[number] = None;
+            *pose = None;
         }
     }
     poses
