@@ -14,13 +14,12 @@ use crate::patch::Patch;
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
-/// Regions of which pairs are looked at, and those of them that are laid on the scene.
-const LOOKED_AT: usize = 96;
+/// Regions of which pairs are looked at: fewest and most.
+const LOOKED_AT: (usize, usize) = (64, 400);
 /// Hypotheses that the network adds to a region's.
-const HYPOTHESES: usize = 4;
+const HYPOTHESES: usize = 3;
 /// Pairs that go through the network at a time.
 const AT_A_TIME: usize = 32;
-const PLACED: usize = 64;
 /// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several.
 const LEAST_TRUST: f64 = 0.1;
 
@@ -42,7 +41,9 @@ pub(crate) fn first_matching(
     let nearest = learned.nearest(&regions.descriptors);
     let mut order: Vec<usize> = (0..rois.len()).collect();
     order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
-    let chosen = apart(rois, order, 0.15 * diameter, LOOKED_AT);
+    // The more there is in the scene, the more looks like the object at first sight.
+    let looked_at = (rois.len() / 5).saturating_sub(30).clamp(LOOKED_AT.0, LOOKED_AT.1);
+    let chosen = apart(rois, order, 0.15 * diameter, looked_at);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
     let says: Vec<Vec<PairSays>> = chosen
         .par_chunks(AT_A_TIME)
@@ -54,7 +55,7 @@ pub(crate) fn first_matching(
     let says = says.concat();
     let mut order: Vec<usize> = (0..chosen.len()).collect();
     order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
-    order.truncate(PLACED);
+    order.truncate(3 * looked_at / 4);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
         // Where the network sees the middle of the object.
         let centred: Vec<Roi> = order

@@ -7,9 +7,10 @@ use sixfold_mesh::Mesh;
 use sixfold_mttm::align::camera_from_view;
 use sixfold_mttm::mask::to_image;
 use sixfold_mttm::matching::{MatchOptions, Matcher};
+use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::roi::Roi;
 use sixfold_mttm::{
-    DepthView, Estimate, EstimateOptions, KnownObject, ObjectTemplates, TemplateOptions, estimate,
+    DepthView, Estimate, EstimateOptions, KnownObject, ObjectTemplates, Search, TemplateOptions, estimate,
 };
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
@@ -69,6 +70,12 @@ fn known(with_mesh: bool) -> KnownObject {
     KnownObject::new(templates, model)
 }
 
+/// An object as points find it, and as the network does.
+fn both_ways(object: KnownObject) -> [KnownObject; 2] {
+    let model = std::sync::Arc::new(MttmModel::shipped().unwrap());
+    [object.clone(), object.with_network(model)]
+}
+
 fn off(found: &Estimate, truth: &Pose) -> (f64, f64) {
     let pose = &found.camera_from_object;
     (1000.0 * pose.distance_to(truth), pose.rotation_angle_to(truth).to_degrees())
@@ -87,21 +94,27 @@ fn iou(found: &Estimate, visible: &Mask, depth: &DepthImage) -> f64 {
 
 #[test]
 fn found_from_all_sides_with_its_mask() {
-    let (alone, with_mesh) = (known(false), known(true));
+    let (alone, with_mesh) = (both_ways(known(false)), both_ways(known(true)));
     let options = EstimateOptions::default();
     for (i, (x, y, yaw)) in [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4)].into_iter().enumerate()
     {
         let truth = on_table(x, y, yaw);
         let (depth, visible) = look(&[(&part(), truth)], i as u64);
         let scene = prepared(&depth);
-        for (object, millimetres, degrees) in [(&alone, 6.0, 5.0), (&with_mesh, 4.0, 3.0)] {
+        let all = [
+            (&alone[0], 6.0, 5.0),
+            (&alone[1], 6.0, 5.0),
+            (&with_mesh[0], 4.0, 3.0),
+            (&with_mesh[1], 4.0, 3.0),
+        ];
+        for (object, millimetres, degrees) in all {
             let (found, stages) = estimate(&scene, object, &options);
             let best = found.first().unwrap_or_else(|| panic!("nothing found at {x} {y} {yaw}"));
             let (t, r) = off(best, &truth);
             assert!(t < millimetres && r < degrees, "{x} {y} {yaw}: {t:.1} mm, {r:.1} degrees");
             let overlap = iou(best, &visible, &depth);
             assert!(overlap > 0.75, "{x} {y} {yaw}: {overlap}");
-            assert!(stages.sampled > 50 && stages.regions > 0);
+            assert!(stages.sampled > 20 && stages.regions > 0, "{stages:?}");
         }
     }
 }
@@ -142,29 +155,34 @@ fn a_hidden_half_does_not_shift_the_pose() {
     assert!((0.3..0.8).contains(&share), "the screen hides {share}");
     // The screen itself resembles parts of the object: it may be named as well, but the object must be among the first.
     let options = EstimateOptions { max_instances: 3, ..EstimateOptions::default() };
-    let (found, _) = estimate(&prepared(&depth), &known(true), &options);
-    let all: Vec<(f64, f64)> = found.iter().map(|e| off(e, &truth)).collect();
-    let best = all.iter().position(|(t, r)| *t < 5.0 && *r < 4.0);
-    let best = best.unwrap_or_else(|| panic!("mm and degrees off: {all:?}, {share:.2} seen"));
-    // The centroid of the visible part lies centimetres from that of the whole.
-    assert!(iou(&found[best], &visible, &depth) > 0.6);
+    for object in both_ways(known(true)) {
+        let (found, _) = estimate(&prepared(&depth), &object, &options);
+        let all: Vec<(f64, f64)> = found.iter().map(|e| off(e, &truth)).collect();
+        let best = all.iter().position(|(t, r)| *t < 5.0 && *r < 4.0);
+        let best = best.unwrap_or_else(|| panic!("mm and degrees off: {all:?}, {share:.2} seen"));
+        // The centroid of the visible part lies centimetres from that of the whole.
+        assert!(iou(&found[best], &visible, &depth) > 0.6);
+    }
 }
 
 #[test]
 fn what_is_not_there_is_not_surely_found() {
     let box_alone = cuboid([-0.1, -0.07, 0.0], [0.1, 0.07, 0.09]);
-    let (depth, _) = look(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
-    let (wrong, _) = estimate(&prepared(&depth), &known(true), &EstimateOptions::default());
-    let truth = on_table(0.1, 0.0, 1.0);
-    let (depth, _) = look(&[(&part(), truth)], 3);
-    let (right, _) = estimate(&prepared(&depth), &known(true), &EstimateOptions::default());
     let sure = |found: &[Estimate]| found.first().map_or(0.0, |e| e.confidence);
-    assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
-    // An empty table: nothing at all.
-    let (depth, _) = look(&[], 3);
-    let (nothing, stages) = estimate(&prepared(&depth), &known(false), &EstimateOptions::default());
-    assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
-    assert!(stages.sampled < 400, "{}", stages.sampled);
+    for object in both_ways(known(true)) {
+        let (depth, _) = look(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
+        let (wrong, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        let truth = on_table(0.1, 0.0, 1.0);
+        let (depth, _) = look(&[(&part(), truth)], 3);
+        let (right, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
+        // An empty table: nothing at all.
+        let (depth, _) = look(&[], 3);
+        let (nothing, stages) =
+            estimate(&prepared(&depth), &object.without_mesh(), &EstimateOptions::default());
+        assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
+        assert!(stages.sampled < 400, "{}", stages.sampled);
+    }
 }
 
 #[test]
@@ -174,26 +192,35 @@ fn one_masked_view_is_enough_to_find_it_elsewhere() {
     let camera = camera();
     let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: Some(first) };
     let templates = ObjectTemplates::from_depth(&[view], &TemplateOptions::default()).unwrap();
-    let object = KnownObject::new(templates, None);
     let truth = on_table(0.12, -0.06, 0.6);
     let other = cuboid([-0.04, -0.04, 0.0], [0.04, 0.04, 0.12]);
     let (depth, visible) = look(&[(&part(), truth), (&other, on_table(-0.12, 0.0, 0.2))], 9);
-    let (found, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
-    let best = found.first().expect("found");
-    let (t, r) = off(best, &truth);
-    assert!(t < 12.0 && r < 8.0, "{t:.1} mm, {r:.1} degrees");
-    assert!(iou(best, &visible, &depth) > 0.5);
+    for object in both_ways(KnownObject::new(templates, None)) {
+        let (found, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        let best = found.first().expect("found");
+        let (t, r) = off(best, &truth);
+        assert!(t < 12.0 && r < 8.0, "{t:.1} mm, {r:.1} degrees");
+        assert!(iou(best, &visible, &depth) > 0.5);
+    }
 }
 
 #[test]
 fn same_result_at_any_number_of_threads() {
     let (depth, _) = look(&[(&part(), on_table(0.02, 0.03, 1.1))], 2);
-    let (scene, object) = (prepared(&depth), known(true));
-    let with = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| estimate(&scene, &object, &EstimateOptions::default()).0)
-    };
-    assert_eq!(with(1), with(3));
+    let scene = prepared(&depth);
+    for object in both_ways(known(true)) {
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| estimate(&scene, &object, &EstimateOptions::default()).0)
+        };
+        let alone = with(1);
+        assert_eq!(alone, with(3));
+        // Nor does it matter what else is searched in the scene.
+        let search = Search::new(&scene);
+        let first = search.estimate(&object, &EstimateOptions::default()).0;
+        assert_eq!(first, alone);
+        assert_eq!(search.estimate(&object, &EstimateOptions::default()).0, alone);
+    }
 }
 
 #[test]
@@ -201,13 +228,15 @@ fn two_of_a_kind_are_two() {
     let poses = [on_table(-0.12, 0.0, 0.4), on_table(0.13, 0.02, 2.2)];
     let (depth, _) = look(&[(&part(), poses[0]), (&part(), poses[1])], 6);
     let options = EstimateOptions { max_instances: 2, ..EstimateOptions::default() };
-    let (mut found, _) = estimate(&prepared(&depth), &known(true), &options);
-    assert_eq!(found.len(), 2);
-    found.sort_by(|a, b| {
-        a.camera_from_object.translation().x.total_cmp(&b.camera_from_object.translation().x)
-    });
-    for (e, truth) in found.iter().zip(&poses) {
-        let (t, r) = off(e, truth);
-        assert!(t < 5.0 && r < 4.0, "{t:.1} mm, {r:.1} degrees");
+    for object in both_ways(known(true)) {
+        let (mut found, _) = estimate(&prepared(&depth), &object, &options);
+        assert_eq!(found.len(), 2);
+        found.sort_by(|a, b| {
+            a.camera_from_object.translation().x.total_cmp(&b.camera_from_object.translation().x)
+        });
+        for (e, truth) in found.iter().zip(&poses) {
+            let (t, r) = off(e, truth);
+            assert!(t < 5.0 && r < 4.0, "{t:.1} mm, {r:.1} degrees");
+        }
     }
 }

@@ -175,7 +175,7 @@ impl Scene<'_> {
             .zip(&posed)
             .map(|((thing, _), (_, pose))| GroundTruth::new(thing.id, *pose))
             .collect();
-        let infos: Vec<_> = visible.iter().map(|v| v.info.clone()).collect();
+        let infos: Vec<_> = visible.iter().map(|v| v.info).collect();
         let (masks, masks_visible): (Vec<Mask>, Vec<Mask>) =
             visible.into_iter().map(|v| (v.mask, v.mask_visible)).unzip();
         writer.add(&NewImage {
