@@ -119,6 +119,17 @@ for color, (obj_id, pose) in zip(COLORS, from_depth.items()):
     outline(panels[1, 0], meshes[obj_id], pose, color, obj_id)
 panels[1, 0].set_title("poses from depth alone (point pair features)")
 
+# %% An object by its templates, with nothing but the mesh, and then without one: cut out of this very image
+begin = time.perf_counter()
+templates = sixfold.Templates.from_mesh(mesh, coverage="around")
+found = sixfold.estimate_mttm(scene, sixfold.Mttm(templates, mesh), min_score=0.2)
+said = f"{judge(mesh, found[0].camera_from_object, truth[SHOWN])[0]:.1f} mm ADD" if found else "not found"
+print(f"templates: {len(templates)} views of object {SHOWN}, {said}, {time.perf_counter() - begin:.1f} s")
+seen = sixfold.Templates.from_depth([(depth, camera, drawn.mask)])
+again = sixfold.estimate_mttm(scene, seen, min_score=0.2)
+shared = (again[0].mask & drawn.mask).sum() / drawn.mask.sum() if again else 0.0
+print(f"templates: one masked view in place of the mesh, {100 * shared:.0f} % of its mask found again")
+
 # %% Poses from colour alone: a detector says where the objects are, a second network how they are turned
 from_colour = {}
 panels[1, 1].imshow(rgb)
@@ -158,6 +169,16 @@ panels[1, 2].set_xticks(range(len(labels)), [str(i) for i in labels])
 panels[1, 2].set_ylim(0, 0.5)
 panels[1, 2].set(xlabel="object", ylabel="ADD(-S) / diameter, cut at 0.5", title="errors against ground truth")
 panels[1, 2].legend()
+
+# %% A grasp tried in a physics engine: from above, across the narrower side of the object at rest on a table
+solid = sixfold.Solid(mesh)
+rest = solid.rest()
+if rest is not None:
+    low, high = mesh.transformed(rest).bounding_box
+    narrow = np.argmin((high - low)[:2])
+    grasp = sixfold.gripper_pose([*(low + high)[:2] / 2, high[2] - 0.03], closing=np.eye(3)[narrow])
+    trial = sixfold.try_grasp(solid, grasp, world_from_object=rest, gripper="jaws-140")
+    print(f"physics: object {SHOWN} in {solid.part_count} convex parts, grasped from above: {trial.outcome}")
 
 # %% The picture, and the estimates as a result file of the BOP Challenge
 arguments.out.mkdir(parents=True, exist_ok=True)

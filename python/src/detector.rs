@@ -57,7 +57,7 @@ pub(crate) struct Detector {
 
 #[pymethods]
 impl Detector {
-    /// Reads a weight file (.safetensors) that `sixfold train detector` wrote.
+    /// Reads a weight file (.safetensors) that `train_detector` or `sixfold train detector` wrote.
     ///
     /// Raises OSError when the file cannot be read, ValueError when it is no such model.
     #[classmethod]

@@ -22,6 +22,7 @@ mod guard;
 mod mesh;
 mod metrics;
 mod mttm;
+mod photograph;
 mod photographs;
 mod pix2pose;
 mod ppf;
@@ -72,7 +73,7 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<experienced::PyExperience>()?;
     module.add_class::<detector::Detector>()?;
     module.add_class::<detector::DetectedObject>()?;
-    module.add_class::<photographs::PyPhotograph>()?;
+    module.add_class::<photograph::PyPhotograph>()?;
     module.add_class::<photographs::RefinedPoses>()?;
     module.add_class::<photographs::SynthesizedView>()?;
     module.add_class::<pix2pose::Pix2Pose>()?;

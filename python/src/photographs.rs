@@ -1,7 +1,6 @@
-//! Neural Object Learning: `Photograph`, `refine_poses` and `synthesize` (`sixfold-nol`; dissertation, chapter 4).
+//! Neural Object Learning: `refine_poses` and `synthesize` (`sixfold-nol`; dissertation, chapter 4).
 
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use numpy::{PyArray1, PyArray2, PyArray3};
@@ -13,12 +12,13 @@ use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::{ModelError, NolModel};
 use sixfold_nol::refine::{RefineOptions, Refinement, SceneKind, SceneSource, refine_scene};
 use sixfold_nol::synthesis::{NewView, ViewMaker, Weighting};
-use sixfold_nol::{NolError, Photograph, SourceView};
+use sixfold_nol::{Photograph, SourceView};
 
-use crate::arrays::{self, about, bad, whole};
+use crate::arrays::{self, bad, whole};
 use crate::camera::PyCamera;
 use crate::guard::{Leave, Tell, free, os_error, reporting};
 use crate::mesh::PyMesh;
+use crate::photograph::{PyPhotograph, nol_error};
 
 /// Side of the crops that new views take their colours from, pixels: as the command line has it.
 const CROP: usize = 256;
@@ -27,98 +27,6 @@ fn model_error(error: ModelError) -> PyErr {
     match &error {
         ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
         _ => PyValueError::new_err(format!("weights: {error}")),
-    }
-}
-
-fn nol_error(error: NolError) -> PyErr {
-    match &error {
-        NolError::Option { field, expected, found } => {
-            let argument = match *field {
-                "sources per view" => "per_view",
-                field if field.starts_with("source") => "photographs",
-                field => field,
-            };
-            bad(argument, expected, found)
-        }
-        _ => PyValueError::new_err(format!("photographs: {error}")),
-    }
-}
-
-/// A photograph of an object with a rough pose, for refine_poses and synthesize. It cannot be changed.
-///
-/// rgb (H, W, 3) uint8, without lens distortion; camera_from_object (4, 4), off by a centimetre and some degrees at most;
-/// mask (H, W) bool: where the object is visible, None for all of its outline; name: what stands for it in messages.
-///
-/// Raises ValueError for images of another size than the camera's, a pose that puts the object outside the image.
-///
-/// >>> import numpy as np
-/// >>> pose = np.eye(4)
-/// >>> pose[2, 3] = 0.7
-/// >>> Photograph(np.zeros((480, 640, 3), np.uint8), Camera(500, 500, 320, 240, 640, 480), pose, name="first")
-/// <Photograph: first>
-#[pyclass(name = "Photograph", module = "sixfold", frozen)]
-pub(crate) struct PyPhotograph(Photograph);
-
-#[pymethods]
-impl PyPhotograph {
-    #[new]
-    #[pyo3(signature = (rgb, camera, camera_from_object, mask=None, *, name="unnamed"))]
-    fn new(
-        rgb: &Bound<'_, PyAny>,
-        camera: PyCamera,
-        camera_from_object: &Bound<'_, PyAny>,
-        mask: Option<&Bound<'_, PyAny>>,
-        name: &str,
-    ) -> PyResult<Self> {
-        let image = arrays::rgb("rgb", rgb)?;
-        let camera = camera.of_image("rgb", image.size())?;
-        let pose = arrays::pose("camera_from_object", camera_from_object)?;
-        let mask = mask.map(|mask| arrays::mask("mask", mask)).transpose()?;
-        let photograph = Photograph::new(name, Arc::new(image), camera, pose, mask);
-        photograph.map(PyPhotograph).map_err(|error| match &error {
-            NolError::Size { what: "mask", .. } => about("mask")(error),
-            _ => about("camera_from_object")(error),
-        })
-    }
-
-    /// What stands for it in messages.
-    #[getter]
-    fn name(&self) -> &str {
-        self.0.name()
-    }
-
-    /// Its camera.
-    #[getter]
-    fn camera(&self) -> PyCamera {
-        PyCamera(*self.0.camera())
-    }
-
-    /// Its pose, (4, 4) float64, metres.
-    #[getter]
-    fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        arrays::from_pose(py, self.0.camera_from_object())
-    }
-
-    /// The image, (H, W, 3) uint8.
-    #[getter]
-    fn rgb<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        arrays::from_image_of(py, self.0.image().as_ref().clone())
-    }
-
-    /// Where the object is visible, (H, W) bool, or None.
-    #[getter]
-    fn mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<bool>>>> {
-        self.0.mask().map(|mask| arrays::from_image(py, mask.clone())).transpose()
-    }
-
-    /// The same photograph with another pose (4, 4).
-    fn with_pose(&self, camera_from_object: &Bound<'_, PyAny>) -> PyResult<Self> {
-        let pose = arrays::pose("camera_from_object", camera_from_object)?;
-        self.0.with_pose(pose).map(PyPhotograph).map_err(about("camera_from_object"))
-    }
-
-    fn __repr__(&self) -> String {
-        format!("<Photograph: {}>", self.0.name())
     }
 }
 

@@ -185,7 +185,7 @@ fn look_into(
 
 #[pymethods]
 impl Pix2Pose {
-    /// Reads a weight file (.safetensors) that `sixfold train pix2pose` wrote.
+    /// Reads a weight file (.safetensors) that `train_pix2pose` or `sixfold train pix2pose` wrote.
     ///
     /// camera: the camera of the images, unless every call names its own; meshes {object id: Mesh}: with an object's mesh
     /// its outline is aligned with the image as the last step.

@@ -12,11 +12,12 @@ use sixfold_mesh::ModelInfo;
 use sixfold_nn::recipe::{Listener, News, Trained};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_pix2pose::material::{Frames, Material};
+use sixfold_pix2pose::material::{Frames, Material, MaterialError};
+use sixfold_pix2pose::samples::SampleError;
 
 use crate::arrays::{self, bad, whole};
 use crate::bop::PyDataset;
-use crate::guard::{Leave, Tell, os_error, reporting};
+use crate::guard::{Leave, Tell, dataset_error, interruptible, os_error, reporting};
 use crate::mesh::PyMesh;
 
 /// An `OSError` where a file is at the bottom of it, else a `ValueError`.
@@ -202,13 +203,18 @@ impl Source {
     }
 
     pub(crate) fn read(self, py: Python<'_>, least_visible: f64) -> PyResult<Material> {
-        let read = crate::guard::interruptible(py, move |_| match self {
+        let read = interruptible(py, move |_| match self {
             Source::Dataset { root, split, ids, frames } => {
                 Material::of_dataset(&root, &split, &ids, &frames, least_visible)
             }
             Source::Meshes(meshes) => Ok(Material::of_meshes(meshes, "meshes")),
         })?;
-        read.map_err(|error| file_or_value(&error))
+        read.map_err(|error| match error {
+            MaterialError::Dataset(error) | MaterialError::Samples(SampleError::Dataset(error)) => {
+                dataset_error(error)
+            }
+            other => file_or_value(&other),
+        })
     }
 }
 

@@ -25,7 +25,7 @@ use crate::mesh::PyMesh;
 ///
 /// >>> cube = Mesh([[x, y, z] for x in (0, .05) for y in (0, .05) for z in (0, .05)]).convex_hull()
 /// >>> solid = Solid(cube, convex=True)
-/// >>> abs(solid.rest()[2, 3]) < 1e-3  # its origin is at the bottom
+/// >>> bool(abs(solid.rest()[2, 3]) < 1e-3)  # its origin is at the bottom
 /// True
 #[pyclass(name = "Solid", module = "sixfold", frozen)]
 pub(crate) struct PySolid {

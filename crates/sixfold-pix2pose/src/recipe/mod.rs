@@ -1,31 +1,30 @@
 //! A whole training: objects and their photographs in, a model file out. Interrupted at any time, it goes on.
 
+mod error;
+
 use std::collections::BTreeMap;
 use std::f32::consts::PI;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use sixfold_augment::AugmentError;
-use sixfold_mesh::{Mesh, MeshError, ModelInfo};
+use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
-use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, Trained, continued_from};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::{ModelCard, WeightsError};
+use sixfold_nn::weights::ModelCard;
 use sixfold_outline::outline_mesh;
-use thiserror::Error;
 
+pub use self::error::RecipeError;
 use crate::adversarial::{AdversarialOptions, train_adversarial};
 use crate::aligned::measure_corrections;
-use crate::estimate::EstimateError;
 use crate::material::{Material, backgrounds};
-use crate::model::{ImageSizes, ModelError, Network, Pix2PoseModel};
+use crate::model::{ImageSizes, Network, Pix2PoseModel};
 use crate::networks::{Compact, CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
 use crate::object::{ObjectEntry, SymmetryMap, lmo_threshold, symmetry_deviation};
-use crate::samples::{RealCrop, SampleError, SampleOptions, SampleSource, TrainingObject};
-use crate::training::{TrainingError, TrainingOptions, last_checkpoint, train};
+use crate::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
+use crate::training::{TrainingOptions, last_checkpoint, train};
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -123,57 +122,6 @@ impl Default for Recipe {
             command: String::new(),
         }
     }
-}
-
-/// Why no model could be trained. What was trained until then is kept.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
-    /// A mesh without a hull.
-    #[error("object {id}: its vertices have no convex hull: {reason}")]
-    Hull {
-        /// The object.
-        id: u32,
-        /// Why.
-        reason: MeshError,
-    },
-    /// Backgrounds.
-    #[error(transparent)]
-    Backgrounds(#[from] AugmentError),
-    /// Samples.
-    #[error(transparent)]
-    Samples(#[from] SampleError),
-    /// Weights to begin with.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// Weights in torchvision's layout.
-    #[error(transparent)]
-    Pretrained(#[from] PretrainedError),
-    /// A model file.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The training itself.
-    #[error(transparent)]
-    Training(#[from] TrainingError),
-    /// What is measured after it.
-    #[error(transparent)]
-    Estimate(#[from] EstimateError),
 }
 
 /// Instances of a photograph that are less visible teach more confusion than shape.

@@ -1,0 +1,65 @@
+//! Why no model could be trained.
+
+use std::path::PathBuf;
+
+use sixfold_augment::AugmentError;
+use sixfold_mesh::MeshError;
+use sixfold_nn::pretrained::PretrainedError;
+use sixfold_nn::weights::WeightsError;
+use thiserror::Error;
+
+use crate::estimate::EstimateError;
+use crate::model::ModelError;
+use crate::samples::SampleError;
+use crate::training::TrainingError;
+
+/// Why no model could be trained. What was trained until then is kept.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RecipeError {
+    /// An option is out of its range.
+    #[error("{field}: found {found}, expected {expected}")]
+    Option {
+        /// Its name.
+        field: &'static str,
+        /// What it held.
+        found: String,
+        /// What it should hold.
+        expected: &'static str,
+    },
+    /// There is nothing to export.
+    #[error("{}: holds no checkpoint; train first", folder.display())]
+    NoCheckpoint {
+        /// The training's folder.
+        folder: PathBuf,
+    },
+    /// A mesh without a hull.
+    #[error("object {id}: its vertices have no convex hull: {reason}")]
+    Hull {
+        /// The object.
+        id: u32,
+        /// Why.
+        reason: MeshError,
+    },
+    /// Backgrounds.
+    #[error(transparent)]
+    Backgrounds(#[from] AugmentError),
+    /// Samples.
+    #[error(transparent)]
+    Samples(#[from] SampleError),
+    /// Weights to begin with.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// Weights in torchvision's layout.
+    #[error(transparent)]
+    Pretrained(#[from] PretrainedError),
+    /// A model file.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The training itself.
+    #[error(transparent)]
+    Training(#[from] TrainingError),
+    /// What is measured after it.
+    #[error(transparent)]
+    Estimate(#[from] EstimateError),
+}
