@@ -210,9 +210,11 @@ impl Source {
             Source::Meshes(meshes) => Ok(Material::of_meshes(meshes, "meshes")),
         })?;
         read.map_err(|error| match error {
-            MaterialError::Dataset(error) | MaterialError::Samples(SampleError::Dataset(error)) => {
-                dataset_error(error)
-            }
+            MaterialError::Dataset(error) => dataset_error(*error),
+            MaterialError::Samples(error) => match *error {
+                SampleError::Dataset(error) => dataset_error(error),
+                other => file_or_value(&other),
+            },
             other => file_or_value(&other),
         })
     }

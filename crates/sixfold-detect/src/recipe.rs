@@ -137,7 +137,7 @@ pub enum RecipeError {
     Backgrounds(#[from] AugmentError),
     /// Photographs.
     #[error(transparent)]
-    Samples(#[from] SampleError),
+    Samples(Box<SampleError>),
     /// Training images.
     #[error(transparent)]
     Scenes(#[from] SceneError),
@@ -153,6 +153,12 @@ pub enum RecipeError {
     /// The training itself.
     #[error(transparent)]
     Training(#[from] TrainingError),
+}
+
+impl From<SampleError> for RecipeError {
+    fn from(error: SampleError) -> Self {
+        RecipeError::Samples(Box::new(error))
+    }
 }
 
 /// Less complete instances are not cut out to be pasted elsewhere.

@@ -44,10 +44,10 @@ pub enum Frames {
 pub enum MaterialError {
     /// The dataset cannot be read.
     #[error(transparent)]
-    Dataset(#[from] DatasetError),
+    Dataset(Box<DatasetError>),
     /// The photographs cannot be read.
     #[error(transparent)]
-    Samples(#[from] SampleError),
+    Samples(Box<SampleError>),
     /// The backgrounds cannot be read.
     #[error(transparent)]
     Backgrounds(#[from] AugmentError),
@@ -78,6 +78,18 @@ pub enum MaterialError {
         /// How much should be seen.
         percent: f64,
     },
+}
+
+impl From<DatasetError> for MaterialError {
+    fn from(error: DatasetError) -> Self {
+        MaterialError::Dataset(Box::new(error))
+    }
+}
+
+impl From<SampleError> for MaterialError {
+    fn from(error: SampleError) -> Self {
+        MaterialError::Samples(Box::new(error))
+    }
 }
 
 impl Material {

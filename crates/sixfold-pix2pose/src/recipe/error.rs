@@ -46,7 +46,7 @@ pub enum RecipeError {
     Backgrounds(#[from] AugmentError),
     /// Samples.
     #[error(transparent)]
-    Samples(#[from] SampleError),
+    Samples(Box<SampleError>),
     /// Weights to begin with.
     #[error(transparent)]
     Weights(#[from] WeightsError),
@@ -62,4 +62,10 @@ pub enum RecipeError {
     /// What is measured after it.
     #[error(transparent)]
     Estimate(#[from] EstimateError),
+}
+
+impl From<SampleError> for RecipeError {
+    fn from(error: SampleError) -> Self {
+        RecipeError::Samples(Box::new(error))
+    }
 }
