@@ -4,7 +4,9 @@
 //! `P_O = 1 - N_out / N_m`, the share `S_N` of matched normals, the share `S_B` of the silhouette that lies on an edge
 //! of the scene, and their product. `N_m` are the rendered pixels; a pixel is an inlier within the threshold,
 //! occluded when the scene is nearer, an outlier when the scene is further away (one would see through the object).
-//! Pixels without measured depth count in `N_m` only, as printed.
+//! Pixels without measured depth count in `N_m` only, as printed. Beyond the dissertation: what hides an object has an
+//! outline. Hidden pixels behind a surface that goes on smoothly from what is seen of the object ([`pierced`]
+//! (VerificationScore::pierced)) are no excuse and stay in `N_m - N_occ`.
 
 use sixfold_geometry::{Camera, Pose, Rect, Vec3};
 use sixfold_mesh::Mesh;
@@ -22,11 +24,19 @@ pub struct VerificationOptions {
     pub normal_angle: f64,
     /// A silhouette pixel lies on a scene edge within this distance, pixels.
     pub boundary_distance: u8,
+    /// Hidden pixels count as hidden only as far as the scene has an edge between them and what is seen; `false` as
+    /// printed.
+    pub occluders_have_edges: bool,
 }
 
 impl Default for VerificationOptions {
     fn default() -> Self {
-        VerificationOptions { depth_threshold: None, normal_angle: 30f64.to_radians(), boundary_distance: 3 }
+        VerificationOptions {
+            depth_threshold: None,
+            normal_angle: 30f64.to_radians(),
+            boundary_distance: 3,
+            occluders_have_edges: true,
+        }
     }
 }
 
@@ -46,6 +56,8 @@ pub struct VerificationScore {
     pub inliers: usize,
     /// Pixels where the scene is nearer, `N_occ`.
     pub occluded: usize,
+    /// Those of them that nothing excuses: the pose reaches into a surface.
+    pub pierced: usize,
     /// Pixels where the scene is further away, `N_out`.
     pub outliers: usize,
     /// Depth fitness `S_D`.
@@ -78,12 +90,27 @@ impl VerificationScore {
 #[derive(Debug)]
 pub struct Verifier {
     frame: Frame,
+    agreement: Vec<Agreement>,
+}
+
+/// What the scene says at a pixel of a rendering or template.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Agreement {
+    /// Nothing there, nothing measured, or the scene is further away.
+    Nothing,
+    /// The depth agrees.
+    Inlier {
+        /// Near an edge of the scene.
+        on_edge: bool,
+    },
+    /// The scene is nearer.
+    Occluded,
 }
 
 impl Default for Verifier {
     fn default() -> Self {
         let one = Camera { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1, distortion: None };
-        Verifier { frame: Frame::new(&one) }
+        Verifier { frame: Frame::new(&one), agreement: vec![] }
     }
 }
 
@@ -146,6 +173,8 @@ impl Verifier {
         let inverse = self.frame.inverse_depth();
         let (mut with_normal, mut good_normals, mut contour, mut on_edge) = (0usize, 0usize, 0usize, 0usize);
         let [cx0, cy0, cx1, cy1] = self.frame.covered();
+        self.agreement.clear();
+        self.agreement.resize(width * height, Agreement::Nothing);
         for y in cy0..cy1 {
             for x in cx0..cx1 {
                 let index = y * width + x;
@@ -159,10 +188,13 @@ impl Verifier {
                 let occluded = measured > 0.0 && difference < -threshold;
                 if occluded {
                     score.occluded += 1;
+                    self.agreement[index] = Agreement::Occluded;
                 } else if measured > 0.0 && difference > threshold {
                     score.outliers += 1;
                 } else if measured > 0.0 {
                     score.inliers += 1;
+                    let on_edge = scene.edge_distance[(sx, sy)] <= options.boundary_distance;
+                    self.agreement[index] = Agreement::Inlier { on_edge };
                     let (a, b) = (normals[(x, y)], scene.normals[(sx, sy)]);
                     if b != [0.0; 3] {
                         with_normal += 1;
@@ -186,8 +218,11 @@ impl Verifier {
             }
         }
         let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+        if options.occluders_have_edges {
+            score.pierced = pierced(&mut self.agreement, width);
+        }
         let outlier_penalty = 1.0 - share(score.outliers, score.rendered);
-        score.depth = outlier_penalty * share(score.inliers, score.rendered - score.occluded);
+        score.depth = outlier_penalty * share(score.inliers, score.rendered + score.pierced - score.occluded);
         score.boundary = share(on_edge, contour);
         score.normals = share(good_normals, with_normal);
         score.total = score.depth * score.boundary * score.normals;
@@ -258,4 +293,49 @@ impl Verifier {
         }
         pixels
     }
+}
+
+/// How many hidden pixels no occluder excuses: of each connected part of them, the share of its border with inliers that
+/// lies on no edge of the scene. `agreement` holds rows of `width` pixels; its hidden ones are taken out.
+pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
+    let mut total = 0;
+    let mut open = vec![];
+    for start in 0..agreement.len() {
+        if agreement[start] != Agreement::Occluded {
+            continue;
+        }
+        let (mut pixels, mut border, mut without_edge) = (0usize, 0usize, 0usize);
+        open.push(start);
+        agreement[start] = Agreement::Nothing;
+        while let Some(index) = open.pop() {
+            pixels += 1;
+            let (x, y) = (index % width, index / width);
+            let mut touch = |x: usize, y: usize| {
+                let Some(at) = agreement.get_mut(y * width + x).filter(|_| x < width) else { return };
+                match at {
+                    Agreement::Nothing => {}
+                    Agreement::Inlier { on_edge } => {
+                        border += 1;
+                        without_edge += usize::from(!*on_edge);
+                    }
+                    Agreement::Occluded => {
+                        *at = Agreement::Nothing;
+                        open.push(y * width + x);
+                    }
+                }
+            };
+            if x > 0 {
+                touch(x - 1, y);
+            }
+            if y > 0 {
+                touch(x, y - 1);
+            }
+            touch(x + 1, y);
+            touch(x, y + 1);
+        }
+        if border > 0 {
+            total += pixels * without_edge / border;
+        }
+    }
+    total
 }

@@ -182,6 +182,33 @@ fn scores_of_exact_shifted_and_hidden_poses() {
 }
 
 #[test]
+fn what_hides_an_object_has_an_outline() {
+    let block = boxes(&[([-0.05, -0.05, 0.0], [0.05, 0.05, 0.1])]);
+    let options = VerificationOptions::default();
+    let printed = VerificationOptions { occluders_have_edges: false, ..options };
+    let score = |depth: &DepthImage, pose: &Pose, options| {
+        let whole = SceneOptions { remove_plane: false, ..SceneOptions::default() };
+        let scene = Scene::new(depth, &camera(), None, &whole).unwrap();
+        Verifier::default().score(&scene, &block, pose, 0.01, options)
+    };
+    // Sunk into the table, its top a little askew in the table's plane: one edge of it agrees, the rest would lie below
+    // a table that goes on smoothly.
+    let askew = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.35, 0.0].into());
+    let sunk = on_table(0.0, 0.0, 0.0) * askew * Pose::from_translation(Vec3::new(0.04, 0.0, -0.1));
+    let empty = depth_of(&[], None);
+    let (ours, as_printed) = (score(&empty, &sunk, &options), score(&empty, &sunk, &printed));
+    assert!(ours.occluded > 500 && ours.inliers > 500, "{ours:?}");
+    assert!(ours.pierced == ours.occluded, "{ours:?}");
+    assert_eq!((as_printed.pierced, as_printed.occluded), (0, ours.occluded));
+    assert!(ours.depth < 0.8 * as_printed.depth, "{ours:?} {as_printed:?}");
+    // A board above the block hides as much of it, and has an outline.
+    let stands = on_table(0.0, 0.0, 0.0);
+    let board = boxes(&[([0.0, -0.2, 0.15], [0.2, 0.2, 0.16])]);
+    let hidden = score(&depth_of(&[(&block, stands), (&board, stands)], None), &stands, &options);
+    assert!(hidden.occluded > 500 && hidden.pierced == 0, "{hidden:?}");
+}
+
+#[test]
 fn most_votes_of_a_clean_view_are_near_the_truth() {
     let (mesh, model) = (bracket(), model());
     let truth = on_table(0.0, 0.0, 0.7);

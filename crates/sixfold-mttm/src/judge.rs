@@ -2,6 +2,7 @@
 //! matched in place of a rendering (what its section 5.4 leaves for the future).
 
 use sixfold_geometry::{PointCloud, Pose};
+use sixfold_match::verification::{Agreement, pierced};
 use sixfold_match::{Scene, VerificationOptions, VerificationScore};
 
 use crate::template::{SIDE, Template};
@@ -15,6 +16,8 @@ pub struct Surface {
     pub dense: PointCloud,
     /// Which of them lie on the outline.
     pub outline: Vec<bool>,
+    /// Their pixels in the template, row by row.
+    pub pixels: Vec<u16>,
 }
 
 impl Surface {
@@ -44,7 +47,8 @@ impl Surface {
                 few.normals.push(dense.normals[i]);
             }
         }
-        Surface { sparse: few, dense, outline }
+        let pixels = pixels.iter().map(|&[x, y]| (y * SIDE + x) as u16).collect();
+        Surface { sparse: few, dense, outline, pixels }
     }
 }
 
@@ -60,6 +64,7 @@ pub fn judge(
     let (width, height) = (camera.width as f64, camera.height as f64);
     let cosine = options.normal_angle.cos();
     let mut score = VerificationScore::default();
+    let mut agreement = [Agreement::Nothing; SIDE * SIDE];
     let (mut with_normal, mut good_normals, mut contour, mut on_edge) = (0usize, 0usize, 0usize, 0usize);
     for (i, p) in surface.dense.points.iter().enumerate() {
         let p = camera_from_view.transform_point(p);
@@ -78,10 +83,13 @@ pub fn judge(
         let hidden = measured > 0.0 && off < -threshold;
         if hidden {
             score.occluded += 1;
+            agreement[usize::from(surface.pixels[i])] = Agreement::Occluded;
         } else if measured > 0.0 && off > threshold {
             score.outliers += 1;
         } else if measured > 0.0 {
             score.inliers += 1;
+            let on_edge = scene.edge_distance()[at] <= options.boundary_distance;
+            agreement[usize::from(surface.pixels[i])] = Agreement::Inlier { on_edge };
             let m = scene.normals()[at];
             if m != [0.0; 3] {
                 with_normal += 1;
@@ -95,8 +103,11 @@ pub fn judge(
         }
     }
     let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
-    score.depth =
-        (1.0 - share(score.outliers, score.rendered)) * share(score.inliers, score.rendered - score.occluded);
+    if options.occluders_have_edges && score.occluded > 0 {
+        score.pierced = pierced(&mut agreement, SIDE);
+    }
+    score.depth = (1.0 - share(score.outliers, score.rendered))
+        * share(score.inliers, score.rendered + score.pierced - score.occluded);
     score.boundary = share(on_edge, contour);
     score.normals = share(good_normals, with_normal);
     score.total = score.depth * score.boundary * score.normals;

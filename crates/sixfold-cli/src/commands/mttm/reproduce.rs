@@ -12,7 +12,7 @@ use anyhow::{Context, Result, bail};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, Vec3};
-use sixfold_match::{Scene, SceneOptions};
+use sixfold_match::{Scene, SceneOptions, VerificationOptions};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions};
@@ -38,20 +38,29 @@ struct Way {
     predicted_pose: bool,
     align: bool,
     mesh: bool,
+    occluders_have_edges: bool,
 }
 
 const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
-    Way { key, title, by, predicted_pose: true, align: true, mesh: true }
+    Way { key, title, by, predicted_pose: true, align: true, mesh: true, occluders_have_edges: true }
 }
 
 /// Ways of template matching, the default first.
-const WAYS: [Way; 9] = [
+const WAYS: [Way; 10] = [
     way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
     Way {
         predicted_pose: false,
         ..way("both-template-pose", "the same without the predicted rotation and place", MatchedBy::Both)
     },
     Way { mesh: false, ..way("both-templates", "the same judged by the templates alone", MatchedBy::Both) },
+    Way {
+        occluders_have_edges: false,
+        ..way(
+            "both-printed-score",
+            "the same with the printed score, which forgives whatever is hidden",
+            MatchedBy::Both,
+        )
+    },
     way("network", "network alone, aligned, verified with the mesh", MatchedBy::Network),
     Way {
         predicted_pose: false,
@@ -285,7 +294,11 @@ fn measure(
         for (way, search) in WAYS.iter().zip(&searches) {
             let object = if way.mesh { &k.with_mesh } else { &k.alone };
             let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
-            let options = EstimateOptions { matched_by, predicted_pose, align, ..plain };
+            let verification = VerificationOptions {
+                occluders_have_edges: way.occluders_have_edges,
+                ..VerificationOptions::default()
+            };
+            let options = EstimateOptions { matched_by, predicted_pose, align, verification, ..plain };
             let (found, stages) = search.estimate(object, &options);
             let best = found.first();
             let iou = best.map(|e| {
