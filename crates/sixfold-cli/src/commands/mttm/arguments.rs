@@ -30,7 +30,7 @@ pub(crate) enum Matcher {
     Points,
     /// The network's descriptors alone, as in the dissertation
     Network,
-    /// Points first, then both
+    /// The network says where to look, and both say with which template
     Both,
 }
 
