@@ -315,7 +315,7 @@ impl Pix2Pose {
                     let diameter = model.object(object_id).map(|(_, o)| o.diameter)?;
                     // Too little depth on the object leaves the pose that colour gave.
                     let start = posed.camera_from_object;
-                    if let Ok(aligned) = scene.align(&mesh.whole, diameter, &start, &posed.found) {
+                    if let Ok(aligned) = scene.align(&mesh.whole, diameter, &start, &posed.found, None) {
                         posed.camera_from_object = aligned.camera_from_object;
                         posed.aligned = true;
                     }

@@ -129,6 +129,30 @@ impl<T> Image<T> {
     }
 }
 
+impl Image<bool> {
+    /// The mask with all pixels that lie at most so many columns and rows from one of its own.
+    pub fn grown(&self, pixels: usize) -> Image<bool> {
+        let spread = |line: &[bool]| -> Vec<bool> {
+            let mut near = vec![false; line.len()];
+            for (i, _) in line.iter().enumerate().filter(|(_, inside)| **inside) {
+                near[i.saturating_sub(pixels)..(i + pixels + 1).min(line.len())].fill(true);
+            }
+            near
+        };
+        let mut grown = self.clone();
+        for row in grown.data.chunks_mut(self.width.max(1)) {
+            row.copy_from_slice(&spread(row));
+        }
+        for x in 0..self.width {
+            let column: Vec<bool> = (0..self.height).map(|y| grown.data[y * self.width + x]).collect();
+            for (y, near) in spread(&column).into_iter().enumerate() {
+                grown.data[y * self.width + x] = near;
+            }
+        }
+        grown
+    }
+}
+
 impl<T> std::ops::Index<(usize, usize)> for Image<T> {
     type Output = T;
     fn index(&self, (x, y): (usize, usize)) -> &T {
@@ -195,6 +219,20 @@ mod tests {
     fn a_buffer_of_the_wrong_length_is_refused() {
         let error = Image::from_vec(3, 2, vec![0u8; 5]).unwrap_err();
         assert_eq!(error, ImageError::WrongLength { width: 3, height: 2, expected: 6, found: 5 });
+    }
+
+    #[test]
+    fn masks_grow_by_whole_pixels_up_to_the_border() {
+        let mut mask = Image::filled(6, 4, false);
+        mask[(1, 0)] = true;
+        let inside = |grown: &Image<bool>| -> Vec<(usize, usize)> {
+            (0..4).flat_map(|y| (0..6).map(move |x| (x, y))).filter(|at| grown[*at]).collect()
+        };
+        assert_eq!(inside(&mask.grown(0)), [(1, 0)]);
+        assert_eq!(inside(&mask.grown(1)), [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]);
+        mask[(5, 3)] = true;
+        assert_eq!(mask.grown(2).as_slice().iter().filter(|v| **v).count(), 12 + 9 - 1);
+        assert!(Image::<bool>::filled(0, 0, true).grown(3).as_slice().is_empty());
     }
 
     #[test]

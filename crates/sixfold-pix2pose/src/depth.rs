@@ -6,8 +6,8 @@
 
 use crate::estimate::Found;
 use sixfold_geometry::{
-    Camera, DepthImage, DepthTarget, IcpError, IcpLevel, IcpOptions, NormalImage, NormalOptions, PointCloud,
-    Pose, icp, inpaint_depth, normals_from_depth,
+    Camera, DepthImage, DepthTarget, IcpError, IcpLevel, IcpOptions, Mask, NormalImage, NormalOptions,
+    PointCloud, Pose, icp, inpaint_depth, normals_from_depth,
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
@@ -47,7 +47,11 @@ impl DepthScene {
         Self { depth: depth.clone(), normals, camera: *camera }
     }
 
-    /// Aligns a pose of the object that `found` saw; `diameter` in metres.
+    /// Aligns a pose of the object that `found` saw; `diameter` in metres. `mask`, of the image's size, holds the pixels
+    /// that may be the object's; without one the network's word is taken.
+    ///
+    /// # Panics
+    /// If the mask is of another size.
     ///
     /// # Errors
     /// [`IcpError`] where too little depth is measured on the object or its surface can slide.
@@ -57,9 +61,12 @@ impl DepthScene {
         diameter: f64,
         start: &Pose,
         found: &Found,
+        mask: Option<&Mask>,
     ) -> Result<AlignedToDepth, IcpError> {
+        assert!(mask.is_none_or(|m| m.size() == self.depth.size()), "mask of another size than the depth");
+        let visible = |x: usize, y: usize| visible(found, x, y) && mask.is_none_or(|m| m[(x, y)]);
         let mut frame = Frame::new(&self.camera);
-        let mut pose = self.at_measured_distance(&mut frame, mesh, diameter, start, found)?;
+        let mut pose = self.at_measured_distance(&mut frame, mesh, diameter, start, &visible)?;
         let target = DepthTarget { depth: &self.depth, normals: &self.normals, camera: &self.camera };
         let (mut inliers, mut rms) = (0, 0.0);
         for share in [0.15, 0.08, 0.04] {
@@ -69,7 +76,7 @@ impl DepthScene {
             let mut seen = frame.depth();
             for y in 0..seen.height() {
                 for x in 0..seen.width() {
-                    if !visible(found, x, y) {
+                    if !visible(x, y) {
                         seen[(x, y)] = 0.0;
                     }
                 }
@@ -96,7 +103,7 @@ impl DepthScene {
         mesh: &Mesh,
         diameter: f64,
         start: &Pose,
-        found: &Found,
+        visible: &dyn Fn(usize, usize) -> bool,
     ) -> Result<Pose, IcpError> {
         frame.render(&[SceneObject { mesh, camera_from_object: *start }], &RenderOptions::default());
         let rendered = frame.depth();
@@ -104,7 +111,7 @@ impl DepthScene {
         for y in 0..rendered.height() {
             for x in 0..rendered.width() {
                 let (expected, measured) = (rendered[(x, y)], self.depth[(x, y)]);
-                if expected > 0.0 && measured > 0.0 && measured.is_finite() && visible(found, x, y) {
+                if expected > 0.0 && measured > 0.0 && measured.is_finite() && visible(x, y) {
                     differences.push(f64::from(measured) - f64::from(expected));
                 }
             }
@@ -202,12 +209,27 @@ mod tests {
             object_points: vec![],
             image_points: vec![],
         };
-        let aligned = scene.align(&mesh, mesh.diameter(), &start, &found).unwrap();
+        let aligned = scene.align(&mesh, mesh.diameter(), &start, &found, None).unwrap();
         assert!(start.distance_to(&truth) > 0.04);
         assert!(aligned.camera_from_object.distance_to(&truth) < 0.002, "{aligned:?}");
         assert!(aligned.camera_from_object.rotation_angle_to(&truth) < 0.02, "{aligned:?}");
         // Nothing was measured on the object.
         let empty = DepthScene::new(&DepthImage::filled(320, 240, 0.0), &camera);
-        assert!(empty.align(&mesh, mesh.diameter(), &start, &found).is_err());
+        assert!(empty.align(&mesh, mesh.diameter(), &start, &found, None).is_err());
+        // Something stands before half of the object, which the network did not notice and a mask knows of.
+        let mut half = render_depth(&mesh, &truth, &camera);
+        let mut mask = Mask::filled(320, 240, true);
+        for y in 0..240 {
+            for x in 0..140 {
+                half[(x, y)] = 0.65;
+                mask[(x, y)] = false;
+            }
+        }
+        let scene = DepthScene::new(&half, &camera);
+        let error = |mask: Option<&Mask>| {
+            let aligned = scene.align(&mesh, mesh.diameter(), &start, &found, mask);
+            aligned.map_or(f64::INFINITY, |a| a.camera_from_object.distance_to(&truth))
+        };
+        assert!(error(Some(&mask)) < 0.003 && error(None) > 0.01, "{} {}", error(Some(&mask)), error(None));
     }
 }

@@ -5,14 +5,15 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow};
 use sixfold_bop::{
-    Adjustment, BopDataset, Detection, ReadDetections, Scene, Target, TargetObject, ground_truth_visibility,
-    read_detections,
+    Adjustment, BopDataset, Detection, ReadDetections, Rle, Scene, Target, TargetObject,
+    ground_truth_visibility, read_detections,
 };
-use sixfold_geometry::Rect;
+use sixfold_geometry::{Camera, Mask, Rect};
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::ModelCard;
 
 use super::detect::Detector;
+use super::estimate::box_mask;
 
 /// Where targets are looked for.
 pub(crate) enum Boxes {
@@ -21,6 +22,32 @@ pub(crate) enum Boxes {
     Detections(Vec<Detection>),
     /// A detector, and what it found in the image that was looked at last.
     Detector(Box<Detector>, RefCell<LastImage>),
+}
+
+/// Where one instance of a target is looked for.
+pub(crate) struct Region {
+    pub bbox: Rect,
+    /// The detector's confidence; 1 for the ground truth.
+    pub score: f64,
+    /// Its visible pixels, of the image's size, where the detection says so.
+    pub mask: Option<Mask>,
+}
+
+/// A mask is grown by this share of its box's longer side, and by no less than two pixels: masks are coarse, and depth shifts
+/// against colour.
+const MASK_MARGIN: f64 = 0.04;
+
+impl Region {
+    /// The pixels in which a method on depth looks: the mask's where there is one, else the box's, both grown a little.
+    pub fn pixels(&self, camera: &Camera) -> Mask {
+        match &self.mask {
+            Some(mask) => {
+                let margin = (MASK_MARGIN * self.bbox.width.max(self.bbox.height)).ceil().max(2.0);
+                mask.grown(margin as usize)
+            }
+            None => box_mask(&self.bbox, camera),
+        }
+    }
 }
 
 type LastImage = Option<((u32, u32), Vec<Detection>)>;
@@ -68,14 +95,14 @@ impl Boxes {
         target: &Target,
         object: &TargetObject,
         mesh_of: impl Fn(u32) -> Option<&'m Mesh>,
-    ) -> Result<Vec<(Rect, f64)>> {
+    ) -> Result<Vec<Region>> {
         Ok(match self {
             Boxes::Anywhere => vec![],
             Boxes::GroundTruth => ground_truth_boxes(scene, target.im_id, object.obj_id, mesh_of)?
                 .into_iter()
-                .map(|region| (region, 1.0))
+                .map(|bbox| Region { bbox, score: 1.0, mask: None })
                 .collect(),
-            Boxes::Detections(all) => best(all, target, object),
+            Boxes::Detections(all) => best(all, target, object, &scene.camera(target.im_id)?)?,
             Boxes::Detector(detector, last) => {
                 let image = (target.scene_id, target.im_id);
                 let mut last = last.borrow_mut();
@@ -84,19 +111,34 @@ impl Boxes {
                     let rgb = rgb.ok_or_else(|| anyhow!("has no colour image, which the detector needs"))?;
                     *last = Some((image, detector.detections(&rgb, target.scene_id, target.im_id)?));
                 }
-                last.as_ref().map_or_else(Vec::new, |(_, all)| best(all, target, object))
+                match last.as_ref() {
+                    Some((_, all)) => best(all, target, object, &scene.camera(target.im_id)?)?,
+                    None => vec![],
+                }
             }
         })
     }
 }
 
 /// The target's boxes among detections, best first.
-fn best(all: &[Detection], target: &Target, object: &TargetObject) -> Vec<(Rect, f64)> {
+fn best(all: &[Detection], target: &Target, object: &TargetObject, camera: &Camera) -> Result<Vec<Region>> {
     let wanted = (target.scene_id, target.im_id, object.obj_id);
     let mut mine: Vec<&Detection> =
         all.iter().filter(|d| (d.scene_id, d.image_id, d.category_id) == wanted).collect();
     mine.sort_by(|x, y| y.score.total_cmp(&x.score));
-    mine.iter().take(object.inst_count).filter_map(|d| Some((d.bbox?, d.score))).collect()
+    mine.iter()
+        .take(object.inst_count)
+        .filter_map(|d| Some((d, d.bbox?)))
+        .map(|(d, bbox)| {
+            let mask = d.segmentation.as_ref().map(Rle::decode);
+            if let Some(mask) = &mask {
+                camera.check_image(mask.width(), mask.height()).with_context(|| {
+                    format!("segmentation of object {} in image {}/{}", object.obj_id, d.scene_id, d.image_id)
+                })?;
+            }
+            Ok(Region { bbox, score: d.score, mask })
+        })
+        .collect()
 }
 
 /// The visible boxes of an object's instances: from `scene_gt_info.json`, or rendered.

@@ -14,7 +14,7 @@ use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::estimate::EstimateError;
 
 use super::boxes::Boxes;
-use super::estimate::{box_mask, estimate_options, scene_options};
+use super::estimate::{estimate_options, scene_options};
 use super::frames::excepted;
 use super::mttm;
 use super::pix2pose::Pix2Pose;
@@ -354,8 +354,8 @@ fn by_pix2pose(
     for target in targets {
         let Some(o) = target.object else { continue };
         let Some(k) = known.get(&o.obj_id) else { continue };
-        for (region, detection) in boxes.of_target(scene, target, &o, |id| known.get(&id).map(|k| &k.mesh))? {
-            let posed = match pix2pose.estimate(&image, &camera, o.obj_id, &region, Some(&k.mesh)) {
+        for region in boxes.of_target(scene, target, &o, |id| known.get(&id).map(|k| &k.mesh))? {
+            let posed = match pix2pose.estimate(&image, &camera, o.obj_id, &region.bbox, Some(&k.mesh)) {
                 Ok(Some(posed)) => posed,
                 Ok(None) => continue,
                 // One bad box costs its own target only.
@@ -370,12 +370,15 @@ fn by_pix2pose(
                 }
                 Err(error) => return Err(error),
             };
-            let confidence = posed.score * detection;
+            let confidence = posed.score * region.score;
             if confidence < a.min_score.unwrap_or(0.0) {
                 continue;
             }
             let aligned = match &depth {
-                Some(depth) => pix2pose.align(depth, o.obj_id, &k.mesh, &posed)?,
+                Some(depth) => {
+                    let seen = region.mask.is_some().then(|| region.pixels(&camera));
+                    pix2pose.align(depth, o.obj_id, &k.mesh, &posed, seen.as_ref())?
+                }
                 None => None,
             };
             let camera_from_object = aligned.map_or(posed.camera_from_object, |i| i.camera_from_object);
@@ -436,9 +439,9 @@ fn by_depth(
         if let Some(whole) = &whole {
             found.extend(search(whole, o.inst_count));
         }
-        for (region, _) in regions {
-            let mask = box_mask(&region, &camera);
-            let scene = Scene::new(&depth, &camera, Some(&mask), &options).context("depth image")?;
+        for region in regions {
+            let scene = Scene::new(&depth, &camera, Some(&region.pixels(&camera)), &options)
+                .context("depth image")?;
             found.extend(search(&scene, 1));
         }
     }

@@ -13,6 +13,7 @@ use sixfold_mesh::Mesh;
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::object::ObjectEntry;
 
+use super::boxes::Region;
 use super::detect;
 use super::estimate::{depth_scale, given_box};
 use super::pix2pose::{Pix2Pose, view_picture};
@@ -119,14 +120,15 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let mesh = object.as_ref().map(|o| &o.mesh);
     let start = Instant::now();
     let posed = match &region {
-        Some(region) => pix2pose.estimate(&image, &camera, entry.id, region, mesh)?,
+        Some(region) => pix2pose.estimate(&image, &camera, entry.id, &region.bbox, mesh)?,
         None => None,
     };
     let posed = posed.filter(|p| p.score >= a.min_score.unwrap_or(0.0));
     let mut pose: Option<Pose> = posed.as_ref().map(|p| p.camera_from_object);
     let mut aligned = None;
     if let (Some(depth), Some(posed), Some(mesh)) = (&depth, &posed, mesh) {
-        aligned = pix2pose.align(depth, entry.id, mesh, posed)?;
+        let seen = region.as_ref().filter(|r| r.mask.is_some()).map(|r| r.pixels(&camera));
+        aligned = pix2pose.align(depth, entry.id, mesh, posed, seen.as_ref())?;
         match &aligned {
             Some(aligned) => pose = Some(aligned.camera_from_object),
             None => eprintln!("note: too little depth is measured on {name}: its pose is that from colour"),
@@ -209,25 +211,31 @@ fn print_table(whole: &Whole, folder: Option<&Path>) {
 const ASKED_FOR: f32 = 0.4;
 
 /// Where a detector sees the object best, if at all.
-fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Rect>> {
+fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Region>> {
     let model = DetectorModel::load(weights)?;
     model.check_object(id).with_context(|| weights.display().to_string())?;
     let options = model.options();
     let options = DetectOptions { threshold: options.threshold.min(ASKED_FOR), ..options };
     let found = model.detect(image, &options)?;
-    Ok(detect::best(&found, &model, id).map(|d| d.bbox))
+    Ok(detect::best(&found, &model, id).map(|d| Region {
+        bbox: d.bbox,
+        score: f64::from(d.score),
+        mask: d.mask.clone(),
+    }))
 }
 
 /// Where the object is: `--box`, or the box of `--mask`; in the pinhole image.
-fn region(a: &EstimateArguments, lens: &Camera) -> Result<Rect> {
-    let region = match (given_box(a, lens)?, &a.mask) {
-        (Some(region), None) => region,
+fn region(a: &EstimateArguments, lens: &Camera) -> Result<Region> {
+    let (bbox, mask) = match (given_box(a, lens)?, &a.mask) {
+        (Some(region), None) => (region, None),
         (None, Some(path)) => {
             let mask = read_mask(path)?;
             lens.check_image(mask.width(), mask.height()).with_context(|| path.display().to_string())?;
-            box_of_mask(&mask).ok_or_else(|| {
+            let bbox = box_of_mask(&mask).ok_or_else(|| {
                 anyhow!("{}: the mask is empty: it has to be above zero on the object", path.display())
-            })?
+            })?;
+            // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
+            (bbox, lens.distortion.is_none().then_some(mask))
         }
         (Some(_), Some(_)) => bail!("--box and --mask: give one of them, --method pix2pose needs one box"),
         (None, None) => {
@@ -237,7 +245,7 @@ fn region(a: &EstimateArguments, lens: &Camera) -> Result<Rect> {
             )
         }
     };
-    Ok(undistorted(&region, lens))
+    Ok(Region { bbox: undistorted(&bbox, lens), score: 1.0, mask })
 }
 
 fn box_of_mask(mask: &Mask) -> Option<Rect> {

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
+use sixfold_geometry::{Camera, Image, Mask, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
 use sixfold_outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
@@ -125,16 +125,18 @@ impl Pix2Pose {
         Ok(Some(Pix2PosePose { camera_from_object, score, refined: false, found }))
     }
 
-    /// The pose brought to a depth image; `None` where too little depth is measured on the object.
+    /// The pose brought to a depth image; `None` where too little depth is measured on the object. `mask` holds the pixels
+    /// that may be the object's, if something says so.
     pub fn align(
         &self,
         depth: &DepthScene,
         object_id: u32,
         mesh: &Mesh,
         posed: &Pix2PosePose,
+        mask: Option<&Mask>,
     ) -> Result<Option<AlignedToDepth>> {
         let diameter = self.entry(Some(object_id))?.diameter;
-        Ok(depth.align(mesh, diameter, &posed.camera_from_object, &posed.found).ok())
+        Ok(depth.align(mesh, diameter, &posed.camera_from_object, &posed.found, mask).ok())
     }
 }
 

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use serde_json::Value;
-use sixfold_bop::read_results;
+use sixfold_bop::{Detection, Rle, ground_truth_visibility, read_results, write_detections};
+use sixfold_geometry::{Mask, Rect};
 
 use crate::support::*;
 
@@ -114,6 +115,43 @@ fn boxes_of_the_ground_truth_or_of_a_file() {
     assert_eq!(results.len(), 1);
     assert_eq!((results[0].im_id, results[0].obj_id), (4, 2));
     assert_near(&results[0].camera_from_object, &tiny.truth_of(4, 2));
+}
+
+#[test]
+fn masks_of_detections_say_more_than_their_boxes() {
+    let tiny = Tiny::new(true);
+    let (meshes, posed) = ([part(), other_part()], [1, 2].map(|id| tiny.truth_of(4, id)));
+    let posed: Vec<_> = meshes.iter().zip(posed).collect();
+    let masks = ground_truth_visibility(&posed, &camera(), None, 0.015);
+    // The box is the whole image; only the mask says where in it.
+    let found = |mask: Option<&Mask>| {
+        let detection = Detection {
+            scene_id: 7,
+            image_id: 4,
+            category_id: 2,
+            score: 0.8,
+            bbox: Some(Rect { x: 0.0, y: 0.0, width: WIDTH as f64, height: HEIGHT as f64 }),
+            segmentation: mask.map(|m| Rle::encode(m).unwrap()),
+            time: None,
+        };
+        write_detections(&tiny.path().join("boxes.json"), &[detection]).unwrap();
+        for file in ["results.csv", "results.csv.run.json"] {
+            let _ = std::fs::remove_file(tiny.path().join(file));
+        }
+        let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --boxes boxes.json"));
+        let results = read_results(&tiny.path().join("results.csv")).unwrap_or_default();
+        (run, results.first().map(|r| r.camera_from_object.distance_to(&tiny.truth_of(4, 2))))
+    };
+    assert!(found(None).1.unwrap() < 0.005);
+    assert!(found(Some(&masks[1].mask_visible)).1.unwrap() < 0.005);
+    // Where the other object is, this one cannot be.
+    assert!(found(Some(&masks[0].mask_visible)).1.is_none_or(|off| off > 0.05));
+    let (run, none) = found(Some(&Mask::filled(7, 5, true)));
+    assert!(none.is_none());
+    for words in ["boxes.json", "segmentation.size", "found [5, 7]"] {
+        assert!(run.stderr.contains(words), "{}", run.stderr);
+    }
+    run.expect(2);
 }
 
 #[test]

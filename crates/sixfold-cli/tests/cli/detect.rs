@@ -84,6 +84,20 @@ fn a_detector_is_trained_and_used() {
     let json = sixfold(tiny.path(), &format!("{all} --except except.json")).expect(0).json();
     assert_eq!(json["images"], 2);
 
+    // Its masks for ICP and for new views.
+    let pose = format!(
+        "estimate --dataset tiny --targets targets.json --out masked.csv --detector {WEIGHTS} --json"
+    );
+    let target = r#"[{"scene_id": 7, "im_id": 4, "obj_id": 1, "inst_count": 1}]"#;
+    std::fs::write(tiny.path().join("targets.json"), target).unwrap();
+    assert!(sixfold(tiny.path(), &pose).code < 2);
+    let views = "synthesize --dataset tiny --ids 1 --step 90 --elevation 30,30 --size 48 --weighting average";
+    let run = sixfold(tiny.path(), &format!("{views} --detector {WEIGHTS} --out views")).expect(0);
+    let note = run.stderr.lines().find(|l| l.contains("by the detector")).unwrap();
+    assert!(note.contains("of 3 objects"), "{note}");
+    let other = views.replace("--ids 1", "--ids 1,2");
+    fails(tiny.path(), &format!("{other} --detector {WEIGHTS} --out more"), &["detector", "not object 2"]);
+
     // Objects it does not know.
     fails(tiny.path(), &detect(&format!("{rgb} --ids 2")), &["--ids", "knows the objects 1", "not object 2"]);
     let estimate = "estimate --dataset tiny --out r.csv --detector detector/model.safetensors";

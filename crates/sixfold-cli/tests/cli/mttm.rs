@@ -160,7 +160,8 @@ fn a_dataset_is_estimated_and_reproduced_and_both_go_on() {
     let whole = sixfold(dir, reproduce).expect(0).json();
     let keys: Vec<&str> =
         whole["rows"].as_array().unwrap().iter().map(|row| row["key"].as_str().unwrap()).collect();
-    for key in ["both", "both-printed-score", "network", "network-nearest", "points", "points-nearest", "ppf"] {
+    for key in ["both", "both-printed-score", "network", "network-nearest", "points", "points-nearest", "ppf"]
+    {
         assert!(keys.contains(&key), "{key} of {keys:?}");
     }
     assert_eq!((keys.len(), keys[0]), (11, "both"));

@@ -125,10 +125,10 @@ fn with_model(
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
                 let regions = boxes.of_target(&scene, t, &o, |id| known.get(&id).map(|k| &k.object.mesh))?;
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
-                let (Some((region, _)), Some(truth)) = (regions.first(), truth) else { continue };
+                let (Some(region), Some(truth)) = (regions.first(), truth) else { continue };
                 let start = Instant::now();
                 let Some(posed) =
-                    pix2pose.estimate(&image, &camera, o.obj_id, region, Some(&k.object.mesh))?
+                    pix2pose.estimate(&image, &camera, o.obj_id, &region.bbox, Some(&k.object.mesh))?
                 else {
                     continue;
                 };

@@ -102,6 +102,7 @@ fn regions(
         }
         let Some(scene) = scenes.get(&t.scene_id) else { continue };
         let found = boxes.of_target(scene, t, &o, |id| meshes.get(&id))?;
+        let found = found.into_iter().map(|r| (r.bbox, r.score)).collect();
         all.insert((t.scene_id, t.im_id, o.obj_id), found);
     }
     Ok(all)

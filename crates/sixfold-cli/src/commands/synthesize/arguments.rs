@@ -60,6 +60,10 @@ pub(crate) struct SynthesizeArguments {
     /// Photographs that show less of the object than this share are left out
     #[arg(long, value_name = "SHARE", default_value = "0.5")]
     pub least_visible: f64,
+    /// Trained detector whose masks are taken where the photographs have none of their own (default: masks are drawn
+    /// from the poses, which know nothing of what hides the object)
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub detector: Option<PathBuf>,
     /// How colours of several photographs become one
     #[arg(long, value_enum, default_value = "network")]
     pub weighting: WeightingKind,

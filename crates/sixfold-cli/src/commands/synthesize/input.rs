@@ -1,6 +1,6 @@
 //! Photographs with rough poses: from a BOP dataset, or from a file that names them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -8,7 +8,9 @@ use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use sixfold_bop::{BopDataset, MaskKind, Models, ground_truth_visibility, read_mask, read_rgb};
+use sixfold_bop::{
+    BopDataset, Detection, MaskKind, Models, Rle, ground_truth_visibility, read_mask, read_rgb,
+};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
@@ -16,14 +18,55 @@ use sixfold_nol::Photograph;
 
 use super::arguments::SynthesizeArguments;
 use crate::camera_file;
+use crate::commands::detect::Detector;
 
 /// All that is given.
 pub(super) struct Input {
     pub subjects: Vec<Subject>,
     /// Objects that are not looked for but may hide others.
     others: BTreeMap<u32, Mesh>,
-    /// Camera, objects and poses of every image whose masks were drawn from poses.
+    /// Camera, objects and poses of every image some of whose masks were drawn from poses.
     drawn: BTreeMap<usize, (Camera, Vec<(u32, Pose)>)>,
+    /// Image and object of masks that were not.
+    kept: BTreeSet<(usize, u32)>,
+}
+
+/// Masks that a detector sees in photographs.
+struct DetectedMasks(Option<Detector>);
+
+/// A detection is that of a posed object where its mask and the pose's silhouette overlap by this much (intersection over union).
+const SAME_OBJECT: f64 = 0.3;
+
+impl DetectedMasks {
+    fn new(a: &SynthesizeArguments, ids: &[u32]) -> Result<Self> {
+        let Some(weights) = &a.detector else { return Ok(DetectedMasks(None)) };
+        let detector = Detector::load(weights)?;
+        for id in ids {
+            detector.model().check_object(*id).with_context(|| weights.display().to_string())?;
+        }
+        Ok(DetectedMasks(Some(detector)))
+    }
+
+    /// What is seen in an image, best first.
+    fn of(&self, image: &RgbImage) -> Result<Vec<Detection>> {
+        self.0.as_ref().map_or_else(|| Ok(vec![]), |detector| detector.detections(image, 0, 0))
+    }
+
+    /// The mask of an object that lies about where it was drawn.
+    fn choose(all: &[Detection], id: u32, drawn: &Mask) -> Option<Mask> {
+        let mine = all.iter().filter(|d| d.category_id == id);
+        mine.filter_map(|d| d.segmentation.as_ref().map(Rle::decode))
+            .find(|mask| iou(mask, drawn) >= SAME_OBJECT)
+    }
+}
+
+fn iou(a: &Mask, b: &Mask) -> f64 {
+    let (mut both, mut either) = (0usize, 0usize);
+    for (a, b) in a.as_slice().iter().zip(b.as_slice()) {
+        both += usize::from(*a && *b);
+        either += usize::from(*a || *b);
+    }
+    if either == 0 { 0.0 } else { both as f64 / either as f64 }
 }
 
 impl Input {
@@ -47,7 +90,9 @@ impl Input {
             let scene: Vec<(&Mesh, Pose)> = placed.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
             let visible = ground_truth_visibility(&scene, camera, None, 0.015);
             for ((id, _, _), visible) in placed.iter().zip(visible) {
-                masks.insert((*image, *id), visible.mask_visible);
+                if !self.kept.contains(&(*image, *id)) {
+                    masks.insert((*image, *id), visible.mask_visible);
+                }
             }
         }
         for subject in &mut self.subjects {
@@ -87,7 +132,7 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<Input> {
         (Some(root), _) => from_dataset(a, root),
         (None, Some(file)) => {
             let subjects = vec![from_file(a, file)?];
-            Ok(Input { subjects, others: BTreeMap::new(), drawn: BTreeMap::new() })
+            Ok(Input { subjects, others: BTreeMap::new(), drawn: BTreeMap::new(), kept: BTreeSet::new() })
         }
         (None, None) => bail!("what is to be seen anew? Give --dataset DIR or --photographs FILE.json"),
     }
@@ -142,6 +187,7 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
     frames.sort_unstable();
     frames.dedup();
     let mut disturber = Disturber::new(a)?;
+    let detected = DetectedMasks::new(a, &ids)?;
     let mut subjects = BTreeMap::new();
     for id in ids {
         let mesh = dataset.model(id, Models::Rendering)?;
@@ -149,7 +195,7 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
         subjects.insert(id, Subject { id, mesh, info, photographs: vec![] });
     }
     let mut others: BTreeMap<u32, Mesh> = BTreeMap::new();
-    let mut drawn = BTreeMap::new();
+    let (mut drawn, mut kept) = (BTreeMap::new(), BTreeSet::new());
     for (number, (scene_id, im_id)) in frames.iter().enumerate() {
         let scene = dataset.scene(*scene_id)?;
         let truth = &scene.image(*im_id)?.ground_truth;
@@ -171,13 +217,17 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
         let placed: Vec<(&Mesh, Pose)> =
             truth.iter().zip(&poses).filter_map(|(g, pose)| Some((mesh_of(g.obj_id)?, *pose))).collect();
         let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let seen = detected.of(&image)?;
         for (index, ((g, pose), visible)) in truth.iter().zip(&poses).zip(visible).enumerate() {
             if visible.info.visib_fract < a.least_visible {
                 continue;
             }
             // Masks of the dataset fit its own poses, not disturbed ones.
             let own = if a.disturb.is_empty() { scene.mask(*im_id, index, MaskKind::Visible)? } else { None };
-            if own.is_none() {
+            let own = own.or_else(|| DetectedMasks::choose(&seen, g.obj_id, &visible.mask_visible));
+            if own.is_some() {
+                kept.insert((number, g.obj_id));
+            } else {
                 let objects = truth.iter().zip(&poses).map(|(g, pose)| (g.obj_id, *pose)).collect();
                 drawn.entry(number).or_insert((camera, objects));
             }
@@ -204,7 +254,15 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
     let (subjects, without): (Vec<Subject>, Vec<Subject>) =
         subjects.into_values().partition(|s| !s.photographs.is_empty());
     others.extend(without.into_iter().map(|s| (s.id, s.mesh)));
-    Ok(Input { subjects, others, drawn })
+    if detected.0.is_some() {
+        let all: usize = subjects.iter().map(|s| s.photographs.len()).sum();
+        let with = subjects.iter().flat_map(|s| s.photographs.iter().map(|p| (p.image, s.id)));
+        let with = with.filter(|key| kept.contains(key)).count();
+        eprintln!(
+            "note: masks of {with} of {all} objects in photographs by the detector or the dataset, the others drawn"
+        );
+    }
+    Ok(Input { subjects, others, drawn, kept })
 }
 
 #[derive(Deserialize)]
@@ -239,17 +297,34 @@ fn from_file(a: &SynthesizeArguments, path: &Path) -> Result<Subject> {
         bail!("{shown}: photographs: found none, expected at least one");
     }
     let mut disturber = Disturber::new(a)?;
+    let detected = DetectedMasks::new(a, &[])?;
+    let id = match &detected.0 {
+        None => 1,
+        Some(detector) => match detector.model().classes() {
+            [only] => only.id,
+            several => bail!(
+                "--detector: found {} objects, expected one that knows the object of {shown} alone",
+                several.len()
+            ),
+        },
+    };
     let mut photographs = vec![];
     for (number, entry) in file.photographs.iter().enumerate() {
         let (image, camera) = picture(folder, entry)?;
         let rotation = Mat3::from_row_slice(&entry.cam_R_m2c);
         let given = Pose::from_parts(&rotation, Vec3::from(entry.cam_t_m2c) * 1e-3)
             .with_context(|| format!("{shown}: photographs[{number}].cam_R_m2c"))?;
+        let pose = disturber.disturb(&given);
         let mask = match &entry.mask {
             Some(mask) => Some(read_mask(&folder.join(mask))?),
-            None => None,
+            None if detected.0.is_none() => None,
+            None => {
+                let silhouette = ground_truth_visibility(&[(&mesh, pose)], &camera, None, 0.015);
+                let silhouette = silhouette.into_iter().next().map(|v| v.mask_visible);
+                let seen = detected.of(&image)?;
+                silhouette.and_then(|s| DetectedMasks::choose(&seen, id, &s))
+            }
         };
-        let pose = disturber.disturb(&given);
         let photograph = Photograph::new(&entry.image, Arc::new(image), camera, pose, mask)?;
         photographs.push(Source { image: number, frame: None, photograph, given });
     }

@@ -225,7 +225,7 @@ fn keep_options(a: &SynthesizeArguments) -> Result<()> {
         "dataset": a.dataset, "split": a.split, "frames": a.frames, "ids": a.ids,
         "photographs": a.photographs, "new_split": a.new_split, "sources": a.sources, "per_view": a.per_view,
         "least_visible": a.least_visible, "weighting": format!("{:?}", a.weighting), "weights": a.weights,
-        "no_refine": a.no_refine, "scene": format!("{:?}", a.scene), "rough": a.rough, "disturb": a.disturb,
+        "detector": a.detector, "no_refine": a.no_refine, "scene": format!("{:?}", a.scene), "rough": a.rough, "disturb": a.disturb,
         "step": a.step, "elevation": a.elevation, "turns": a.turns, "size": a.size,
         "backgrounds": a.backgrounds, "with_photographs": a.with_photographs, "seed": a.seed,
     });
