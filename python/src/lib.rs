@@ -108,6 +108,7 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(recipes::train_pix2pose, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_detector, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_dgcm, module)?)?;
+    module.add_function(wrap_pyfunction!(recipes::train_mttm, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_nol, module)?)?;
     module.add_function(wrap_pyfunction!(mttm::estimate_mttm, module)?)?;
     module.add_function(wrap_pyfunction!(trial::gripper_pose, module)?)?;

@@ -1,8 +1,8 @@
-//! `Templates` and `estimate_mttm`: objects found in depth by templates, with or without a mesh, nothing trained
-//! (`sixfold-mttm`).
+//! `Templates`, `Mttm` and `estimate_mttm`: objects found in depth by templates, with or without a mesh, nothing trained for
+//! them (`sixfold-mttm`).
 
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -10,8 +10,9 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
 use sixfold_mttm::mask::to_image;
+use sixfold_mttm::model::{ModelError, MttmModel};
 use sixfold_mttm::{
-    Coverage, DepthView, EstimateOptions, KnownObject, ObjectTemplates, SIDE, Source, StoreError,
+    Coverage, DepthView, EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, SIDE, Source, StoreError,
     TemplateError, TemplateOptions, estimate,
 };
 
@@ -20,6 +21,7 @@ use crate::camera::PyCamera;
 use crate::guard::{interruptible, os_error};
 use crate::mesh::PyMesh;
 use crate::ppf::{model_of, scene_of, verification_to_python};
+use crate::training::file_or_value;
 
 fn template_error(argument: &str, error: &TemplateError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
@@ -187,23 +189,67 @@ fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
     Ok(View { depth, camera, mask, pose })
 }
 
-/// An object ready to be looked for by its templates. Prepared once, used for any number of images.
+/// Who matches regions with templates, as it is typed.
+const MATCHERS: [(&str, MatchedBy); 3] =
+    [("points", MatchedBy::Points), ("network", MatchedBy::Network), ("both", MatchedBy::Both)];
+
+/// The network within the package, read once, or that of a file.
+fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelError> {
+    static SHIPPED: OnceLock<Arc<MttmModel>> = OnceLock::new();
+    match (weights, SHIPPED.get()) {
+        (Some(file), _) => MttmModel::load(&file).map(Arc::new),
+        (None, Some(model)) => Ok(model.clone()),
+        (None, None) => {
+            let model = Arc::new(MttmModel::shipped()?);
+            Ok(SHIPPED.get_or_init(|| model).clone())
+        }
+    }
+}
+
+/// An object ready to be looked for by its templates (dissertation, chapter 5). Prepared once, used for any number of images.
 ///
 /// templates: Templates, or a Mesh, whose templates from above are made first. mesh: a Mesh or PpfModel of the object, with
-/// which poses are refined and verified; without it (and with Templates) the templates alone decide.
+/// which poses are refined and verified; without it (and with Templates) the templates alone decide. matcher: who matches
+/// regions of the image with templates: "points" compares them point by point, "network" by a network's descriptors alone
+/// (as the dissertation does), "both" by both. The network was trained on made-up objects and comes with the package;
+/// weights: another one, a file that `train_mttm` or `sixfold train mttm` wrote. With `cache`, a file, its descriptors of the
+/// templates are read from there when they fit network and templates, and written there otherwise.
 ///
-/// Raises ValueError for a mesh without faces. Ctrl-C is heard.
+/// Raises ValueError for a mesh without faces, another matcher, weights or cache with matcher="points", a file that is no such
+/// network; OSError when it cannot be read. Ctrl-C is heard.
 ///
-/// >>> known = Mttm(Templates.load("mug.sixfold-templates"))  # doctest: +SKIP
+/// >>> known = Mttm(Templates.load("mug.sixfold-templates"), matcher="both")  # doctest: +SKIP
 /// >>> estimate_mttm(depth, known, camera)[0].camera_from_object  # doctest: +SKIP
 #[pyclass(name = "Mttm", module = "sixfold", frozen)]
-pub(crate) struct Mttm(Arc<KnownObject>);
+pub(crate) struct Mttm {
+    known: Arc<KnownObject>,
+    matched_by: MatchedBy,
+    /// Why descriptors in `cache` were not taken, or could not be written; None otherwise.
+    #[pyo3(get)]
+    cache_note: Option<String>,
+}
 
 #[pymethods]
 impl Mttm {
     #[new]
-    #[pyo3(signature = (templates, mesh=None))]
-    fn new(py: Python<'_>, templates: &Bound<'_, PyAny>, mesh: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
+    #[pyo3(signature = (templates, mesh=None, *, matcher="both", weights=None, cache=None))]
+    fn new(
+        py: Python<'_>,
+        templates: &Bound<'_, PyAny>,
+        mesh: Option<&Bound<'_, PyAny>>,
+        matcher: &str,
+        weights: Option<PathBuf>,
+        cache: Option<PathBuf>,
+    ) -> PyResult<Self> {
+        let known = MATCHERS.into_iter().find(|(name, _)| *name == matcher);
+        let (_, matched_by) = known.ok_or_else(|| {
+            bad("matcher", MATCHERS.map(|(name, _)| format!("{name:?}")).join(" or "), format!("{matcher:?}"))
+        })?;
+        for (argument, file) in [("weights", &weights), ("cache", &cache)] {
+            if let (MatchedBy::Points, Some(file)) = (matched_by, file) {
+                return Err(bad(argument, "None with matcher=\"points\"", file.display().to_string()));
+            }
+        }
         let (templates, mesh) = if let Ok(templates) = templates.cast::<PyTemplates>() {
             (templates.get().0.clone(), mesh)
         } else if let Ok(own) = templates.cast::<PyMesh>() {
@@ -212,27 +258,41 @@ impl Mttm {
             return Err(bad("templates", "Templates or a Mesh", templates.get_type().to_string()));
         };
         let model = mesh.map(|mesh| model_of(py, "mesh", mesh)).transpose()?;
-        let known = interruptible(py, move |_| {
-            KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()))
+        let made = interruptible(py, move |_| -> Result<_, ModelError> {
+            let network = (matched_by != MatchedBy::Points).then(|| network(weights)).transpose()?;
+            let known = KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()));
+            Ok(match (network, cache) {
+                (None, _) => (known, None),
+                (Some(network), None) => (known.with_network(network), None),
+                (Some(network), Some(file)) => known.with_network_cached(network, &file),
+            })
         })?;
-        Ok(Mttm(Arc::new(known)))
+        let (known, note) = made.map_err(|error| file_or_value(&error))?;
+        Ok(Mttm { known: Arc::new(known), matched_by, cache_note: note.map(|n| n.to_string()) })
     }
 
     /// The templates.
     #[getter]
     fn templates(&self) -> PyTemplates {
-        PyTemplates(Arc::new(self.0.templates().clone()))
+        PyTemplates(Arc::new(self.known.templates().clone()))
     }
 
     /// Whether poses are refined and verified with a mesh.
     #[getter]
     fn has_mesh(&self) -> bool {
-        self.0.has_mesh()
+        self.known.has_mesh()
+    }
+
+    /// Who matches regions with templates: "points", "network" or "both".
+    #[getter]
+    fn matcher(&self) -> &'static str {
+        MATCHERS.iter().find(|(_, matched_by)| *matched_by == self.matched_by).map_or("", |(name, _)| name)
     }
 
     fn __repr__(&self) -> String {
-        let verified = if self.0.has_mesh() { "a mesh" } else { "templates alone" };
-        format!("<Mttm: {} views, {verified}>", self.0.templates().templates.len())
+        let verified = if self.known.has_mesh() { "a mesh" } else { "templates alone" };
+        let views = self.known.templates().templates.len();
+        format!("<Mttm: {views} views matched by {}, verified by {verified}>", self.matcher())
     }
 }
 
@@ -268,7 +328,7 @@ impl MttmEstimate {
 /// best first, empty when nothing scores min_score.
 ///
 /// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool of where objects may be). model: an
-/// Mttm, or Templates or a Mesh, which are prepared first. instances: most poses returned. The same input gives the same
+/// Mttm, or Templates or a Mesh, which are prepared first (matched by "both"). instances: most poses returned. The same input gives the same
 /// result at any number of threads. Ctrl-C is heard.
 ///
 /// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit or without any value.
@@ -292,15 +352,16 @@ pub(crate) fn estimate_mttm(
         return Err(bad("min_score", "a number from 0 to 1", min_score.to_string()));
     }
     let max_instances = whole("instances", instances, 1)?;
-    let options = EstimateOptions { max_instances, min_score, ..EstimateOptions::default() };
     let scene = scene_of(py, scene, camera, mask, seed)?;
-    let known = match model.cast::<Mttm>() {
-        Ok(known) => known.get().0.clone(),
+    let (known, matched_by) = match model.cast::<Mttm>() {
+        Ok(known) => (known.get().known.clone(), known.get().matched_by),
         Err(_) if model.is_instance_of::<PyTemplates>() || model.is_instance_of::<PyMesh>() => {
-            Mttm::new(py, model, None)?.0
+            let made = Mttm::new(py, model, None, "both", None, None)?;
+            (made.known, made.matched_by)
         }
         Err(_) => return Err(bad("model", "an Mttm, Templates or a Mesh", model.get_type().to_string())),
     };
+    let options = EstimateOptions { matched_by, max_instances, min_score, ..EstimateOptions::default() };
     let size = scene.depth().size();
     let found = interruptible(py, move |_| estimate(&scene, &known, &options).0)?;
     found

@@ -1,4 +1,4 @@
-//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_nol`: material in, a model file out. They tell of their progress,
+//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`: material in, a model file out. They tell of their progress,
 //! stop after the step in which Ctrl-C is heard, and go on when they are called again with the same arguments.
 
 use std::path::PathBuf;
@@ -7,6 +7,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays::{positive, seed, whole};
+use crate::bop::json_to_python;
 use crate::training::{Source, kind, run, share, steps_of, summary, turn};
 
 /// Trains Pix2Pose (dissertation, chapter 3) on posed photographs and renders of objects; the model is what Pix2Pose.load
@@ -202,6 +203,55 @@ pub(crate) fn train_dgcm<'py>(
     };
     let trained = run(py, progress, move |stop, hear| recipe.train(&out, stop, hear))?;
     summary(py, trained)
+}
+
+/// Trains the network that matches regions of depth images with templates (dissertation, chapter 5) on made-up objects that
+/// fall on a table; the model is what Mttm takes as weights. A dict with model (its path), steps, seconds, losses, and quality,
+/// measured on objects that it was not trained on: regions (their number); shares of them: nearest (own template the nearest of
+/// 40), masks (overlap by more than half), matching (pairs told right); medians, of the nearest template and after the network's
+/// correction: rotation (radians), offset (share of a patch).
+///
+/// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first, and out gets a picture of the first
+/// regions, samples.png. network: "compact", which trains on two cores, or the dissertation's "paper"; steps, anchors (regions
+/// with an object in a step) and learning_rate have its defaults if None; objects: made-up objects, 16 or more; scenes: scenes
+/// of them, 4 or more, each seen by five cameras; encoder: torchvision's ResNet-50 weights for "paper".
+///
+/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+///
+/// >>> trained = train_mttm("out/mttm", steps=100, objects=32, scenes=16)  # doctest: +SKIP
+/// >>> known = Mttm(mesh, weights=trained["model"])  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (out, *, network="compact", steps=None, anchors=None, learning_rate=None, objects=300, scenes=500, encoder=None, progress=None, seed=0))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn train_mttm<'py>(
+    py: Python<'py>,
+    out: PathBuf,
+    network: &str,
+    steps: Option<i64>,
+    anchors: Option<i64>,
+    learning_rate: Option<f64>,
+    objects: i64,
+    scenes: i64,
+    encoder: Option<PathBuf>,
+    progress: Option<Py<PyAny>>,
+    seed: i64,
+) -> PyResult<Bound<'py, PyDict>> {
+    use sixfold_mttm::recipe::{MttmKind, Recipe};
+    let recipe = Recipe {
+        network: kind(network, MttmKind::ALL, MttmKind::name)?,
+        encoder,
+        steps: steps_of(steps)?,
+        anchors: anchors.map(|n| whole("anchors", n, 2)).transpose()?,
+        learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
+        objects: whole("objects", objects, 16)?,
+        scenes: whole("scenes", scenes, 4)?,
+        seed: self::seed(seed)?,
+        command: "sixfold.train_mttm".to_owned(),
+    };
+    let (trained, quality) = run(py, progress, move |stop, hear| recipe.train(&out, stop, hear))?;
+    let dict = summary(py, trained)?;
+    dict.set_item("quality", json_to_python(py, &quality)?)?;
+    Ok(dict)
 }
 
 /// Trains the network of Neural Object Learning (dissertation, chapter 4) on made-up objects; the model is what synthesize

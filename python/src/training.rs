@@ -21,7 +21,7 @@ use crate::guard::{Leave, Tell, dataset_error, interruptible, os_error, reportin
 use crate::mesh::PyMesh;
 
 /// An `OSError` where a file is at the bottom of it, else a `ValueError`.
-fn file_or_value(error: &(dyn Error + 'static)) -> PyErr {
+pub(crate) fn file_or_value(error: &(dyn Error + 'static)) -> PyErr {
     let mut below = Some(error);
     while let Some(at) = below {
         if let Some(io) = at.downcast_ref::<std::io::Error>() {

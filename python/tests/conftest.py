@@ -57,3 +57,8 @@ def dgcm_weights():
 @pytest.fixture(scope="session")
 def detector_weights():
     return at_hand("weights/detector-lmo.safetensors", "weights")
+
+
+@pytest.fixture(scope="session")
+def mttm_weights():
+    return at_hand("crates/sixfold-mttm/weights/mttm-compact.safetensors", "weights")

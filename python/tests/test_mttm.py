@@ -78,6 +78,36 @@ def test_a_mesh_is_found(templates, thing, scene):
     assert sixfold.estimate_mttm(hidden, known, camera, min_score=0.6) == []
 
 
+@pytest.mark.parametrize("matcher", ["points", "network", "both"])
+def test_who_matches(templates, thing, scene, matcher):
+    depth, camera, mask, pose = scene
+    known = sixfold.Mttm(templates, thing, matcher=matcher)
+    assert known.matcher == matcher and matcher in repr(known)
+    [found] = sixfold.estimate_mttm(depth, known, camera)
+    assert sixfold.metrics.add(thing, found.camera_from_object, pose) < 0.02 * thing.diameter
+    # Without the mesh too, which would put a wrong template right.
+    [found] = sixfold.estimate_mttm(depth, sixfold.Mttm(templates, matcher=matcher), camera)
+    assert sixfold.metrics.add(thing, found.camera_from_object, pose) < 0.1 * thing.diameter
+    assert overlap(found.mask, mask) > 0.7
+
+
+def test_another_network_and_what_it_keeps(templates, scene, mttm_weights, tmp_path):
+    depth, camera, *_ = scene
+    [shipped] = sixfold.estimate_mttm(depth, sixfold.Mttm(templates, matcher="network"), camera, min_score=0)
+    kept = tmp_path / "thing.sixfold-descriptors"
+    for cache in (None, kept, kept):
+        read = sixfold.Mttm(templates, matcher="network", weights=mttm_weights, cache=cache)
+        [same] = sixfold.estimate_mttm(depth, read, camera, min_score=0)
+        assert read.cache_note is None and same.template == shipped.template
+        assert (same.camera_from_object == shipped.camera_from_object).all()
+    written = kept.read_bytes()
+    kept.write_bytes(written[: len(written) // 2])
+    read = sixfold.Mttm(templates, matcher="network", cache=str(kept))
+    assert kept.name in read.cache_note and kept.read_bytes() == written
+    read = sixfold.Mttm(templates, matcher="network", cache=tmp_path / "no/such/folder")
+    assert "no/such/folder" in read.cache_note
+
+
 def test_an_object_without_a_mesh(thing, scene):
     seen_depth, camera, seen_mask, seen_pose = scene_of(thing, 0.6, (-0.02, 0.01))
     depth, _, mask, pose = scene
@@ -92,7 +122,7 @@ def test_an_object_without_a_mesh(thing, scene):
     assert not sixfold.Mttm(known).has_mesh
 
 
-def test_wrong_use(thing, templates, scene):
+def test_wrong_use(thing, templates, scene, weights, tmp_path):
     depth, camera, mask, pose = scene
     lens = sixfold.Camera(525, 525, 320, 240, 640, 480, distortion=(0.1, 0, 0, 0))
     for views, name in [
@@ -119,6 +149,10 @@ def test_wrong_use(thing, templates, scene):
         (lambda: sixfold.Mttm("mug"), "templates"),
         (lambda: sixfold.Mttm(templates, 3), "mesh"),
         (lambda: sixfold.Mttm(templates, cloud), "mesh"),
+        (lambda: sixfold.Mttm(templates, matcher="forest"), "matcher: expected .*points.*both.*, found"),
+        (lambda: sixfold.Mttm(templates, matcher="points", weights="w.safetensors"), "weights"),
+        (lambda: sixfold.Mttm(templates, matcher="points", cache="kept"), "cache"),
+        (lambda: sixfold.Mttm(templates, weights=weights), "pix2pose-lmo.safetensors"),
         (lambda: sixfold.estimate_mttm(depth, templates), "camera"),
         (lambda: sixfold.estimate_mttm(depth, "mug", camera), "model"),
         (lambda: sixfold.estimate_mttm(depth, templates, camera, instances=0), "instances"),
@@ -129,3 +163,7 @@ def test_wrong_use(thing, templates, scene):
     ]:
         with pytest.raises(ValueError, match=name):
             call()
+    with pytest.raises(FileNotFoundError, match="none.safetensors"):
+        sixfold.Mttm(templates, weights=tmp_path / "none.safetensors")
+    with pytest.raises(TypeError):
+        sixfold.Mttm(templates, weights=3)

@@ -81,6 +81,26 @@ def test_grasp_and_view_networks_learn(tmp_path):
     assert trained["model"] == tmp_path / "dgcm/model.safetensors"
 
 
+def test_the_network_for_templates_learns(colored, tmp_path):
+    heard = []
+    options = {"steps": 2, "anchors": 4, "objects": 16, "scenes": 4}
+    trained = sixfold.train_mttm(tmp_path, progress=heard.append, **options)
+    stages = [news["stage"] for news in heard]
+    assert list(dict.fromkeys(stages)) == ["preparing", "training", "measuring"]
+    assert heard[0]["total"] == heard[-1]["total"] == heard[-1]["done"] == 8
+    assert trained["steps"] == 2 and trained["losses"]["mask"] > 0 and (tmp_path / "samples.png").exists()
+    quality = trained["quality"]
+    assert quality["regions"] >= 40 and 0 <= quality["nearest"] <= 1 and len(quality["rotation"]) == 2
+    known = sixfold.Mttm(colored, weights=trained["model"])
+    assert known.matcher == "both" and known.has_mesh
+    # Going on where nothing is left to do gives the same file; other options are another training.
+    before = trained["model"].read_bytes()
+    trained["model"].unlink()
+    assert sixfold.train_mttm(tmp_path, **options)["model"].read_bytes() == before
+    with pytest.raises(ValueError, match="anchors.:4.*, is .*anchors.:5"):
+        sixfold.train_mttm(tmp_path, **{**options, "anchors": 5})
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise on Windows")
 def test_ctrl_c_keeps_what_was_learnt(tmp_path):
     script = textwrap.dedent(
@@ -146,6 +166,15 @@ def test_wrong_use(demo, colored, weights, tmp_path):
         (lambda: sixfold.train_dgcm(out, views=3), "views"),
         (lambda: sixfold.train_dgcm(out, encoder=weights), "encoder"),
         (lambda: sixfold.train_dgcm(out, lambda_=0), "lambda_"),
+        (lambda: sixfold.train_mttm(out, network="big"), "network"),
+        (lambda: sixfold.train_mttm(out, steps=0), "steps"),
+        (lambda: sixfold.train_mttm(out, anchors=1), "anchors"),
+        (lambda: sixfold.train_mttm(out, objects=5), "objects"),
+        (lambda: sixfold.train_mttm(out, objects=10**9), "objects"),
+        (lambda: sixfold.train_mttm(out, scenes=3), "scenes"),
+        (lambda: sixfold.train_mttm(out, learning_rate=np.inf), "learning_rate"),
+        (lambda: sixfold.train_mttm(out, encoder=weights), "encoder"),
+        (lambda: sixfold.train_mttm(out, seed=-1), "seed"),
         (lambda: sixfold.train_nol(out, network="big"), "network"),
         (lambda: sixfold.train_nol(out, encoder=weights), "encoder"),
         (lambda: sixfold.train_nol(out, steps=-1), "steps"),

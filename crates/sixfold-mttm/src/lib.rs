@@ -27,6 +27,8 @@ pub mod network;
 pub mod patch;
 pub mod pose_distance;
 pub mod quality;
+#[cfg(feature = "recipe")]
+pub mod recipe;
 mod regions;
 pub mod roi;
 pub mod samples;

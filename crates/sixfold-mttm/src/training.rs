@@ -328,7 +328,8 @@ mod tests {
             })
             .collect();
         let options = PoolOptions { views: 3, ..PoolOptions::for_side(CompactConfig::SIDE) };
-        Pool::new(&meshes, &[arrangement.clone(), arrangement], &options, || ())
+        let stop = AtomicBool::new(false);
+        Pool::new(&meshes, &[arrangement.clone(), arrangement], &options, &stop, || ()).unwrap()
     }
 
     #[test]

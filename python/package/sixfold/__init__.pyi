@@ -599,11 +599,23 @@ class Templates:
     def __len__(self) -> int: ...
 
 class Mttm:
-    def __new__(cls, templates: Templates | Mesh, mesh: Mesh | PpfModel | None = None) -> Mttm: ...
+    def __new__(
+        cls,
+        templates: Templates | Mesh,
+        mesh: Mesh | PpfModel | None = None,
+        *,
+        matcher: Literal["points", "network", "both"] = "both",
+        weights: Path | None = None,
+        cache: Path | None = None,
+    ) -> Mttm: ...
     @property
     def templates(self) -> Templates: ...
     @property
     def has_mesh(self) -> bool: ...
+    @property
+    def matcher(self) -> Literal["points", "network", "both"]: ...
+    @property
+    def cache_note(self) -> str | None: ...
 
 class MttmEstimate:
     @property
@@ -813,6 +825,19 @@ def train_dgcm(
     learning_rate: float | None = None,
     lambda_: float | None = None,
     views: int = 6000,
+    encoder: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...
+def train_mttm(
+    out: Path,
+    *,
+    network: Literal["compact", "paper"] = "compact",
+    steps: int | None = None,
+    anchors: int | None = None,
+    learning_rate: float | None = None,
+    objects: int = 300,
+    scenes: int = 500,
     encoder: Path | None = None,
     progress: Progress | None = None,
     seed: int = 0,

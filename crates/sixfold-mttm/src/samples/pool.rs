@@ -1,5 +1,7 @@
 //! All regions a training draws from, cut out of simulated scenes once (dissertation, section 5.3.1: about 20,000 scenes).
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -62,7 +64,7 @@ pub struct Pool {
 
 impl Pool {
     /// Draws every arrangement from all of its cameras and cuts the regions out. The same input gives the same pool at any
-    /// number of threads; `progress` hears of every arrangement done, `stop` ends early.
+    /// number of threads; `progress` hears of every arrangement done. `None` when `stop` was set meanwhile.
     ///
     /// # Panics
     /// For an arrangement with a number beyond the meshes.
@@ -70,13 +72,17 @@ impl Pool {
         meshes: &[Mesh],
         arrangements: &[Arrangement],
         options: &PoolOptions,
+        stop: &AtomicBool,
         progress: impl Fn() + Sync,
-    ) -> Pool {
-        let per_arrangement: Vec<Vec<Anchor>> = arrangements
+    ) -> Option<Pool> {
+        let per_arrangement: Option<Vec<Vec<Anchor>>> = arrangements
             .par_iter()
             .enumerate()
             .map(|(number, arrangement)| {
-                let anchors = (0..options.views as u64)
+                if stop.load(Ordering::Relaxed) {
+                    return None;
+                }
+                let anchors: Vec<Anchor> = (0..options.views as u64)
                     .flat_map(|view| {
                         let mut random = ChaCha8Rng::seed_from_u64(options.seed);
                         random.set_stream(number as u64 * 1000 + view);
@@ -84,11 +90,12 @@ impl Pool {
                     })
                     .collect();
                 progress();
-                anchors
+                Some(anchors)
             })
             .collect();
-        let (with_object, without) = per_arrangement.into_iter().flatten().partition(|a| a.object.is_some());
-        Pool { options: *options, with_object, without }
+        let (with_object, without) =
+            per_arrangement?.into_iter().flatten().partition(|a| a.object.is_some());
+        Some(Pool { options: *options, with_object, without })
     }
 
     /// How it was made.
