@@ -149,6 +149,12 @@ pub(crate) fn pnp_ransac(
 /// object_points (N, 3) metres, image_points (N, 2) pixels of the raw image.
 ///
 /// Raises ValueError as pnp_ransac.
+///
+/// >>> import numpy as np
+/// >>> points = np.array([[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [0.1, 0.1, 0.1], [0, 0, 0]])
+/// >>> camera = Camera(500, 500, 320, 240, 640, 480)
+/// >>> epnp(points, camera.project(points + [0, 0, 0.6]), camera)[2, 3].round(6)
+/// np.float64(0.6)
 #[pyfunction]
 pub(crate) fn epnp<'py>(
     py: Python<'py>,
@@ -166,6 +172,14 @@ pub(crate) fn epnp<'py>(
 /// 1987): reprojection errors beyond threshold_px have no influence. Returns the pose (4, 4) and the number of inliers.
 ///
 /// Raises ValueError as pnp_ransac; NoSolutionError when fewer than three correspondences are within the threshold.
+///
+/// >>> import numpy as np
+/// >>> points = np.array([[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [0.1, 0.1, 0.1], [0, 0, 0]])
+/// >>> camera = Camera(500, 500, 320, 240, 640, 480)
+/// >>> near = np.eye(4); near[2, 3] = 0.62
+/// >>> pose, inliers = refine_pose(points, camera.project(points + [0, 0, 0.6]), camera, near, threshold_px=30)
+/// >>> inliers, pose[2, 3].round(6)
+/// (5, np.float64(0.6))
 #[pyfunction]
 #[pyo3(signature = (object_points, image_points, camera, initial, threshold_px=3.0, max_iterations=50))]
 pub(crate) fn refine_pose<'py>(
@@ -426,6 +440,9 @@ pub(crate) fn icp(
 /// 1995). The source is in the object's frame, the result is camera_from_object.
 ///
 /// Raises ValueError when depth and camera differ in size; NoSolutionError as icp.
+///
+/// >>> seen = render(mesh, start, camera)  # doctest: +SKIP
+/// >>> icp_to_depth(seen.coordinates[seen.mask], depth, camera, start).target_from_source  # doctest: +SKIP
 #[pyfunction]
 #[pyo3(signature = (source, depth, camera, initial, *, rejection_distance=0.02, source_normals=None, levels=None, max_angle=1.0471975511965976))]
 #[allow(clippy::too_many_arguments)]

@@ -44,6 +44,14 @@ pub(crate) fn id(argument: &str, value: i64) -> PyResult<u32> {
     u32::try_from(value).map_err(|_| bad(argument, "an id from 0 to 4294967295", value.to_string()))
 }
 
+/// Scenes with images.
+pub(crate) fn pairs(argument: &str, list: &Bound<'_, PyAny>) -> PyResult<Vec<(u32, u32)>> {
+    let pairs: Vec<(i64, i64)> = list
+        .extract()
+        .map_err(|_| bad(argument, "a list of pairs (scene_id, im_id)", list.get_type().to_string()))?;
+    pairs.into_iter().map(|(s, i)| Ok((id(argument, s)?, id(argument, i)?))).collect()
+}
+
 /// A finite number above zero.
 pub(crate) fn positive(argument: &str, value: f64) -> PyResult<f64> {
     if value.is_finite() && value > 0.0 {

@@ -196,6 +196,16 @@ impl PyDataset {
     fn scene(&self, scene_id: i64) -> PyResult<Scene> {
         self.0.scene(id("scene_id", scene_id)?).map_err(dataset_error)
     }
+
+    /// All images, as scene and number.
+    pub(crate) fn images(&self) -> PyResult<Vec<(u32, u32)>> {
+        let mut images = vec![];
+        for scene_id in self.0.scene_ids() {
+            let scene = self.scene(i64::from(scene_id))?;
+            images.extend(scene.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
+        }
+        Ok(images)
+    }
 }
 
 #[pymethods]
@@ -328,6 +338,8 @@ impl PyDataset {
 }
 
 /// Reads a colour image (grey ones as colour): (H, W, 3) uint8. Raises OSError or ValueError.
+///
+/// >>> rgb = read_rgb("data/demo/test/000002/rgb/000003.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> {
     let image = free(py, || sixfold_bop::read_rgb(&path))?.map_err(dataset_error)?;
@@ -335,6 +347,10 @@ fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> 
 }
 
 /// Reads a 16 bit depth image: (H, W) float32 metres. mm_per_unit is BOP's depth_scale, the millimetres of one step.
+///
+/// Raises OSError when the file cannot be read, ValueError when it is no such image.
+///
+/// >>> depth = read_depth("data/demo/test/000002/depth/000003.png", mm_per_unit=1.0)  # doctest: +SKIP
 #[pyfunction]
 fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound<'_, PyArray2<f32>>> {
     let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
@@ -343,6 +359,10 @@ fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound
 }
 
 /// Reads a mask: (H, W) bool, True where the file is above zero.
+///
+/// Raises OSError when the file cannot be read, ValueError when it is no such image.
+///
+/// >>> mask = read_mask("mask.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>>> {
     let image = free(py, || sixfold_bop::read_mask(&path))?.map_err(dataset_error)?;
@@ -350,6 +370,10 @@ fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>
 }
 
 /// Writes a colour image (H, W, 3) uint8 as PNG.
+///
+/// Raises OSError when the file cannot be written.
+///
+/// >>> write_rgb("out/rgb.png", rgb)  # doctest: +SKIP
 #[pyfunction]
 fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::rgb("rgb", rgb)?;
@@ -357,6 +381,10 @@ fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<
 }
 
 /// Writes a depth image (H, W) in metres as 16 bit PNG in steps of mm_per_unit millimetres (BOP's depth_scale).
+///
+/// Raises OSError when the file cannot be written.
+///
+/// >>> write_depth("out/depth.png", depth, mm_per_unit=0.1)  # doctest: +SKIP
 #[pyfunction]
 fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_unit: f64) -> PyResult<()> {
     let image = arrays::depth("depth", depth)?;
@@ -365,6 +393,10 @@ fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_u
 }
 
 /// Writes a mask (H, W) bool as PNG.
+///
+/// Raises OSError when the file cannot be written.
+///
+/// >>> write_mask("out/mask.png", mask)  # doctest: +SKIP
 #[pyfunction]
 fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::mask("mask", mask)?;
@@ -374,6 +406,10 @@ fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResul
 /// Masks and visibility of posed objects, [(mesh, camera_from_object (4, 4)), ...], as BOP's ground-truth info: a list of
 /// dicts with mask and mask_visible (H, W) bool and visible (fraction). depth (H, W) metres is the sensor's image, where
 /// there is one; delta the tolerance of the visibility test in metres.
+///
+/// Raises ValueError for a depth image of another size than the camera's, no object.
+///
+/// >>> ground_truth_visibility([(mesh, pose)], camera, depth)[0]["visible"]  # doctest: +SKIP
 #[pyfunction]
 #[pyo3(signature = (objects, camera, depth=None, *, delta=0.015))]
 fn ground_truth_visibility<'py>(
@@ -466,5 +502,5 @@ pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(write_depth, module)?)?;
     module.add_function(wrap_pyfunction!(write_mask, module)?)?;
     module.add_function(wrap_pyfunction!(ground_truth_visibility, module)?)?;
-    Ok(())
+    crate::scene_writer::register(module)
 }

@@ -5,10 +5,12 @@ use std::path::{Path, PathBuf};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_bop::{CocoGroundTruth, Detection, IouType, ReadDetections, evaluate_coco, parse_detections};
+use sixfold_bop::{
+    CocoGroundTruth, Detection, IouType, ReadDetections, VisibleTruth, evaluate_coco, parse_detections,
+};
 
-use crate::arrays::{bad, id};
-use crate::bop::{decode_mask, encode_mask, json_to_python};
+use crate::arrays::{bad, id, pairs};
+use crate::bop::{PyDataset, decode_mask, encode_mask, json_to_python};
 use crate::guard::{dataset_error, free, interruptible, os_error};
 
 /// A file, or what such a file holds, as text.
@@ -40,7 +42,8 @@ fn detections_of(argument: &'static str, source: &Bound<'_, PyAny>) -> PyResult<
 /// or None where there is no ground truth of that size (pycocotools gives -1).
 ///
 /// ground_truth: a COCO JSON file (BOP: scene_gt_coco.json) or a dict of that form, or {scene_id: file or dict} for several
-/// scenes; detections: a JSON file or a list of dicts with image_id, category_id, score, bbox [x, y, w, h] (pixels) and/or
+/// scenes, or a bop.Dataset, whose poses say what is visible where; images: those of a dataset that count,
+/// [(scene_id, im_id), ...], all if None; detections: a JSON file or a list of dicts with image_id, category_id, score, bbox [x, y, w, h] (pixels) and/or
 /// segmentation (run lengths), BOP's with scene_id; iou_type: "bbox" or "segm". Ctrl-C is heard.
 ///
 /// Raises OSError for files that cannot be read, ValueError with entry and field for broken ones.
@@ -51,18 +54,28 @@ fn detections_of(argument: &'static str, source: &Bound<'_, PyAny>) -> PyResult<
 /// >>> round(evaluate(truth, found)["ap"], 6)
 /// 1.0
 #[pyfunction]
-#[pyo3(signature = (ground_truth, detections, iou_type="bbox"))]
+#[pyo3(signature = (ground_truth, detections, iou_type="bbox", *, images=None))]
 fn evaluate<'py>(
     py: Python<'py>,
     ground_truth: &Bound<'py, PyAny>,
     detections: &Bound<'py, PyAny>,
     iou_type: &str,
+    images: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let iou_type = match iou_type {
         "bbox" => IouType::Box,
         "segm" => IouType::Mask,
         other => return Err(bad("iou_type", "\"bbox\" or \"segm\"", format!("{other:?}"))),
     };
+    if let Ok(dataset) = ground_truth.cast::<PyDataset>() {
+        let truth = truth_of(py, dataset.get(), images)?;
+        let detections = detections_of("detections", detections)?;
+        let scores = interruptible(py, move |_| evaluate_coco(&truth, &detections, iou_type))?;
+        return json_to_python(py, &scores);
+    }
+    if images.is_some() {
+        return Err(bad("images", "None, as ground_truth is no Dataset", "some"));
+    }
     let mut truth = CocoGroundTruth::default();
     let mut add = |scene_id: u32, source: &Bound<'py, PyAny>| -> PyResult<()> {
         let (text, path) = document("ground_truth", source)?;
@@ -82,6 +95,21 @@ fn evaluate<'py>(
     let detections = detections_of("detections", detections)?;
     let scores = interruptible(py, move |_| evaluate_coco(&truth, &detections, iou_type))?;
     json_to_python(py, &scores)
+}
+
+/// The ground truth of a dataset's images by its poses.
+fn truth_of(
+    py: Python<'_>,
+    dataset: &PyDataset,
+    images: Option<&Bound<'_, PyAny>>,
+) -> PyResult<CocoGroundTruth> {
+    let images = match images {
+        Some(list) => pairs("images", list)?,
+        None => dataset.images()?,
+    };
+    let dataset = dataset.0.clone();
+    let truth = interruptible(py, move |_| VisibleTruth::of_poses(&dataset, &images))?;
+    Ok(truth.map_err(dataset_error)?.truth)
 }
 
 /// Reads detections in COCO's JSON (BOP's form with scene_id): a list of dicts with scene_id, image_id, category_id, score,
@@ -130,6 +158,8 @@ fn as_json(d: &Detection) -> serde_json::Value {
 /// Writes detections, a list of dicts as read_detections gives, in BOP's form; all or nothing.
 ///
 /// Raises OSError when the file cannot be written, ValueError with entry and field for a broken one.
+///
+/// >>> write_detections("out/detections.json", found)  # doctest: +SKIP
 #[pyfunction]
 fn write_detections(py: Python<'_>, path: PathBuf, detections: &Bound<'_, PyAny>) -> PyResult<()> {
     if detections.extract::<PathBuf>().is_ok() {

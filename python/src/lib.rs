@@ -19,6 +19,7 @@ mod experienced;
 mod grasp;
 mod gripper;
 mod guard;
+mod made_up;
 mod mesh;
 mod metrics;
 mod mttm;
@@ -29,6 +30,7 @@ mod ppf;
 mod recipes;
 mod render;
 mod scene;
+mod scene_writer;
 mod training;
 mod trial;
 
@@ -111,6 +113,8 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(recipes::train_mttm, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_nol, module)?)?;
     module.add_function(wrap_pyfunction!(mttm::estimate_mttm, module)?)?;
+    module.add_function(wrap_pyfunction!(made_up::made_up_mesh, module)?)?;
+    module.add_function(wrap_pyfunction!(made_up::drop_objects, module)?)?;
     module.add_function(wrap_pyfunction!(trial::gripper_pose, module)?)?;
     module.add_function(wrap_pyfunction!(trial::try_grasp, module)?)?;
     module.add_function(wrap_pyfunction!(grasp::find_objects, module)?)?;

@@ -139,6 +139,14 @@ fn mspd(
 
 /// The mean distance in pixels between the projections of corresponding points (Brachmann et al. 2016); infinite when one
 /// lies behind the camera.
+///
+/// Raises ValueError for a pose that is none, points that are not finite.
+///
+/// >>> import numpy as np
+/// >>> truth = np.eye(4); truth[2, 3] = 1.0
+/// >>> estimate = truth.copy(); estimate[0, 3] = 0.01
+/// >>> round(projection_error(np.eye(3) * 0, estimate, truth, Camera(500, 500, 320, 240, 640, 480)), 6)
+/// 5.0
 #[pyfunction]
 fn projection_error(
     py: Python<'_>,
@@ -247,6 +255,13 @@ fn vsd<'py>(
 
 /// As vsd from depth images (H, W) in metres that were drawn elsewhere: of the model at the estimate, at the ground
 /// truth, and the sensor's.
+///
+/// Raises ValueError for images of different sizes, a diameter that is not above 0.
+///
+/// >>> import numpy as np
+/// >>> wall = np.ones((480, 640), np.float32)
+/// >>> vsd_of_depth(wall, wall, wall, Camera(500, 500, 320, 240, 640, 480), diameter=0.1, taus=[0.2])
+/// array([0.])
 #[pyfunction]
 #[pyo3(signature = (depth_estimate, depth_ground_truth, depth, camera, diameter, *, taus=None, delta=0.015))]
 #[allow(clippy::too_many_arguments)]
@@ -391,6 +406,10 @@ fn bop19<'py>(
 
 /// Scores estimates as 6D detections (BOP Challenge 2024): a dict with ap, ap_mssd, ap_mspd, ap_mssd_mm (thresholds 2 to
 /// 20 mm), objects, reasons. Arguments as for bop19.
+///
+/// Raises as bop19.
+///
+/// >>> bop24("data/demo", "out/results.csv")["ap"]  # doctest: +SKIP
 #[pyfunction]
 #[pyo3(signature = (dataset, results, *, split="test", targets=None, visib_gt_min=None, models="eval"))]
 fn bop24<'py>(

@@ -260,7 +260,8 @@ impl Mttm {
         let model = mesh.map(|mesh| model_of(py, "mesh", mesh)).transpose()?;
         let made = interruptible(py, move |_| -> Result<_, ModelError> {
             let network = (matched_by != MatchedBy::Points).then(|| network(weights)).transpose()?;
-            let known = KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()));
+            let known =
+                KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()));
             Ok(match (network, cache) {
                 (None, _) => (known, None),
                 (Some(network), None) => (known.with_network(network), None),

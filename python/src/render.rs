@@ -73,7 +73,10 @@ pub(crate) struct SceneRendering {
     rgb: Py<PyArray3<u8>>,
 }
 
-/// Ambient(color=(0.35, 0.35, 0.35)): light from everywhere. Colours are linear, 1 is full white.
+/// Light from everywhere. Colours are linear, 1 is full white.
+///
+/// >>> light = AmbientLight((0.5, 0.5, 0.5))
+/// >>> drawn = render(mesh, pose, camera, lights=[light])  # doctest: +SKIP
 #[pyclass(name = "AmbientLight", module = "sixfold", frozen, from_py_object)]
 #[derive(Clone)]
 pub(crate) struct AmbientLight([f32; 3]);
@@ -89,6 +92,10 @@ impl AmbientLight {
 
 /// Light from infinitely far away that travels along `direction` (3,) in the camera frame. Colours are linear, 1 is full
 /// white.
+///
+/// Raises ValueError for a direction without a length, a colour below 0.
+///
+/// >>> light = DirectionalLight((0, 0.3, 1))  # from behind the camera, and from above
 #[pyclass(name = "DirectionalLight", module = "sixfold", frozen, from_py_object)]
 #[derive(Clone)]
 pub(crate) struct DirectionalLight(Vec3, [f32; 3]);
@@ -108,6 +115,8 @@ impl DirectionalLight {
 
 /// Light from `position` (3,) in the camera frame, metres, falling off with the square of the distance; `color` is that
 /// at one metre, linear.
+///
+/// >>> light = PointLight((0, -0.5, 0))  # half a metre above the camera
 #[pyclass(name = "PointLight", module = "sixfold", frozen, from_py_object)]
 #[derive(Clone)]
 pub(crate) struct PointLight(Vec3, [f32; 3]);
@@ -390,6 +399,8 @@ pub(crate) fn simulate_depth<'py>(
 
 /// The table under posed objects, [(mesh, camera_from_object (4, 4)), ...]: a Plane in the camera frame, normal up, or
 /// None. The camera is taken to be held upright and above the table.
+///
+/// >>> table = support_plane([(mesh, pose)])  # doctest: +SKIP
 #[pyfunction]
 pub(crate) fn support_plane(
     py: Python<'_>,

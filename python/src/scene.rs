@@ -190,6 +190,9 @@ pub(crate) fn dominant_plane(
 }
 
 /// The least-squares plane through points (N, 3). Raises ValueError for fewer than three or points on one line.
+///
+/// >>> fit_plane([[0, 0, 1], [1, 0, 1], [0, 1, 1]]).distance([[0, 0, 3]])
+/// array([2.])
 #[pyfunction]
 pub(crate) fn fit_plane(py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<PyPlane> {
     let points = arrays::points3("points", points)?;

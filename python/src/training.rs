@@ -193,7 +193,7 @@ impl Source {
         };
         let frames = match frames {
             Some(_) if renders_only => return Err(bad("frames", "None with renders_only", "some")),
-            Some(list) => Frames::Listed(frames_of(list)?),
+            Some(list) => Frames::Listed(arrays::pairs("frames", list)?),
             None if renders_only => Frames::RendersOnly,
             None => Frames::All,
         };
@@ -218,12 +218,4 @@ impl Source {
             other => file_or_value(&other),
         })
     }
-}
-
-/// `(N, 2)` scenes and images.
-fn frames_of(list: &Bound<'_, PyAny>) -> PyResult<Vec<(u32, u32)>> {
-    let pairs: Vec<(i64, i64)> = list
-        .extract()
-        .map_err(|_| bad("frames", "a list of pairs (scene_id, im_id)", list.get_type().to_string()))?;
-    pairs.into_iter().map(|(s, i)| Ok((arrays::id("frames", s)?, arrays::id("frames", i)?))).collect()
 }

@@ -76,6 +76,10 @@ impl PySolid {
 }
 
 impl PySolid {
+    pub(crate) fn parts(&self) -> Arc<ConvexParts> {
+        self.parts.clone()
+    }
+
     fn settled(&self, py: Python<'_>, start: Pose) -> PyResult<Option<Pose>> {
         let (mesh, parts) = (self.mesh.clone(), self.parts.clone());
         interruptible(py, move |_| settle_in_middle(&mesh, &parts, &start))
@@ -252,7 +256,7 @@ pub(crate) fn try_grasp(
     Ok(GraspTrial { report, world_from_object: arrays::from_pose(py, &world_from_object)?.unbind() })
 }
 
-fn simulation_error(error: SimulationError) -> PyErr {
+pub(crate) fn simulation_error(error: SimulationError) -> PyErr {
     match &error {
         SimulationError::Option { field, found, expected } => bad(field, expected, found.to_string()),
         _ => PyValueError::new_err(format!("object: {error}")),

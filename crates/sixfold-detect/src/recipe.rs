@@ -10,7 +10,7 @@ use burn::tensor::Device;
 use sixfold_augment::AugmentError;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, Trained, continued_from};
+use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::{ModelCard, WeightsError};
@@ -116,22 +116,9 @@ impl Default for Recipe {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
+    /// An option out of its range, or nothing to export.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
     /// Backgrounds.
     #[error(transparent)]
     Backgrounds(#[from] AugmentError),
@@ -243,7 +230,7 @@ impl Recipe {
     pub fn export(&self, material: &Material, out: &Path) -> Result<Trained, RecipeError> {
         let p = self.prepare(material, out)?;
         let Some((network, step)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(RecipeError::NoCheckpoint { folder: p.folder });
+            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
         };
         let card = ModelCard { steps: step, ..p.card };
         DetectorModel::new(network, p.config, p.classes, p.usage, card).save(&p.path)?;
@@ -251,7 +238,7 @@ impl Recipe {
     }
 
     fn check(&self) -> Result<(), RecipeError> {
-        let wrong = |field, found: String, expected| Err(RecipeError::Option { field, found, expected });
+        let wrong = |field, found: String, expected| Err(NotReady::option(field, found, expected).into());
         if !(0.0..=1.0).contains(&self.threshold) {
             return wrong("threshold", self.threshold.to_string(), "0 to 1");
         }

@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, Trained};
+use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use thiserror::Error;
@@ -84,22 +84,9 @@ impl Default for Recipe {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
+    /// An option out of its range, or nothing to export.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
     /// Weights in torchvision's layout.
     #[error("encoder: {0}")]
     Pretrained(#[from] PretrainedError),
@@ -167,14 +154,14 @@ impl Recipe {
     pub fn export(&self, out: &Path) -> Result<Trained, RecipeError> {
         let p = self.prepare(out)?;
         let Some((network, step)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(RecipeError::NoCheckpoint { folder: p.folder });
+            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
         };
         DgcmModel::new(network, p.crop, ModelCard { steps: step, ..p.card }).save(&p.path)?;
         Ok(Trained { model: p.path, steps: step, seconds: None, losses: BTreeMap::new() })
     }
 
     fn prepare(&self, out: &Path) -> Result<Prepared, RecipeError> {
-        let wrong = |field, found: String, expected| Err(RecipeError::Option { field, found, expected });
+        let wrong = |field, found: String, expected| Err(NotReady::option(field, found, expected).into());
         if !(64..=1_000_000).contains(&self.views) {
             return wrong("views", self.views.to_string(), "64 to 1000000");
         }

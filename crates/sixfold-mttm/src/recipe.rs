@@ -14,7 +14,7 @@ use sixfold_bop::{DatasetError, write_rgb};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_nn::checkpoint::Checkpoint;
 use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, Trained};
+use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use sixfold_shapes::{Family, member, toy};
@@ -102,22 +102,9 @@ impl Default for Recipe {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
+    /// An option out of its range, or nothing to export.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
     /// Weights in torchvision's layout.
     #[error("encoder: {0}")]
     Pretrained(#[from] PretrainedError),
@@ -206,7 +193,7 @@ impl Recipe {
     ) -> Result<Ending<(Trained, Quality)>, RecipeError> {
         let p = self.prepare(out)?;
         let Some((network, steps)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(RecipeError::NoCheckpoint { folder: p.folder });
+            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
         };
         let card = ModelCard { steps, ..p.card };
         let measured = self.finish(network, &p.options, &p.pool, card, &p.path, stop, hear)?;
@@ -243,7 +230,7 @@ impl Recipe {
     }
 
     fn prepare(&self, out: &Path) -> Result<Prepared, RecipeError> {
-        let wrong = |field, found: String, expected| Err(RecipeError::Option { field, found, expected });
+        let wrong = |field, found: String, expected| Err(NotReady::option(field, found, expected).into());
         if !(16..=100_000).contains(&self.objects) {
             return wrong("objects", self.objects.to_string(), "16 to 100000");
         }

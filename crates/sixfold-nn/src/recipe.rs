@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
+use thiserror::Error;
 
 use crate::training_log::TrainingRecord;
 use crate::weights::{WeightsError, read_card};
@@ -38,6 +39,35 @@ pub struct Trained {
     pub seconds: Option<f64>,
     /// The last record's losses by name.
     pub losses: BTreeMap<String, f64>,
+}
+
+/// Why a training cannot begin, or its model not be exported.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum NotReady {
+    /// An option is out of its range.
+    #[error("{field}: found {found}, expected {expected}")]
+    Option {
+        /// Its name.
+        field: &'static str,
+        /// What it held.
+        found: String,
+        /// What it should hold.
+        expected: &'static str,
+    },
+    /// There is nothing to export.
+    #[error("{}: holds no checkpoint; train first", folder.display())]
+    NoCheckpoint {
+        /// The training's folder.
+        folder: PathBuf,
+    },
+}
+
+impl NotReady {
+    /// An option that is out of its range.
+    pub fn option(field: &'static str, found: impl ToString, expected: &'static str) -> NotReady {
+        NotReady::Option { field, found: found.to_string(), expected }
+    }
 }
 
 /// What a card says of the weights that a training began with: how they came about, and theirs in turn.

@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use sixfold_augment::{AugmentError, Backgrounds, PhotographOptions};
 use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, Trained};
+use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::{ModelCard, WeightsError};
 use thiserror::Error;
@@ -70,22 +70,9 @@ pub struct Recipe {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
+    /// An option out of its range, or nothing to export.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
     /// Backgrounds.
     #[error("backgrounds: {0}")]
     Backgrounds(#[from] AugmentError),
@@ -153,7 +140,7 @@ impl Recipe {
     pub fn export(&self, out: &Path, hear: &mut Listener<'_>) -> Result<(Trained, Quality), RecipeError> {
         let p = self.prepare(out)?;
         let Some((network, steps)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(RecipeError::NoCheckpoint { folder: p.folder });
+            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
         };
         let card = ModelCard { steps, ..p.card };
         let quality = self.finish(network, &p.options, &p.textures, card, &p.path, hear)?;
@@ -181,11 +168,8 @@ impl Recipe {
 
     fn prepare(&self, out: &Path) -> Result<Prepared, RecipeError> {
         if self.encoder.is_some() && self.network == NolKind::Compact {
-            return Err(RecipeError::Option {
-                field: "encoder",
-                found: "one for the compact network".to_owned(),
-                expected: "network paper; the compact network brings its encoder along",
-            });
+            let expected = "network paper; the compact network brings its encoder along";
+            return Err(NotReady::option("encoder", "one for the compact network", expected).into());
         }
         let device = Device::flex().autodiff();
         let parts = self.parts;

@@ -746,6 +746,18 @@ class GraspTrial:
     def time(self) -> float: ...
     def __bool__(self) -> bool: ...
 
+def made_up_mesh(
+    kind: Literal["can", "mug", "cup", "bottle", "bowl", "box", "clamp", "drill", "toy"] = "toy", *, seed: int = 0
+) -> Mesh: ...
+def drop_objects(
+    solids: Sequence[Solid],
+    *,
+    radius: float = 0.18,
+    reach: float = 0.31,
+    upright: float = 0.5,
+    stacked: float = 0.4,
+    seed: int = 0,
+) -> list[Float | None]: ...
 def gripper_pose(tip: ArrayLike, approach: ArrayLike | None = None, closing: ArrayLike | None = None) -> Float: ...
 def try_grasp(
     object: Solid | Mesh,

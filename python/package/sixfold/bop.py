@@ -6,6 +6,7 @@ from ._sixfold import bop as _native
 
 Dataset = _native.Dataset
 Estimate = _native.Estimate
+SceneWriter = _native.SceneWriter
 ground_truth_visibility = _native.ground_truth_visibility
 pose_from_mm = _native.pose_from_mm
 pose_to_mm = _native.pose_to_mm
@@ -13,14 +14,18 @@ read_depth = _native.read_depth
 read_mask = _native.read_mask
 read_results = _native.read_results
 read_rgb = _native.read_rgb
+write_camera = _native.write_camera
 write_depth = _native.write_depth
 write_mask = _native.write_mask
+write_models = _native.write_models
 write_results = _native.write_results
 write_rgb = _native.write_rgb
+write_targets = _native.write_targets
 
 __all__ = [
     "Dataset",
     "Estimate",
+    "SceneWriter",
     "ground_truth_visibility",
     "pose_from_mm",
     "pose_to_mm",
@@ -28,8 +33,11 @@ __all__ = [
     "read_mask",
     "read_results",
     "read_rgb",
+    "write_camera",
     "write_depth",
     "write_mask",
+    "write_models",
     "write_results",
     "write_rgb",
+    "write_targets",
 ]

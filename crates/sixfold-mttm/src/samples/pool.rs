@@ -93,8 +93,7 @@ impl Pool {
                 Some(anchors)
             })
             .collect();
-        let (with_object, without) =
-            per_arrangement?.into_iter().flatten().partition(|a| a.object.is_some());
+        let (with_object, without) = per_arrangement?.into_iter().flatten().partition(|a| a.object.is_some());
         Some(Pool { options: *options, with_object, without })
     }
 

@@ -1,10 +1,9 @@
 //! Why no model could be trained.
 
-use std::path::PathBuf;
-
 use sixfold_augment::AugmentError;
 use sixfold_mesh::MeshError;
 use sixfold_nn::pretrained::PretrainedError;
+use sixfold_nn::recipe::NotReady;
 use sixfold_nn::weights::WeightsError;
 use thiserror::Error;
 
@@ -17,22 +16,9 @@ use crate::training::TrainingError;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
+    /// An option out of its range, or nothing to export.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
     /// A mesh without a hull.
     #[error("object {id}: its vertices have no convex hull: {reason}")]
     Hull {

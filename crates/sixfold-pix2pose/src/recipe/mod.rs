@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
-use sixfold_nn::recipe::{Listener, News, Trained, continued_from};
+use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
@@ -229,7 +229,7 @@ impl Recipe {
         }
         let p = self.prepare(material, out, hear)?;
         let Some((network, step)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(RecipeError::NoCheckpoint { folder: p.folder });
+            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
         };
         let card = ModelCard { steps: step, ..p.card };
         let model = Pix2PoseModel::new(Network::Compact(Box::new(network)), p.entries, p.sizes, card);
@@ -345,7 +345,7 @@ impl Recipe {
 }
 
 fn wrong(field: &'static str, found: impl ToString, expected: &'static str) -> RecipeError {
-    RecipeError::Option { field, found: found.to_string(), expected }
+    NotReady::option(field, found, expected).into()
 }
 
 /// What the alignment is measured with, where there are photographs to measure it on.
