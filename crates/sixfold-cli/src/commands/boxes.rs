@@ -33,20 +33,28 @@ pub(crate) struct Region {
     pub mask: Option<Mask>,
 }
 
-/// A mask is grown by this share of its box's longer side, and by no less than two pixels: masks are coarse, and depth shifts
-/// against colour.
+/// Masks are grown by this share of their box's longer side: masks are coarse, and depth shifts against colour.
 const MASK_MARGIN: f64 = 0.04;
+/// The same for ICP, whose network has its own, finer idea of where the object is: only what lies well beside it is kept out.
+const ICP_MARGIN: f64 = 0.12;
 
 impl Region {
     /// The pixels in which a method on depth looks: the mask's where there is one, else the box's, both grown a little.
     pub fn pixels(&self, camera: &Camera) -> Mask {
         match &self.mask {
-            Some(mask) => {
-                let margin = (MASK_MARGIN * self.bbox.width.max(self.bbox.height)).ceil().max(2.0);
-                mask.grown(margin as usize)
-            }
+            Some(mask) => mask.grown(self.margin(MASK_MARGIN)),
             None => box_mask(&self.bbox, camera),
         }
+    }
+
+    /// The pixels whose depth may be the object's, where there is a mask.
+    pub fn pixels_for_icp(&self) -> Option<Mask> {
+        self.mask.as_ref().map(|mask| mask.grown(self.margin(ICP_MARGIN)))
+    }
+
+    /// Pixels, two at least.
+    fn margin(&self, share: f64) -> usize {
+        (share * self.bbox.width.max(self.bbox.height)).ceil().max(2.0) as usize
     }
 }
 

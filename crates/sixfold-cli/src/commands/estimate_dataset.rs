@@ -376,7 +376,7 @@ fn by_pix2pose(
             }
             let aligned = match &depth {
                 Some(depth) => {
-                    let seen = region.mask.is_some().then(|| region.pixels(&camera));
+                    let seen = region.pixels_for_icp();
                     pix2pose.align(depth, o.obj_id, &k.mesh, &posed, seen.as_ref())?
                 }
                 None => None,

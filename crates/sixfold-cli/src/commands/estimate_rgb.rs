@@ -127,7 +127,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let mut pose: Option<Pose> = posed.as_ref().map(|p| p.camera_from_object);
     let mut aligned = None;
     if let (Some(depth), Some(posed), Some(mesh)) = (&depth, &posed, mesh) {
-        let seen = region.as_ref().filter(|r| r.mask.is_some()).map(|r| r.pixels(&camera));
+        let seen = region.as_ref().and_then(Region::pixels_for_icp);
         aligned = pix2pose.align(depth, entry.id, mesh, posed, seen.as_ref())?;
         match &aligned {
             Some(aligned) => pose = Some(aligned.camera_from_object),
