@@ -4,8 +4,10 @@
     pip install poselib==2.0.5 opencv-python-headless open3d small_gicp pycocotools scipy
     python python/benches/compare.py [pnp] [icp] [metrics] [coco] [render] [--cases N] [--toolkit DIR]
 
-Without a name all five run. Open3D's wheel also asks for the system's libusb-1.0, libGL, libX11 and libgomp. A peer that is not installed is left out, and the table says so. Times include the way
-through Python (arrays in, arrays out). The scenes of `pnp` and `icp` are those of `benches/` beside the Rust sources.
+Without a name all five run. Open3D's wheel also asks for the system's libusb-1.0, libGL, libX11 and libgomp. A peer that
+is not installed is left out, and the table says so. Times are processor time and include the way through Python (arrays in,
+arrays out). Poses and clouds go to all solvers in turn, so that all see the same state of the machine; where other programs
+run too, only the ratios mean something. The scenes of `pnp` and `icp` are those of `benches/` beside the Rust sources.
 
 pnp      800 correspondences with 30, 60, 80 % outliers, threshold 3 pixels: PoseLib, OpenCV (AP3P, EPnP)
 icp      point to plane on a partly hidden object with strays: Open3D, small_gicp
@@ -46,13 +48,13 @@ def optional(name):
 
 
 def timed(work, repeats=3):
-    """Result and milliseconds: the median of a few calls after a first one."""
+    """Result and milliseconds of processor time, all threads together: the median of a few calls after a first one."""
     result = work()
     times = []
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = time.process_time()
         result = work()
-        times.append(1e3 * (time.perf_counter() - begin))
+        times.append(1e3 * (time.process_time() - begin))
     return result, sorted(times)[len(times) // 2]
 
 
@@ -108,13 +110,15 @@ def pnp(arguments):
     for outliers in (0.3, 0.6, 0.8):
         rng = np.random.default_rng(1)
         cases = [scenes.make_case(rng, outliers, "volume") for _ in range(count)]
-        for name, solve in solvers.items():
-            turns, shifts, times = [], [], []
-            for points, pixels, rotation, translation in cases:
+        measured = {name: ([], [], []) for name in solvers}
+        for points, pixels, rotation, translation in cases:
+            for name, solve in solvers.items():
                 (r, t), ms = timed(lambda: solve(points, pixels))
+                turns, shifts, times = measured[name]
                 turns.append(angle(r, rotation))
                 shifts.append(1e3 * np.linalg.norm(t - translation))
                 times.append(ms)
+        for name, (turns, shifts, times) in measured.items():
             print(
                 f"  {outliers:8.0%}  {name:12} {np.median(turns):10.2f} deg {np.mean(np.array(turns) > 10):12.1%} "
                 f"{np.median(shifts):15.1f} mm {np.mean(times):13.2f} ms"
@@ -128,6 +132,8 @@ def icp(arguments):
         return
     import icp_vs_open3d_small_gicp as scenes
 
+    scenes.clock = time.process_time
+
     def run_sixfold(cases):
         levels = [(distance, iterations, 1) for distance, iterations in scenes.LEVELS]
         for target, normals, source, source_normals, start, _ in cases:
@@ -140,17 +146,19 @@ def icp(arguments):
     cases = [scenes.make_case(rng) for _ in range(arguments.cases or 30)]
     print(f"  {len(cases)} cases, about {len(cases[0][0])} target and {len(cases[0][2])} source points")
     print("                         rotation   translation   success   index and alignment, median")
-    for name, run in {
+    runs = {
         "Sixfold": run_sixfold,
         "Open3D": scenes.run_open3d,
         "small_gicp PLANE_ICP": scenes.run_small_gicp("PLANE_ICP"),
         "small_gicp GICP": scenes.run_small_gicp("GICP"),
-    }.items():
-        turns, shifts, times = [], [], []
-        for (pose, index, align), case in zip(run(cases), cases, strict=True):
+    }
+    measured = {name: ([], [], []) for name in runs}
+    for case, *found in zip(cases, *(run(cases) for run in runs.values()), strict=True):
+        for (turns, shifts, times), (pose, index, align) in zip(measured.values(), found, strict=True):
             turns.append(angle(pose[:3, :3], case[5][:3, :3]))
             shifts.append(1e3 * np.linalg.norm(pose[:3, 3] - case[5][:3, 3]))
             times.append(index + align)
+    for name, (turns, shifts, times) in measured.items():
         success = np.mean((np.array(turns) < 3) & (np.array(shifts) < 3))
         print(
             f"  {name:22} {np.median(turns):6.3f} deg {np.median(shifts):8.3f} mm {success:9.1%} {np.median(times):10.2f} ms"
