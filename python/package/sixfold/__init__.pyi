@@ -1,7 +1,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path as PurePath
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,7 @@ Bool = NDArray[np.bool_]
 Path = str | PathLike[str]
 Unit = Literal["m", "mm", "cm", "in"]
 Color = tuple[float, float, float] | Sequence[float]
-Light = AmbientLight | DirectionalLight | PointLight
+Light: TypeAlias = "AmbientLight | DirectionalLight | PointLight"
 Dicts = list[dict[str, Any]]
 Texts = list[str]
 View = tuple[ArrayLike, Camera, ArrayLike] | tuple[ArrayLike, Camera, ArrayLike, ArrayLike]
