@@ -94,6 +94,9 @@ def test_who_matches(templates, thing, scene, matcher):
 def test_another_network_and_what_it_keeps(templates, scene, mttm_weights, tmp_path):
     depth, camera, *_ = scene
     [shipped] = sixfold.estimate_mttm(depth, sixfold.Mttm(templates, matcher="network"), camera, min_score=0)
+    # Another matcher is another way to the pose.
+    [by_points] = sixfold.estimate_mttm(depth, sixfold.Mttm(templates, matcher="points"), camera, min_score=0)
+    assert (by_points.camera_from_object != shipped.camera_from_object).any()
     kept = tmp_path / "thing.sixfold-descriptors"
     for cache in (None, kept, kept):
         read = sixfold.Mttm(templates, matcher="network", weights=mttm_weights, cache=cache)

@@ -93,6 +93,15 @@ def test_the_network_for_templates_learns(colored, tmp_path):
     assert quality["regions"] >= 40 and 0 <= quality["nearest"] <= 1 and len(quality["rotation"]) == 2
     known = sixfold.Mttm(colored, weights=trained["model"])
     assert known.matcher == "both" and known.has_mesh
+    # It describes templates otherwise than the network within the package: kept descriptors of one do not fit the other.
+    kept = tmp_path / "kept"
+    sixfold.Mttm(colored, weights=trained["model"], cache=kept)
+    of_this = kept.read_bytes()
+    assert (
+        sixfold.Mttm(colored, weights=trained["model"], cache=kept).cache_note is None and kept.read_bytes() == of_this
+    )
+    sixfold.Mttm(colored, cache=kept)
+    assert kept.read_bytes() != of_this
     # Going on where nothing is left to do gives the same file; other options are another training.
     before = trained["model"].read_bytes()
     trained["model"].unlink()
