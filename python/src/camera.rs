@@ -1,12 +1,15 @@
 //! `Camera`: pinhole intrinsics with an optional lens distortion, and the images that belong to it.
 
+use std::path::PathBuf;
+
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
-use pyo3::types::PyTuple;
+use pyo3::types::{PyTuple, PyType};
+use sixfold_bop::CameraFile;
 use sixfold_geometry::{BrownConrady, Camera, Vec2};
 
 use crate::arrays::{self, about, bad, whole};
-use crate::guard::free;
+use crate::guard::{camera_file_error, free};
 
 /// A pinhole camera: focal lengths and principal point in pixels, image size in pixels. The centre of the top left
 /// pixel is (0, 0); x runs right, y down, z forward (OpenCV's frame).
@@ -89,6 +92,37 @@ impl PyCamera {
         let camera = Camera { fx, fy, cx, cy, width, height, distortion };
         camera.check().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
         Ok(PyCamera(camera))
+    }
+
+    /// Reads a JSON file with fx, fy, cx, cy or cam_K, and perhaps width, height, distortion and depth_scale (BOP's
+    /// camera.json), or a scene_camera.json of one image. `width` and `height` are those of the image, pixels; they may be
+    /// left out when the file says them. Returns the camera and the file's depth_scale, millimetres per unit of the
+    /// depth image, None without one.
+    ///
+    /// Raises OSError when the file cannot be read; ValueError, with the file and field, when it is broken, states another
+    /// size, or belongs to another resolution.
+    ///
+    /// >>> camera, mm_per_unit = Camera.load("data/demo/camera.json", 640, 480)  # doctest: +SKIP
+    #[classmethod]
+    #[pyo3(signature = (path, width=None, height=None))]
+    fn load(
+        _class: &Bound<'_, PyType>,
+        py: Python<'_>,
+        path: PathBuf,
+        width: Option<i64>,
+        height: Option<i64>,
+    ) -> PyResult<(Self, Option<f64>)> {
+        let file = free(py, || CameraFile::read(&path))?.map_err(camera_file_error)?;
+        let (width, height) = match (width, height) {
+            (Some(width), Some(height)) => (whole("width", width, 1)?, whole("height", height, 1)?),
+            (None, None) if file.sized => (file.camera.width, file.camera.height),
+            _ => {
+                let expected = "the image's width and height, as the file does not say them";
+                return Err(bad("width and height", expected, "one or none of them"));
+            }
+        };
+        let camera = file.for_image(width, height, &path).map_err(camera_file_error)?;
+        Ok((PyCamera(camera), file.depth_scale))
     }
 
     /// Focal length in x, pixels.

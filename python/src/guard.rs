@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use sixfold_bop::{DatasetError, EvalError, ResultsError};
+use sixfold_bop::{CameraFileError, DatasetError, EvalError, ResultsError};
 use sixfold_mesh::MeshFileError;
 
 /// How often Ctrl-C is looked for.
@@ -167,6 +167,14 @@ pub(crate) fn dataset_error(error: DatasetError) -> PyErr {
             Err(error) => PyValueError::new_err(error.to_string()),
         },
         other => PyValueError::new_err(other.to_string()),
+    }
+}
+
+/// A camera file that cannot be used.
+pub(crate) fn camera_file_error(error: CameraFileError) -> PyErr {
+    match &error {
+        CameraFileError::Read { source, .. } => os_error(source.kind(), error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
     }
 }
 

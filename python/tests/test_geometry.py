@@ -25,6 +25,23 @@ def test_projection_is_the_pinhole_formula(camera):
     assert np.isnan(camera.project([[0, 0, -1], [0, 0, 0]])).all()
 
 
+def test_camera_files(tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text('{"fx": 500, "fy": 510, "cx": 320, "cy": 240, "depth_scale": 0.1}')
+    assert sixfold.Camera.load(file, 640, 480) == (sixfold.Camera(500, 510, 320, 240, 640, 480), 0.1)
+    with pytest.raises(ValueError, match="width and height"):
+        sixfold.Camera.load(file)
+    with pytest.raises(ValueError, match=r"camera\.json.*another resolution"):
+        sixfold.Camera.load(file, 320, 240)
+    file.write_text('{"cam_K": [500, 0, 320, 0, 510, 240, 0, 0, 1], "width": 640, "height": 480}')
+    assert sixfold.Camera.load(file) == (sixfold.Camera(500, 510, 320, 240, 640, 480), None)
+    file.write_text('{"cam_K": [500, 0]}')
+    with pytest.raises(ValueError, match=r"camera\.json.*cam_K"):
+        sixfold.Camera.load(file, 640, 480)
+    with pytest.raises(FileNotFoundError):
+        sixfold.Camera.load(tmp_path / "none.json", 640, 480)
+
+
 def test_distortion_is_undone():
     camera = sixfold.Camera(500, 510, 320, 240, 640, 480, distortion=(-0.1, 0.02, 0.001, -0.002))
     assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.0)

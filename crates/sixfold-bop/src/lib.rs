@@ -3,6 +3,7 @@
 //! Millimetres exist in the files only; everything here is in metres, radians and pixels. The short way from a result
 //! file to scores: [`BopDataset::open`], [`read_results`], [`BopDataset::targets`], [`evaluate`].
 
+mod camera_file;
 mod coco;
 mod coco_score;
 mod coco_truth;
@@ -23,6 +24,7 @@ mod single_images;
 mod visibility;
 mod write;
 
+pub use camera_file::{CameraFile, CameraFileError};
 pub use coco::{
     AdjustedDetection, Adjustment, Annotation, CocoGroundTruth, Detection, Detections, ReadDetections,
     parse_detections, read_detections, write_detections,

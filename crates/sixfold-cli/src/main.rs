@@ -3,7 +3,6 @@
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
 mod arguments;
-mod camera_file;
 mod commands;
 mod objects;
 mod output;

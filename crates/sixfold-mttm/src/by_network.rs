@@ -17,7 +17,7 @@ use crate::roi::Roi;
 /// Regions of which pairs are looked at: fewest and most.
 const LOOKED_AT: (usize, usize) = (64, 400);
 /// Hypotheses that the network adds to a region's.
-const HYPOTHESES: usize = 3;
+const HYPOTHESES: usize = 2;
 /// Pairs that go through the network at a time.
 const AT_A_TIME: usize = 32;
 /// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several.

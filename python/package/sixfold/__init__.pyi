@@ -42,6 +42,10 @@ class Camera:
         height: int,
         distortion: ArrayLike | None = None,
     ) -> Camera: ...
+    @classmethod
+    def load(
+        cls, path: Path, width: int | None = None, height: int | None = None
+    ) -> tuple[Camera, float | None]: ...
     @property
     def fx(self) -> float: ...
     @property

@@ -4,13 +4,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
+use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_geometry::{Camera, DepthImage, Mask, Rect, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
 
 use crate::Outcome;
 use crate::arguments::EstimateArguments;
-use crate::camera_file::{self, CameraFile};
 use crate::objects;
 use crate::output::{pose_rows, report};
 use crate::overlay::{self, Drawn};
@@ -39,7 +38,7 @@ impl Input {
         if a.objects.is_empty() {
             bail!("--object NAME_OR_MESH is missing: what is to be found?");
         }
-        let file = camera_file::read(camera_path)?;
+        let file = CameraFile::read(camera_path)?;
         let depth = read_depth(depth_file, depth_scale(a, &file, camera_path)? / 1000.0)?;
         let (width, height) = depth.size();
         let camera = file.for_image(width, height, camera_path)?;

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{read_depth, read_mask, read_rgb, write_rgb};
+use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2, Vec3, undistort_depth, undistort_rgb};
@@ -19,7 +19,6 @@ use super::estimate::{depth_scale, given_box};
 use super::pix2pose::{Pix2Pose, view_picture};
 use crate::Outcome;
 use crate::arguments::EstimateArguments;
-use crate::camera_file;
 use crate::objects;
 use crate::output::{pose_rows, report, write_atomically};
 use crate::overlay::{self, Drawn};
@@ -95,7 +94,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     };
     let raw = read_rgb(rgb_file)?;
     let (width, height) = raw.size();
-    let file = camera_file::read(camera_path)?;
+    let file = CameraFile::read(camera_path)?;
     let lens = file.for_image(width, height, camera_path)?;
     // Lens distortion ends here: everything behind works on pinhole images.
     let image = undistort_rgb(&raw, &lens).with_context(|| rgb_file.display().to_string())?;

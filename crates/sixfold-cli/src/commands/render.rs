@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use serde_json::json;
-use sixfold_bop::{write_depth, write_mask, write_rgb};
+use sixfold_bop::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
@@ -11,13 +11,13 @@ use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, Sc
 use crate::Outcome;
 use crate::arguments::RenderArguments;
 use crate::output::{pose_rows, report};
-use crate::{camera_file, objects, overlay};
+use crate::{objects, overlay};
 
 pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
     let object = objects::find(&a.object, a.unit, &a.store)?;
     let camera = match &a.camera {
         Some(path) => {
-            let file = camera_file::read(path)?;
+            let file = CameraFile::read(path)?;
             if !file.sized {
                 bail!("{}: fields width and height are missing: how large is the picture?", path.display());
             }

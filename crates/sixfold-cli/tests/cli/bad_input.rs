@@ -149,7 +149,7 @@ fn broken_camera() {
         ),
         (
             r#"{"0": {"cam_K": [300, 0, 159.5, 0, 300, 119.5, 0, 0, 1]}, "1": {}}"#,
-            &["camera.json", "--dataset"],
+            &["camera.json", "images", "dataset"],
         ),
     ];
     for (text, words) in cases {

@@ -1,12 +1,11 @@
 //! A depth image from files, prepared for grasping.
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_bop::{read_depth, read_mask, read_rgb};
+use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_grasp::{GraspView, ViewOptions, find_objects};
 
 use super::arguments::InputArguments;
-use crate::camera_file;
 
 /// What was read, without distortion.
 pub(super) struct Input {
@@ -20,7 +19,7 @@ pub(super) struct Input {
 
 /// Reads and prepares the view of the masked object, or of the largest thing on the table.
 pub(super) fn read(a: &InputArguments, seed: u64) -> Result<Input> {
-    let file = camera_file::read(&a.camera)?;
+    let file = CameraFile::read(&a.camera)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
         anyhow!(
             "{}: field depth_scale is missing: give it there or as --depth-scale (millimetres per unit of the depth image: 1 for most cameras)",

@@ -3,14 +3,13 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_bop::{read_depth, read_mask};
+use sixfold_bop::{CameraFile, read_depth, read_mask};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 
 use super::arguments::{DepthViewArguments, TemplateViews};
-use crate::camera_file;
 
 /// The templates of a mesh.
 pub(crate) fn of_mesh(mesh: &Mesh, views: TemplateViews) -> Result<ObjectTemplates> {
@@ -28,7 +27,7 @@ struct Read {
 /// The templates of an object in depth images.
 pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<ObjectTemplates> {
     let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
-    let file = camera_file::read(camera_path)?;
+    let file = CameraFile::read(camera_path)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
         anyhow!("{}: field depth_scale is missing: give it there or as --depth-scale", camera_path.display())
     })?;

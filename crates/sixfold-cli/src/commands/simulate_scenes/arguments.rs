@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
+use sixfold_bop::CameraFile;
 use sixfold_geometry::Camera;
 use sixfold_mesh::Unit;
 use sixfold_shapes::Family;
 use sixfold_simulation::PileOptions;
 
 use crate::arguments::{JsonArguments, Sensor};
-use crate::camera_file;
 
 /// Shown under `sixfold simulate-scenes --help`.
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
@@ -181,7 +181,7 @@ impl SimulateScenesArguments {
         let Some(file) = &self.camera else {
             return Ok(Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480)?);
         };
-        let read = camera_file::read(file)?;
+        let read = CameraFile::read(file)?;
         let (width, height) = if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
         let camera = read.for_image(width, height, file)?;
         if camera.distortion.is_some() {

@@ -9,7 +9,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 use sixfold_bop::{
-    BopDataset, Detection, MaskKind, Models, Rle, ground_truth_visibility, read_mask, read_rgb,
+    BopDataset, CameraFile, Detection, MaskKind, Models, Rle, ground_truth_visibility, read_mask, read_rgb,
 };
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
@@ -17,7 +17,6 @@ use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 use sixfold_nol::Photograph;
 
 use super::arguments::SynthesizeArguments;
-use crate::camera_file;
 use crate::commands::detect::Detector;
 
 /// All that is given.
@@ -337,7 +336,7 @@ fn picture(folder: &Path, entry: &Entry) -> Result<(RgbImage, Camera)> {
     let image = read_rgb(&folder.join(&entry.image))?;
     let file = folder.join(&entry.camera);
     let (width, height) = image.size();
-    let camera = camera_file::read(&file)?.for_image(width, height, &file)?;
+    let camera = CameraFile::read(&file)?.for_image(width, height, &file)?;
     let image = if camera.distortion.is_some() { undistort_rgb(&image, &camera)? } else { image };
     Ok((image, camera.without_distortion()))
 }
