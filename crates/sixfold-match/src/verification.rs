@@ -333,9 +333,8 @@ pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
             touch(x + 1, y);
             touch(x, y + 1);
         }
-        if border > 0 {
-            total += pixels * without_edge / border;
-        }
+        // Hidden all over, it says nothing about what hides it.
+        total += (pixels * without_edge).checked_div(border).unwrap_or(0);
     }
     total
 }
