@@ -216,14 +216,16 @@ mod tests {
         // Nothing was measured on the object.
         let empty = DepthScene::new(&DepthImage::filled(320, 240, 0.0), &camera);
         assert!(empty.align(&mesh, mesh.diameter(), &start, &found, None).is_err());
-        // Something stands before half of the object, which the network did not notice and a mask knows of.
+        // Something stands before most of the object, which the network did not notice and a mask knows of.
         let mut half = render_depth(&mesh, &truth, &camera);
-        let mut mask = Mask::filled(320, 240, true);
-        for y in 0..240 {
-            for x in 0..140 {
-                half[(x, y)] = 0.65;
-                mask[(x, y)] = false;
-            }
+        let at = |i: usize| (i % 320, i / 320);
+        let covered = half.as_slice().iter().enumerate().filter(|(_, z)| **z > 0.0);
+        let mut columns: Vec<usize> = covered.map(|(i, _)| at(i).0).collect();
+        columns.sort_unstable();
+        let edge = columns[columns.len() * 7 / 10];
+        let mask = Mask::from_fn(320, 240, |x, _| x >= edge);
+        for i in (0..320 * 240).filter(|i| at(*i).0 < edge) {
+            half[at(i)] = 0.65;
         }
         let scene = DepthScene::new(&half, &camera);
         let error = |mask: Option<&Mask>| {
