@@ -53,19 +53,14 @@ impl DetectedMasks {
 
     /// The mask of an object that lies about where it was drawn.
     fn choose(all: &[Detection], id: u32, drawn: &Mask) -> Option<Mask> {
-        let mine = all.iter().filter(|d| d.category_id == id);
-        mine.filter_map(|d| d.segmentation.as_ref().map(Rle::decode))
-            .find(|mask| iou(mask, drawn) >= SAME_OBJECT)
+        let drawn = Rle::encode(drawn).ok()?;
+        let iou = |mask: &Rle| {
+            let both = mask.intersection(&drawn)?;
+            Some(both as f64 / (mask.area() + drawn.area() - both) as f64)
+        };
+        let mut mine = all.iter().filter(|d| d.category_id == id).filter_map(|d| d.segmentation.as_ref());
+        mine.find(|mask| iou(mask).is_some_and(|iou| iou >= SAME_OBJECT)).map(Rle::decode)
     }
-}
-
-fn iou(a: &Mask, b: &Mask) -> f64 {
-    let (mut both, mut either) = (0usize, 0usize);
-    for (a, b) in a.as_slice().iter().zip(b.as_slice()) {
-        both += usize::from(*a && *b);
-        either += usize::from(*a || *b);
-    }
-    if either == 0 { 0.0 } else { both as f64 / either as f64 }
 }
 
 impl Input {
@@ -339,4 +334,31 @@ fn picture(folder: &Path, entry: &Entry) -> Result<(RgbImage, Camera)> {
     let camera = CameraFile::read(&file)?.for_image(width, height, &file)?;
     let image = if camera.distortion.is_some() { undistort_rgb(&image, &camera)? } else { image };
     Ok((image, camera.without_distortion()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mask_that_lies_where_the_pose_says_is_taken() {
+        let bar = |from: usize, to: usize| Mask::from_fn(20, 4, |x, _| (from..to).contains(&x));
+        let seen = |category_id: u32, mask: &Mask| Detection {
+            scene_id: 0,
+            image_id: 0,
+            category_id,
+            score: 0.9,
+            bbox: None,
+            segmentation: Some(Rle::encode(mask).unwrap()),
+            time: None,
+        };
+        let all = [seen(1, &bar(12, 20)), seen(2, &bar(0, 10)), seen(1, &bar(2, 10))];
+        assert_eq!(DetectedMasks::choose(&all, 1, &bar(0, 8)), Some(bar(2, 10)));
+        assert_eq!(DetectedMasks::choose(&all, 2, &bar(0, 8)), Some(bar(0, 10)));
+        // Four of ten columns in common are enough, two are not.
+        assert_eq!(DetectedMasks::choose(&all, 1, &bar(0, 6)), Some(bar(2, 10)));
+        assert_eq!(DetectedMasks::choose(&all, 1, &bar(0, 4)), None);
+        assert_eq!(DetectedMasks::choose(&all, 3, &bar(0, 8)), None);
+        assert_eq!(DetectedMasks::choose(&all, 1, &Mask::filled(20, 4, false)), None);
+    }
 }
