@@ -4,10 +4,10 @@ use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank};
+use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank_by_outcome};
 use sixfold_geometry::Pose;
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspView, ViewError, ViewOptions, antipodal_grasps,
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, GraspView, ViewError, ViewOptions, antipodal_grasps,
     cluster_grasps, draw_grasps as draw, find_objects as find,
 };
 
@@ -234,15 +234,17 @@ pub(crate) fn propose_grasps(
             return Ok(plain.collect());
         };
         let only_experience = part.is_some();
-        let options = ProposeOptions { judge: planner, part, ..ProposeOptions::default() };
-        let found = {
+        let options = ProposeOptions { part, ..ProposeOptions::default() };
+        let fitter = GraspFitter::new(&view, &gripper, &planner)
+            .unwrap_or_else(|error| unreachable!("default options: {error}"));
+        let (found, outcomes) = {
             let mut opened = lock(&store);
             let memory = opened.memory(&model).map_err(ProposeError::Store)?;
-            propose(&view, &gripper, &model, memory, &options)?
+            (propose(&fitter, &model, memory, &options)?, memory.outcomes(&gripper.name))
         };
         stop.check();
         let geometry = if only_experience { vec![] } else { planned() };
-        let ranked = rank(&geometry, &found.proposals, &clusters);
+        let ranked = rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes);
         let learnt = ranked.iter().map(|r| {
             let from = r.proposal.map(|i| &found.proposals[i]);
             let kind = match r.kind {

@@ -15,6 +15,7 @@ mod crop_turn;
 pub mod loss;
 pub mod model;
 pub mod networks;
+pub mod outcome;
 pub mod recipe;
 pub mod samples;
 pub mod store;

@@ -170,6 +170,8 @@ pub(crate) struct Planner<'a> {
     pub cone: f64,
     /// A point stands for the square of this of surface, metres.
     pub step: f64,
+    /// The table, where one is known.
+    pub table: Option<sixfold_geometry::Plane>,
 }
 
 impl<'a> Planner<'a> {
@@ -189,6 +191,7 @@ impl<'a> Planner<'a> {
             object,
             cone: gripper.friction.atan(),
             step: view.step,
+            table: view.table,
         }
     }
 
@@ -289,7 +292,7 @@ impl<'a> Planner<'a> {
     fn deepest(&self, centre: &Vec3, closing: &Vec3, approach: &Vec3, width: f64) -> Option<Grasp> {
         let length = self.gripper.finger_length;
         let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
-        [0.9, 0.6, 0.35, 0.2].into_iter().find_map(|share| {
+        [0.9, 0.6, 0.35, 0.2, 0.1].into_iter().find_map(|share| {
             let tip = centre + approach * (share * length);
             let pose = gripper_pose(&tip, approach, closing)?;
             self.grasp(&pose, opening)

@@ -11,10 +11,30 @@ use crate::{
 
 /// Fits grasps to the object of a view.
 pub struct GraspFitter<'a> {
+    view: &'a GraspView,
     planner: Planner<'a>,
 }
 
 impl<'a> GraspFitter<'a> {
+    /// The view.
+    pub fn view(&self) -> &'a GraspView {
+        self.view
+    }
+
+    /// The gripper.
+    pub fn gripper(&self) -> &'a Gripper {
+        self.planner.gripper
+    }
+
+    /// What a grasp has to fulfil.
+    pub fn options(&self) -> &'a AntipodalOptions {
+        self.planner.options
+    }
+
+    pub(crate) fn planner(&self) -> &Planner<'a> {
+        &self.planner
+    }
+
     /// A fitter for a view and a gripper. The object's far side is assumed as the options say.
     ///
     /// # Errors
@@ -31,7 +51,7 @@ impl<'a> GraspFitter<'a> {
                 CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] }
             }
         };
-        Ok(GraspFitter { planner: Planner::new(view, gripper, object, options) })
+        Ok(GraspFitter { view, planner: Planner::new(view, gripper, object, options) })
     }
 
     /// The grasp at about this pose, moved along the closing direction so that the object is midway between the pads;

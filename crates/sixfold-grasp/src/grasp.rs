@@ -1,11 +1,11 @@
 //! A grasp: where the gripper goes, how far it opens, and how good the contacts look.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Mat3, Pose, Vec3};
 
 /// How good a two-finger grasp looks from its contacts alone. Every part lies in 0 to 1. Nothing here knows of the robot's
 /// reach, of forces or of the object's weight: it is the geometry of the contacts.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AntipodalQuality {
     /// How far the closing axis lies inside both friction cones: 1 along both contact normals, 0 on the edge of a cone
     /// (two contacts hold against any disturbance when the axis lies inside both cones: Nguyen 1988).

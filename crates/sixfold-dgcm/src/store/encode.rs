@@ -6,7 +6,9 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
 
+use super::StoreError;
 use crate::crop::Crop;
+use crate::outcome::Attempt;
 
 /// Steps of the stored depth, metres: 6.5 m fit into 16 bits.
 const DEPTH_STEP: f64 = 1e-4;
@@ -133,6 +135,25 @@ pub(super) fn doubles(bytes: &[u8]) -> Vec<f64> {
 
 pub(super) fn vectors(vectors: &[Vec3]) -> Vec<u8> {
     vectors.iter().flat_map(|v| [v.x, v.y, v.z]).flat_map(f64::to_le_bytes).collect()
+}
+
+/// An attempt as text, and the key by which it is known again: everything but the time.
+pub(super) fn attempt(attempt: &Attempt) -> Result<([u8; 16], String), StoreError> {
+    let wrong = |field, found: String| StoreError::Field { id: 0, field, expected: "a finite number", found };
+    attempt.check().map_err(|field| wrong(field, "none".to_owned()))?;
+    let attempt = attempt.clone().rounded();
+    let text = |a: &Attempt| serde_json::to_string(a).map_err(|e| wrong("attempt", e.to_string()));
+    let key = key(&[text(&Attempt { time: 0, ..attempt.clone() })?.as_bytes()]);
+    Ok((key, text(&attempt)?))
+}
+
+pub(super) fn from_attempt(id: i64, text: &str) -> Result<Attempt, StoreError> {
+    serde_json::from_str(text).map_err(|e| StoreError::Field {
+        id,
+        field: "attempt",
+        expected: "an attempt as this program writes it",
+        found: e.to_string(),
+    })
 }
 
 /// FNV-1a over 128 bits: the same bytes give the same key on every machine.

@@ -15,6 +15,8 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::outcome::Attempt;
+
 pub use describe::Description;
 pub use experience::{COPIES, Copy, Experience, Stored, region};
 pub use index::{FeatureIndex, Match};
@@ -195,7 +197,19 @@ pub trait ExperienceStore {
     /// [`StoreError`].
     fn changes(&self, since: Position) -> Result<Changes, StoreError>;
 
-    /// Takes over all experiences of another store that are not here yet; how many were new.
+    /// Keeps a grasp that was tried, whatever came of it; false when it is there already.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is stored then.
+    fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError>;
+
+    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError>;
+
+    /// Takes over all experiences and attempts of another store that are not here yet; how many experiences were new.
     ///
     /// # Errors
     /// [`StoreError`]; what was taken over until then is kept.
@@ -205,6 +219,9 @@ pub trait ExperienceStore {
             if let Some(stored) = other.get(summary.id)? {
                 added += usize::from(self.add(&stored.experience)?.1);
             }
+        }
+        for (_, attempt) in other.attempts(0)? {
+            self.add_attempt(&attempt)?;
         }
         Ok(added)
     }

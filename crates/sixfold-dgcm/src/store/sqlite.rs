@@ -14,12 +14,13 @@ use sixfold_grasp::parse_gripper;
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
 use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
+use crate::outcome::Attempt;
 use crate::vd_noc::Extent;
 
 /// Says that a SQLite file is one of ours: "6fEx".
 const APPLICATION: i64 = 0x3666_4578;
-/// Version of the tables.
-const VERSION: i64 = 1;
+/// Version of the tables. A store of version 1 has no attempts; it is brought up to date when it is written to.
+const VERSION: i64 = 2;
 const TABLES: &str = "
     CREATE TABLE experience (
         id INTEGER PRIMARY KEY AUTOINCREMENT, key BLOB NOT NULL UNIQUE, time INTEGER NOT NULL,
@@ -32,6 +33,9 @@ const TABLES: &str = "
         angle REAL NOT NULL, feature BLOB NOT NULL);
     CREATE INDEX feature_of_experience ON feature(experience);
     CREATE TABLE removal (id INTEGER PRIMARY KEY AUTOINCREMENT, experience INTEGER NOT NULL);
+";
+const ATTEMPTS: &str = "
+    CREATE TABLE attempt (id INTEGER PRIMARY KEY AUTOINCREMENT, key BLOB NOT NULL UNIQUE, attempt TEXT NOT NULL);
 ";
 
 /// A store in a file.
@@ -102,9 +106,20 @@ impl SqliteStore {
         let empty = self.number("SELECT count(*) FROM sqlite_master")? == 0;
         if empty && self.number("PRAGMA application_id")? == 0 {
             self.run(TABLES)?;
+            self.run(ATTEMPTS)?;
             self.run(&format!("PRAGMA application_id={APPLICATION}; PRAGMA user_version={VERSION}"))?;
         }
+        self.bring_up()?;
         self.check_version()
+    }
+
+    /// Adds what a store of version 1 lacks.
+    fn bring_up(&self) -> Result<(), StoreError> {
+        if self.number("PRAGMA application_id")? == APPLICATION && self.number("PRAGMA user_version")? == 1 {
+            self.run(ATTEMPTS)?;
+            self.run(&format!("PRAGMA user_version={VERSION}"))?;
+        }
+        Ok(())
     }
 
     fn check_version(&self) -> Result<(), StoreError> {
@@ -113,7 +128,7 @@ impl SqliteStore {
             return Err(StoreError::NotAStore { file: self.file.clone(), found });
         }
         let found = self.number("PRAGMA user_version")?;
-        if found != VERSION {
+        if !(1..=VERSION).contains(&found) {
             return Err(StoreError::Version { file: self.file.clone(), found, expected: VERSION });
         }
         Ok(())
@@ -390,6 +405,34 @@ impl ExperienceStore for SqliteStore {
             Ok(removed)
         })();
         self.checked(removed)
+    }
+
+    fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
+        let (key, text) = encode::attempt(attempt)?;
+        if self.number("PRAGMA user_version")? < VERSION {
+            // Another process may do so at the same time: the lock decides.
+            self.run("BEGIN IMMEDIATE")?;
+            let done = self.bring_up();
+            self.run(if done.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
+            done?;
+        }
+        self.checked(self.connection.execute(
+            "INSERT INTO attempt (key, attempt) VALUES (?1,?2) ON CONFLICT(key) DO NOTHING",
+            params![key, text],
+        ))
+        .map(|rows| rows > 0)
+    }
+
+    fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+        if self.number("PRAGMA user_version")? < VERSION {
+            return Ok(vec![]);
+        }
+        let rows: Vec<(i64, String)> = self.checked((|| {
+            let mut query =
+                self.connection.prepare("SELECT id, attempt FROM attempt WHERE id > ?1 ORDER BY id")?;
+            query.query_map([after], |row| Ok((row.get(0)?, row.get(1)?)))?.collect()
+        })())?;
+        rows.into_iter().map(|(id, text)| Ok((id, encode::from_attempt(id, &text)?))).collect()
     }
 
     fn changes(&self, since: Position) -> Result<Changes, StoreError> {

@@ -2,11 +2,13 @@
 //!
 //! The dissertation adds to the score of each geometric candidate what experience says of it (section 6.3.2). So it can
 //! only choose among what the geometric planner proposes, and fails where all of that is bad. Here the transferred grasps
-//! are candidates as well, judged by the same two numbers.
+//! are candidates as well, judged by the same numbers; and what came of earlier attempts says how much each number counts
+//! ([`crate::outcome`]).
 
-use sixfold_grasp::{ClusterOptions, Grasp};
+use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 
 use super::Proposal;
+use crate::outcome::OutcomeModel;
 
 /// Where a grasp comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
@@ -25,7 +27,7 @@ pub struct Ranked {
     pub grasp: Grasp,
     /// Where it comes from.
     pub kind: Kind,
-    /// What decides: the mean of the next two for both kinds together.
+    /// What decides: the mean of the next two for both kinds together, or the chance to hold ([`rank_by_outcome`]).
     pub score: f64,
     /// Quality of its contacts over the best one's, 0 to 1.
     pub geometry: f64,
@@ -37,51 +39,101 @@ pub struct Ranked {
     pub members: usize,
 }
 
-/// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees). Without experience that is the
-/// order of the planner's clusters, without geometry that of summed scores of equation 6.6 (section 6.3.2).
+/// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees), by the mean of their quality and of the
+/// share of experience that agrees. Without experience that is the order of the planner's clusters, without geometry that of
+/// summed scores of equation 6.6 (section 6.3.2).
 pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
+    let mut candidates = candidates(geometry, experience, clusters);
+    for c in &mut candidates {
+        c.score = match (geometry.is_empty(), experience.is_empty()) {
+            (true, _) => c.experience,
+            (_, true) => c.geometry,
+            _ => 0.5 * (c.geometry + c.experience),
+        };
+    }
+    let (chosen, sums) = joined(candidates, clusters);
+    if experience.is_empty() {
+        // The planner alone: clusters by summed quality.
+        let mut order: Vec<usize> = (0..chosen.len()).collect();
+        order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]).then(a.cmp(&b)));
+        return order.into_iter().map(|i| chosen[i]).collect();
+    }
+    chosen
+}
+
+/// Ranks the planner's grasps as the dissertation does (section 6.3.2): by the mean of quality and agreement, and nothing
+/// but experience's own proposals is left out. For comparison: where all of the planner's grasps are bad, so is the best.
+pub fn rank_as_printed(
+    geometry: &[Grasp],
+    experience: &[Proposal],
+    clusters: &ClusterOptions,
+) -> Vec<Ranked> {
+    let mut candidates = candidates(geometry, experience, clusters);
+    candidates.retain(|c| c.kind == Kind::Geometry);
+    for c in &mut candidates {
+        c.score = 0.5 * (c.geometry + c.experience);
+    }
+    joined(candidates, clusters).0
+}
+
+/// Ranks grasps of both kinds by their chance to hold, best first, one of each cluster. The score is that chance. With a
+/// model that has seen no attempt, quality and agreement with experience decide, as in [`rank`].
+pub fn rank_by_outcome(
+    geometry: &[Grasp],
+    experience: &[Proposal],
+    clusters: &ClusterOptions,
+    fitter: &GraspFitter<'_>,
+    outcomes: &OutcomeModel,
+) -> Vec<Ranked> {
+    let mut candidates = candidates(geometry, experience, clusters);
+    for c in &mut candidates {
+        let transferred = c.kind == Kind::Experience;
+        c.score = outcomes.promise(&fitter.describe(&c.grasp), c.experience, transferred);
+    }
+    joined(candidates, clusters).0
+}
+
+fn near(a: &Grasp, b: &Grasp, clusters: &ClusterOptions) -> bool {
+    let (distance, angle) = a.difference(b);
+    distance <= clusters.distance && angle <= clusters.angle
+}
+
+/// All grasps with quality and the share of experience that agrees, without a score.
+fn candidates(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let all: f64 = experience.iter().map(|p| p.score).sum();
     let best = geometry
         .iter()
         .chain(experience.iter().filter(|p| p.firm).map(|p| &p.grasp))
         .map(|g| g.quality.total())
         .fold(1e-9, f64::max);
-    let near = |a: &Grasp, b: &Grasp| {
-        let (distance, angle) = a.difference(b);
-        distance <= clusters.distance && angle <= clusters.angle
-    };
-    let candidates = geometry
+    let both = geometry
         .iter()
         .map(|g| (g, Kind::Geometry, None))
         .chain(experience.iter().enumerate().map(|(i, p)| (&p.grasp, Kind::Experience, Some(i))));
-    let mut ranked: Vec<Ranked> = candidates
-        .map(|(grasp, kind, proposal)| {
-            let agreeing =
-                experience.iter().filter(|p| near(grasp, &p.grasp)).fold(0.0, |sum, p| sum + p.score);
-            let experience_share = if all > 0.0 { agreeing / all } else { 0.0 };
-            let quality = grasp.quality.total() / best;
-            let score = match (geometry.is_empty(), experience.is_empty()) {
-                (true, _) => experience_share,
-                (_, true) => quality,
-                _ => 0.5 * (quality + experience_share),
-            };
-            Ranked {
-                grasp: *grasp,
-                kind,
-                score,
-                geometry: quality,
-                experience: experience_share,
-                proposal,
-                members: 1,
-            }
-        })
-        .collect();
+    both.map(|(grasp, kind, proposal)| {
+        let agreeing =
+            experience.iter().filter(|p| near(grasp, &p.grasp, clusters)).fold(0.0, |sum, p| sum + p.score);
+        Ranked {
+            grasp: *grasp,
+            kind,
+            score: 0.0,
+            geometry: grasp.quality.total() / best,
+            experience: if all > 0.0 { agreeing / all } else { 0.0 },
+            proposal,
+            members: 1,
+        }
+    })
+    .collect()
+}
+
+/// The best of each cluster, best first, and the summed qualities of the clusters.
+fn joined(mut candidates: Vec<Ranked>, clusters: &ClusterOptions) -> (Vec<Ranked>, Vec<f64>) {
     // Equal scores: the better contacts first.
-    ranked.sort_by(|a, b| b.score.total_cmp(&a.score).then(b.geometry.total_cmp(&a.geometry)));
+    candidates.sort_by(|a, b| b.score.total_cmp(&a.score).then(b.geometry.total_cmp(&a.geometry)));
     let mut chosen: Vec<Ranked> = vec![];
     let mut sums: Vec<f64> = vec![];
-    for candidate in ranked {
-        match chosen.iter().position(|c| near(&c.grasp, &candidate.grasp)) {
+    for candidate in candidates {
+        match chosen.iter().position(|c| near(&c.grasp, &candidate.grasp, clusters)) {
             Some(cluster) => {
                 chosen[cluster].members += 1;
                 sums[cluster] += candidate.geometry;
@@ -92,13 +144,7 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
             }
         }
     }
-    if experience.is_empty() {
-        // The planner alone: clusters by summed quality.
-        let mut order: Vec<usize> = (0..chosen.len()).collect();
-        order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]).then(a.cmp(&b)));
-        return order.into_iter().map(|i| chosen[i]).collect();
-    }
-    chosen
+    (chosen, sums)
 }
 
 #[cfg(test)]

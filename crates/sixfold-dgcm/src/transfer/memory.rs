@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use crate::model::DgcmModel;
+use crate::outcome::{Attempt, OutcomeModel};
 use crate::store::{ExperienceStore, FeatureIndex, Match, StoreError, Stored, Summary};
 
 /// Experiences of one store for one network.
@@ -13,6 +14,9 @@ pub struct Memory {
     /// By number; what is known for steering.
     labels: HashMap<i64, Summary>,
     kept: HashMap<i64, Arc<Stored>>,
+    attempts: Vec<Attempt>,
+    /// Number of the last attempt at hand.
+    last_attempt: i64,
 }
 
 impl Memory {
@@ -26,6 +30,8 @@ impl Memory {
             index: FeatureIndex::new(&model.fingerprint()),
             labels: HashMap::new(),
             kept: HashMap::new(),
+            attempts: vec![],
+            last_attempt: 0,
         };
         memory.refresh()?;
         Ok(memory)
@@ -39,7 +45,16 @@ impl Memory {
         self.index.refresh(&*self.store)?;
         self.labels = self.store.list()?.into_iter().map(|s| (s.id, s)).collect();
         self.kept.retain(|id, _| self.labels.contains_key(id));
+        for (id, attempt) in self.store.attempts(self.last_attempt)? {
+            self.last_attempt = id;
+            self.attempts.push(attempt);
+        }
         Ok(())
+    }
+
+    /// What the attempts with a gripper say of the next one.
+    pub fn outcomes(&self, gripper: &str) -> OutcomeModel {
+        OutcomeModel::learn(&self.attempts, gripper)
     }
 
     /// The store.

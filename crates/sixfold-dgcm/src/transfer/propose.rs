@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError};
+use sixfold_grasp::{Grasp, GraspFitter, Gripper};
 use thiserror::Error;
 
 use super::Memory;
@@ -23,9 +23,6 @@ pub enum ProposeError {
     /// The store.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// An option is out of range.
-    #[error(transparent)]
-    Options(#[from] OptionsError),
     /// The object's cloud has no normals.
     #[error(transparent)]
     Cloud(#[from] IcpError),
@@ -38,8 +35,6 @@ pub struct ProposeOptions {
     pub neighbours: usize,
     /// How they are aligned.
     pub align: AlignOptions,
-    /// How grasps are tested and judged.
-    pub judge: AntipodalOptions,
     /// Only experiences on parts of this name.
     pub part: Option<String>,
     /// Not those whose object has this name: what a test must not know.
@@ -51,7 +46,6 @@ impl Default for ProposeOptions {
         ProposeOptions {
             neighbours: 10,
             align: AlignOptions::default(),
-            judge: AntipodalOptions::default(),
             part: None,
             without_object: None,
         }
@@ -86,17 +80,17 @@ pub struct Proposals {
     pub proposals: Vec<Proposal>,
 }
 
-/// Proposes grasps on the object of a view.
+/// Proposes grasps on the object of a fitter's view, tested and judged as the fitter does.
 ///
 /// # Errors
 /// [`ProposeError`]. No experience, or none that fits, is no error: there are no proposals then.
 pub fn propose(
-    view: &GraspView,
-    gripper: &Gripper,
+    fitter: &GraspFitter<'_>,
     model: &DgcmModel,
     memory: &mut Memory,
     options: &ProposeOptions,
 ) -> Result<Proposals, ProposeError> {
+    let (view, gripper) = (fitter.view(), fitter.gripper());
     let crop = Crop::new(&view.depth, &view.camera, &view.mask, model.crop_options())?;
     let input = model.encode(&crop);
     let wanted = |s: &Summary| {
@@ -117,7 +111,6 @@ pub fn propose(
         }
     }
     experiences.retain(|(_, stored, copy)| copy.side == crop.side && !stored.experience.copies.is_empty());
-    let fitter = GraspFitter::new(view, gripper, &options.judge)?;
     if experiences.is_empty() || view.object.is_empty() {
         return Ok(Proposals { nearest, crop, proposals: vec![] });
     }
@@ -145,7 +138,7 @@ pub fn propose(
                 .iter()
                 .filter_map(|t| {
                     let source = Source { copy, grasp: &turned_grasp, opening: e.opening, width: e.width };
-                    place(&fitter, gripper, &source, t, options).map(|(grasp, moved, firm)| Proposal {
+                    place(fitter, gripper, &source, t).map(|(grasp, moved, firm)| Proposal {
                         grasp,
                         score: (-from.distance).exp(),
                         from: *from,
@@ -182,9 +175,8 @@ fn place(
     gripper: &Gripper,
     source: &Source<'_>,
     t: &Transferred,
-    options: &ProposeOptions,
 ) -> Option<(Grasp, f64, bool)> {
-    let room = (source.opening - source.width).max(2.0 * options.judge.clearance);
+    let room = (source.opening - source.width).max(2.0 * fitter.options().clearance);
     // The scale across the fingers, along the closing direction of the experience.
     let closing = source.grasp.transform_direction(&Vec3::x()).map(f64::abs);
     let scale = (t.scale.dot(&closing.component_mul(&closing))).clamp(0.5, 2.0);

@@ -1,4 +1,7 @@
 //! `sixfold grasp compare`: geometry, experience and both, on the same simulated scenes (table 6.2).
+//!
+//! Five ways to choose the grasp: the planner alone; experience alone (equation 6.6); the two as the dissertation joins them
+//! (section 6.3.2); the planner's grasps by what came of earlier attempts; and the grasps of both kinds by that.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -10,9 +13,13 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank};
+use sixfold_dgcm::transfer::{
+    Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
+};
 use sixfold_geometry::Pose;
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Gripper, antipodal_grasps, draw_grasps};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps,
+};
 use sixfold_mesh::Mesh;
 use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;
@@ -35,7 +42,7 @@ use crate::progress::{Progress, check_interrupt};
 /// Pictures of this many scenes of each object are kept.
 const PICTURES: u64 = 2;
 /// The methods, in the order of the table.
-pub(super) const METHODS: [&str; 3] = ["geometry", "experience", "both"];
+pub(super) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "outcomes", "both"];
 
 #[derive(Debug, Args)]
 pub(crate) struct CompareArguments {
@@ -144,6 +151,7 @@ struct Recorded<'a> {
     seed: u64,
     network: String,
     experiences: usize,
+    outcomes: usize,
     gripper: &'a Gripper,
     mass: f64,
 }
@@ -152,20 +160,21 @@ struct Recorded<'a> {
 struct Whole {
     hard: bool,
     experiences: usize,
+    outcomes: usize,
     friction: f64,
     mass: f64,
     classes: Vec<Class>,
-    median_seconds: [f64; 3],
+    median_seconds: [f64; METHODS.len()],
 }
 
 #[derive(Serialize)]
 struct Class {
     class: String,
     trials: usize,
-    /// Of geometry, experience and both.
-    rates: [f64; 3],
+    /// In the order of the methods.
+    rates: [f64; METHODS.len()],
     /// Wilson, 95 %.
-    intervals: [(f64, f64); 3],
+    intervals: [(f64, f64); METHODS.len()],
 }
 
 pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
@@ -184,6 +193,7 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
         seed: a.seed,
         network: network.fingerprint(),
         experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
         gripper: real,
         mass: options.trial.mass,
     };
@@ -192,7 +202,7 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
     let scenes = Scenes { a, setting: &setting, gripper, options, network: &network };
     for (class, name, mesh) in &objects {
         // A scene whose rows are not all there is made again.
-        let done = |number: u64| rows.iter().filter(|r| r.object == *name && r.number == number).count() >= 3;
+        let done = |number: u64| rows.iter().filter(|r| r.object == *name && r.number == number).count() >= METHODS.len();
         let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
         (missing.len()..a.trials as usize).for_each(|_| progress.step(name.clone()));
         if missing.is_empty() {
@@ -213,6 +223,7 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
     let whole = Whole {
         hard: a.hard,
         experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
         friction: real.friction,
         mass: options.trial.mass,
         classes: classes(&rows),
@@ -269,16 +280,30 @@ impl Scenes<'_> {
         let geometry = antipodal_grasps(view, self.gripper, &planner)?;
         let of_geometry = began.elapsed().as_secs_f64();
         let began = Instant::now();
-        let options = ProposeOptions { judge: planner, ..ProposeOptions::default() };
-        let found = propose(view, self.gripper, self.network, memory, &options)?;
+        let fitter = GraspFitter::new(view, self.gripper, &planner)?;
+        let of_fitter = began.elapsed().as_secs_f64();
+        let found = propose(&fitter, self.network, memory, &ProposeOptions::default())?;
         let of_experience = began.elapsed().as_secs_f64();
         let clusters = ClusterOptions::default();
+        let began = Instant::now();
+        let outcomes = memory.outcomes(&self.gripper.name);
+        let by_outcome = |proposals| rank_by_outcome(&geometry, proposals, &clusters, &fitter, &outcomes);
+        let both = by_outcome(&found.proposals);
+        let of_outcomes = began.elapsed().as_secs_f64();
         let ranked = [
             rank(&geometry, &[], &clusters),
             rank(&[], &found.proposals, &clusters),
-            rank(&geometry, &found.proposals, &clusters),
+            rank_as_printed(&geometry, &found.proposals, &clusters),
+            by_outcome(&[]),
+            both,
         ];
-        let seconds = [of_geometry, of_experience, of_geometry + of_experience];
+        let seconds = [
+            of_geometry,
+            of_experience,
+            of_geometry + of_experience,
+            of_geometry + of_fitter + of_outcomes,
+            of_geometry + of_experience + of_outcomes,
+        ];
         let mut out = vec![];
         for ((mut row, ranked), seconds) in rows.into_iter().zip(&ranked).zip(seconds) {
             row.nearest = found.nearest.first().map(|m| m.distance);
@@ -330,8 +355,8 @@ fn classes(rows: &[Row]) -> Vec<Class> {
         }
     }
     let of = |name: &str, wanted: &dyn Fn(&Row) -> bool| {
-        let mut rates = [0.0; 3];
-        let mut intervals = [(0.0, 0.0); 3];
+        let mut rates = [0.0; METHODS.len()];
+        let mut intervals = [(0.0, 0.0); METHODS.len()];
         let mut trials = 0;
         for (k, method) in METHODS.iter().enumerate() {
             let mine: Vec<&Row> =
@@ -349,17 +374,21 @@ fn classes(rows: &[Row]) -> Vec<Class> {
 }
 
 fn print_table(whole: &Whole) {
-    println!("{:>10} {:>7} {:>20} {:>20} {:>20}", "", "scenes", "geometry", "experience", "both");
+    let heads: Vec<String> = METHODS.iter().map(|m| format!("{m:>20}")).collect();
+    println!("{:>10} {:>7} {}", "", "scenes", heads.join(" "));
     for c in &whole.classes {
-        let cells: Vec<String> = (0..3)
-            .map(|k| format!("{:.2} ({:.2} to {:.2})", c.rates[k], c.intervals[k].0, c.intervals[k].1))
+        let cells: Vec<String> = c
+            .rates
+            .iter()
+            .zip(&c.intervals)
+            .map(|(rate, (low, high))| format!("{:>20}", format!("{rate:.2} ({low:.2} to {high:.2})")))
             .collect();
-        println!("{:>10} {:>7} {:>20} {:>20} {:>20}", c.class, c.trials, cells[0], cells[1], cells[2]);
+        println!("{:>10} {:>7} {}", c.class, c.trials, cells.join(" "));
     }
-    let s = whole.median_seconds;
-    println!("median seconds from depth to ranked grasps: {:.3}, {:.3}, {:.3}", s[0], s[1], s[2]);
+    let seconds: Vec<String> = whole.median_seconds.iter().map(|s| format!("{s:.3}")).collect();
+    println!("median seconds from depth to ranked grasps: {}", seconds.join(", "));
     println!(
-        "{} experiences; friction {}, {} kg; 95 % intervals after Wilson",
-        whole.experiences, whole.friction, whole.mass
+        "{} experiences, {} outcomes; friction {}, {} kg; 95 % intervals after Wilson",
+        whole.experiences, whole.outcomes, whole.friction, whole.mass
     );
 }

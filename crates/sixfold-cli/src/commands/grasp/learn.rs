@@ -11,13 +11,14 @@ use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::store::Experience;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_dgcm::outcome::Attempt;
+use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome};
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, Gripper, antipodal_grasps};
+use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, GraspFitter, Gripper, antipodal_grasps};
 use sixfold_mesh::Mesh;
 use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
-    AttemptOptions, ConvexParts, PartsOptions, Scene, scene, try_grasp, wilson_interval,
+    AttemptOptions, ConvexParts, Ending, PartsOptions, Scene, SimulatedView, scene, try_grasp, wilson_interval,
 };
 
 use super::arguments::PhysicsArguments;
@@ -50,6 +51,9 @@ pub(crate) struct LearnArguments {
     /// Grasps tried in a scene until one holds, the best first
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
+    /// Further grasps tried in every scene, spread over the ranked ones: what fails teaches how much to trust a grasp
+    #[arg(long, value_name = "N", default_value = "0")]
+    pub explore: usize,
     /// Feature distance of the nearest experience from which on it proposes: 0 for never (dissertation: 0.9)
     #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
     pub near: f64,
@@ -151,6 +155,7 @@ struct Recorded<'a> {
     objects: Vec<&'a str>,
     attempts: u64,
     tries: usize,
+    explore: usize,
     near: f64,
     part: &'a Option<String>,
     hard: bool,
@@ -168,6 +173,8 @@ struct Whole {
     interval: (f64, f64),
     from_experience: usize,
     experiences: usize,
+    /// Grasps whose outcome is known for this gripper.
+    outcomes: usize,
     objects: Vec<Curve>,
 }
 
@@ -203,6 +210,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         objects: pupils.iter().map(|p| p.name.as_str()).collect(),
         attempts: a.attempts,
         tries: a.tries,
+        explore: a.explore,
         near: a.near,
         part: &a.part,
         hard: a.hard,
@@ -234,6 +242,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         }
     }
     progress.finish();
+    memory.refresh()?;
     let held = rows.iter().filter(|r| r.held).count();
     let whole = Whole {
         attempts: rows.len(),
@@ -242,6 +251,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         interval: wilson_interval(held, rows.len()),
         from_experience: rows.iter().filter(|r| r.from_experience).count(),
         experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
         objects: pupils
             .iter()
             .map(|p| {
@@ -272,7 +282,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         }
         println!("G geometry, E experience; capitals held");
         println!(
-            "{} of {} held ({:.2}, 95 % interval {:.2} to {:.2}), {} from experience; {} experiences in {}",
+            "{} of {} held ({:.2}, 95 % interval {:.2} to {:.2}), {} from experience; {} experiences and {} outcomes in {}",
             whole.held,
             whole.attempts,
             whole.rate,
@@ -280,6 +290,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
             whole.interval.1,
             whole.from_experience,
             whole.experiences,
+            whole.outcomes,
             a.experiences.display()
         );
     })?;
@@ -319,41 +330,81 @@ impl Robot<'_> {
         if pupil.made.is_some() {
             geometry.retain(on_part);
         }
+        let fitter = GraspFitter::new(view, self.gripper, &planner)?;
         let mut proposals = vec![];
+        self.memory.refresh()?;
         if self.a.near > 0.0 {
-            self.memory.refresh()?;
-            let options =
-                ProposeOptions { judge: planner, part: self.a.part.clone(), ..ProposeOptions::default() };
-            let found = propose(view, self.gripper, &self.network, self.memory, &options)?;
+            let options = ProposeOptions { part: self.a.part.clone(), ..ProposeOptions::default() };
+            let found = propose(&fitter, &self.network, self.memory, &options)?;
             row.nearest = found.nearest.first().map(|m| m.distance);
             if row.nearest.is_some_and(|d| d < self.a.near) {
                 proposals = found.proposals;
             }
         }
         row.from_experience = !proposals.is_empty();
-        let ranked = rank(&geometry, &proposals, &ClusterOptions::default());
+        let outcomes = self.memory.outcomes(&self.gripper.name);
+        let ranked =
+            rank_by_outcome(&geometry, &proposals, &ClusterOptions::default(), &fitter, &outcomes);
+        let mut left = 0;
         for (number, candidate) in ranked.iter().take(self.a.tries).enumerate() {
-            let sent = seen.world_from_camera * candidate.grasp.camera_from_gripper;
-            let reached = self.setting.reached(&sent, scene.noise);
-            let opening = candidate.grasp.opening;
-            let tried = try_grasp(
-                parts,
-                &scene.world_from_object,
-                &self.setting.real,
-                &reached,
-                opening,
-                &self.options.trial,
-            )?;
-            let ending = sixfold_simulation::Ending::Tried(tried.outcome);
+            let ending = self.execute(pupil, parts, &scene, seen, &fitter, candidate, attempt, number)?;
             row.ending = ending_name(ending);
             row.rank = number;
+            left = number + 1;
             if ending.is_success() {
                 row.held = true;
                 row.stored = self.remember(pupil, &scene, &candidate.grasp, &camera_from_object, attempt)?;
                 break;
             }
         }
+        // The object is put back after every try: what the others would have done costs nothing but time.
+        let others = &ranked[left..];
+        let count = self.a.explore.min(others.len());
+        for k in 0..count {
+            let number = k * others.len() / count;
+            self.execute(pupil, parts, &scene, seen, &fitter, &others[number], attempt, left + number)?;
+        }
         Ok(row)
+    }
+
+    /// Tries one grasp and keeps what came of it.
+    #[allow(clippy::too_many_arguments)]
+    fn execute(
+        &mut self,
+        pupil: &Pupil,
+        parts: &ConvexParts,
+        scene: &Scene,
+        seen: &SimulatedView,
+        fitter: &GraspFitter<'_>,
+        candidate: &Ranked,
+        attempt: u64,
+        number: usize,
+    ) -> Result<Ending> {
+        let sent = seen.world_from_camera * candidate.grasp.camera_from_gripper;
+        let tried = try_grasp(
+            parts,
+            &scene.world_from_object,
+            &self.setting.real,
+            &self.setting.reached(&sent, scene.noise),
+            candidate.grasp.opening,
+            &self.options.trial,
+        )?;
+        let ending = Ending::Tried(tried.outcome);
+        let tried = Attempt {
+            description: fitter.describe(&candidate.grasp),
+            share: candidate.experience,
+            transferred: candidate.kind == Kind::Experience,
+            held: ending.is_success(),
+            gripper: self.gripper.name.clone(),
+            object: pupil.name.clone(),
+            time: now(),
+            provenance: format!(
+                "simulated, class {}, seed {}, attempt {attempt}, rank {number}",
+                pupil.class, self.a.seed
+            ),
+        };
+        self.memory.store().add_attempt(&tried)?;
+        Ok(ending)
     }
 
     fn remember(

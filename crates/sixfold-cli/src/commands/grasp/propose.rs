@@ -173,18 +173,22 @@ fn with_experience(
     gripper: &Gripper,
     planner: &AntipodalOptions,
 ) -> Result<Vec<Proposed>> {
-    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank};
+    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank_by_outcome};
+    use sixfold_grasp::GraspFitter;
     let Some(file) = &a.experiences else { return Ok(vec![]) };
     let model = super::experience::model(&a.network)?;
     let mut memory = super::experience::memory(file, &model)?;
-    let options = ProposeOptions { judge: *planner, part: a.part.clone(), ..ProposeOptions::default() };
-    let found = propose(view, gripper, &model, &mut memory, &options)?;
+    let options = ProposeOptions { part: a.part.clone(), ..ProposeOptions::default() };
+    let fitter = GraspFitter::new(view, gripper, planner)?;
+    let found = propose(&fitter, &model, &mut memory, &options)?;
     if found.nearest.is_empty() {
         let wanted = a.part.as_ref().map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {} holds no experience{wanted} that this network can use", file.display());
     }
     let geometry = if a.part.is_some() { vec![] } else { antipodal_grasps(view, gripper, planner)? };
-    let ranked = rank(&geometry, &found.proposals, &ClusterOptions::default());
+    let outcomes = memory.outcomes(&gripper.name);
+    let ranked =
+        rank_by_outcome(&geometry, &found.proposals, &ClusterOptions::default(), &fitter, &outcomes);
     Ok(ranked
         .iter()
         .map(|r| {

@@ -1,0 +1,260 @@
+//! What has come of the grasps that were tried: the chance that the next one holds.
+//!
+//! The dissertation stores successes only ("unsuccessful grasp attempts do not provide any information for replicating past
+//! experience", section 6.2.1), and ranks by how near an experience is. Failures do say something: how much worse than the
+//! planner believes a grasp on the edge of its friction cone is, or one far from the object's middle, with this hand and
+//! these pads. So every attempt is kept with a dozen numbers that were known before, and a logistic regression with a normal
+//! prior (Cox 1958; MAP by Newton's method) foretells the next one. Without attempts the prior ranks by the quality of the
+//! contacts and the agreement with experience, as section 6.3.2 does.
+
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::nalgebra::{SMatrix, SVector};
+use sixfold_grasp::{AntipodalQuality, GraspDescription};
+
+/// A grasp that was tried.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Attempt {
+    /// What was known of it before.
+    pub description: GraspDescription,
+    /// The share of experience that agreed with it, 0 to 1.
+    pub share: f64,
+    /// It was transferred from experience; else the planner proposed it.
+    pub transferred: bool,
+    /// Whether it held.
+    pub held: bool,
+    /// The gripper's name: attempts of one say little of another.
+    pub gripper: String,
+    /// What was grasped.
+    pub object: String,
+    /// Seconds since 1970.
+    pub time: i64,
+    /// Where it comes from.
+    pub provenance: String,
+}
+
+impl Attempt {
+    /// The attempt with its numbers rounded to a millionth, so that they survive being written as text and read again.
+    pub fn rounded(mut self) -> Attempt {
+        let d = &mut self.description;
+        let q = &mut d.quality;
+        for v in [
+            &mut q.alignment,
+            &mut q.support,
+            &mut q.centring,
+            &mut q.observed,
+            &mut d.overlap,
+            &mut d.lever,
+            &mut d.above_middle,
+            &mut self.share,
+        ] {
+            *v = (*v * 1e6).round() / 1e6;
+        }
+        d.tip_height = d.tip_height.map(|v| (v * 1e6).round() / 1e6);
+        self
+    }
+
+    /// The names of fields that hold no finite number.
+    pub(crate) fn check(&self) -> Result<(), &'static str> {
+        let GraspDescription { quality: q, overlap, lever, above_middle, tip_height } = &self.description;
+        let AntipodalQuality { alignment, support, centring, observed } = q;
+        for (name, value) in [
+            ("alignment", alignment),
+            ("support", support),
+            ("centring", centring),
+            ("observed", observed),
+            ("overlap", overlap),
+            ("lever", lever),
+            ("above_middle", above_middle),
+            ("tip_height", tip_height.as_ref().unwrap_or(&0.0)),
+            ("share", &self.share),
+        ] {
+            if !value.is_finite() {
+                return Err(name);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// How many numbers describe a grasp to the model, the constant included.
+const NUMBERS: usize = 12;
+type Numbers = SVector<f64, NUMBERS>;
+
+/// Weights without any attempt, in the order of [`numbers`]: quality and experience decide.
+const PRIOR: [f64; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0];
+/// One over the variance of the weights around the prior. The constant is nearly free.
+const PRECISION: f64 = 10.0;
+const PRECISION_OF_CONSTANT: f64 = 0.01;
+
+/// What is known of a grasp, each number in about -1 to 1.
+fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
+    let q = &d.quality;
+    let both_sides = |v: f64| 2.0 * v - 1.0;
+    Numbers::from([
+        1.0,
+        both_sides(q.alignment),
+        both_sides(q.support),
+        both_sides(q.centring),
+        both_sides(q.observed),
+        both_sides(d.overlap.clamp(0.0, 0.05) / 0.05),
+        -both_sides(d.lever.clamp(0.0, 0.06) / 0.06),
+        d.above_middle.clamp(-0.03, 0.03) / 0.03,
+        both_sides(d.tip_height.unwrap_or(0.03).clamp(0.0, 0.03) / 0.03),
+        2.0 * q.total().max(0.03).ln() + 2.0,
+        share,
+        f64::from(u8::from(transferred)),
+    ])
+}
+
+/// The chance that a grasp holds, from the attempts so far.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutcomeModel {
+    weights: Numbers,
+    /// Attempts it has seen.
+    pub attempts: usize,
+    /// How many of them held.
+    pub held: usize,
+}
+
+impl Default for OutcomeModel {
+    fn default() -> Self {
+        OutcomeModel { weights: Numbers::from(PRIOR), attempts: 0, held: 0 }
+    }
+}
+
+impl OutcomeModel {
+    /// Learns from the attempts with a gripper. The same attempts in the same order give the same model.
+    pub fn learn<'a>(attempts: impl IntoIterator<Item = &'a Attempt>, gripper: &str) -> OutcomeModel {
+        let seen: Vec<(Numbers, f64)> = attempts
+            .into_iter()
+            .filter(|a| a.gripper == gripper && a.check().is_ok())
+            .map(|a| (numbers(&a.description, a.share, a.transferred), f64::from(u8::from(a.held))))
+            .collect();
+        let mut model = OutcomeModel {
+            attempts: seen.len(),
+            held: seen.iter().filter(|(_, held)| *held > 0.5).count(),
+            ..OutcomeModel::default()
+        };
+        let prior = model.weights;
+        let mut precision = SMatrix::<f64, NUMBERS, NUMBERS>::identity() * PRECISION;
+        precision[(0, 0)] = PRECISION_OF_CONSTANT;
+        let loss = |w: &Numbers| -> f64 {
+            let fit: f64 = seen
+                .iter()
+                .map(|(x, held)| {
+                    let z = if *held > 0.5 { -w.dot(x) } else { w.dot(x) };
+                    z.max(0.0) + (-z.abs()).exp().ln_1p()
+                })
+                .sum();
+            let off = w - prior;
+            fit + 0.5 * off.dot(&(precision * off))
+        };
+        let mut value = loss(&model.weights);
+        for _ in 0..50 {
+            let mut gradient = precision * (model.weights - prior);
+            let mut curvature = precision;
+            for (x, held) in &seen {
+                let p = sigmoid(model.weights.dot(x));
+                gradient += x * (p - held);
+                curvature += x * x.transpose() * (p * (1.0 - p));
+            }
+            let Some(step) = curvature.cholesky().map(|c| c.solve(&gradient)) else { break };
+            // Newton's step may go too far where the sigmoid is flat.
+            let mut length = 1.0;
+            let mut next = model.weights - step;
+            while loss(&next) > value && length > 1e-6 {
+                length *= 0.5;
+                next = model.weights - step * length;
+            }
+            let reached = loss(&next);
+            if !(reached < value) {
+                break;
+            }
+            let gained = value - reached;
+            (model.weights, value) = (next, reached);
+            if gained < 1e-9 {
+                break;
+            }
+        }
+        model
+    }
+
+    /// The chance that a grasp holds, 0 to 1.
+    pub fn promise(&self, description: &GraspDescription, share: f64, transferred: bool) -> f64 {
+        sigmoid(self.weights.dot(&numbers(description, share, transferred)))
+    }
+}
+
+fn sigmoid(z: f64) -> f64 {
+    1.0 / (1.0 + (-z).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn description(alignment: f64, lever: f64) -> GraspDescription {
+        let quality = AntipodalQuality { alignment, support: 0.8, centring: 0.7, observed: 0.5 };
+        GraspDescription { quality, overlap: 0.03, lever, above_middle: 0.0, tip_height: Some(0.02) }
+    }
+
+    fn attempt(description: GraspDescription, held: bool) -> Attempt {
+        let (gripper, object) = ("jaws".to_owned(), "can".to_owned());
+        let provenance = "test".to_owned();
+        Attempt { description, share: 0.0, transferred: false, held, gripper, object, time: 0, provenance }
+    }
+
+    #[test]
+    fn without_attempts_quality_and_agreement_decide() {
+        let model = OutcomeModel::learn(&[], "jaws");
+        let of = |alignment, share| model.promise(&description(alignment, 0.0), share, false);
+        assert!(of(0.9, 0.0) > of(0.5, 0.0));
+        assert!(of(0.5, 0.9) > of(0.5, 0.1));
+        // A lever nobody has failed with does not count.
+        assert_eq!(model.promise(&description(0.5, 0.05), 0.0, false), of(0.5, 0.0));
+    }
+
+    #[test]
+    fn it_learns_what_fails_with_this_hand_only() {
+        // A hand that loses what it holds off its middle, whatever the contacts: 3 of 4 times against 1 of 10.
+        let mut random = ChaCha8Rng::seed_from_u64(3);
+        let attempts: Vec<Attempt> = (0..200)
+            .map(|_| {
+                let (alignment, off) = (random.random_range(0.2..1.0), random.random_bool(0.5));
+                let lost = random.random_bool(if off { 0.75 } else { 0.1 });
+                attempt(description(alignment, if off { 0.05 } else { 0.005 }), !lost)
+            })
+            .collect();
+        let model = OutcomeModel::learn(&attempts, "jaws");
+        let off = model.promise(&description(0.95, 0.05), 0.0, false);
+        let near = model.promise(&description(0.5, 0.005), 0.0, false);
+        assert!(off < 0.45 && near > 0.8, "{off} {near}");
+        assert_eq!(model.attempts, 200);
+        assert_eq!(OutcomeModel::learn(&attempts, "other"), OutcomeModel::default());
+        // Nothing but successes does not make everything certain.
+        let good: Vec<Attempt> = (0..50).map(|_| attempt(description(0.7, 0.0), true)).collect();
+        let sure = OutcomeModel::learn(&good, "jaws").promise(&description(0.7, 0.0), 0.0, false);
+        assert!(sure > 0.9 && sure < 0.9999, "{sure}");
+    }
+
+    #[test]
+    fn it_is_where_the_loss_is_smallest() {
+        // The gradient of the penalised loss, by hand, is zero there.
+        let attempts: Vec<Attempt> = (0..60)
+            .map(|k| {
+                let d = description(f64::from(k % 10) / 10.0, f64::from(k % 7) / 100.0);
+                attempt(d, k % 3 != 0).rounded()
+            })
+            .collect();
+        let model = OutcomeModel::learn(&attempts, "jaws");
+        let mut gradient = (model.weights - Numbers::from(PRIOR)) * PRECISION;
+        gradient[0] *= PRECISION_OF_CONSTANT / PRECISION;
+        for a in &attempts {
+            let x = numbers(&a.description, a.share, a.transferred);
+            gradient += x * (sigmoid(model.weights.dot(&x)) - f64::from(u8::from(a.held)));
+        }
+        assert!(gradient.amax() < 1e-4, "{gradient}");
+    }
+}

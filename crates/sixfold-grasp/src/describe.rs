@@ -1,0 +1,94 @@
+//! What is known of a grasp before it is tried, in numbers from which its outcome can be foretold.
+
+use serde::{Deserialize, Serialize};
+use sixfold_geometry::Vec3;
+
+use crate::{AntipodalQuality, Grasp, GraspFitter};
+
+/// What is known of a grasp before it is tried.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct GraspDescription {
+    /// The quality of its contacts.
+    pub quality: AntipodalQuality,
+    /// How far the pads reach over the object along the approach, metres.
+    pub overlap: f64,
+    /// Horizontal distance of the object's middle from the middle between the pads along the closing direction, metres: the
+    /// lever that pulls the object out of one pad.
+    pub lever: f64,
+    /// Height of what is between the pads over the object's middle, metres.
+    pub above_middle: f64,
+    /// Height of the finger tips over the table, metres; `None` where no table is known.
+    pub tip_height: Option<f64>,
+}
+
+impl GraspFitter<'_> {
+    /// Describes a grasp on the object of this view.
+    pub fn describe(&self, grasp: &Grasp) -> GraspDescription {
+        let planner = self.planner();
+        let between = planner.between(&grasp.camera_from_gripper, grasp.opening);
+        let count = between.len().max(1) as f64;
+        let sum: Vec3 = between.iter().map(|(i, _)| planner.object.cloud.points[*i]).sum();
+        let lever = planner.centre - sum / count;
+        let up = -lever.dot(&planner.down);
+        let level = lever + planner.down * up;
+        let tip = grasp.camera_from_gripper.translation();
+        GraspDescription {
+            quality: grasp.quality,
+            overlap: -between.iter().map(|(_, q)| q.z).fold(0.0, f64::min),
+            lever: level.dot(&grasp.closing()).abs(),
+            // Upwards the middle of what is held lies this far from the object's middle.
+            above_middle: if between.is_empty() { 0.0 } else { -up },
+            tip_height: planner.table.map(|table| table.distance(&tip)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud};
+
+    use super::*;
+    use crate::{AntipodalOptions, GraspView, Gripper, gripper_pose};
+
+    #[test]
+    fn a_bar_held_off_its_middle() {
+        // A bar of 20 x 2 x 6 cm on a table, its long side along x, seen from above (the camera looks down the z axis).
+        let mut object = PointCloud::default();
+        for i in 0..=100 {
+            for k in 0..=30 {
+                for side in [-1.0, 1.0] {
+                    let (x, z) = (0.002 * f64::from(i) - 0.1, 0.5 - 0.002 * f64::from(k));
+                    object.points.push(Vec3::new(x, 0.01 * side, z));
+                    object.normals.push(Vec3::y() * side);
+                }
+            }
+        }
+        let view = GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: Some(Plane { normal: -Vec3::z(), offset: -0.5 }),
+            object,
+            obstacles: PointCloud::default(),
+            step: 0.002,
+            cut_by_edge: false,
+        };
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
+        let fitter = GraspFitter::new(&view, &gripper, &options).unwrap();
+        let at = |x: f64, closing: Vec3| {
+            let pose = gripper_pose(&Vec3::new(x, 0.0, 0.47), &Vec3::z(), &closing).unwrap();
+            let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
+            fitter.describe(&Grasp { camera_from_gripper: pose, opening: 0.05, width: 0.02, quality })
+        };
+        // Across the bar, 5 cm off its middle: no lever along the closing direction.
+        let d = at(0.05, Vec3::y());
+        assert!(d.lever < 1e-3, "{d:?}");
+        assert!((d.overlap - 0.03).abs() < 0.002, "{d:?}");
+        assert!((d.tip_height.unwrap() - 0.03).abs() < 1e-9, "{d:?}");
+        // The pads reach over the upper half, whose middle is 15 mm above the bar's.
+        assert!((d.above_middle - 0.015).abs() < 0.002, "{d:?}");
+        // Along the bar (as if its end were held): all of the way is a lever.
+        assert!((at(0.05, Vec3::x()).lever - 0.05).abs() < 2e-3);
+    }
+}
