@@ -96,7 +96,7 @@ pub(crate) enum Command {
 }
 
 /// `--json`: to the screen, or to a file.
-#[derive(Debug, Args, Clone)]
+#[derive(Debug, Default, Args, Clone)]
 pub(crate) struct JsonArguments {
     /// Print the result as JSON, or write it to FILE and keep the table
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1)]
@@ -696,6 +696,12 @@ pub(crate) enum ReproduceCommand {
     /// Poses and views of Neural Object Learning beside truth and real pixels, wrong meshes, another lamp, and times
     #[command(after_help = NOL_HELP)]
     Nol(ReproduceNolArguments),
+    /// Grasps from experience: table 6.2, figure 6.7, learning from nothing, handles
+    #[cfg(all(feature = "physics", feature = "experience"))]
+    #[command(after_help = "Example:\n  \
+        sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
+        Every part is kept; interrupted, it goes on when the same command is given again.")]
+    Dgcm(Box<crate::commands::grasp::reproduce::ReproduceDgcmArguments>),
 }
 
 #[derive(Debug, Args)]

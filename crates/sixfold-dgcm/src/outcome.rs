@@ -49,13 +49,13 @@ impl Attempt {
         ] {
             *v = (*v * 1e6).round() / 1e6;
         }
-        d.tip_height = d.tip_height.map(|v| (v * 1e6).round() / 1e6);
+        d.table_room = d.table_room.map(|v| (v * 1e6).round() / 1e6);
         self
     }
 
     /// The names of fields that hold no finite number.
     pub(crate) fn check(&self) -> Result<(), &'static str> {
-        let GraspDescription { quality: q, overlap, lever, above_middle, tip_height } = &self.description;
+        let GraspDescription { quality: q, overlap, lever, above_middle, table_room } = &self.description;
         let AntipodalQuality { alignment, support, centring, observed } = q;
         for (name, value) in [
             ("alignment", alignment),
@@ -65,7 +65,7 @@ impl Attempt {
             ("overlap", overlap),
             ("lever", lever),
             ("above_middle", above_middle),
-            ("tip_height", tip_height.as_ref().unwrap_or(&0.0)),
+            ("table_room", table_room.as_ref().unwrap_or(&0.0)),
             ("share", &self.share),
         ] {
             if !value.is_finite() {
@@ -86,6 +86,9 @@ const PRIOR: [f64; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0,
 const PRECISION: f64 = 10.0;
 const PRECISION_OF_CONSTANT: f64 = 0.01;
 
+/// More room over the table than this counts no more, metres.
+const ROOM: f64 = 0.02;
+
 /// What is known of a grasp, each number in about -1 to 1.
 fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
     let q = &d.quality;
@@ -99,7 +102,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
         both_sides(d.overlap.clamp(0.0, 0.05) / 0.05),
         -both_sides(d.lever.clamp(0.0, 0.06) / 0.06),
         d.above_middle.clamp(-0.03, 0.03) / 0.03,
-        both_sides(d.tip_height.unwrap_or(0.03).clamp(0.0, 0.03) / 0.03),
+        both_sides(d.table_room.unwrap_or(ROOM).clamp(0.0, ROOM) / ROOM),
         2.0 * q.total().max(0.03).ln() + 2.0,
         share,
         f64::from(u8::from(transferred)),
@@ -197,7 +200,7 @@ mod tests {
 
     fn description(alignment: f64, lever: f64) -> GraspDescription {
         let quality = AntipodalQuality { alignment, support: 0.8, centring: 0.7, observed: 0.5 };
-        GraspDescription { quality, overlap: 0.03, lever, above_middle: 0.0, tip_height: Some(0.02) }
+        GraspDescription { quality, overlap: 0.03, lever, above_middle: 0.0, table_room: Some(0.02) }
     }
 
     fn attempt(description: GraspDescription, held: bool) -> Attempt {

@@ -170,8 +170,6 @@ pub(crate) struct Planner<'a> {
     pub cone: f64,
     /// A point stands for the square of this of surface, metres.
     pub step: f64,
-    /// The table, where one is known.
-    pub table: Option<sixfold_geometry::Plane>,
 }
 
 impl<'a> Planner<'a> {
@@ -191,7 +189,6 @@ impl<'a> Planner<'a> {
             object,
             cone: gripper.friction.atan(),
             step: view.step,
-            table: view.table,
         }
     }
 

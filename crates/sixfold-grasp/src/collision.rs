@@ -46,19 +46,22 @@ impl CollisionScene {
         &self.points
     }
 
+    /// Distance of the gripper's lowest corner from the table, metres; `None` without a table.
+    pub fn table_room(&self, gripper: &Gripper, camera_from_gripper: &Pose, opening: f64) -> Option<f64> {
+        self.above_table(&gripper.boxes(opening), camera_from_gripper)
+    }
+
+    fn above_table(&self, boxes: &[GripperBox], camera_from_gripper: &Pose) -> Option<f64> {
+        let table = self.table.as_ref()?;
+        let corners = boxes.iter().flat_map(GripperBox::corners);
+        corners.map(|c| table.distance(&camera_from_gripper.transform_point(&c))).min_by(f64::total_cmp)
+    }
+
     /// What the gripper would hit at a pose, with its pads `opening` metres apart; `None` when it is free.
     pub fn hit(&self, gripper: &Gripper, camera_from_gripper: &Pose, opening: f64) -> Option<Hit> {
         let boxes = gripper.boxes(opening);
-        if let Some(table) = &self.table {
-            let low = |part: &GripperBox| {
-                part.corners()
-                    .iter()
-                    .map(|c| table.distance(&camera_from_gripper.transform_point(c)))
-                    .fold(f64::INFINITY, f64::min)
-            };
-            if boxes.iter().any(|part| low(part) < self.table_clearance) {
-                return Some(Hit::Table);
-            }
+        if self.above_table(&boxes, camera_from_gripper).is_some_and(|room| room < self.table_clearance) {
+            return Some(Hit::Table);
         }
         // All parts lie within the box around them: most points are sorted out by it.
         let around = boxes

@@ -17,8 +17,8 @@ pub struct GraspDescription {
     pub lever: f64,
     /// Height of what is between the pads over the object's middle, metres.
     pub above_middle: f64,
-    /// Height of the finger tips over the table, metres; `None` where no table is known.
-    pub tip_height: Option<f64>,
+    /// Distance of the gripper's lowest corner from the table, metres; `None` where no table is known.
+    pub table_room: Option<f64>,
 }
 
 impl GraspFitter<'_> {
@@ -31,14 +31,13 @@ impl GraspFitter<'_> {
         let lever = planner.centre - sum / count;
         let up = -lever.dot(&planner.down);
         let level = lever + planner.down * up;
-        let tip = grasp.camera_from_gripper.translation();
         GraspDescription {
             quality: grasp.quality,
             overlap: -between.iter().map(|(_, q)| q.z).fold(0.0, f64::min),
             lever: level.dot(&grasp.closing()).abs(),
             // Upwards the middle of what is held lies this far from the object's middle.
             above_middle: if between.is_empty() { 0.0 } else { -up },
-            tip_height: planner.table.map(|table| table.distance(&tip)),
+            table_room: planner.scene.table_room(planner.gripper, &grasp.camera_from_gripper, grasp.opening),
         }
     }
 }
@@ -85,7 +84,7 @@ mod tests {
         let d = at(0.05, Vec3::y());
         assert!(d.lever < 1e-3, "{d:?}");
         assert!((d.overlap - 0.03).abs() < 0.002, "{d:?}");
-        assert!((d.tip_height.unwrap() - 0.03).abs() < 1e-9, "{d:?}");
+        assert!((d.table_room.unwrap() - 0.03).abs() < 1e-9, "{d:?}");
         // The pads reach over the upper half, whose middle is 15 mm above the bar's.
         assert!((d.above_middle - 0.015).abs() < 0.002, "{d:?}");
         // Along the bar (as if its end were held): all of the way is a lever.

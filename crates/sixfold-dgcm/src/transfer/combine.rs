@@ -5,6 +5,7 @@
 //! are candidates as well, judged by the same numbers; and what came of earlier attempts says how much each number counts
 //! ([`crate::outcome`]).
 
+use sixfold_geometry::Pose;
 use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 
 use super::Proposal;
@@ -90,7 +91,47 @@ pub fn rank_by_outcome(
         let transferred = c.kind == Kind::Experience;
         c.score = outcomes.promise(&fitter.describe(&c.grasp), c.experience, transferred);
     }
-    joined(candidates, clusters).0
+    let (mut chosen, _) = joined(candidates, clusters);
+    let few = chosen.len().min(REFINED);
+    for c in &mut chosen[..few] {
+        refine(c, fitter, outcomes);
+    }
+    chosen.sort_by(|a, b| b.score.total_cmp(&a.score));
+    chosen
+}
+
+/// How many of the best are refined.
+const REFINED: usize = 6;
+
+/// Moves a grasp by small steps while that raises its chance to hold: forth and back, along the pads, and turned about each of
+/// its axes.
+fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
+    const ROUNDS: usize = 4;
+    const STEP: f64 = 0.006;
+    let turn = 8f64.to_radians();
+    let moves: Vec<Pose> = (1..6)
+        .flat_map(|axis| [-1.0, 1.0].map(|sign| (axis, sign)))
+        .map(|(axis, sign)| {
+            let mut twist = [0.0; 6];
+            twist[axis] = sign * if axis < 3 { STEP } else { turn };
+            Pose::exp(&twist.into())
+        })
+        .collect();
+    let transferred = c.kind == Kind::Experience;
+    for _ in 0..ROUNDS {
+        let start = c.grasp.camera_from_gripper;
+        let mut better = None;
+        for step in &moves {
+            let Some(grasp) = fitter.fit(&(start * *step), c.grasp.opening) else { continue };
+            let score = outcomes.promise(&fitter.describe(&grasp), c.experience, transferred);
+            if score > c.score + 1e-6 {
+                c.score = score;
+                better = Some(grasp);
+            }
+        }
+        let Some(grasp) = better else { break };
+        c.grasp = grasp;
+    }
 }
 
 fn near(a: &Grasp, b: &Grasp, clusters: &ClusterOptions) -> bool {
@@ -152,7 +193,6 @@ mod tests {
     use super::*;
     use crate::store::Match;
     use crate::transfer::Hypothesis;
-    use sixfold_geometry::Pose;
     use sixfold_grasp::AntipodalQuality;
 
     fn grasp(x: f64, alignment: f64) -> Grasp {

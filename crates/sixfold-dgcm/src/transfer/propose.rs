@@ -1,5 +1,7 @@
 //! Grasps from the nearest experiences: retrieval, transfer, stand-off, and a place where the gripper is free.
 
+use std::collections::BTreeSet;
+
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
@@ -37,6 +39,8 @@ pub struct ProposeOptions {
     pub align: AlignOptions,
     /// Only experiences on parts of this name.
     pub part: Option<String>,
+    /// Only the experiences with these numbers.
+    pub only: Option<BTreeSet<i64>>,
     /// Not those whose object has this name: what a test must not know.
     pub without_object: Option<String>,
 }
@@ -47,6 +51,7 @@ impl Default for ProposeOptions {
             neighbours: 10,
             align: AlignOptions::default(),
             part: None,
+            only: None,
             without_object: None,
         }
     }
@@ -95,6 +100,7 @@ pub fn propose(
     let input = model.encode(&crop);
     let wanted = |s: &Summary| {
         options.part.as_ref().is_none_or(|part| s.part.as_ref() == Some(part))
+            && options.only.as_ref().is_none_or(|only| only.contains(&s.id))
             && options.without_object.as_ref().is_none_or(|object| s.object != *object)
     };
     let nearest = memory.nearest(&input.feature, options.neighbours, wanted);

@@ -156,28 +156,40 @@ struct Recorded<'a> {
     mass: f64,
 }
 
+/// What came out.
 #[derive(Serialize)]
-struct Whole {
+pub(super) struct Whole {
     hard: bool,
     experiences: usize,
     outcomes: usize,
     friction: f64,
     mass: f64,
-    classes: Vec<Class>,
-    median_seconds: [f64; METHODS.len()],
+    pub classes: Vec<Class>,
+    pub median_seconds: [f64; METHODS.len()],
 }
 
 #[derive(Serialize)]
-struct Class {
-    class: String,
-    trials: usize,
+pub(super) struct Class {
+    pub class: String,
+    pub trials: usize,
     /// In the order of the methods.
-    rates: [f64; METHODS.len()],
+    pub rates: [f64; METHODS.len()],
     /// Wilson, 95 %.
-    intervals: [(f64, f64); METHODS.len()],
+    pub intervals: [(f64, f64); METHODS.len()],
 }
 
 pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
+    let whole = compare(a)?;
+    report(&a.json, &whole, || print_table(&whole))?;
+    Ok(if whole.classes.iter().any(|c| c.rates.iter().any(|r| *r > 0.0)) {
+        Outcome::Found
+    } else {
+        Outcome::NothingFound
+    })
+}
+
+/// Compares, or goes on comparing.
+pub(super) fn compare(a: &CompareArguments) -> Result<Whole> {
     if a.trials == 0 {
         bail!("--trials: found 0, expected at least 1");
     }
@@ -202,7 +214,9 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
     let scenes = Scenes { a, setting: &setting, gripper, options, network: &network };
     for (class, name, mesh) in &objects {
         // A scene whose rows are not all there is made again.
-        let done = |number: u64| rows.iter().filter(|r| r.object == *name && r.number == number).count() >= METHODS.len();
+        let done = |number: u64| {
+            rows.iter().filter(|r| r.object == *name && r.number == number).count() >= METHODS.len()
+        };
         let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
         (missing.len()..a.trials as usize).for_each(|_| progress.step(name.clone()));
         if missing.is_empty() {
@@ -235,8 +249,7 @@ pub(super) fn run(a: &CompareArguments) -> Result<Outcome> {
         }),
     };
     write_atomically(&a.out.join("table.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    report(&a.json, &whole, || print_table(&whole))?;
-    Ok(if rows.iter().any(|r| r.held) { Outcome::Found } else { Outcome::NothingFound })
+    Ok(whole)
 }
 
 struct Scenes<'a> {

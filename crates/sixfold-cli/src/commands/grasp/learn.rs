@@ -10,15 +10,16 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::Experience;
 use sixfold_dgcm::outcome::Attempt;
+use sixfold_dgcm::store::Experience;
 use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, GraspFitter, Gripper, antipodal_grasps};
 use sixfold_mesh::Mesh;
 use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
-    AttemptOptions, ConvexParts, Ending, PartsOptions, Scene, SimulatedView, scene, try_grasp, wilson_interval,
+    AttemptOptions, ConvexParts, Ending, PartsOptions, Scene, SimulatedView, scene, try_grasp,
+    wilson_interval,
 };
 
 use super::arguments::PhysicsArguments;
@@ -164,8 +165,9 @@ struct Recorded<'a> {
     gripper: &'a Gripper,
 }
 
+/// What was learned.
 #[derive(Serialize)]
-struct Whole {
+pub(super) struct Whole {
     attempts: usize,
     held: usize,
     rate: f64,
@@ -175,19 +177,26 @@ struct Whole {
     experiences: usize,
     /// Grasps whose outcome is known for this gripper.
     outcomes: usize,
-    objects: Vec<Curve>,
+    pub objects: Vec<Curve>,
 }
 
 /// How it went with one object, attempt by attempt.
 #[derive(Serialize)]
-struct Curve {
-    object: String,
-    held: Vec<bool>,
-    nearest: Vec<Option<f64>>,
-    from_experience: Vec<bool>,
+pub(super) struct Curve {
+    pub object: String,
+    pub held: Vec<bool>,
+    pub nearest: Vec<Option<f64>>,
+    pub from_experience: Vec<bool>,
 }
 
 pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
+    let whole = learn(a)?;
+    report(&a.json, &whole, || print_table(&whole, a))?;
+    Ok(if whole.held > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+/// Learns, or goes on learning.
+pub(super) fn learn(a: &LearnArguments) -> Result<Whole> {
     if a.near.is_nan() || a.near < 0.0 {
         bail!("--near: found {}, expected 0 or more", a.near);
     }
@@ -244,7 +253,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
     progress.finish();
     memory.refresh()?;
     let held = rows.iter().filter(|r| r.held).count();
-    let whole = Whole {
+    Ok(Whole {
         attempts: rows.len(),
         held,
         rate: held as f64 / rows.len().max(1) as f64,
@@ -264,37 +273,37 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
                 }
             })
             .collect(),
+    })
+}
+
+/// One letter an attempt: G geometry, E experience; capitals held.
+pub(super) fn marks(curve: &Curve) -> String {
+    let letter = |(held, e): (&bool, &bool)| match (held, e) {
+        (true, true) => 'E',
+        (true, false) => 'G',
+        (false, true) => 'e',
+        (false, false) => 'g',
     };
-    report(&a.json, &whole, || {
-        for c in &whole.objects {
-            let marks: String = c
-                .held
-                .iter()
-                .zip(&c.from_experience)
-                .map(|(held, e)| match (held, e) {
-                    (true, true) => 'E',
-                    (true, false) => 'G',
-                    (false, true) => 'e',
-                    (false, false) => 'g',
-                })
-                .collect();
-            println!("{:>16} {marks}", c.object);
-        }
-        println!("G geometry, E experience; capitals held");
-        println!(
-            "{} of {} held ({:.2}, 95 % interval {:.2} to {:.2}), {} from experience; {} experiences and {} outcomes in {}",
-            whole.held,
-            whole.attempts,
-            whole.rate,
-            whole.interval.0,
-            whole.interval.1,
-            whole.from_experience,
-            whole.experiences,
-            whole.outcomes,
-            a.experiences.display()
-        );
-    })?;
-    Ok(if held > 0 { Outcome::Found } else { Outcome::NothingFound })
+    curve.held.iter().zip(&curve.from_experience).map(letter).collect()
+}
+
+fn print_table(whole: &Whole, a: &LearnArguments) {
+    for c in &whole.objects {
+        println!("{:>16} {}", c.object, marks(c));
+    }
+    println!("G geometry, E experience; capitals held");
+    println!(
+        "{} of {} held ({:.2}, 95 % interval {:.2} to {:.2}), {} from experience; {} experiences and {} outcomes in {}",
+        whole.held,
+        whole.attempts,
+        whole.rate,
+        whole.interval.0,
+        whole.interval.1,
+        whole.from_experience,
+        whole.experiences,
+        whole.outcomes,
+        a.experiences.display()
+    );
 }
 
 struct Robot<'a> {
@@ -343,8 +352,7 @@ impl Robot<'_> {
         }
         row.from_experience = !proposals.is_empty();
         let outcomes = self.memory.outcomes(&self.gripper.name);
-        let ranked =
-            rank_by_outcome(&geometry, &proposals, &ClusterOptions::default(), &fitter, &outcomes);
+        let ranked = rank_by_outcome(&geometry, &proposals, &ClusterOptions::default(), &fitter, &outcomes);
         let mut left = 0;
         for (number, candidate) in ranked.iter().take(self.a.tries).enumerate() {
             let ending = self.execute(pupil, parts, &scene, seen, &fitter, candidate, attempt, number)?;

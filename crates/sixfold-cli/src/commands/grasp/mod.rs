@@ -15,6 +15,8 @@ mod measure;
 #[cfg(feature = "physics")]
 mod object_list;
 mod propose;
+#[cfg(all(feature = "physics", feature = "experience"))]
+pub(crate) mod reproduce;
 #[cfg(feature = "experience")]
 mod store;
 #[cfg(feature = "physics")]

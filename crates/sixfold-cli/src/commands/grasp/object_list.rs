@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::Deserialize;
-use sixfold_geometry::Pose;
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 
 use crate::objects;
@@ -19,6 +19,25 @@ struct Listed {
     /// The axis of the mesh that points up when the object stands.
     #[serde(default)]
     up: Up,
+    /// A part with a name, such as a handle: a box of the mesh as it stands (z up), metres.
+    #[serde(default)]
+    part: Option<PartBox>,
+}
+
+/// A named part of an object: what lies within a box of its frame, metres.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct PartBox {
+    pub name: String,
+    low: [f64; 3],
+    high: [f64; 3],
+}
+
+impl PartBox {
+    /// Whether a point lies inside, or at most `margin` metres off each side.
+    pub fn contains(&self, p: &Vec3, margin: f64) -> bool {
+        (0..3).all(|k| p[k] >= self.low[k] - margin && p[k] <= self.high[k] + margin)
+    }
 }
 
 #[derive(Deserialize, Default)]
@@ -43,7 +62,7 @@ impl Up {
 }
 
 /// Objects by name, or by a list.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub(crate) struct ObjectsArguments {
     /// Objects: mesh files, or names of stored objects; each is a class of its own
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1..)]
@@ -64,11 +83,19 @@ pub(crate) struct ObjectsArguments {
 
 /// Class, name and mesh of every object.
 pub(super) fn named_objects(a: &ObjectsArguments) -> Result<Vec<(String, String, Mesh)>> {
+    Ok(objects_with_parts(a)?.0)
+}
+
+/// Classes, names and meshes of objects.
+pub(super) type Named = Vec<(String, String, Mesh)>;
+
+/// Class, name and mesh of every object, and its named part where the list tells one.
+pub(super) fn objects_with_parts(a: &ObjectsArguments) -> Result<(Named, Vec<Option<PartBox>>)> {
     let Some(list) = a.list.as_deref() else {
         if a.objects.is_empty() {
             bail!("--object NAME_OR_MESH or --list FILE is missing");
         }
-        return a
+        let named: Result<Named> = a
             .objects
             .iter()
             .map(|name| {
@@ -76,6 +103,7 @@ pub(super) fn named_objects(a: &ObjectsArguments) -> Result<Vec<(String, String,
                 Ok((object.name.clone(), object.name.clone(), object.mesh))
             })
             .collect();
+        return named.map(|named| (named, vec![None; a.objects.len()]));
     };
     let text = std::fs::read_to_string(list).with_context(|| list.display().to_string())?;
     let listed: Vec<Listed> = serde_json::from_str(&text).with_context(|| {
@@ -88,13 +116,15 @@ pub(super) fn named_objects(a: &ObjectsArguments) -> Result<Vec<(String, String,
         Some(folder) => folder.clone(),
         None => list.parent().map(Path::to_path_buf).unwrap_or_default(),
     };
-    listed
+    let parts = listed.iter().map(|l| l.part.clone()).collect();
+    let named: Result<Named> = listed
         .into_iter()
         .map(|l| {
             let mesh = read_mesh(folder.join(&l.mesh), l.unit)?.transformed(&l.up.turn());
             Ok((l.class, l.mesh.display().to_string(), mesh))
         })
-        .collect()
+        .collect();
+    Ok((named?, parts))
 }
 
 /// A name as part of a file's name.

@@ -187,8 +187,7 @@ fn with_experience(
     }
     let geometry = if a.part.is_some() { vec![] } else { antipodal_grasps(view, gripper, planner)? };
     let outcomes = memory.outcomes(&gripper.name);
-    let ranked =
-        rank_by_outcome(&geometry, &found.proposals, &ClusterOptions::default(), &fitter, &outcomes);
+    let ranked = rank_by_outcome(&geometry, &found.proposals, &ClusterOptions::default(), &fitter, &outcomes);
     Ok(ranked
         .iter()
         .map(|r| {

@@ -34,6 +34,8 @@ pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
         ReproduceCommand::Pix2pose(pix2pose) => run_pix2pose(pix2pose, a),
         ReproduceCommand::Mttm(mttm) => super::mttm::reproduce::run(mttm, &a.json),
         ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),
+        #[cfg(all(feature = "physics", feature = "experience"))]
+        ReproduceCommand::Dgcm(arguments) => super::grasp::reproduce::run(arguments, &a.json),
     }
 }
 
