@@ -111,6 +111,11 @@ pub(super) fn pose(pose: &Pose) -> Vec<u8> {
     (0..16).flat_map(|i| m[(i / 4, i % 4)].to_le_bytes()).collect()
 }
 
+/// Focal lengths and principal point.
+pub(super) fn camera(camera: &Camera) -> Vec<u8> {
+    [camera.fx, camera.fy, camera.cx, camera.cy].into_iter().flat_map(f64::to_le_bytes).collect()
+}
+
 /// A pose to the micrometre, which reading and writing do not change.
 pub(super) fn rounded(pose: &Pose) -> Vec<u8> {
     let m = pose.to_matrix();

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::Experience;
+use sixfold_dgcm::store::{Experience, StorePlace};
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, Gripper, antipodal_grasps};
@@ -22,7 +22,7 @@ use sixfold_simulation::{
 
 use super::arguments::PhysicsArguments;
 use super::compare::{Hardness, hardness};
-use super::experience::{NetworkArguments, model, new_memory, now};
+use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
 use super::journal::Journal;
 use super::measure::ending_name;
 use super::object_list::{ObjectsArguments, named_objects};
@@ -33,9 +33,11 @@ use crate::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnArguments {
-    /// The store of experiences; it is made where there is none
+    /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
     #[arg(long, value_name = "FILE")]
-    pub experiences: PathBuf,
+    pub experiences: StorePlace,
+    #[command(flatten)]
+    pub outbox: OutboxArguments,
     /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
     pub families: Vec<String>,
@@ -147,7 +149,7 @@ struct Row {
 
 #[derive(Serialize)]
 struct Recorded<'a> {
-    experiences: &'a std::path::Path,
+    experiences: &'a StorePlace,
     objects: Vec<&'a str>,
     attempts: u64,
     tries: usize,
@@ -211,7 +213,7 @@ pub(super) fn run(a: &LearnArguments) -> Result<Outcome> {
         gripper: &setting.real,
     };
     let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
-    let mut memory = new_memory(&a.experiences, &network)?;
+    let mut memory = new_memory(&a.experiences, &a.outbox, &a.out, &network)?;
     let mut robot = Robot { a, setting: &setting, gripper, options, network, memory: &mut memory };
     let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
     for pupil in &pupils {
