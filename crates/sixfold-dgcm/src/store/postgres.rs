@@ -237,9 +237,6 @@ impl PostgresStore {
             let found = "a schema `sixfold` with other tables".to_owned();
             return Err(StoreError::NotAStore { file: self.place(), found });
         }
-        let Some(extension) = found.extension else {
-            return Err(self.no_extension("it was dropped"));
-        };
         let row = client
             .query_opt("SELECT application, version, identity FROM sixfold.store", &[])
             .and_then(|row| row.map(|r| Ok((r.try_get(0)?, r.try_get(1)?, r.try_get(2)?))).transpose());
@@ -257,6 +254,9 @@ impl PostgresStore {
         if version != VERSION {
             return Err(StoreError::Version { file: self.place(), found: version, expected: VERSION });
         }
+        let Some(extension) = found.extension else {
+            return Err(self.no_extension("it was dropped"));
+        };
         let mut known = self.identity.borrow_mut();
         if known.as_ref().is_some_and(|k| *k != identity) {
             let found = "another store than before".to_owned();
