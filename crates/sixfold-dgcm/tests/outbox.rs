@@ -17,7 +17,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sixfold_dgcm::store::{
     Changes, Experience, ExperienceStore, FeatureIndex, Notice, OutboxOptions, OutboxStore, Position,
-    SqliteStore, StoreError, Stored, Summary,
+    SqliteStore, StoreError, StorePlace, Stored, Summary,
 };
 use support::{contract, experience, feature, kills, named, objects, said};
 
@@ -240,6 +240,35 @@ fn another_server_is_noticed_and_an_unwanted_experience_does_not_block_the_rest(
     let error =
         OutboxStore::create(&file, Box::new(other), &NOW, Box::new(|_| {})).err().unwrap().to_string();
     assert!(error.contains("outbox.db") && error.contains("another store"), "{error}");
+}
+
+#[test]
+fn a_place_never_shows_a_password() {
+    for (url, expected) in [
+        ("postgres://robot:secret@host:5433/fleet", "postgres://robot@host:5433/fleet"),
+        ("postgres://robot@host/fleet?connect_timeout=3", "postgres://robot@host/fleet"),
+        ("postgresql://host/fleet", "postgresql://host/fleet"),
+        ("postgres://robot:sec/ret?x@host/fleet", "postgres://robot@host/fleet"),
+        ("postgres://robot:a:secret@host", "postgres://robot@host"),
+        // A @ that should be %40: which one ends the password is not clear.
+        ("postgres://robot:sec@ret@host/fleet", "postgres://(not shown)"),
+        ("postgres://host/fleet?user=robot&password=secret", "postgres://(not shown)"),
+        ("postgres://host/fleet?Password=sec@ret", "postgres://(not shown)"),
+    ] {
+        let place = StorePlace::from(url);
+        assert!(matches!(place, StorePlace::Server(_)));
+        assert_eq!(place.to_string(), expected);
+        let all = format!("{place:?} {} {}", place.display(), serde_json::to_string(&place).unwrap());
+        assert!(!all.contains("sec") && !all.contains("ret"), "{all}");
+    }
+    assert_eq!(StorePlace::from("out/a.db"), StorePlace::File("out/a.db".into()));
+    if cfg!(not(feature = "postgres")) {
+        let place = StorePlace::from("postgres://robot:secret@host/fleet");
+        for error in [place.open().err(), place.create().err()] {
+            let error = error.unwrap().to_string();
+            assert!(error.contains("--features postgres") && !error.contains("secret"), "{error}");
+        }
+    }
 }
 
 #[test]

@@ -97,10 +97,12 @@ pub(super) fn from_bits(bytes: &[u8], count: usize) -> Option<Vec<bool>> {
     (bytes.len() == count.div_ceil(8)).then(|| (0..count).map(|i| bytes[i / 8] >> (i % 8) & 1 == 1).collect())
 }
 
+#[cfg(feature = "sqlite")]
 pub(super) fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
+#[cfg(feature = "sqlite")]
 pub(super) fn from_floats(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
 }

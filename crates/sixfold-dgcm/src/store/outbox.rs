@@ -236,7 +236,7 @@ impl OutboxStore {
             .checked(copy.connection.query_row("SELECT identity FROM followed", [], |r| r.get(0)))
             .map_err(Trouble::Here)?;
         if found.is_some() && found != identity {
-            return Err(Trouble::Here(StoreError::Other {
+            return Err(Trouble::There(StoreError::Other {
                 file: copy.file.clone(),
                 reason: "this file goes with another store than the one that answers at the address; give the other address, or another file with --outbox (`sixfold grasp store merge` takes experiences over)".to_owned(),
             }));
