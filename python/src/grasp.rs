@@ -4,11 +4,11 @@ use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank_by_outcome};
+use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank_by_outcome, rank_on_part};
 use sixfold_geometry::Pose;
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, GraspView, ViewError, ViewOptions, antipodal_grasps,
-    cluster_grasps, draw_grasps as draw, find_objects as find,
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, GraspView, ViewError, ViewOptions,
+    antipodal_grasps, cluster_grasps, draw_grasps as draw, find_objects as find,
 };
 
 use crate::arrays::{self, about, bad, whole};
@@ -233,7 +233,7 @@ pub(crate) fn propose_grasps(
             });
             return Ok(plain.collect());
         };
-        let only_experience = part.is_some();
+        let on_part = part.is_some();
         let options = ProposeOptions { part, ..ProposeOptions::default() };
         let fitter = GraspFitter::new(&view, &gripper, &planner)
             .unwrap_or_else(|error| unreachable!("default options: {error}"));
@@ -243,8 +243,12 @@ pub(crate) fn propose_grasps(
             (propose(&fitter, &model, memory, &options)?, memory.outcomes(&gripper.name))
         };
         stop.check();
-        let geometry = if only_experience { vec![] } else { planned() };
-        let ranked = rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes);
+        let geometry = planned();
+        let ranked = if on_part {
+            rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes)
+        } else {
+            rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes)
+        };
         let learnt = ranked.iter().map(|r| {
             let from = r.proposal.map(|i| &found.proposals[i]);
             let kind = match r.kind {

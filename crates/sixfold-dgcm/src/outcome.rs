@@ -83,11 +83,11 @@ type Numbers = SVector<f64, NUMBERS>;
 /// Weights without any attempt, in the order of [`numbers`]: quality and experience decide.
 const PRIOR: [f64; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0];
 /// One over the variance of the weights around the prior. The constant is nearly free.
-const PRECISION: f64 = 10.0;
+const PRECISION: f64 = 5.0;
 const PRECISION_OF_CONSTANT: f64 = 0.01;
 
-/// More room over the table than this counts no more, metres.
-const ROOM: f64 = 0.02;
+/// Room over the table counts by its logarithm between these, metres: the first millimetres are worth most.
+const ROOM: (f64, f64) = (0.003, 0.1);
 
 /// What is known of a grasp, each number in about -1 to 1.
 fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
@@ -102,7 +102,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
         both_sides(d.overlap.clamp(0.0, 0.05) / 0.05),
         -both_sides(d.lever.clamp(0.0, 0.06) / 0.06),
         d.above_middle.clamp(-0.03, 0.03) / 0.03,
-        both_sides(d.table_room.unwrap_or(ROOM).clamp(0.0, ROOM) / ROOM),
+        (d.table_room.unwrap_or(ROOM.1).clamp(ROOM.0, ROOM.1) / 0.02).ln() / 5f64.ln(),
         2.0 * q.total().max(0.03).ln() + 2.0,
         share,
         f64::from(u8::from(transferred)),

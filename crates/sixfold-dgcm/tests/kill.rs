@@ -3,6 +3,8 @@
 //! `SIXFOLD_KILLS=1000 cargo test --workspace --release --test kill -- --nocapture` kills a writer a thousand times.
 #![cfg(feature = "sqlite")]
 
+mod support;
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -10,41 +12,8 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::crop::{Crop, CropOptions};
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::store::{
-    COPIES, Copy, Experience, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError,
-};
-use sixfold_geometry::{Camera, Image, Mask, Pose};
-use sixfold_grasp::Gripper;
-
-/// An experience that can be told from all others, with a feature that follows from its number.
-fn experience(number: i64) -> Experience {
-    let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
-    let inside = |x: usize, y: usize| (120..180).contains(&x) && (90..150).contains(&y);
-    let depth = Image::from_fn(320, 240, |x, y| if inside(x, y) { 0.7 + 0.0003 * x as f32 } else { 0.0 });
-    let crop = Crop::new(&depth, &camera, &Mask::from_fn(320, 240, inside), &CropOptions::compact()).unwrap();
-    let region = crop.mask.iter().enumerate().map(|(i, m)| *m && i % 3 == 0).collect();
-    Experience {
-        crop,
-        camera_from_gripper: Pose::exp(&[0.0, 0.01, 0.7, 0.1, 3.0, number as f64 * 1e-3].into()),
-        opening: 0.07,
-        width: 0.05,
-        region,
-        copies: COPIES.iter().map(|&angle| Copy { angle, feature: feature(number, angle) }).collect(),
-        network: "test".to_owned(),
-        gripper: Gripper::built_in("jaws-85").unwrap(),
-        object: format!("object {number}"),
-        part: (number % 2 == 0).then(|| "handle".to_owned()),
-        time: 1_700_000_000 + number,
-        provenance: "a test".to_owned(),
-    }
-}
-
-fn feature(number: i64, angle: f64) -> Vec<f32> {
-    let mut random = ChaCha8Rng::seed_from_u64(number as u64 ^ angle.to_bits());
-    (0..FEATURE).map(|_| random.random_range(-1.0f32..1.0)).collect()
-}
+use sixfold_dgcm::store::{COPIES, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError};
+use support::{experience, feature, kills, said};
 
 /// This test binary again, as a process of its own that does one thing.
 fn process(what: &str, file: &Path) -> Child {
@@ -94,17 +63,9 @@ fn helper_process() {
     }
 }
 
-/// The numbers after a word in the lines that a process printed.
-fn said(text: &str, word: &str) -> Vec<Vec<i64>> {
-    text.lines()
-        .filter_map(|line| line.strip_prefix(word))
-        .filter_map(|rest| rest.split_whitespace().map(|n| n.parse().ok()).collect())
-        .collect()
-}
-
 #[test]
 fn nothing_acknowledged_is_lost_when_the_writer_is_killed() {
-    let kills: u64 = std::env::var("SIXFOLD_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(12);
+    let kills = kills(12);
     let folder = tempfile::tempdir().unwrap();
     let mut file = folder.path().join("experience.db");
     let mut random = ChaCha8Rng::seed_from_u64(7);
@@ -241,7 +202,7 @@ fn what_is_no_store_says_so() {
     SqliteStore::create(&version).unwrap();
     write_version(&version, 7);
     let error = SqliteStore::open(&version).unwrap_err();
-    assert!(matches!(error, StoreError::Version { found: 7, expected: 1, .. }), "{error}");
+    assert!(matches!(error, StoreError::Version { found: 7, expected: 2, .. }), "{error}");
     assert!(SqliteStore::create(&version).is_err());
 
     // Pages overwritten in the middle of the file.

@@ -99,10 +99,12 @@ pub(super) fn from_bits(bytes: &[u8], count: usize) -> Option<Vec<bool>> {
     (bytes.len() == count.div_ceil(8)).then(|| (0..count).map(|i| bytes[i / 8] >> (i % 8) & 1 == 1).collect())
 }
 
+#[cfg(feature = "sqlite")]
 pub(super) fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
+#[cfg(feature = "sqlite")]
 pub(super) fn from_floats(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
 }
@@ -111,6 +113,11 @@ pub(super) fn from_floats(bytes: &[u8]) -> Vec<f32> {
 pub(super) fn pose(pose: &Pose) -> Vec<u8> {
     let m = pose.to_matrix();
     (0..16).flat_map(|i| m[(i / 4, i % 4)].to_le_bytes()).collect()
+}
+
+/// Focal lengths and principal point.
+pub(super) fn camera(camera: &Camera) -> Vec<u8> {
+    [camera.fx, camera.fy, camera.cx, camera.cy].into_iter().flat_map(f64::to_le_bytes).collect()
 }
 
 /// A pose to the micrometre, which reading and writing do not change.

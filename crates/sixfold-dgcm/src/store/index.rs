@@ -139,8 +139,7 @@ impl FeatureIndex {
             .into_iter()
             .map(|(i, _)| {
                 let row = &self.exact[i * FEATURE..(i + 1) * FEATURE];
-                let sum: f64 = row.iter().zip(feature).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-                (i, sum.sqrt())
+                (i, distance(row, feature))
             })
             .collect();
         found.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
@@ -150,6 +149,12 @@ impl FeatureIndex {
             .map(|(i, distance)| Match { experience: self.owners[i].0, angle: self.owners[i].1, distance })
             .collect()
     }
+}
+
+/// Euclidean distance of two features.
+pub(super) fn distance(a: &[f32], b: &[f32]) -> f64 {
+    let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    sum.sqrt()
 }
 
 /// The candidates of a block.

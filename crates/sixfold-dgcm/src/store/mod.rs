@@ -1,13 +1,22 @@
 //! The memory of what worked: every successful grasp with what the camera saw (dissertation, section 6.2.1).
 //!
-//! [`ExperienceStore`] is what a store can do, [`SqliteStore`] one in a single file; a store on a server for several robots
-//! has the same interface. Searching is not the store's task: [`FeatureIndex`] holds all features in memory, asks the store
-//! only for what has changed, and finds the nearest exactly.
+//! [`ExperienceStore`] is what a store can do. `SqliteStore` is one in a single file, `PostgresStore` (feature `postgres`) one on
+//! a server for several robots, `OutboxStore` a robot's own copy of that one, which goes on when the server is away.
+//! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
+//! memory, asks the store only for what has changed, and finds the nearest exactly.
 
 mod describe;
+#[cfg(any(feature = "sqlite", feature = "postgres"))]
 mod encode;
 mod experience;
 mod index;
+#[cfg(feature = "sqlite")]
+mod outbox;
+mod place;
+#[cfg(feature = "postgres")]
+mod postgres;
+#[cfg(any(feature = "sqlite", feature = "postgres"))]
+mod row;
 #[cfg(feature = "sqlite")]
 mod sqlite;
 
@@ -20,6 +29,11 @@ use crate::outcome::Attempt;
 pub use describe::Description;
 pub use experience::{COPIES, Copy, Experience, Stored, region};
 pub use index::{FeatureIndex, Match};
+#[cfg(feature = "sqlite")]
+pub use outbox::{Listener, Notice, OutboxOptions, OutboxStore};
+pub use place::StorePlace;
+#[cfg(feature = "postgres")]
+pub use postgres::PostgresStore;
 #[cfg(feature = "sqlite")]
 pub use sqlite::SqliteStore;
 
@@ -37,7 +51,7 @@ pub enum StoreError {
     },
     /// The file holds something else.
     #[error(
-        "{}: found {found}, expected an experience store; give a file that `sixfold grasp learn` or `sixfold grasp store add` wrote", file.display()
+        "{}: found {found}, expected an experience store; give one that `sixfold grasp learn` or `sixfold grasp store add` wrote", file.display()
     )]
     NotAStore {
         /// The file.
@@ -82,10 +96,70 @@ pub enum StoreError {
         file: PathBuf,
     },
     /// The store may not be written.
-    #[error("{}: the experience store may only be read; check the permissions of file and folder", file.display())]
+    #[error("{}: the experience store may only be read; check the permissions of file and folder, or, of a server, that it is no standby", file.display())]
     ReadOnly {
         /// The file.
         file: PathBuf,
+    },
+    /// The server does not answer. Nothing was asked of it, so nothing was stored.
+    #[error(
+        "{server}: the server of the experience store cannot be reached ({reason}); check that it runs, its name and port, and the network"
+    )]
+    Unreachable {
+        /// The server, without the password.
+        server: String,
+        /// Why.
+        reason: String,
+    },
+    /// The connection broke off before the server had confirmed.
+    #[error(
+        "{server}: the connection to the experience store was lost ({reason}); whether what was being stored has arrived is not known: do the same again, nothing is stored twice"
+    )]
+    Lost {
+        /// The server, without the password.
+        server: String,
+        /// Why.
+        reason: String,
+    },
+    /// The server lets nobody in with this address, or not do this.
+    #[error(
+        "{server}: the server refuses ({reason}); check user, database and password (PGPASSWORD, or in the address) and what the user may do there"
+    )]
+    Refused {
+        /// The server, without the password.
+        server: String,
+        /// What the server says.
+        reason: String,
+    },
+    /// The server's database lacks pgvector.
+    #[error(
+        "{server}: the database has no extension `vector` ({reason}); install pgvector on the server (Debian: postgresql-VERSION-pgvector) and let an administrator say CREATE EXTENSION vector in this database"
+    )]
+    Extension {
+        /// The server, without the password.
+        server: String,
+        /// What is missing.
+        reason: String,
+    },
+    /// The address of a server cannot be understood.
+    #[error(
+        "{server}: {reason}; expected postgres://user@host:port/database, a password in PGPASSWORD or behind the user's name"
+    )]
+    Address {
+        /// The address, without what may be a password.
+        server: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The program was built without this kind of store.
+    #[error(
+        "{place}: this program was built without the feature `{feature}`; build it with: cargo install --path crates/sixfold-cli --features {feature}"
+    )]
+    Feature {
+        /// The file, or the server without the password.
+        place: String,
+        /// The feature that it needs.
+        feature: &'static str,
     },
     /// A field of an experience cannot be used.
     #[error("experience {id}: field {field}: expected {expected}, found {found}")]
@@ -107,6 +181,21 @@ pub enum StoreError {
         /// What SQLite says.
         reason: String,
     },
+}
+
+impl StoreError {
+    /// Whether the same may well succeed later, with nothing changed here: the server or the network is away, or the server is
+    /// busy, full or a standby.
+    pub fn is_passing(&self) -> bool {
+        matches!(
+            self,
+            StoreError::Unreachable { .. }
+                | StoreError::Lost { .. }
+                | StoreError::Busy { .. }
+                | StoreError::Full { .. }
+                | StoreError::ReadOnly { .. }
+        )
+    }
 }
 
 /// How far a reader has followed a store.
@@ -208,6 +297,14 @@ pub trait ExperienceStore {
     /// # Errors
     /// [`StoreError`].
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError>;
+
+    /// A name that no other store has, where the store has one: a server's, so that its robots notice when another one answers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn identity(&self) -> Result<Option<String>, StoreError> {
+        Ok(None)
+    }
 
     /// Takes over all experiences and attempts of another store that are not here yet; how many experiences were new.
     ///

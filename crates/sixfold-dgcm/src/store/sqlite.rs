@@ -8,14 +8,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Row, params};
-use sixfold_geometry::{Camera, Vec3};
-use sixfold_grasp::parse_gripper;
 
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
+use super::row::{self, Raw};
 use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
 use crate::outcome::Attempt;
-use crate::vd_noc::Extent;
 
 /// Says that a SQLite file is one of ours: "6fEx".
 const APPLICATION: i64 = 0x3666_4578;
@@ -41,8 +39,8 @@ const ATTEMPTS: &str = "
 /// A store in a file.
 #[derive(Debug)]
 pub struct SqliteStore {
-    connection: Connection,
-    file: PathBuf,
+    pub(super) connection: Connection,
+    pub(super) file: PathBuf,
 }
 
 impl SqliteStore {
@@ -160,12 +158,12 @@ impl SqliteStore {
         self.checked(self.connection.query_row(question, [], |row| row.get(0)))
     }
 
-    fn run(&self, statements: &str) -> Result<(), StoreError> {
+    pub(super) fn run(&self, statements: &str) -> Result<(), StoreError> {
         self.checked(self.connection.execute_batch(statements))
     }
 
     /// SQLite's errors in our words.
-    fn checked<T>(&self, result: rusqlite::Result<T>) -> Result<T, StoreError> {
+    pub(super) fn checked<T>(&self, result: rusqlite::Result<T>) -> Result<T, StoreError> {
         result.map_err(|error| {
             let (file, reason) = (self.file.clone(), error.to_string());
             match error.sqlite_error_code() {
@@ -191,13 +189,6 @@ impl SqliteStore {
         if let Some(id) = known {
             return Ok((id, false));
         }
-        // As a gripper file, which says what kind it is.
-        let mut gripper = serde_json::to_value(&e.gripper).unwrap_or_default();
-        gripper["kind"] = "parallel-jaws".into();
-        let gripper = gripper.to_string();
-        let camera = &e.crop.camera;
-        let numbers = [camera.fx, camera.fy, camera.cx, camera.cy];
-        let numbers: Vec<u8> = numbers.iter().flat_map(|v| v.to_le_bytes()).collect();
         transaction.execute(
             "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
              extent, depth, normals, vd_noc, region, network, provenance)
@@ -207,11 +198,11 @@ impl SqliteStore {
                 e.time,
                 e.object,
                 e.part,
-                gripper,
+                row::gripper_text(&e.gripper),
                 e.opening,
                 e.width,
                 encode::pose(&e.camera_from_gripper),
-                numbers,
+                encode::camera(&e.crop.camera),
                 e.crop.side as i64,
                 encode::vectors(&[e.crop.extent.centre, e.crop.extent.half]),
                 images.depth,
@@ -234,112 +225,28 @@ impl SqliteStore {
     }
 }
 
-/// The columns of an experience before they are understood.
-struct Raw {
-    time: i64,
-    object: String,
-    part: Option<String>,
-    gripper: String,
-    opening: f64,
-    width: f64,
-    pose: Vec<u8>,
-    camera: Vec<u8>,
-    side: i64,
-    extent: Vec<u8>,
-    images: Images,
-    region: Vec<u8>,
-    network: String,
-    provenance: String,
-}
-
-impl Raw {
-    fn read(row: &Row<'_>) -> rusqlite::Result<Raw> {
-        Ok(Raw {
-            time: row.get(0)?,
-            object: row.get(1)?,
-            part: row.get(2)?,
-            gripper: row.get(3)?,
-            opening: row.get(4)?,
-            width: row.get(5)?,
-            pose: row.get(6)?,
-            camera: row.get(7)?,
-            side: row.get(8)?,
-            extent: row.get(9)?,
-            images: Images { depth: row.get(10)?, normals: row.get(11)?, vd_noc: row.get(12)? },
-            region: row.get(13)?,
-            network: row.get(14)?,
-            provenance: row.get(15)?,
-        })
-    }
-
-    fn understand(self, id: i64, copies: Vec<Copy>) -> Result<Experience, StoreError> {
-        let wrong = |field, expected, found: String| StoreError::Field { id, field, expected, found };
-        let side = usize::try_from(self.side)
-            .ok()
-            .filter(|s| (8..=1024).contains(s))
-            .ok_or_else(|| wrong("side", "8 to 1024 pixels", self.side.to_string()))?;
-        let numbers = encode::doubles(&self.camera);
-        let &[fx, fy, cx, cy] = numbers.as_slice() else {
-            return Err(wrong("camera", "four numbers", numbers.len().to_string()));
-        };
-        let camera = Camera::new(fx, fy, cx, cy, side, side)
-            .map_err(|e| wrong("camera", "a camera", e.to_string()))?;
-        let extent = encode::doubles(&self.extent);
-        if extent.len() != 6 || !extent.iter().all(|v| v.is_finite()) {
-            return Err(wrong("extent", "six finite numbers", format!("{extent:?}")));
-        }
-        let extent = Extent {
-            centre: Vec3::from_column_slice(&extent[..3]),
-            half: Vec3::from_column_slice(&extent[3..]),
-        };
-        let crop = encode::crop(&self.images, &camera, extent)
-            .map_err(|(field, found)| wrong(field, "a PNG image of the crop's size", found))?;
-        let pose = encode::from_pose(&self.pose).ok_or_else(|| {
-            wrong("camera_from_gripper", "a pose of 16 numbers", self.pose.len().to_string())
-        })?;
-        let region = encode::from_bits(&self.region, side * side)
-            .ok_or_else(|| wrong("region", "one bit a pixel", self.region.len().to_string()))?;
-        let gripper = parse_gripper(&self.gripper, "gripper")
-            .map_err(|e| wrong("gripper", "a gripper", e.to_string()))?;
-        Ok(Experience {
-            crop,
-            camera_from_gripper: pose,
-            opening: self.opening,
-            width: self.width,
-            region,
-            copies,
-            network: self.network,
-            gripper,
-            object: self.object,
-            part: self.part,
-            time: self.time,
-            provenance: self.provenance,
-        })
-    }
+fn raw(row: &Row<'_>) -> rusqlite::Result<Raw> {
+    Ok(Raw {
+        time: row.get(0)?,
+        object: row.get(1)?,
+        part: row.get(2)?,
+        gripper: row.get(3)?,
+        opening: row.get(4)?,
+        width: row.get(5)?,
+        pose: row.get(6)?,
+        camera: row.get(7)?,
+        side: row.get(8)?,
+        extent: row.get(9)?,
+        images: Images { depth: row.get(10)?, normals: row.get(11)?, vd_noc: row.get(12)? },
+        region: row.get(13)?,
+        network: row.get(14)?,
+        provenance: row.get(15)?,
+    })
 }
 
 impl ExperienceStore for SqliteStore {
     fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
-        experience.check()?;
-        let images = encode::images(&experience.crop).ok_or_else(|| StoreError::Field {
-            id: 0,
-            field: "crop",
-            expected: "images that can be written as PNG",
-            found: format!("{} pixels a side", experience.crop.side),
-        })?;
-        let e = experience;
-        // Without the time: what is stored twice after an interruption is the same experience.
-        let key = encode::key(&[
-            &images.depth,
-            &images.vd_noc,
-            &encode::rounded(&e.camera_from_gripper),
-            &e.opening.to_le_bytes(),
-            e.object.as_bytes(),
-            e.part.as_deref().unwrap_or_default().as_bytes(),
-            e.gripper.name.as_bytes(),
-            e.network.as_bytes(),
-            e.provenance.as_bytes(),
-        ]);
+        let (images, key) = row::prepare(experience)?;
         let inserted = self.insert(experience, &key, &images);
         self.checked(inserted)
     }
@@ -351,7 +258,7 @@ impl ExperienceStore for SqliteStore {
                     "SELECT time, object, part, gripper, opening, width, camera_from_gripper, camera, side, extent, depth,
                      normals, vd_noc, region, network, provenance FROM experience WHERE id=?1",
                     [id],
-                    Raw::read,
+                    raw,
                 )
                 .optional(),
         )?;
@@ -377,13 +284,12 @@ impl ExperienceStore for SqliteStore {
             query
                 .query_map([], |row| {
                     let gripper: String = row.get(4)?;
-                    let gripper = serde_json::from_str::<serde_json::Value>(&gripper).unwrap_or_default();
                     Ok(Summary {
                         id: row.get(0)?,
                         time: row.get(1)?,
                         object: row.get(2)?,
                         part: row.get(3)?,
-                        gripper: gripper["name"].as_str().unwrap_or_default().to_owned(),
+                        gripper: row::gripper_name(&gripper),
                         width: row.get(5)?,
                         network: row.get(6)?,
                         provenance: row.get(7)?,
@@ -463,5 +369,45 @@ impl ExperienceStore for SqliteStore {
             }
             Ok(changes)
         })())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::outcome::Attempt;
+    use sixfold_grasp::{AntipodalQuality, GraspDescription};
+
+    #[test]
+    fn a_store_of_version_1_is_read_and_brought_up_to_date_when_written_to() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("old.db");
+        {
+            let made = SqliteStore::create(&file).unwrap();
+            made.run("DROP TABLE attempt; PRAGMA user_version=1").unwrap();
+        }
+        let quality = AntipodalQuality { alignment: 0.5, support: 0.5, centring: 0.5, observed: 0.5 };
+        let description =
+            GraspDescription { quality, overlap: 0.0, lever: 0.0, above_middle: 0.0, table_room: None };
+        let attempt = Attempt {
+            description,
+            share: 0.0,
+            transferred: false,
+            held: true,
+            gripper: "g".to_owned(),
+            object: "o".to_owned(),
+            time: 0,
+            provenance: "p".to_owned(),
+        };
+        let mut store = SqliteStore::open(&file).unwrap();
+        assert_eq!(store.attempts(0).unwrap(), []);
+        assert_eq!(store.number("PRAGMA user_version").unwrap(), 1, "reading changes nothing");
+        assert!(store.add_attempt(&attempt).unwrap());
+        assert_eq!(store.number("PRAGMA user_version").unwrap(), VERSION);
+        assert_eq!(SqliteStore::open(&file).unwrap().attempts(0).unwrap()[0].1, attempt);
+        // A later version is refused.
+        store.run("PRAGMA user_version=3").unwrap();
+        let error = SqliteStore::open(&file).unwrap_err().to_string();
+        assert!(error.contains("version 3"), "{error}");
     }
 }

@@ -126,12 +126,17 @@ pub fn transfer(
     found
 }
 
-fn noc(v: &[f32; 3]) -> Vec3 {
+pub(super) fn noc(v: &[f32; 3]) -> Vec3 {
     Vec3::from_fn(|k, _| f64::from(v[k]))
 }
 
 /// The region of interest here: pixels whose VD-NOC are within `threshold` of one of the region's there.
-fn pixels_near(input: &Crop, coordinates: &[[f32; 3]], anchors: &[Vec3], threshold: f64) -> Vec<usize> {
+pub(super) fn pixels_near(
+    input: &Crop,
+    coordinates: &[[f32; 3]],
+    anchors: &[Vec3],
+    threshold: f64,
+) -> Vec<usize> {
     let limit = threshold * threshold;
     input
         .pixels()

@@ -8,7 +8,7 @@
 use sixfold_geometry::Pose;
 use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 
-use super::Proposal;
+use super::{Proposal, Proposals};
 use crate::outcome::OutcomeModel;
 
 /// Where a grasp comes from.
@@ -98,6 +98,28 @@ pub fn rank_by_outcome(
     }
     chosen.sort_by(|a, b| b.score.total_cmp(&a.score));
     chosen
+}
+
+/// Ranks grasps of both kinds by their chance to hold what experience held: the chance to hold anything times
+/// [`Proposals::holds_the_same`]. With experience on one part alone (a handle) the best is on the counterpart of that part,
+/// whoever proposed it. The planner's grasps that hold nothing of it are left out; those transferred stay, last, for it is from
+/// such a part that they come.
+pub fn rank_on_part(
+    geometry: &[Grasp],
+    experience: &Proposals,
+    clusters: &ClusterOptions,
+    fitter: &GraspFitter<'_>,
+    outcomes: &OutcomeModel,
+) -> Vec<Ranked> {
+    let mut candidates = candidates(geometry, &experience.proposals, clusters);
+    for c in &mut candidates {
+        let transferred = c.kind == Kind::Experience;
+        let promise = outcomes.promise(&fitter.describe(&c.grasp), c.experience, transferred);
+        let least = if transferred { 0.01 } else { 0.0 };
+        c.score = promise * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
+    }
+    candidates.retain(|c| c.score > 0.0);
+    joined(candidates, clusters).0
 }
 
 /// How many of the best are refined.
@@ -191,9 +213,13 @@ fn joined(mut candidates: Vec<Ranked>, clusters: &ClusterOptions) -> (Vec<Ranked
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::outcome::Attempt;
     use crate::store::Match;
     use crate::transfer::Hypothesis;
-    use sixfold_grasp::AntipodalQuality;
+    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
+    use sixfold_grasp::{
+        AntipodalOptions, AntipodalQuality, GraspDescription, GraspView, Gripper, gripper_pose,
+    };
 
     fn grasp(x: f64, alignment: f64) -> Grasp {
         let quality = AntipodalQuality { alignment, support: 1.0, centring: 1.0, observed: 1.0 };
@@ -220,5 +246,88 @@ mod tests {
         assert!(only.iter().any(|r| r.kind == Kind::Experience && r.proposal == Some(0)));
         let dgcm = rank(&[], &[proposal(0.0, 0.1), proposal(0.2, 0.3), proposal(0.21, 0.3)], &options);
         assert!(dgcm[0].grasp.camera_from_gripper.translation().x > 0.1 && dgcm[0].experience > 0.8);
+    }
+
+    /// A bar of 30 x 3 x 5 cm on a table, seen from above, with its lower half assumed.
+    fn bar() -> GraspView {
+        let mut object = PointCloud::default();
+        for i in 0..=120 {
+            for k in 0..=20 {
+                for side in [-1.0, 1.0] {
+                    let (x, z) = (0.0025 * f64::from(i) - 0.15, 0.6 - 0.0025 * f64::from(k));
+                    object.points.push(Vec3::new(x, 0.015 * side, z));
+                    object.normals.push(Vec3::y() * side);
+                }
+            }
+        }
+        GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: Some(Plane { normal: -Vec3::z(), offset: -0.6 }),
+            object,
+            obstacles: PointCloud::default(),
+            step: 0.0025,
+            cut_by_edge: false,
+        }
+    }
+
+    #[test]
+    fn outcomes_decide_between_grasps_and_move_the_best() {
+        let view = bar();
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
+        let fitter = GraspFitter::new(&view, &gripper, &options).unwrap();
+        // Both across the bar, at its end and near its middle, with the tips just over its upper edge.
+        let at = |x: f64| {
+            let tip = Vec3::new(x, 0.0, 0.575);
+            fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
+        };
+        let (end, middle) = (at(0.12), at(0.05));
+        // A hand that has lost whatever its pads reached over by less than 3 cm, wherever it was.
+        let attempts: Vec<Attempt> = (0..80)
+            .map(|k| {
+                let overlap = 0.001 * f64::from(k % 50);
+                let description = GraspDescription { overlap, ..fitter.describe(&middle) };
+                Attempt {
+                    description,
+                    share: 0.0,
+                    transferred: false,
+                    held: overlap > 0.03,
+                    gripper: gripper.name.clone(),
+                    object: "bar".to_owned(),
+                    time: 0,
+                    provenance: k.to_string(),
+                }
+            })
+            .collect();
+        let clusters = ClusterOptions::default();
+        let rank =
+            |outcomes: &OutcomeModel| rank_by_outcome(&[end, middle], &[], &clusters, &fitter, outcomes);
+        let untaught = rank(&OutcomeModel::default());
+        assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the middle");
+        let taught = rank(&OutcomeModel::learn(&attempts, &gripper.name));
+        assert_eq!(taught.len(), 2);
+        let depth = |r: &Ranked| fitter.describe(&r.grasp).overlap;
+        assert!(
+            depth(&taught[0]) > fitter.describe(&middle).overlap + 0.005,
+            "it reaches deeper: {taught:?}"
+        );
+        let outcomes = OutcomeModel::learn(&attempts, &gripper.name);
+        let unmoved = outcomes.promise(&fitter.describe(&middle), 0.0, false);
+        assert!(taught[0].score > 1.5 * unmoved, "{} {unmoved}", taught[0].score);
+        assert!(taught.is_sorted_by(|a, b| a.score >= b.score));
+        // What was moved is still a grasp that the planner would make.
+        let again = fitter.fit(&taught[0].grasp.camera_from_gripper, taught[0].grasp.opening);
+        assert!(again.is_some());
+    }
+
+    #[test]
+    fn as_printed_only_the_planner_proposes() {
+        let geometry = [grasp(0.0, 0.5), grasp(0.3, 0.45)];
+        let found = [proposal(0.29, 0.6), proposal(-0.4, 0.9)];
+        let ranked = rank_as_printed(&geometry, &found, &ClusterOptions::default());
+        assert!(ranked.iter().all(|r| r.kind == Kind::Geometry && r.proposal.is_none()));
+        assert!(ranked[0].grasp.camera_from_gripper.translation().x > 0.2, "experience agrees with it");
     }
 }

@@ -6,6 +6,6 @@ mod memory;
 mod propose;
 
 pub use align::{AlignOptions, Hypothesis, Transferred, transfer};
-pub use combine::{Kind, Ranked, rank, rank_as_printed, rank_by_outcome};
+pub use combine::{Kind, Ranked, rank, rank_as_printed, rank_by_outcome, rank_on_part};
 pub use memory::Memory;
 pub use propose::{Proposal, Proposals, ProposeError, ProposeOptions, propose};

@@ -53,7 +53,9 @@ pub(crate) enum GraspCommand {
     Compare(Box<super::compare::CompareArguments>),
     /// The store of experiences: add, list, show, forget, merge, export, refresh
     #[cfg(feature = "experience")]
-    #[command(after_help = "Example:\n  sixfold grasp store list experience.db")]
+    #[command(after_help = "Example:\n  sixfold grasp store list experience.db\n\n\
+        A store is a file, or, in a program built with the feature postgres, a server for several robots: \
+        postgres://user@host:port/database, the password in PGPASSWORD. The connection is not encrypted.")]
     Store(Box<super::store::StoreArguments>),
 }
 
@@ -87,14 +89,15 @@ pub(crate) struct ProposeArguments {
     /// Most grasps
     #[arg(long, value_name = "N", default_value = "5")]
     pub number: NonZeroUsize,
-    /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote
+    /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
+    /// postgres://user@host/database
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "FILE")]
-    pub experiences: Option<PathBuf>,
+    pub experiences: Option<sixfold_dgcm::store::StorePlace>,
     #[cfg(feature = "experience")]
     #[command(flatten)]
     pub network: super::experience::NetworkArguments,
-    /// Only experiences on parts of this name, and nothing by geometry alone (such as handle)
+    /// Only experiences on parts of this name, such as handle, and only grasps that hold what they held
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", requires = "experiences")]
     pub part: Option<String>,

@@ -13,6 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::{
     Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
 };
@@ -46,9 +47,9 @@ pub(super) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "out
 
 #[derive(Debug, Args)]
 pub(crate) struct CompareArguments {
-    /// The store of experiences
+    /// The store of experiences, a file or postgres://user@host/database
     #[arg(long, value_name = "FILE")]
-    pub experiences: PathBuf,
+    pub experiences: StorePlace,
     #[command(flatten)]
     pub objects: ObjectsArguments,
     /// Scenes of each object

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::{SqliteStore, StoreError};
+use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::Memory;
 
 /// Which network encodes objects.
@@ -14,6 +14,15 @@ pub(crate) struct NetworkArguments {
     /// Trained network for experience: a file that `sixfold train dgcm` wrote
     #[arg(long, value_name = "FILE", env = "SIXFOLD_DGCM", default_value = "weights/dgcm.safetensors")]
     pub weights: PathBuf,
+}
+
+/// Where experiences wait for a server.
+#[derive(Debug, Default, Args)]
+pub(crate) struct OutboxArguments {
+    /// With a server as --experiences: file of this robot's copy of its store, in which new experiences wait while it is away
+    /// (default: outbox.db in --out)
+    #[arg(long, value_name = "FILE")]
+    pub outbox: Option<PathBuf>,
 }
 
 /// Reads the network.
@@ -28,21 +37,37 @@ pub(super) fn model(a: &NetworkArguments) -> Result<DgcmModel> {
 }
 
 /// The experiences of a store that is there, for a network.
-pub(super) fn memory(file: &Path, model: &DgcmModel) -> Result<Memory> {
-    let memory = Memory::new(Box::new(SqliteStore::open(file)?), model)?;
+pub(super) fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
+    let memory = Memory::new(place.open()?, model)?;
     if memory.index().is_empty() && !memory.is_empty() {
         eprintln!(
-            "note: the {} experiences in {} were encoded by another network; `sixfold grasp store refresh` encodes them anew",
-            memory.len(),
-            file.display()
+            "note: the {} experiences in {place} were encoded by another network; `sixfold grasp store refresh` encodes them anew",
+            memory.len()
         );
     }
     Ok(memory)
 }
 
-/// The experiences of a store, made where there is none.
-pub(super) fn new_memory(file: &Path, model: &DgcmModel) -> Result<Memory, StoreError> {
-    Memory::new(Box::new(SqliteStore::create(file)?), model)
+/// The experiences of a store, made where there is none. When it lies on a server, a file in `out` is between, so that the
+/// server may go away.
+pub(super) fn new_memory(
+    place: &StorePlace,
+    outbox: &OutboxArguments,
+    out: &Path,
+    model: &DgcmModel,
+) -> Result<Memory> {
+    let file = match (&outbox.outbox, place) {
+        (Some(file), StorePlace::File(_)) => {
+            bail!(
+                "--outbox: {} is for --experiences on a server, postgres://user@host/database",
+                file.display()
+            )
+        }
+        (Some(file), _) => file.clone(),
+        (None, _) => out.join("outbox.db"),
+    };
+    let store = place.create_with_outbox(&file, |notice| eprintln!("note: {notice}"))?;
+    Ok(Memory::new(store, model)?)
 }
 
 /// Seconds since 1970.

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::outcome::Attempt;
-use sixfold_dgcm::store::Experience;
-use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome};
+use sixfold_dgcm::store::{Experience, StorePlace};
+use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, GraspFitter, Gripper, antipodal_grasps};
 use sixfold_mesh::Mesh;
@@ -24,7 +24,7 @@ use sixfold_simulation::{
 
 use super::arguments::PhysicsArguments;
 use super::compare::{Hardness, hardness};
-use super::experience::{NetworkArguments, model, new_memory, now};
+use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
 use super::journal::Journal;
 use super::measure::ending_name;
 use super::object_list::{ObjectsArguments, named_objects};
@@ -35,9 +35,11 @@ use crate::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnArguments {
-    /// The store of experiences; it is made where there is none
+    /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
     #[arg(long, value_name = "FILE")]
-    pub experiences: PathBuf,
+    pub experiences: StorePlace,
+    #[command(flatten)]
+    pub outbox: OutboxArguments,
     /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
     pub families: Vec<String>,
@@ -152,7 +154,7 @@ struct Row {
 
 #[derive(Serialize)]
 struct Recorded<'a> {
-    experiences: &'a std::path::Path,
+    experiences: &'a StorePlace,
     objects: Vec<&'a str>,
     attempts: u64,
     tries: usize,
@@ -228,7 +230,7 @@ pub(super) fn learn(a: &LearnArguments) -> Result<Whole> {
         gripper: &setting.real,
     };
     let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
-    let mut memory = new_memory(&a.experiences, &network)?;
+    let mut memory = new_memory(&a.experiences, &a.outbox, &a.out, &network)?;
     let mut robot = Robot { a, setting: &setting, gripper, options, network, memory: &mut memory };
     let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
     for pupil in &pupils {
@@ -340,19 +342,28 @@ impl Robot<'_> {
             geometry.retain(on_part);
         }
         let fitter = GraspFitter::new(view, self.gripper, &planner)?;
-        let mut proposals = vec![];
+        let mut found = None;
         self.memory.refresh()?;
         if self.a.near > 0.0 {
             let options = ProposeOptions { part: self.a.part.clone(), ..ProposeOptions::default() };
-            let found = propose(&fitter, &self.network, self.memory, &options)?;
-            row.nearest = found.nearest.first().map(|m| m.distance);
-            if row.nearest.is_some_and(|d| d < self.a.near) {
-                proposals = found.proposals;
-            }
+            let proposed = propose(&fitter, &self.network, self.memory, &options)?;
+            row.nearest = proposed.nearest.first().map(|m| m.distance);
+            found = Some(proposed)
+                .filter(|p| !p.proposals.is_empty() && row.nearest.is_some_and(|d| d < self.a.near));
         }
-        row.from_experience = !proposals.is_empty();
+        row.from_experience = found.is_some();
         let outcomes = self.memory.outcomes(&self.gripper.name);
-        let ranked = rank_by_outcome(&geometry, &proposals, &ClusterOptions::default(), &fitter, &outcomes);
+        let clusters = ClusterOptions::default();
+        let ranked = match &found {
+            // Where nobody says what a handle is, experience on handles does.
+            Some(found) if self.a.part.is_some() && pupil.made.is_none() => {
+                rank_on_part(&geometry, found, &clusters, &fitter, &outcomes)
+            }
+            found => {
+                let proposals = found.as_ref().map_or(&[][..], |f| &f.proposals);
+                rank_by_outcome(&geometry, proposals, &clusters, &fitter, &outcomes)
+            }
+        };
         let mut left = 0;
         for (number, candidate) in ranked.iter().take(self.a.tries).enumerate() {
             let ending = self.execute(pupil, parts, &scene, seen, &fitter, candidate, attempt, number)?;

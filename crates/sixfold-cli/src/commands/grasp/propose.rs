@@ -156,7 +156,7 @@ fn method(a: &ProposeArguments) -> &'static str {
     match (&a.experiences, &a.part) {
         (None, _) => "antipodal",
         (Some(_), None) => "antipodal and dgcm",
-        (Some(_), Some(_)) => "dgcm",
+        (Some(_), Some(_)) => "dgcm on a part",
     }
 }
 
@@ -165,7 +165,7 @@ fn method(_: &ProposeArguments) -> &'static str {
     "antipodal"
 }
 
-/// Grasps of both kinds, ranked together; with a part's name, those from experience only.
+/// Grasps of both kinds, ranked together; with a part's name, those that hold what experience on it held.
 #[cfg(feature = "experience")]
 fn with_experience(
     a: &ProposeArguments,
@@ -173,7 +173,7 @@ fn with_experience(
     gripper: &Gripper,
     planner: &AntipodalOptions,
 ) -> Result<Vec<Proposed>> {
-    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank_by_outcome};
+    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank_by_outcome, rank_on_part};
     use sixfold_grasp::GraspFitter;
     let Some(file) = &a.experiences else { return Ok(vec![]) };
     let model = super::experience::model(&a.network)?;
@@ -185,9 +185,13 @@ fn with_experience(
         let wanted = a.part.as_ref().map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {} holds no experience{wanted} that this network can use", file.display());
     }
-    let geometry = if a.part.is_some() { vec![] } else { antipodal_grasps(view, gripper, planner)? };
+    let geometry = antipodal_grasps(view, gripper, planner)?;
     let outcomes = memory.outcomes(&gripper.name);
-    let ranked = rank_by_outcome(&geometry, &found.proposals, &ClusterOptions::default(), &fitter, &outcomes);
+    let clusters = ClusterOptions::default();
+    let ranked = match &a.part {
+        None => rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes),
+        Some(_) => rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes),
+    };
     Ok(ranked
         .iter()
         .map(|r| {

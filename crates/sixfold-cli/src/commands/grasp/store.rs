@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::crop::Crop;
-use sixfold_dgcm::store::{Description, Experience, ExperienceStore, SqliteStore, Stored};
+use sixfold_dgcm::store::{Description, Experience, ExperienceStore, StorePlace, Stored};
 use sixfold_geometry::Pose;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_grasp::{AntipodalQuality, Grasp};
@@ -41,14 +41,14 @@ pub(crate) enum StoreCommand {
     List {
         /// The store
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
     },
     /// Show one experience: what is known, and a picture
     #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
     Show {
         /// The store
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
         /// Number of the experience
         #[arg(value_name = "ID")]
         id: i64,
@@ -61,7 +61,7 @@ pub(crate) enum StoreCommand {
     Forget {
         /// The store
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
         /// Numbers of the experiences
         #[arg(value_name = "ID", required = true)]
         ids: Vec<i64>,
@@ -71,17 +71,17 @@ pub(crate) enum StoreCommand {
     Merge {
         /// The store that gets them; it is made where there is none
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
         /// The other stores
         #[arg(value_name = "OTHER", required = true)]
-        others: Vec<PathBuf>,
+        others: Vec<StorePlace>,
     },
     /// Write all experiences as files: pictures, and JSON with everything else
     #[command(after_help = "Example:\n  sixfold grasp store export experience.db --out out/experiences")]
     Export {
         /// The store
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
         /// Folder for the files
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
@@ -93,10 +93,10 @@ pub(crate) enum StoreCommand {
     Refresh {
         /// The store
         #[arg(value_name = "FILE")]
-        file: PathBuf,
+        file: StorePlace,
         /// The new store
         #[arg(long, value_name = "FILE")]
-        out: PathBuf,
+        out: StorePlace,
         #[command(flatten)]
         network: NetworkArguments,
     },
@@ -106,7 +106,7 @@ pub(crate) enum StoreCommand {
 pub(crate) struct AddArguments {
     /// The store; it is made where there is none
     #[arg(value_name = "FILE")]
-    pub file: PathBuf,
+    pub file: StorePlace,
     #[command(flatten)]
     pub input: InputArguments,
     /// The grasp: a grasps.json of `sixfold grasp propose`, or JSON with camera_from_gripper (4x4, metres), opening and width
@@ -209,15 +209,15 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
             a.grasp.display()
         );
     }
-    let (id, new) = SqliteStore::create(&a.file)?.add(&experience)?;
+    let (id, new) = a.file.create()?.add(&experience)?;
     report(json, &Added { id, new, region_pixels }, || {
         println!("experience {id} {}", if new { "is stored" } else { "was stored already" });
     })?;
     Ok(Outcome::Found)
 }
 
-fn list(file: &Path, json: &JsonArguments) -> Result<Outcome> {
-    let all = SqliteStore::open(file)?.list()?;
+fn list(file: &StorePlace, json: &JsonArguments) -> Result<Outcome> {
+    let all = file.open()?.list()?;
     report(json, &all, || {
         println!("{:>6} {:>12} {:>10} {:>10} {:>10} from", "id", "object", "part", "gripper", "width (m)");
         for s in &all {
@@ -232,7 +232,7 @@ fn list(file: &Path, json: &JsonArguments) -> Result<Outcome> {
     Ok(if all.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
 
-fn found(store: &SqliteStore, file: &Path, id: i64) -> Result<Stored> {
+fn found(store: &dyn ExperienceStore, file: &StorePlace, id: i64) -> Result<Stored> {
     match store.get(id)? {
         Some(stored) => Ok(stored),
         None => bail!(
@@ -242,8 +242,8 @@ fn found(store: &SqliteStore, file: &Path, id: i64) -> Result<Stored> {
     }
 }
 
-fn show(file: &Path, id: i64, picture: Option<&Path>, json: &JsonArguments) -> Result<Outcome> {
-    let stored = found(&SqliteStore::open(file)?, file, id)?;
+fn show(file: &StorePlace, id: i64, picture: Option<&Path>, json: &JsonArguments) -> Result<Outcome> {
+    let stored = found(&*file.open()?, file, id)?;
     if let Some(path) = picture {
         write_rgb(path, &stored.experience.picture()?)?;
     }
@@ -267,8 +267,8 @@ struct Forgotten {
     unknown: Vec<i64>,
 }
 
-fn forget(file: &Path, ids: &[i64], json: &JsonArguments) -> Result<Outcome> {
-    let mut store = SqliteStore::open(file)?;
+fn forget(file: &StorePlace, ids: &[i64], json: &JsonArguments) -> Result<Outcome> {
+    let mut store = file.open()?;
     let mut done = Forgotten { forgotten: vec![], unknown: vec![] };
     for &id in ids {
         if store.forget(id)? { done.forgotten.push(id) } else { done.unknown.push(id) }
@@ -288,13 +288,13 @@ struct Merged {
     experiences: usize,
 }
 
-fn merge(file: &Path, others: &[PathBuf], json: &JsonArguments) -> Result<Outcome> {
-    let sources: Vec<SqliteStore> = others.iter().map(|o| SqliteStore::open(o)).collect::<Result<_, _>>()?;
-    let mut store = SqliteStore::create(file)?;
+fn merge(file: &StorePlace, others: &[StorePlace], json: &JsonArguments) -> Result<Outcome> {
+    let sources: Vec<_> = others.iter().map(StorePlace::open).collect::<Result<_, _>>()?;
+    let mut store = file.create()?;
     let mut added = 0;
     for (source, name) in sources.iter().zip(others) {
         check_interrupt("what was taken over is kept; the same command goes on")?;
-        added += store.merge(source).with_context(|| name.display().to_string())?;
+        added += store.merge(&**source).with_context(|| name.display().to_string())?;
     }
     let merged = Merged { added, experiences: store.list()?.len() };
     report(json, &merged, || {
@@ -310,8 +310,8 @@ struct Exported {
     folder: PathBuf,
 }
 
-fn export(file: &Path, out: &Path, json: &JsonArguments) -> Result<Outcome> {
-    let store = SqliteStore::open(file)?;
+fn export(file: &StorePlace, out: &Path, json: &JsonArguments) -> Result<Outcome> {
+    let store = file.open()?;
     let all = store.list()?;
     let mut progress = Progress::new("experiences", all.len());
     let mut done = Exported { experiences: 0, unreadable: 0, folder: out.to_path_buf() };
@@ -343,13 +343,18 @@ fn export(file: &Path, out: &Path, json: &JsonArguments) -> Result<Outcome> {
     })
 }
 
-fn refresh(file: &Path, out: &Path, network: &NetworkArguments, json: &JsonArguments) -> Result<Outcome> {
+fn refresh(
+    file: &StorePlace,
+    out: &StorePlace,
+    network: &NetworkArguments,
+    json: &JsonArguments,
+) -> Result<Outcome> {
     if file == out {
         bail!("--out: expected another file than the store itself");
     }
     let network = model(network)?;
-    let source = SqliteStore::open(file)?;
-    let mut target = SqliteStore::create(out)?;
+    let source = file.open()?;
+    let mut target = out.create()?;
     let all = source.list()?;
     let mut progress = Progress::new("experiences", all.len());
     let mut added = 0;

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_by_outcome};
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_on_part};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps};
 use sixfold_mesh::Mesh;
@@ -112,8 +112,8 @@ impl Handles<'_> {
         let found = propose(&fitter, self.network, memory, &options)?;
         let outcomes = memory.outcomes(&gripper.name);
         let clusters = ClusterOptions::default();
-        let first = rank_by_outcome(&[], &found.proposals, &clusters, &fitter, &outcomes);
         let geometry = sixfold_grasp::antipodal_grasps(view, gripper, &planner)?;
+        let first = rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes);
         let plain = sixfold_grasp::cluster_grasps(&geometry, &clusters);
         // What is a centimetre behind the tips, midway between the pads.
         let holds = |g: &Grasp| on(&held_point(&g.camera_from_gripper));

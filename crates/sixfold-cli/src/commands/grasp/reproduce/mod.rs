@@ -10,13 +10,14 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
+use sixfold_dgcm::store::StorePlace;
 
 use self::handles::Handles;
 use self::offline::{Answer, COUNTS, Instance, Offline, Question, Size};
 use self::pictures::Line;
 use super::arguments::PhysicsArguments;
 use super::compare::{self, CompareArguments, METHODS, hardness};
-use super::experience::{NetworkArguments, memory, model};
+use super::experience::{NetworkArguments, OutboxArguments, memory, model};
 use super::learn::{self, Curve, LearnArguments};
 use super::object_list::{ObjectsArguments, file_name, objects_with_parts};
 use crate::Outcome;
@@ -114,7 +115,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     })?;
     eprintln!("2 of 5: table 6.2, geometry and experience on the same scenes");
     let compare = compare::compare(&CompareArguments {
-        experiences: experiences.clone(),
+        experiences: StorePlace::File(experiences.clone()),
         objects: a.objects(),
         trials: if a.quick { 1 } else { 15 },
         hard: true,
@@ -177,7 +178,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         views: if a.quick { 2 } else { 10 },
         seed: a.seed,
     }
-    .run(&mut memory(&handled, &network)?, &a.out.join("handles"))?;
+    .run(&mut memory(&StorePlace::File(handled), &network)?, &a.out.join("handles"))?;
     let whole = Whole {
         quick: a.quick,
         compare,
@@ -226,7 +227,8 @@ impl ReproduceDgcmArguments {
     /// Learning in the hard setting, on meshes in millimetres or on what is added.
     fn learning(&self, folder: &str, store: &Path, attempts: u64, meshes: Vec<String>) -> LearnArguments {
         LearnArguments {
-            experiences: store.to_path_buf(),
+            experiences: StorePlace::File(store.to_path_buf()),
+            outbox: OutboxArguments::default(),
             families: vec![],
             members: 1,
             objects: ObjectsArguments {

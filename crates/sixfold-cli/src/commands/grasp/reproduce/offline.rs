@@ -15,7 +15,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::Experience;
+use sixfold_dgcm::store::{Experience, SqliteStore};
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
@@ -24,7 +24,6 @@ use sixfold_grasp::{
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 
-use crate::commands::grasp::experience::new_memory;
 use crate::commands::grasp::journal::Journal;
 use crate::progress::{Progress, check_interrupt};
 
@@ -142,7 +141,8 @@ impl Offline<'_> {
         let (mut journal, rows) = Journal::open::<Answer>(&folder.join("answers.jsonl"), &recorded)?;
         let mut answers: BTreeMap<Question, Answer> =
             rows.into_iter().map(|r| (r.question.clone(), r)).collect();
-        let mut memory = new_memory(&folder.join("experience.db"), self.network)?;
+        let store = SqliteStore::create(&folder.join("experience.db"))?;
+        let mut memory = Memory::new(Box::new(store), self.network)?;
         let mut progress = Progress::new("views", self.instances.len());
         let mut known: Vec<Vec<i64>> = vec![];
         let mut tests: Vec<View> = vec![];
