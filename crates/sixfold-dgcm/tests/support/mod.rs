@@ -96,7 +96,7 @@ pub fn attempt(number: u32) -> Attempt {
         description,
         share: n / 17.0,
         transferred: number % 2 == 1,
-        held: number % 3 == 0,
+        held: number.is_multiple_of(3),
         gripper: "jaws-85".to_owned(),
         object: "mug".to_owned(),
         time: 7,

@@ -5,6 +5,7 @@
 //! not count. There the poses were annotated by hand on depth images; here they follow from the meshes, and the depth images
 //! are simulated. What is judged is the first grasp of the ranking by equation 6.6, whether it would hold or not.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
@@ -159,11 +160,12 @@ impl Offline<'_> {
         let questions = self.questions(&known, &tests);
         let mut progress = Progress::new("questions", questions.len());
         for (question, test, only) in questions {
-            if !answers.contains_key(&question) {
+            if let Entry::Vacant(place) = answers.entry(question) {
                 check_interrupt("what was answered is kept; run the same command again to go on")?;
-                let answer = Answer { question: question.clone(), error: self.ask(&mut memory, test, only)? };
+                let error = self.ask(&mut memory, test, only)?;
+                let answer = Answer { question: place.key().clone(), error };
                 journal.row(&answer)?;
-                answers.insert(question, answer);
+                place.insert(answer);
             }
             progress.step(String::new());
         }
