@@ -167,9 +167,10 @@ pub(crate) fn find_objects<'py>(
 /// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object, or None for the largest thing on the
 /// table; gripper: a Gripper or the name of one that comes along; most: so many at most; seen_only=True assumes nothing
 /// about the hidden side. With `experiences`, an ExperienceStore, grasps that worked are transferred to the object and
-/// ranked together with the planner's (dissertation, sections 6.2.3 and 6.3.2); weights: a DgcmNet or the path of its file
-/// in place of the store's; part: only grasps from experience on parts of this name, such as "handle". The same input and
-/// seed give the same result. Ctrl-C is heard.
+/// ranked together with the planner's (dissertation, sections 6.2.3 and 6.3.2), by the chance to hold where the store knows what
+/// came of attempts; weights: a DgcmNet or the path of its file in place of the store's; part: only experiences on parts of
+/// this name, such as "handle", and only grasps that hold what they held. The same input and seed give the same result. Ctrl-C
+/// is heard.
 ///
 /// Raises ValueError for a mask without depth or of several objects, no table, a depth in the wrong unit, a part without
 /// experiences.
