@@ -170,6 +170,8 @@ pub(crate) struct Planner<'a> {
     pub cone: f64,
     /// A point stands for the square of this of surface, metres.
     pub step: f64,
+    /// No point lies 3 cm above the table.
+    flat: bool,
 }
 
 impl<'a> Planner<'a> {
@@ -189,6 +191,7 @@ impl<'a> Planner<'a> {
             object,
             cone: gripper.friction.atan(),
             step: view.step,
+            flat: view.table.is_some_and(|t| view.object.points.iter().all(|p| t.distance(p) < 0.03)),
         }
     }
 
@@ -289,7 +292,10 @@ impl<'a> Planner<'a> {
     fn deepest(&self, centre: &Vec3, closing: &Vec3, approach: &Vec3, width: f64) -> Option<Grasp> {
         let length = self.gripper.finger_length;
         let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
-        [0.9, 0.6, 0.35, 0.2, 0.1].into_iter().find_map(|share| {
+        // The last one is for what lies flat: anything higher would be pinched by its edge.
+        const SHARES: [f64; 5] = [0.9, 0.6, 0.35, 0.2, 0.1];
+        let shares = if self.flat { &SHARES[..] } else { &SHARES[..4] };
+        shares.iter().find_map(|share| {
             let tip = centre + approach * (share * length);
             let pose = gripper_pose(&tip, approach, closing)?;
             self.grasp(&pose, opening)
