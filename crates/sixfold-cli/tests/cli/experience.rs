@@ -40,7 +40,9 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     add(path, "b.db", "--number 2").expect(0);
 
     let found =
-        sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --json")).expect(0).json();
+        sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --number 100 --json"))
+            .expect(0)
+            .json();
     assert_eq!(found["method"], "antipodal and dgcm");
     let share = |grasp: &serde_json::Value| grasp["experience"]["share"].as_f64().unwrap();
     assert!(
