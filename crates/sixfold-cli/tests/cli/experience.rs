@@ -50,7 +50,7 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
         "the object itself is stored: {found}"
     );
     let part = format!("{VIEW} --experiences a.db --weights w.safetensors --part");
-    let handle = sixfold(path, &format!("{part} handle --json")).expect(0).json();
+    let handle = sixfold(path, &format!("{part} handle --number 100 --json")).expect(0).json();
     let grasps = handle["grasps"].as_array().unwrap();
     let kinds = ["geometry", "experience"];
     assert!(grasps.iter().all(|g| kinds.contains(&g["experience"]["kind"].as_str().unwrap())));
