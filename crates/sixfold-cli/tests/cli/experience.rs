@@ -54,7 +54,8 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     let grasps = handle["grasps"].as_array().unwrap();
     let kinds = ["geometry", "experience"];
     assert!(grasps.iter().all(|g| kinds.contains(&g["experience"]["kind"].as_str().unwrap())));
-    assert!(grasps.iter().any(|g| g["experience"]["id"] == 1), "the transferred one stays: {handle}");
+    // The transferred one, or one of the planner's within 5 cm and 15 degrees of it.
+    assert!(grasps.iter().any(|g| share(g) > 0.0), "what was stored is among them: {handle}");
     let lid = sixfold(path, &format!("{part} lid")).expect(1);
     assert!(lid.stderr.contains("no experience on a part named lid"), "{}", lid.stderr);
 
