@@ -40,6 +40,13 @@ pub struct Ranked {
     pub members: usize,
 }
 
+impl Ranked {
+    /// The chance to hold of a grasp of this origin.
+    fn promise(&self, grasp: &Grasp, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) -> f64 {
+        outcomes.promise(&fitter.describe(grasp), self.experience, self.kind == Kind::Experience)
+    }
+}
+
 /// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees), by the mean of their quality and of the
 /// share of experience that agrees. Without experience that is the order of the planner's clusters, without geometry that of
 /// summed scores of equation 6.6 (section 6.3.2).
@@ -88,8 +95,7 @@ pub fn rank_by_outcome(
 ) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, experience, clusters);
     for c in &mut candidates {
-        let transferred = c.kind == Kind::Experience;
-        c.score = outcomes.promise(&fitter.describe(&c.grasp), c.experience, transferred);
+        c.score = c.promise(&c.grasp, fitter, outcomes);
     }
     let (mut chosen, _) = joined(candidates, clusters);
     let few = chosen.len().min(REFINED);
@@ -113,10 +119,9 @@ pub fn rank_on_part(
 ) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, &experience.proposals, clusters);
     for c in &mut candidates {
-        let transferred = c.kind == Kind::Experience;
-        let promise = outcomes.promise(&fitter.describe(&c.grasp), c.experience, transferred);
-        let least = if transferred { 0.01 } else { 0.0 };
-        c.score = promise * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
+        let least = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
+        c.score = c.promise(&c.grasp, fitter, outcomes)
+            * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
     }
     candidates.retain(|c| c.score > 0.0);
     joined(candidates, clusters).0
@@ -139,13 +144,12 @@ fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
             Pose::exp(&twist.into())
         })
         .collect();
-    let transferred = c.kind == Kind::Experience;
     for _ in 0..ROUNDS {
         let start = c.grasp.camera_from_gripper;
         let mut better = None;
         for step in &moves {
             let Some(grasp) = fitter.fit(&(start * *step), c.grasp.opening) else { continue };
-            let score = outcomes.promise(&fitter.describe(&grasp), c.experience, transferred);
+            let score = c.promise(&grasp, fitter, outcomes);
             if score > c.score + 1e-6 {
                 c.score = score;
                 better = Some(grasp);

@@ -17,6 +17,8 @@ pub struct Memory {
     attempts: Vec<Attempt>,
     /// Number of the last attempt at hand.
     last_attempt: i64,
+    /// What was learned from them, by gripper.
+    outcomes: HashMap<String, OutcomeModel>,
 }
 
 impl Memory {
@@ -32,6 +34,7 @@ impl Memory {
             kept: HashMap::new(),
             attempts: vec![],
             last_attempt: 0,
+            outcomes: HashMap::new(),
         };
         memory.refresh()?;
         Ok(memory)
@@ -48,13 +51,16 @@ impl Memory {
         for (id, attempt) in self.store.attempts(self.last_attempt)? {
             self.last_attempt = id;
             self.attempts.push(attempt);
+            self.outcomes.clear();
         }
         Ok(())
     }
 
     /// What the attempts with a gripper say of the next one.
-    pub fn outcomes(&self, gripper: &str) -> OutcomeModel {
-        OutcomeModel::learn(&self.attempts, gripper)
+    pub fn outcomes(&mut self, gripper: &str) -> OutcomeModel {
+        let attempts = &self.attempts;
+        let learn = || OutcomeModel::learn(attempts, gripper);
+        self.outcomes.entry(gripper.to_owned()).or_insert_with(learn).clone()
     }
 
     /// The store.
