@@ -217,6 +217,7 @@ fn joined(mut candidates: Vec<Ranked>, clusters: &ClusterOptions) -> (Vec<Ranked
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::crop::{Crop, CropOptions};
     use crate::outcome::Attempt;
     use crate::store::Match;
     use crate::transfer::Hypothesis;
@@ -324,6 +325,40 @@ mod tests {
         // What was moved is still a grasp that the planner would make.
         let again = fitter.fit(&taught[0].grasp.camera_from_gripper, taught[0].grasp.opening);
         assert!(again.is_some());
+    }
+
+    #[test]
+    fn on_a_part_what_holds_its_counterpart_comes_first() {
+        let view = bar();
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
+        let fitter = GraspFitter::new(&view, &gripper, &options).unwrap();
+        let at = |x: f64| {
+            let tip = Vec3::new(x, 0.0, 0.575);
+            fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
+        };
+        // What the network sees of the bar: its upper side, of whose left end experience was held.
+        let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
+        let inside = |x: usize, y: usize| (40..280).contains(&x) && (104..136).contains(&y);
+        let depth = DepthImage::from_fn(320, 240, |x, y| if inside(x, y) { 0.56 } else { 0.0 });
+        let crop = Crop::new(&depth, &camera, &Mask::from_fn(320, 240, inside), &CropOptions::compact());
+        let crop = crop.unwrap();
+        let mut held_before = vec![0.0; crop.mask.len()];
+        crop.pixels().filter(|&i| crop.points[i][0] < -0.06).for_each(|i| held_before[i] = 0.7);
+        let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
+        let found = Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before };
+        // The middle of the bar is where it holds best, and its left end is what was asked for.
+        let ranked = rank_on_part(
+            &[at(0.0), at(-0.09)],
+            &found,
+            &ClusterOptions::default(),
+            &fitter,
+            &OutcomeModel::default(),
+        );
+        let places: Vec<f64> =
+            ranked.iter().map(|r| r.grasp.camera_from_gripper.translation().x.signum()).collect();
+        assert_eq!(places, [-1.0, 1.0], "the left end, then the transferred one; the middle is left out");
+        assert_eq!((ranked[0].kind, ranked[1].kind), (Kind::Geometry, Kind::Experience));
     }
 
     #[test]
