@@ -68,6 +68,15 @@ pub fn said(text: &str, word: &str) -> Vec<Vec<i64>> {
         .collect()
 }
 
+/// How many experiences a process that counts them has acknowledged after it was killed, and how many more it and those before it
+/// may have stored without a word: each at most one, killed between storing and saying so.
+pub fn heard(rows: &[Vec<i64>], acknowledged: i64, unsaid: i64) -> (i64, i64) {
+    match rows.iter().map(|r| r[0] + 1).max() {
+        Some(now) if now > acknowledged => (now, 1),
+        _ => (acknowledged, unsaid + 1),
+    }
+}
+
 /// How often something is killed.
 pub fn kills(default: u64) -> u64 {
     std::env::var("SIXFOLD_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(default)
