@@ -121,6 +121,6 @@ impl Look {
     pub(crate) fn crop(&self, model: &DgcmModel) -> PyResult<Crop> {
         let view =
             GraspView::new(&self.depth, &self.camera, &self.mask, &self.options).map_err(view_error)?;
-        Crop::new(&view.depth, &view.camera, &view.mask, model.crop_options()).map_err(about("mask"))
+        Crop::of_view(&view, model.crop_options()).map_err(about("mask"))
     }
 }

@@ -3,8 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{
-    Camera, DepthImage, Image, Mask, NormalOptions, Rect, Vec2, Vec3, inpaint_depth, normals_from_depth,
+    Camera, DepthImage, Image, Mask, NormalOptions, Plane, Rect, Vec2, Vec3, inpaint_depth,
+    normals_from_depth,
 };
+use sixfold_grasp::GraspView;
 use thiserror::Error;
 
 use crate::vd_noc::Extent;
@@ -83,6 +85,8 @@ pub struct Crop {
     pub vd_noc: Vec<[f32; 3]>,
     /// What turns points into VD-NOC.
     pub extent: Extent,
+    /// What the object stands on, in the camera's frame, its normal up; `None` where it is not known.
+    pub table: Option<Plane>,
 }
 
 impl Crop {
@@ -139,6 +143,7 @@ impl Crop {
             points: vec![[0.0; 3]; total],
             vd_noc: vec![[0.0; 3]; total],
             extent: Extent { centre: centroid, half: Vec3::repeat(1.0) },
+            table: None,
         };
         let mut seen = vec![];
         for (i, (u, v)) in (0..options.side).flat_map(|v| (0..options.side).map(move |u| (u, v))).enumerate()
@@ -166,6 +171,14 @@ impl Crop {
         }
         crop.set_extent(&seen, options.trim);
         Ok(crop)
+    }
+
+    /// Cuts the object of a view out, and keeps the table it stands on.
+    ///
+    /// # Errors
+    /// [`CropError`].
+    pub fn of_view(view: &GraspView, options: &CropOptions) -> Result<Crop, CropError> {
+        Ok(Crop { table: view.table, ..Crop::new(&view.depth, &view.camera, &view.mask, options)? })
     }
 
     /// Computes extent and VD-NOC from the points.

@@ -2,7 +2,7 @@
 //! 6.3.1). That is exact, for a turn about the optical axis moves no viewpoint.
 
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
-use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
+use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
 use crate::crop::Crop;
 
@@ -34,6 +34,7 @@ impl Crop {
             points: vec![[0.0; 3]; total],
             vd_noc: vec![[0.0; 3]; total],
             extent: self.extent,
+            table: self.table.map(|t| Plane { normal: pose.transform_direction(&t.normal), ..t }),
         };
         let moved = |v: [f32; 3]| {
             let r = pose.transform_direction(&Vec3::from_fn(|k, _| f64::from(v[k])));

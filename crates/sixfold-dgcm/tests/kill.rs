@@ -190,6 +190,30 @@ fn stores_are_merged_forgotten_and_followed() {
 }
 
 #[test]
+fn a_store_of_version_1_keeps_what_it_holds() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("old.db");
+    let id = SqliteStore::create(&file).unwrap().add(&experience(2)).unwrap().0;
+    let before = SqliteStore::open(&file).unwrap().get(id).unwrap().unwrap().experience;
+    assert!(before.crop.table.is_some());
+    rusqlite::Connection::open(&file)
+        .unwrap()
+        .execute_batch(
+            "DROP TABLE attempt; ALTER TABLE experience DROP COLUMN table_plane; PRAGMA user_version=1",
+        )
+        .unwrap();
+    let mut store = SqliteStore::open(&file).unwrap();
+    let mut old = store.get(id).unwrap().unwrap().experience;
+    assert_eq!(old.crop.table, None, "it knew no tables");
+    // A new one brings the file up to date.
+    let new = store.add(&experience(4)).unwrap().0;
+    let tables = [id, new].map(|id| store.get(id).unwrap().unwrap().experience.crop.table);
+    assert_eq!(tables, [None, experience(4).crop.table]);
+    old.crop.table = before.crop.table;
+    assert_eq!(old, before);
+}
+
+#[test]
 fn what_is_no_store_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("x.db");

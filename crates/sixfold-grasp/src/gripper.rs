@@ -65,6 +65,14 @@ impl GripperBox {
 }
 
 impl Gripper {
+    /// Whether a point of the gripper's frame lies between the pads, `opening` metres apart.
+    pub fn is_between_pads(&self, p: &Vec3, opening: f64) -> bool {
+        p.x.abs() < 0.5 * opening
+            && p.y.abs() < 0.5 * self.finger_width
+            && p.z < 0.0
+            && p.z > -self.finger_length
+    }
+
     /// Names of the grippers that come with Sixfold. Their sizes are round numbers of their class (strokes of 140 mm and
     /// of 85 mm), not measurements of a product.
     pub const BUILT_IN: [&'static str; 2] = ["jaws-140", "jaws-85"];

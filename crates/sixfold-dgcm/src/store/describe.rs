@@ -21,6 +21,8 @@ pub struct Description {
     pub camera: [f64; 4],
     /// Side of the crop, pixels.
     pub side: usize,
+    /// What the object stood on: unit normal and offset in metres, camera frame; `None` where that is not known.
+    pub table: Option<[f64; 4]>,
     /// Pixels that show the object.
     pub object_pixels: usize,
     /// Those of them near the gripper.
@@ -53,6 +55,7 @@ impl Description {
             opening: e.opening,
             camera: [c.fx, c.fy, c.cx, c.cy],
             side: e.crop.side,
+            table: e.crop.table.map(|t| [t.normal.x, t.normal.y, t.normal.z, t.offset]),
             object_pixels: e.crop.pixels().count(),
             region_pixels: e.region.iter().filter(|r| **r).count(),
             copies: e.copies.len(),

@@ -4,7 +4,7 @@ use std::io::Cursor;
 
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
+use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
 use super::StoreError;
 use crate::crop::Crop;
@@ -57,6 +57,7 @@ pub(super) fn crop(
     images: &Images,
     camera: &Camera,
     extent: crate::vd_noc::Extent,
+    table: Option<Plane>,
 ) -> Result<Crop, (&'static str, String)> {
     let side = camera.width;
     let read = |bytes: &[u8], field: &'static str| {
@@ -87,7 +88,7 @@ pub(super) fn crop(
         points[i] = [p.x as f32, p.y as f32, p.z as f32];
     }
     let source = (0..total as u32).collect();
-    Ok(Crop { side, camera: *camera, mask, source, normals, points, vd_noc, extent })
+    Ok(Crop { side, camera: *camera, mask, source, normals, points, vd_noc, extent, table })
 }
 
 /// Bits, eight to a byte, the first one lowest.
@@ -118,6 +119,18 @@ pub(super) fn pose(pose: &Pose) -> Vec<u8> {
 /// Focal lengths and principal point.
 pub(super) fn camera(camera: &Camera) -> Vec<u8> {
     [camera.fx, camera.fy, camera.cx, camera.cy].into_iter().flat_map(f64::to_le_bytes).collect()
+}
+
+/// Normal and offset of a plane.
+pub(super) fn plane(plane: &Plane) -> Vec<u8> {
+    let n = plane.normal;
+    [n.x, n.y, n.z, plane.offset].into_iter().flat_map(f64::to_le_bytes).collect()
+}
+
+pub(super) fn from_plane(bytes: &[u8]) -> Option<Plane> {
+    let &[x, y, z, offset] = doubles(bytes).as_slice() else { return None };
+    let normal = Vec3::new(x, y, z);
+    ((normal.norm() - 1.0).abs() < 1e-6 && offset.is_finite()).then_some(Plane { normal, offset })
 }
 
 /// A pose to the micrometre, which reading and writing do not change.

@@ -40,7 +40,7 @@ const TABLES: &str = "
         object text NOT NULL, part text, gripper text NOT NULL, opening double precision NOT NULL,
         width double precision NOT NULL, camera_from_gripper bytea NOT NULL, camera bytea NOT NULL, side bigint NOT NULL,
         extent bytea NOT NULL, depth bytea NOT NULL, normals bytea NOT NULL, vd_noc bytea NOT NULL, region bytea NOT NULL,
-        network text NOT NULL, provenance text NOT NULL);
+        network text NOT NULL, provenance text NOT NULL, table_plane bytea);
     CREATE TABLE sixfold.feature (
         id bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
         experience bigint NOT NULL REFERENCES sixfold.experience(id) ON DELETE CASCADE,
@@ -472,6 +472,7 @@ fn raw(row: &Row) -> Result<Raw, Error> {
         region: row.try_get(13)?,
         network: row.try_get(14)?,
         provenance: row.try_get(15)?,
+        table_plane: row.try_get(16)?,
     })
 }
 
@@ -494,6 +495,7 @@ impl ExperienceStore for PostgresStore {
         let side = e.crop.side as i64;
         let extent = encode::vectors(&[e.crop.extent.centre, e.crop.extent.half]);
         let region = encode::bits(&e.region);
+        let table_plane = e.crop.table.as_ref().map(encode::plane);
         let angles: Vec<f64> = e.copies.iter().map(|c| c.angle).collect();
         let features: Vec<f32> = e.copies.iter().flat_map(|c| c.feature.iter().copied()).collect();
         self.transaction(Access::Write, |t| {
@@ -502,8 +504,8 @@ impl ExperienceStore for PostgresStore {
             }
             let row = t.query_one(
                 "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
-                 extent, depth, normals, vd_noc, region, network, provenance)
-                 VALUES ($1,$2,$3,$4,$5,$6,$7,$8,$9,$10,$11,$12,$13,$14,$15,$16,$17) RETURNING id",
+                 extent, depth, normals, vd_noc, region, network, provenance, table_plane)
+                 VALUES ($1,$2,$3,$4,$5,$6,$7,$8,$9,$10,$11,$12,$13,$14,$15,$16,$17,$18) RETURNING id",
                 &[
                     &key,
                     &e.time,
@@ -522,6 +524,7 @@ impl ExperienceStore for PostgresStore {
                     &region,
                     &e.network,
                     &e.provenance,
+                    &table_plane,
                 ],
             )?;
             let id: i64 = row.try_get(0)?;
@@ -539,7 +542,7 @@ impl ExperienceStore for PostgresStore {
         let read = self.transaction(Access::Read, |t| {
             let row = t.query_opt(
                 "SELECT time, object, part, gripper, opening, width, camera_from_gripper, camera, side, extent, depth,
-                 normals, vd_noc, region, network, provenance FROM experience WHERE id = $1",
+                 normals, vd_noc, region, network, provenance, table_plane FROM experience WHERE id = $1",
                 &[&id],
             )?;
             let Some(row) = row else { return Ok(None) };

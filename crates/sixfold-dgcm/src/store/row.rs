@@ -64,6 +64,7 @@ pub(super) struct Raw {
     pub region: Vec<u8>,
     pub network: String,
     pub provenance: String,
+    pub table_plane: Option<Vec<u8>>,
 }
 
 impl Raw {
@@ -91,7 +92,13 @@ impl Raw {
             centre: Vec3::from_column_slice(&extent[..3]),
             half: Vec3::from_column_slice(&extent[3..]),
         };
-        let crop = encode::crop(&self.images, &camera, extent)
+        let table = match &self.table_plane {
+            Some(bytes) => Some(encode::from_plane(bytes).ok_or_else(|| {
+                wrong("table_plane", "a unit normal and an offset", bytes.len().to_string())
+            })?),
+            None => None,
+        };
+        let crop = encode::crop(&self.images, &camera, extent, table)
             .map_err(|(field, found)| wrong(field, "a PNG image of the crop's size", found))?;
         let pose = encode::from_pose(&self.pose).ok_or_else(|| {
             wrong("camera_from_gripper", "a pose of 16 numbers", self.pose.len().to_string())

@@ -17,7 +17,8 @@ use crate::outcome::Attempt;
 
 /// Says that a SQLite file is one of ours: "6fEx".
 const APPLICATION: i64 = 0x3666_4578;
-/// Version of the tables. A store of version 1 has no attempts; it is brought up to date when it is written to.
+/// Version of the tables. A store of version 1 has no attempts, and knows no tables that objects stand on; it is brought up to
+/// date when it is written to.
 const VERSION: i64 = 2;
 const TABLES: &str = "
     CREATE TABLE experience (
@@ -25,7 +26,7 @@ const TABLES: &str = "
         object TEXT NOT NULL, part TEXT, gripper TEXT NOT NULL, opening REAL NOT NULL, width REAL NOT NULL,
         camera_from_gripper BLOB NOT NULL, camera BLOB NOT NULL, side INTEGER NOT NULL, extent BLOB NOT NULL,
         depth BLOB NOT NULL, normals BLOB NOT NULL, vd_noc BLOB NOT NULL, region BLOB NOT NULL,
-        network TEXT NOT NULL, provenance TEXT NOT NULL);
+        network TEXT NOT NULL, provenance TEXT NOT NULL, table_plane BLOB);
     CREATE TABLE feature (
         id INTEGER PRIMARY KEY AUTOINCREMENT, experience INTEGER NOT NULL REFERENCES experience(id) ON DELETE CASCADE,
         angle REAL NOT NULL, feature BLOB NOT NULL);
@@ -111,11 +112,25 @@ impl SqliteStore {
         self.check_version()
     }
 
-    /// Adds what a store of version 1 lacks.
+    /// Adds what a store of an earlier version lacks.
     fn bring_up(&self) -> Result<(), StoreError> {
-        if self.number("PRAGMA application_id")? == APPLICATION && self.number("PRAGMA user_version")? == 1 {
+        let version = self.number("PRAGMA user_version")?;
+        if self.number("PRAGMA application_id")? == APPLICATION && (1..VERSION).contains(&version) {
             self.run(ATTEMPTS)?;
+            self.run("ALTER TABLE experience ADD COLUMN table_plane BLOB")?;
             self.run(&format!("PRAGMA user_version={VERSION}"))?;
+        }
+        Ok(())
+    }
+
+    /// As [`SqliteStore::bring_up`], before something is written.
+    fn bring_up_to_write(&self) -> Result<(), StoreError> {
+        if self.number("PRAGMA user_version")? < VERSION {
+            // Another process may do so at the same time: the lock decides.
+            self.run("BEGIN IMMEDIATE")?;
+            let done = self.bring_up();
+            self.run(if done.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
+            done?;
         }
         Ok(())
     }
@@ -191,8 +206,8 @@ impl SqliteStore {
         }
         transaction.execute(
             "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
-             extent, depth, normals, vd_noc, region, network, provenance)
-             VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17)",
+             extent, depth, normals, vd_noc, region, network, provenance, table_plane)
+             VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18)",
             params![
                 key,
                 e.time,
@@ -210,7 +225,8 @@ impl SqliteStore {
                 images.vd_noc,
                 encode::bits(&e.region),
                 e.network,
-                e.provenance
+                e.provenance,
+                e.crop.table.as_ref().map(encode::plane)
             ],
         )?;
         let id = transaction.last_insert_rowid();
@@ -241,27 +257,25 @@ fn raw(row: &Row<'_>) -> rusqlite::Result<Raw> {
         region: row.get(13)?,
         network: row.get(14)?,
         provenance: row.get(15)?,
+        table_plane: row.get(16)?,
     })
 }
 
 impl ExperienceStore for SqliteStore {
     fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
         let (images, key) = row::prepare(experience)?;
+        self.bring_up_to_write()?;
         let inserted = self.insert(experience, &key, &images);
         self.checked(inserted)
     }
 
     fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
-        let raw = self.checked(
-            self.connection
-                .query_row(
-                    "SELECT time, object, part, gripper, opening, width, camera_from_gripper, camera, side, extent, depth,
-                     normals, vd_noc, region, network, provenance FROM experience WHERE id=?1",
-                    [id],
-                    raw,
-                )
-                .optional(),
-        )?;
+        let plane = if self.number("PRAGMA user_version")? < VERSION { "NULL" } else { "table_plane" };
+        let question = format!(
+            "SELECT time, object, part, gripper, opening, width, camera_from_gripper, camera, side, extent, depth,
+             normals, vd_noc, region, network, provenance, {plane} FROM experience WHERE id=?1"
+        );
+        let raw = self.checked(self.connection.query_row(&question, [id], raw).optional())?;
         let Some(raw) = raw else { return Ok(None) };
         let copies = self.checked((|| {
             let mut query = self
@@ -315,13 +329,7 @@ impl ExperienceStore for SqliteStore {
 
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
         let (key, text) = encode::attempt(attempt)?;
-        if self.number("PRAGMA user_version")? < VERSION {
-            // Another process may do so at the same time: the lock decides.
-            self.run("BEGIN IMMEDIATE")?;
-            let done = self.bring_up();
-            self.run(if done.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
-            done?;
-        }
+        self.bring_up_to_write()?;
         self.checked(self.connection.execute(
             "INSERT INTO attempt (key, attempt) VALUES (?1,?2) ON CONFLICT(key) DO NOTHING",
             params![key, text],
@@ -384,7 +392,10 @@ mod tests {
         let file = folder.path().join("old.db");
         {
             let made = SqliteStore::create(&file).unwrap();
-            made.run("DROP TABLE attempt; PRAGMA user_version=1").unwrap();
+            made.run(
+                "DROP TABLE attempt; ALTER TABLE experience DROP COLUMN table_plane; PRAGMA user_version=1",
+            )
+            .unwrap();
         }
         let quality = AntipodalQuality { alignment: 0.5, support: 0.5, centring: 0.5, observed: 0.5 };
         let description =
@@ -406,8 +417,8 @@ mod tests {
         assert_eq!(store.number("PRAGMA user_version").unwrap(), VERSION);
         assert_eq!(SqliteStore::open(&file).unwrap().attempts(0).unwrap()[0].1, attempt);
         // A later version is refused.
-        store.run("PRAGMA user_version=3").unwrap();
+        store.run("PRAGMA user_version=9").unwrap();
         let error = SqliteStore::open(&file).unwrap_err().to_string();
-        assert!(error.contains("version 3"), "{error}");
+        assert!(error.contains("version 9"), "{error}");
     }
 }

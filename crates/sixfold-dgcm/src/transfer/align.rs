@@ -48,6 +48,8 @@ pub enum Hypothesis {
     Turned,
     /// The object is seen from the same side: its own VD-NOC are taken, and nothing is turned before ICP.
     SameSide,
+    /// The object stands upright, turned about the vertical and stretched: found by its shape, without the network.
+    Upright,
 }
 
 impl Hypothesis {
@@ -57,6 +59,7 @@ impl Hypothesis {
             Hypothesis::Scaled => "scaled",
             Hypothesis::Turned => "turned",
             Hypothesis::SameSide => "same_side",
+            Hypothesis::Upright => "upright",
         }
     }
 }
@@ -161,7 +164,7 @@ fn rotation(
         points.iter().map(|p| (p - extent.centre).component_div(&extent.half)).collect()
     };
     let (source, target) = match hypothesis {
-        Hypothesis::SameSide => return Some(Pose::identity()),
+        Hypothesis::SameSide | Hypothesis::Upright => return Some(Pose::identity()),
         Hypothesis::Scaled => (normalised(restored, &experience.extent), normalised(points, &input.extent)),
         Hypothesis::Turned => (restored.to_vec(), points.to_vec()),
     };

@@ -346,7 +346,8 @@ mod tests {
         let mut held_before = vec![0.0; crop.mask.len()];
         crop.pixels().filter(|&i| crop.points[i][0] < -0.06).for_each(|i| held_before[i] = 0.7);
         let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
-        let found = Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before };
+        let found =
+            Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before, middles: vec![] };
         // The middle of the bar is where it holds best, and its left end is what was asked for.
         let ranked = rank_on_part(
             &[at(0.0), at(-0.09)],

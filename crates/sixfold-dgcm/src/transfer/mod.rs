@@ -2,8 +2,11 @@
 
 mod align;
 mod combine;
+mod fit;
 mod memory;
 mod propose;
+mod shapes;
+mod upright;
 
 pub use align::{AlignOptions, Hypothesis, Transferred, transfer};
 pub use combine::{Kind, Ranked, rank, rank_as_printed, rank_by_outcome, rank_on_part};

@@ -86,38 +86,59 @@ pub struct Proposals {
     /// For every pixel of the crop the share of experience (weighted by equation 6.6) that was held there, 0 to 1: where on this
     /// object the counterparts of what lay between the pads are.
     pub held_before: Vec<f64>,
+    /// Where on this object the middles between the pads of experience are, camera frame, with their weights; empty where shapes
+    /// were not compared.
+    pub middles: Vec<(Vec3, f64)>,
 }
 
 impl Proposals {
-    /// How much a grasp holds what experience held: the mean of [`Proposals::held_before`] over the pixels between its pads; 0
-    /// where none of them was seen.
+    /// How much a grasp holds what experience held: the mean of [`Proposals::held_before`] over the pixels between its pads, 0
+    /// where none of them was seen, times how near the middle between its pads is to those of experience.
     pub fn holds_the_same(&self, grasp: &Grasp, gripper: &Gripper) -> f64 {
         let held = between_pads(&self.crop, &grasp.camera_from_gripper, grasp.opening, gripper);
         if held.len() < FEWEST_HELD {
             return 0.0;
         }
-        held.iter().map(|&i| self.held_before[i]).sum::<f64>() / held.len() as f64
+        let same = held.iter().map(|&i| self.held_before[i]).sum::<f64>() / held.len() as f64;
+        let weights: f64 = self.middles.iter().map(|m| m.1).sum();
+        if weights <= 0.0 {
+            return same;
+        }
+        let middle = middle_between_pads(&grasp.camera_from_gripper);
+        let near = |m: &(Vec3, f64)| m.1 * (-0.5 * (m.0 - middle).norm_squared() / (MIDDLES * MIDDLES)).exp();
+        same * self.middles.iter().map(near).sum::<f64>() / weights
     }
 }
 
+/// The middle between the pads may be this far from where it was in experience (standard deviation), metres.
+const MIDDLES: f64 = 0.02;
+
+/// A centimetre behind the tips, midway between the pads.
+pub(super) fn middle_between_pads(camera_from_gripper: &Pose) -> Vec3 {
+    camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
+}
+
 /// A grasp that holds fewer pixels holds nothing that can be told.
-const FEWEST_HELD: usize = 4;
+pub(super) const FEWEST_HELD: usize = 4;
 /// Pixels whose VD-NOC are nearer than this to those that were held are their counterparts. Less than the 0.3 by which a whole
 /// region is found again: a handle is thin.
 const COUNTERPART: f64 = 0.2;
 
 /// Pixels whose points lie between the pads of a gripper.
-fn between_pads(crop: &Crop, camera_from_gripper: &Pose, opening: f64, gripper: &Gripper) -> Vec<usize> {
+pub(super) fn between_pads(
+    crop: &Crop,
+    camera_from_gripper: &Pose,
+    opening: f64,
+    gripper: &Gripper,
+) -> Vec<usize> {
     let gripper_from_camera = camera_from_gripper.inverse();
-    let inside = |i: &usize| {
-        let p = gripper_from_camera.transform_point(&crop.point(*i));
-        p.x.abs() < 0.5 * opening
-            && p.y.abs() < 0.5 * gripper.finger_width
-            && p.z < 0.0
-            && p.z > -gripper.finger_length
-    };
+    let inside =
+        |i: &usize| gripper.is_between_pads(&gripper_from_camera.transform_point(&crop.point(*i)), opening);
     crop.pixels().filter(inside).collect()
 }
+
+/// Nearest features, in-plane copies among them, whose experiences are compared by shape.
+const IN_SHAPES: usize = 60;
 
 /// Proposes grasps on the object of a fitter's view, tested and judged as the fitter does.
 ///
@@ -130,7 +151,7 @@ pub fn propose(
     options: &ProposeOptions,
 ) -> Result<Proposals, ProposeError> {
     let (view, gripper) = (fitter.view(), fitter.gripper());
-    let crop = Crop::new(&view.depth, &view.camera, &view.mask, model.crop_options())?;
+    let crop = Crop::of_view(view, model.crop_options())?;
     let input = model.encode(&crop);
     let wanted = |s: &Summary| {
         options.part.as_ref().is_none_or(|part| s.part.as_ref() == Some(part))
@@ -153,7 +174,7 @@ pub fn propose(
     experiences.retain(|(_, stored, copy)| copy.side == crop.side && !stored.experience.copies.is_empty());
     if experiences.is_empty() || view.object.is_empty() {
         let held_before = vec![0.0; crop.mask.len()];
-        return Ok(Proposals { nearest, crop, proposals: vec![], held_before });
+        return Ok(Proposals { nearest, crop, proposals: vec![], held_before, middles: vec![] });
     }
     let cloud = IndexedCloud::new(view.object.clone())?;
     let planes: Vec<Vec<f32>> = experiences.iter().map(|(.., copy)| copy.vd_noc_planes()).collect();
@@ -209,7 +230,11 @@ pub fn propose(
                 .collect()
         })
         .collect();
-    Ok(Proposals { nearest, crop, proposals: found.into_iter().flatten().collect(), held_before })
+    let proposals: Vec<Proposal> = found.into_iter().flatten().collect();
+    let mut found = Proposals { nearest, crop, proposals, held_before, middles: vec![] };
+    let nearest = memory.nearest(&input.feature, IN_SHAPES, &wanted);
+    found.add_shapes(fitter, memory, &nearest)?;
+    Ok(found)
 }
 
 /// The region of an experience in its in-plane copy, whose pixels know where they come from.
@@ -220,16 +245,16 @@ fn turned_region(region: &[bool], copy: &Crop) -> Vec<bool> {
 }
 
 /// What is transferred.
-struct Source<'a> {
-    copy: &'a Crop,
-    grasp: &'a Pose,
-    opening: f64,
-    width: f64,
+pub(super) struct Source<'a> {
+    pub copy: &'a Crop,
+    pub grasp: &'a Pose,
+    pub opening: f64,
+    pub width: f64,
 }
 
 /// The transferred grasp at its stand-off, at the nearest place where the gripper is free: shifted and turned by a little,
 /// or drawn back. The grasp, how far it was moved, and whether its contacts are inside their friction cones.
-fn place(
+pub(super) fn place(
     fitter: &GraspFitter<'_>,
     gripper: &Gripper,
     source: &Source<'_>,
@@ -325,7 +350,7 @@ mod tests {
         for i in crop.pixels().filter(|&i| crop.points[i][0] < -0.02) {
             held_before[i] = 0.8;
         }
-        let found = Proposals { nearest: vec![], crop, proposals: vec![], held_before };
+        let found = Proposals { nearest: vec![], crop, proposals: vec![], held_before, middles: vec![] };
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let at = |x: f64| {
             let pose = gripper_pose(&Vec3::new(x, 0.0, 0.72), &Vec3::z(), &Vec3::y()).unwrap();

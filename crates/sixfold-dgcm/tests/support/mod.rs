@@ -14,7 +14,7 @@ use sixfold_dgcm::outcome::Attempt;
 use sixfold_dgcm::store::{
     COPIES, Copy, Experience, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError,
 };
-use sixfold_geometry::{Camera, Image, Mask, Pose};
+use sixfold_geometry::{Camera, Image, Mask, Plane, Pose, Vec3};
 use sixfold_grasp::{AntipodalQuality, GraspDescription, Gripper};
 
 fn crop() -> Crop {
@@ -28,9 +28,11 @@ fn crop() -> Crop {
 pub fn experience(number: i64) -> Experience {
     static CROP: OnceLock<Crop> = OnceLock::new();
     let crop = CROP.get_or_init(crop).clone();
+    // Every second one was made where no table was known.
+    let table = (number % 2 == 0).then(|| Plane { normal: Vec3::new(0.0, -0.6, -0.8), offset: -0.7 });
     let region = crop.mask.iter().enumerate().map(|(i, m)| *m && i % 3 == 0).collect();
     Experience {
-        crop,
+        crop: Crop { table, ..crop },
         camera_from_gripper: Pose::exp(&[0.0, 0.01, 0.7, 0.1, 3.0, number as f64 * 1e-3].into()),
         opening: 0.07,
         width: 0.05,
@@ -160,6 +162,9 @@ fn what_is_added_is_there(store: &mut dyn ExperienceStore) {
     assert_eq!((summary.gripper.as_str(), summary.network.as_str()), (mine.gripper.name.as_str(), "test"));
     assert_eq!((summary.time, summary.width, summary.provenance.as_str()), (mine.time, 0.05, "a test"));
     assert_eq!(listed[1].part, None);
+    let tables = [id, second].map(|id| store.get(id).unwrap().unwrap().experience.crop.table);
+    assert_eq!(tables, [experience(4).crop.table, None]);
+    assert!(tables[0].is_some());
 }
 
 fn a_wrong_experience_is_refused(store: &mut dyn ExperienceStore) {

@@ -14,7 +14,9 @@ use sixfold_dgcm::outcome::Attempt;
 use sixfold_dgcm::store::{Experience, StorePlace};
 use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, GraspFitter, Gripper, antipodal_grasps};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, antipodal_grasps,
+};
 use sixfold_mesh::Mesh;
 use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
@@ -91,12 +93,28 @@ pub(super) struct Pupil {
 
 impl Pupil {
     /// The part that a grasp is on: that of the surface nearest to the middle between the pads, a centimetre behind the
-    /// tips.
-    fn part(&self, camera_from_object: &Pose, grasp: &Grasp) -> Option<&'static str> {
+    /// tips, if most of what was seen between the pads belongs to it too; else "", no part at all. A hand over the body of a
+    /// drill whose tips reach the handle is not on the handle.
+    fn part(
+        &self,
+        camera_from_object: &Pose,
+        grasp: &Grasp,
+        view: &GraspView,
+        gripper: &Gripper,
+    ) -> Option<&'static str> {
         let (member, rest) = self.made.as_ref()?;
-        let middle = grasp.camera_from_gripper.transform_point(&(Vec3::z() * -0.01));
         let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
-        Some(member.part_at(&member_from_camera.transform_point(&middle)))
+        let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
+        let middle = part_at(&grasp.camera_from_gripper.transform_point(&(Vec3::z() * -0.01)));
+        let gripper_from_camera = grasp.camera_from_gripper.inverse();
+        let held: Vec<&Vec3> = view
+            .object
+            .points
+            .iter()
+            .filter(|p| gripper.is_between_pads(&gripper_from_camera.transform_point(p), grasp.opening))
+            .collect();
+        let same = held.iter().filter(|p| part_at(p) == middle).count();
+        Some(if 10 * same >= 7 * held.len() { middle } else { "" })
     }
 }
 
@@ -336,7 +354,8 @@ impl Robot<'_> {
         let mut geometry = antipodal_grasps(view, self.gripper, &planner)?;
         let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
         let on_part = |grasp: &Grasp| {
-            self.a.part.is_none() || pupil.part(&camera_from_object, grasp) == self.a.part.as_deref()
+            self.a.part.is_none()
+                || pupil.part(&camera_from_object, grasp, view, self.gripper) == self.a.part.as_deref()
         };
         if pupil.made.is_some() {
             geometry.retain(on_part);
@@ -435,11 +454,11 @@ impl Robot<'_> {
         attempt: u64,
     ) -> Result<Option<i64>> {
         let Some(view) = &scene.view else { return Ok(None) };
-        let Ok(crop) = Crop::new(&view.depth, &view.camera, &view.mask, self.network.crop_options()) else {
+        let Ok(crop) = Crop::of_view(view, self.network.crop_options()) else {
             return Ok(None);
         };
-        let known = pupil.part(camera_from_object, grasp);
-        let part = known.or(self.a.part.as_deref());
+        let known = pupil.part(camera_from_object, grasp, view, self.gripper).filter(|p| !p.is_empty());
+        let part = if pupil.made.is_some() { known } else { self.a.part.as_deref() };
         let provenance = format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, self.a.seed);
         let experience =
             Experience::new(&self.network, crop, grasp, self.gripper, &pupil.name, part, now(), &provenance);

@@ -198,8 +198,8 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
     let Some(view) = &input.view else {
         bail!("{}: nothing stands on the table; give --mask", a.input.depth.display());
     };
-    let crop = Crop::new(&view.depth, &view.camera, &view.mask, network.crop_options())
-        .with_context(|| a.input.depth.display().to_string())?;
+    let crop =
+        Crop::of_view(view, network.crop_options()).with_context(|| a.input.depth.display().to_string())?;
     let part = a.part.as_deref();
     let experience = Experience::new(&network, crop, &grasp, &gripper, &a.object, part, now(), &a.provenance);
     let region_pixels = experience.region.iter().filter(|r| **r).count();

@@ -214,8 +214,7 @@ impl Offline<'_> {
     }
 
     fn remember(&self, memory: &mut Memory, view: &View) -> Result<i64> {
-        let v = &view.view;
-        let crop = Crop::new(&v.depth, &v.camera, &v.mask, self.network.crop_options())?;
+        let crop = Crop::of_view(&view.view, self.network.crop_options())?;
         let instance = &self.instances[view.instance];
         let provenance = format!("wanted grasp of view {}", view.number);
         let experience = Experience::new(
