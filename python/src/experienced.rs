@@ -96,6 +96,12 @@ impl PyExperience {
         PyCamera(self.0.experience.crop.camera)
     }
 
+    /// What the object stood on: unit normal and offset along it in metres, camera's frame; None where that is not known.
+    #[getter]
+    fn table(&self) -> Option<(f64, f64, f64, f64)> {
+        self.0.experience.crop.table.map(|t| (t.normal.x, t.normal.y, t.normal.z, t.offset))
+    }
+
     /// Which pixels show the object, (side, side) bool.
     #[getter]
     fn mask<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<bool>>> {

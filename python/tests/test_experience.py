@@ -63,6 +63,8 @@ def test_what_is_stored_is_there(store, first, grasp, network, tmp_path):
     assert np.allclose(np.linalg.norm(kept.normals[kept.mask], axis=-1), 1, atol=1e-2)
     assert np.allclose(kept.feature, network.feature(*first), atol=1e-5)
     assert kept.picture().shape == (4 * side, 12 * side, 3)
+    view = posed((0.0, 0.05, 0.75), (2.5, 0.0, 0.0))
+    assert np.allclose(kept.table, [*view[:3, 2], view[:3, 2] @ view[:3, 3]], atol=0.005)
     assert store.get(2) is None
     # The same again is not stored twice; another process sees the same file.
     assert store.add(*first, grasp, object="bar", part="middle", gripper="jaws-85") == (1, False)

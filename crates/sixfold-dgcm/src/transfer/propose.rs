@@ -363,5 +363,16 @@ mod tests {
         // Half of what is between the pads.
         assert!((at(-0.02) - 0.4).abs() < 0.06, "{}", at(-0.02));
         assert_eq!(at(0.5), 0.0, "beside the object");
+        // Experience had its middle 1.5 cm behind what this one holds, and another one, which fits worse, far off.
+        let grasp = |x: f64| {
+            let pose = gripper_pose(&Vec3::new(x, 0.0, 0.72), &Vec3::z(), &Vec3::y()).unwrap();
+            let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
+            Grasp { camera_from_gripper: pose, opening: 0.06, width: 0.04, quality }
+        };
+        let middle = middle_between_pads(&grasp(-0.04).camera_from_gripper);
+        let middles = vec![(middle + Vec3::z() * 0.015, 0.75), (middle + Vec3::x() * 0.3, 0.25)];
+        let found = Proposals { middles, ..found };
+        let share = 0.75 * (-0.5f64 * (0.015f64 / MIDDLES).powi(2)).exp();
+        assert!((found.holds_the_same(&grasp(-0.04), &gripper) - 0.8 * share).abs() < 1e-6);
     }
 }

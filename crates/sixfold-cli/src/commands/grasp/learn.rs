@@ -467,3 +467,55 @@ impl Robot<'_> {
         Ok(Some(id))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::{Camera, DepthImage, Mask, PointCloud};
+    use sixfold_grasp::{AntipodalQuality, gripper_pose};
+
+    #[test]
+    fn a_hand_over_the_body_is_not_on_the_handle() {
+        let pupil = made_up(&["drill".to_owned()], 4, 0)
+            .unwrap()
+            .into_iter()
+            .find(|p| p.made.as_ref().is_some_and(|(_, rest)| rest.rotation().rotation_angle_to(&Pose::identity()) < 0.1))
+            .expect("a drill that stands");
+        let points = pupil.mesh.sample_surface(4000, 0).points;
+        let (member, _) = pupil.made.as_ref().unwrap();
+        let on = |part: &str| -> Vec<Vec3> {
+            points.iter().copied().filter(|p| member.part_at(p) == part).collect()
+        };
+        let handle = on("handle");
+        let middle = handle.iter().sum::<Vec3>() / handle.len() as f64;
+        let top = handle.iter().map(|p| p.z).fold(f64::MIN, f64::max);
+        // The camera's frame is the object's.
+        let view = GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: None,
+            object: PointCloud { normals: vec![Vec3::z(); points.len()], points: points.clone() },
+            obstacles: PointCloud::default(),
+            step: 0.0025,
+            cut_by_edge: false,
+        };
+        let gripper = Gripper::built_in("jaws-140").unwrap();
+        let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
+        let part = |tips: Vec3, approach: Vec3| {
+            let pose = gripper_pose(&tips, &approach, &Vec3::y()).unwrap();
+            let grasp = Grasp { camera_from_gripper: pose, opening: 0.08, width: 0.03, quality };
+            pupil.part(&Pose::identity(), &grasp, &view, &gripper)
+        };
+        // From behind across the handle, the tips a centimetre past its middle.
+        assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
+        // From above, the tips at the upper end of the handle, the body between the fingers.
+        let above = Vec3::new(middle.x, middle.y, top - 0.025);
+        assert_eq!(part(above, -Vec3::z()), Some(""));
+        // Across the body before the handle.
+        let body = on("body");
+        let front = body.iter().map(|p| p.x).fold(f64::MIN, f64::max);
+        let height = body.iter().map(|p| p.z).sum::<f64>() / body.len() as f64;
+        assert_eq!(part(Vec3::new(0.6 * front, 0.0, height - 0.01), -Vec3::z()), Some("body"));
+    }
+}
