@@ -88,3 +88,51 @@ pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f6
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::photograph::Photograph;
+    use crate::refine::tests::photographs;
+
+    #[test]
+    fn what_stands_before_the_object_in_one_photograph_is_left_out() {
+        let (mesh, truth, list) = photographs(40, [0.0, 0.0], 5);
+        // Something bright stands before half of the block in the first one.
+        let side = 96;
+        let middle = list[0].camera().project(&truth[0].translation()).unwrap().x;
+        let mut image = (**list[0].image()).clone();
+        for (x, y) in (0..240).flat_map(|y| (0..320).map(move |x| (x, y))) {
+            if (x as f64) < middle {
+                image[(x, y)] = [250, 250, 20];
+            }
+        }
+        let first =
+            Photograph::new("0".to_owned(), Arc::new(image), *list[0].camera(), truth[0], None).unwrap();
+        let mut views: Vec<SourceView> = std::iter::once(&first)
+            .chain(&list[1..])
+            .map(|p| SourceView::new(p, &mesh, side).unwrap())
+            .collect();
+        let before: Vec<Vec<f32>> = views.iter().map(|v| v.visible.data.clone()).collect();
+        let shares = leave_out_what_differs(&mut views, &mesh);
+        assert!((0.3..0.7).contains(&shares[0]), "{shares:?}");
+        assert!(shares[1..].iter().all(|s| *s < 0.08), "{shares:?}");
+        // Left of the middle it is gone, right of it it is there, and beside the object nothing is said.
+        let view = &views[0];
+        let column = view.camera.project(&truth[0].translation()).unwrap().x;
+        let share = |wanted: &dyn Fn(usize) -> bool| {
+            let pixels: Vec<usize> = (0..side * side).filter(|i| wanted(*i)).collect();
+            let kept = pixels.iter().filter(|i| view.visible.data[**i] > 0.5).count();
+            kept as f64 / pixels.len() as f64
+        };
+        let on = |i: usize| view.depth()[i] > 0.0;
+        let left = |i: usize| ((i % side) as f64) < column - 6.0;
+        let right = |i: usize| ((i % side) as f64) > column + 6.0;
+        assert!(share(&|i| on(i) && left(i)) < 0.1, "{}", share(&|i| on(i) && left(i)));
+        assert!(share(&|i| on(i) && right(i)) > 0.9, "{}", share(&|i| on(i) && right(i)));
+        let corner = |i: usize| i % side > side - 4 && i / side < 3 && before[0][i] > 0.5;
+        assert!((share(&corner) - 1.0).abs() < 1e-9, "beside the object nothing is taken out");
+    }
+}

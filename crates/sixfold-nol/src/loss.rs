@@ -128,6 +128,8 @@ mod tests {
         let (colours, features) = image_loss(within.clone(), truth.clone(), mask.clone(), &perceptual);
         assert!((number(colours) - 0.3).abs() < 1e-4);
         assert!(number(features) > 0.0);
+        let (darker, _) = image_loss(within.clone() * -1.0, truth.clone(), mask.clone(), &perceptual);
+        assert!((number(darker) - 0.3).abs() < 1e-4);
         assert!((number(squared_error(within, truth, mask)) - 0.0025).abs() < 1e-5);
         assert!((psnr(0.01) - 20.0).abs() < 1e-9);
     }
@@ -144,6 +146,11 @@ mod tests {
         // Second difference 2 in rows, at 6 of 8 pixels of a row.
         let bent = number(smooth_loss(plane(&|x, _| x * x), all));
         assert!((bent - 2.0 * 48.0 / 64.0).abs() < 1e-3, "{bent}");
+        // Bent to and fro, in rows and columns, which do not outweigh each other: of 8 rows the four odd ones have six second
+        // differences of 2 or -2, columns too, and all 49 mixed ones are 1 or -1, counted twice.
+        let zigzag = plane(&|x, y| (x % 2.0) * (y % 2.0));
+        let bent = number(smooth_loss(zigzag, plane(&|_, _| 1.0)));
+        assert!((bent - (48.0 + 48.0 + 98.0) / 64.0).abs() < 1e-3, "{bent}");
         let holes = plane(&|x, _| f32::from(u8::from(!(x as usize).is_multiple_of(3))));
         assert!(number(smooth_loss(plane(&|x, _| x * x), holes)) < 1e-4);
     }

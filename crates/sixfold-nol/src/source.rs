@@ -164,3 +164,37 @@ impl SourceView {
         projection
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use sixfold_geometry::RgbImage;
+    use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+
+    use super::*;
+
+    #[test]
+    fn what_the_object_hides_of_itself_is_not_seen() {
+        // A plate of 10 cm, and one of 4 cm three centimetres before it, both facing the camera.
+        let plate = |half: f64, z: f64| {
+            [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+                .map(|(x, y)| Vec3::new(x * half, y * half, z))
+        };
+        let vertices = [plate(0.05, 0.0), plate(0.02, 0.03)].concat();
+        let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]).unwrap();
+        let camera = Camera::new(500.0, 500.0, 159.5, 119.5, 320, 240).unwrap();
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+        let pose = Pose::new(turn, Vec3::new(0.0, 0.0, 0.5));
+        let image = Arc::new(RgbImage::filled(320, 240, [90; 3]));
+        let photograph = Photograph::new("plates".to_owned(), image, camera, pose, None).unwrap();
+        let view = SourceView::new(&photograph, &mesh, 96).unwrap();
+        let up = Vec3::z();
+        let (pixel, cosine) = view.see(&Vec3::new(0.0, 0.0, 0.03), &up).expect("the plate in front");
+        assert!(pixel.iter().all(|p| (p - 47.5).abs() < 1.0) && cosine > 0.99, "{pixel:?} {cosine}");
+        assert!(view.see(&Vec3::new(0.04, 0.0, 0.0), &up).is_some(), "beside it, the plate behind");
+        assert!(view.see(&Vec3::zeros(), &up).is_none(), "behind the plate in front");
+        assert!(view.see(&Vec3::new(0.0, 0.0, 0.03), &-up).is_none(), "turned away");
+        assert!(view.see(&Vec3::new(0.3, 0.0, 0.0), &up).is_none(), "beside the crop");
+    }
+}

@@ -289,6 +289,18 @@ mod tests {
     }
 
     #[test]
+    fn a_rotation_goes_along_with_its_points() {
+        let [here, there] =
+            [(1, 0.3), (2, 1.5)].map(|(seed, yaw)| Shape::new(&seen(Family::Mug, seed, yaw).crop));
+        let moved = Upright { yaw: 0.7, stretch: [1.0; 2], shift: Vec3::new(0.1, 0.2, 0.0), fit: 0.0 };
+        let rotation = moved.rotation(&there, &here);
+        for (p, q) in [(Vec3::x(), Vec3::y()), (Vec3::z(), Vec3::new(0.1, -0.4, 0.3))] {
+            let apart = moved.map_camera(&p, &there, &here) - moved.map_camera(&q, &there, &here);
+            assert!((apart - rotation.transform_direction(&(p - q))).norm() < 1e-9, "{apart}");
+        }
+    }
+
+    #[test]
     fn without_a_table_nothing_is_said() {
         let [a, b] = [1, 2].map(|seed| seen(Family::Mug, seed, 0.0));
         let lying = Crop { table: None, ..b.crop.clone() };

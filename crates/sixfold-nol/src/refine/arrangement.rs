@@ -126,3 +126,47 @@ impl Arrangement {
         true
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_step_brings_cameras_and_objects_to_where_their_images_want_them() {
+        let pairs = vec![[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]];
+        let camera = |x: f64, yaw: f64| Pose::exp(&[x, 0.02 * x, 0.8, 0.3, yaw, 0.1 * yaw].into());
+        let cameras = [camera(0.1, 0.2), camera(-0.2, -0.5), camera(0.0, 1.0)];
+        let objects = [Pose::identity(), Pose::exp(&[0.2, 0.05, -0.1, 0.5, 0.2, -0.4].into())];
+        let poses: Vec<Pose> = pairs.iter().map(|[i, o]| cameras[*i] * objects[*o]).collect();
+        // Small motions of every camera about its own centre, and of one object.
+        let small = |k: f64| Pose::exp(&(Vector6::new(1.0, -0.5, 0.7, 0.8, -0.6, 0.9) * (1e-4 * k)).into());
+        let truth: Vec<Pose> = pairs
+            .iter()
+            .map(|[i, o]| small(3.0 - 2.0 * *i as f64) * cameras[*i] * objects[*o] * small(2.0 * *o as f64))
+            .collect();
+        let mut arrangement = Arrangement::new(pairs, &poses, 3, 2);
+        let wanted: Vec<Wanted> = poses
+            .iter()
+            .zip(&truth)
+            .map(|(pose, truth)| {
+                let centre = pose.translation();
+                let turn = (truth.rotation() * pose.rotation().inverse()).scaled_axis();
+                let shift = truth.translation() - centre;
+                let mut equations = NormalEquations::default();
+                for (k, value) in shift.iter().chain(turn.iter()).enumerate() {
+                    let mut row = [0.0; 6];
+                    row[k] = 1.0;
+                    equations.add(&row, -value, 1.0);
+                }
+                Wanted { equations, centre }
+            })
+            .collect();
+        assert!(arrangement.step(&wanted, 0.0));
+        for (k, (pose, truth)) in poses.iter().zip(&truth).enumerate() {
+            let now = arrangement.camera_from_object(k);
+            let (before, after) = (pose.distance_to(truth), now.distance_to(truth));
+            assert!(before > 5e-5 && after < 1e-6, "{k}: {before} {after}");
+            assert!(now.rotation_angle_to(truth) < 1e-6, "{k}");
+        }
+    }
+}

@@ -37,6 +37,31 @@ pub(super) struct Terms<'a> {
     pub reach: f64,
 }
 
+/// Shift of the object's centre and rotation vector from a given pose to the present one, in the camera's frame.
+fn since(given: &Pose, pose: &Pose, centre: &Vec3) -> [f64; 6] {
+    let shift = pose.transform_point(centre) - given.transform_point(centre);
+    let turn = (pose.rotation() * given.rotation().inverse()).scaled_axis();
+    [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
+}
+
+/// Root of the mean square of such an offset in units of the deviations of rough poses.
+fn off(offset: &[f64; 6], options: &RefineOptions) -> f64 {
+    let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / options.rough[k / 3]).powi(2)).sum();
+    (square / 6.0).sqrt()
+}
+
+/// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are taken
+/// by themselves.
+fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], options: &RefineOptions) {
+    let trust = 1.0 / (1.0 + off(offset, options).powi(2) / 6.0);
+    for (k, offset) in offset.iter().enumerate() {
+        let mut row = [0.0; 6];
+        row[k] = 1.0;
+        let deviation = options.rough[k / 3];
+        equations.add(&row, *offset, trust / (deviation * deviation));
+    }
+}
+
 impl Working<'_> {
     /// Colours are compared inside the silhouette only, as far from its border as the blur carries what lies beside it.
     pub fn allow(&mut self, blur: f32) {
@@ -102,32 +127,17 @@ impl Working<'_> {
         Wanted { equations, centre: self.pose.transform_point(centre) }
     }
 
-    /// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are
-    /// taken by themselves.
     fn add_given(&self, equations: &mut NormalEquations, centre: &Vec3, options: &RefineOptions) {
-        let offset = self.since_given(centre);
-        let trust = 1.0 / (1.0 + self.off(centre, options).powi(2) / 6.0);
-        for (k, offset) in offset.iter().enumerate() {
-            let mut row = [0.0; 6];
-            row[k] = 1.0;
-            let deviation = options.rough[k / 3];
-            equations.add(&row, *offset, trust / (deviation * deviation));
-        }
+        add_given(equations, &self.since_given(centre), options);
     }
 
     /// How far the present pose is from the given one: root of the mean square over six numbers in units of their deviation.
     pub fn off(&self, centre: &Vec3, options: &RefineOptions) -> f64 {
-        let offset = self.since_given(centre);
-        let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / options.rough[k / 3]).powi(2)).sum();
-        (square / 6.0).sqrt()
+        off(&self.since_given(centre), options)
     }
 
-    /// Shift of the object's centre and rotation vector since the given pose, in the camera's frame.
     fn since_given(&self, centre: &Vec3) -> [f64; 6] {
-        let pose = &self.pose;
-        let shift = pose.transform_point(centre) - self.given.transform_point(centre);
-        let turn = (pose.rotation() * self.given.rotation().inverse()).scaled_axis();
-        [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
+        since(&self.given, &self.pose, centre)
     }
 
     fn add_colors(
@@ -220,4 +230,37 @@ pub(super) fn prior(view: &SourceView) -> Vec<f32> {
     });
     inside.blur(0.03 * side as f32);
     inside.data
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_given_pose_draws_the_present_one_back() {
+        let given = Pose::exp(&[0.02, -0.03, 0.7, 0.4, -0.9, 0.3].into());
+        let centre = Vec3::new(0.03, 0.01, -0.02);
+        let about = Pose::from_translation(given.transform_point(&centre));
+        let moved = |twist: [f64; 6], pose: Pose, about: Pose| {
+            about * Pose::exp(&twist.into()) * about.inverse() * pose
+        };
+        let pose = moved([0.004, -0.002, 0.006, 0.02, 0.03, -0.01], given, about);
+        let before = since(&given, &pose, &centre);
+        assert!((before[3] - 0.02).abs() < 1e-9 && (before[5] + 0.01).abs() < 1e-9, "{before:?}");
+        let options = RefineOptions::default();
+        let mut equations = NormalEquations::default();
+        add_given(&mut equations, &before, &options);
+        let step = equations.solve(0.0).unwrap();
+        let about = Pose::from_translation(pose.transform_point(&centre));
+        let back = moved(step.into(), pose, about);
+        let after = since(&given, &back, &centre);
+        assert!(after.iter().all(|v| v.abs() < 2e-4), "{before:?} {after:?}");
+        // What is far off is trusted less.
+        let weight = |scale: f64| {
+            let mut equations = NormalEquations::default();
+            add_given(&mut equations, &before.map(|v| v * scale), &options);
+            equations.parts().0[(0, 0)]
+        };
+        assert!(weight(10.0) < 0.9 * weight(1.0) && weight(1.0) < weight(0.0));
+    }
 }

@@ -13,7 +13,7 @@ mod options;
 mod printed;
 mod printed_poses;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 pub(crate) use appearance::{Common, Light, Shown, look};
 pub use gauss_newton::{SceneSource, refine_poses, refine_scene};

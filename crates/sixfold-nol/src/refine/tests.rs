@@ -12,7 +12,7 @@ use sixfold_render::{Frame, RenderOptions, SceneObject};
 use super::*;
 use crate::photograph::Photograph;
 
-fn block() -> Mesh {
+pub(crate) fn block() -> Mesh {
     let corner = |i: usize| {
         Vec3::from_fn(|axis, _| [0.06, 0.04, 0.05][axis] * if i >> axis & 1 == 0 { -1.0 } else { 1.0 })
     };
@@ -33,7 +33,7 @@ fn paint(p: &[f32; 3]) -> [u8; 3] {
 }
 
 /// Photographs with exact poses, and the same with disturbed ones.
-fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Vec<Pose>, Vec<Photograph>) {
+pub(crate) fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Vec<Pose>, Vec<Photograph>) {
     let mesh = block();
     let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
     let mut random = ChaCha8Rng::seed_from_u64(seed);

@@ -479,7 +479,11 @@ mod tests {
         let pupil = made_up(&["drill".to_owned()], 4, 0)
             .unwrap()
             .into_iter()
-            .find(|p| p.made.as_ref().is_some_and(|(_, rest)| rest.rotation().rotation_angle_to(&Pose::identity()) < 0.1))
+            .find(|p| {
+                p.made
+                    .as_ref()
+                    .is_some_and(|(_, rest)| rest.rotation().rotation_angle_to(&Pose::identity()) < 0.1)
+            })
             .expect("a drill that stands");
         let points = pupil.mesh.sample_surface(4000, 0).points;
         let (member, _) = pupil.made.as_ref().unwrap();
