@@ -232,7 +232,7 @@ pub fn propose(
         .collect();
     let proposals: Vec<Proposal> = found.into_iter().flatten().collect();
     let mut found = Proposals { nearest, crop, proposals, held_before, middles: vec![] };
-    let nearest = memory.nearest(&input.feature, IN_SHAPES, &wanted);
+    let nearest = memory.nearest(&input.feature, IN_SHAPES, wanted);
     found.add_shapes(fitter, memory, &nearest)?;
     Ok(found)
 }

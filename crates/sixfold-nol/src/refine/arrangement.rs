@@ -139,7 +139,7 @@ mod tests {
         let objects = [Pose::identity(), Pose::exp(&[0.2, 0.05, -0.1, 0.5, 0.2, -0.4].into())];
         let poses: Vec<Pose> = pairs.iter().map(|[i, o]| cameras[*i] * objects[*o]).collect();
         // Small motions of every camera about its own centre, and of one object.
-        let small = |k: f64| Pose::exp(&(Vector6::new(1.0, -0.5, 0.7, 0.8, -0.6, 0.9) * (1e-4 * k)).into());
+        let small = |k: f64| Pose::exp(&(Vector6::new(1.0, -0.5, 0.7, 0.8, -0.6, 0.9) * (1e-4 * k)));
         let truth: Vec<Pose> = pairs
             .iter()
             .map(|[i, o]| small(3.0 - 2.0 * *i as f64) * cameras[*i] * objects[*o] * small(2.0 * *o as f64))
