@@ -14,7 +14,7 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, ViewOptions,
-    antipodal_grasps, gripper_pose,
+    antipodal_grasps, gripper_pose, middle_between_pads,
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
@@ -55,7 +55,7 @@ fn seen(seed: u64, yaw: f64) -> Seen {
 impl Seen {
     /// The part in the middle between the pads of a grasp.
     fn part_of(&self, grasp: &Grasp) -> &'static str {
-        let middle = grasp.camera_from_gripper.transform_point(&(Vec3::z() * -0.01));
+        let middle = middle_between_pads(&grasp.camera_from_gripper);
         self.mug.part_at(&self.camera_from_object.inverse().transform_point(&middle))
     }
 

@@ -68,6 +68,11 @@ pub(crate) fn half_turn() -> Pose {
     Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into())
 }
 
+/// The point that a gripper at this pose holds: a centimetre behind the tips, midway between the pads.
+pub fn middle_between_pads(camera_from_gripper: &Pose) -> Vec3 {
+    camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
+}
+
 /// The pose of a gripper whose tips' middle is at `tip_centre` (metres), from approach and closing direction, which need
 /// not be unit nor exactly perpendicular: the approach keeps its direction. `None` when they are parallel or zero.
 pub fn gripper_pose(tip_centre: &Vec3, approach: &Vec3, closing: &Vec3) -> Option<Pose> {

@@ -38,7 +38,7 @@ pub use completion::{CompletedObject, CompletionOptions, assume_walls, complete_
 pub use describe::GraspDescription;
 pub use draw::{DrawnGrasp, draw_grasps};
 pub use fit::GraspFitter;
-pub use grasp::{AntipodalQuality, Grasp, gripper_pose};
+pub use grasp::{AntipodalQuality, Grasp, gripper_pose, middle_between_pads};
 pub use gripper::{Gripper, GripperBox};
 pub use gripper_file::{GripperError, parse_gripper, read_gripper};
 pub use view::{GraspView, ViewError, ViewOptions, find_objects};

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
-use sixfold_grasp::{Grasp, GraspFitter, Gripper};
+use sixfold_grasp::{Grasp, GraspFitter, Gripper, middle_between_pads};
 use thiserror::Error;
 
 use super::Memory;
@@ -113,11 +113,6 @@ impl Proposals {
 /// The middle between the pads may be this far from where it was in experience (standard deviation), metres.
 const MIDDLES: f64 = 0.02;
 
-/// A centimetre behind the tips, midway between the pads.
-pub(super) fn middle_between_pads(camera_from_gripper: &Pose) -> Vec3 {
-    camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
-}
-
 /// A grasp that holds fewer pixels holds nothing that can be told.
 pub(super) const FEWEST_HELD: usize = 4;
 /// Pixels whose VD-NOC are nearer than this to those that were held are their counterparts. Less than the 0.3 by which a whole
@@ -158,7 +153,9 @@ pub fn propose(
             && options.only.as_ref().is_none_or(|only| only.contains(&s.id))
             && options.without_object.as_ref().is_none_or(|object| s.object != *object)
     };
-    let nearest = memory.nearest(&input.feature, options.neighbours, wanted);
+    // One search for both; what the network aligns are the first of them.
+    let in_shapes = memory.nearest(&input.feature, options.neighbours.max(IN_SHAPES), wanted);
+    let nearest = in_shapes[..in_shapes.len().min(options.neighbours)].to_vec();
     let trim = model.crop_options().trim;
     let mut experiences = vec![];
     for m in &nearest {
@@ -232,8 +229,7 @@ pub fn propose(
         .collect();
     let proposals: Vec<Proposal> = found.into_iter().flatten().collect();
     let mut found = Proposals { nearest, crop, proposals, held_before, middles: vec![] };
-    let nearest = memory.nearest(&input.feature, IN_SHAPES, wanted);
-    found.add_shapes(fitter, memory, &nearest)?;
+    found.add_shapes(fitter, memory, &in_shapes[..in_shapes.len().min(IN_SHAPES)])?;
     Ok(found)
 }
 

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use sixfold_geometry::Vec3;
-use sixfold_grasp::{Grasp, GraspFitter};
+use sixfold_grasp::{Grasp, GraspFitter, middle_between_pads};
 
 use super::Memory;
 use super::align::{Hypothesis, Transferred};
 use super::fit::Shape;
-use super::propose::{FEWEST_HELD, Proposal, Proposals, Source, between_pads, middle_between_pads, place};
+use super::propose::{FEWEST_HELD, Proposal, Proposals, Source, between_pads, place};
 use super::upright::upright;
 use crate::store::{Match, StoreError, Stored};
 

@@ -16,6 +16,7 @@ use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, antipodal_grasps,
+    middle_between_pads,
 };
 use sixfold_mesh::Mesh;
 use sixfold_shapes::{Family, Member, Rest, member};
@@ -93,7 +94,7 @@ pub(super) struct Pupil {
 
 impl Pupil {
     /// The part that a grasp is on: that of the surface nearest to the middle between the pads, a centimetre behind the
-    /// tips, if most of what was seen between the pads belongs to it too; else "", no part at all. A hand over the body of a
+    /// tips, if most of what was seen between the pads belongs to it too; `None` for no part in particular. A hand over the body of a
     /// drill whose tips reach the handle is not on the handle.
     fn part(
         &self,
@@ -105,7 +106,7 @@ impl Pupil {
         let (member, rest) = self.made.as_ref()?;
         let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
         let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
-        let middle = part_at(&grasp.camera_from_gripper.transform_point(&(Vec3::z() * -0.01)));
+        let middle = part_at(&middle_between_pads(&grasp.camera_from_gripper));
         let gripper_from_camera = grasp.camera_from_gripper.inverse();
         let held: Vec<&Vec3> = view
             .object
@@ -114,7 +115,7 @@ impl Pupil {
             .filter(|p| gripper.is_between_pads(&gripper_from_camera.transform_point(p), grasp.opening))
             .collect();
         let same = held.iter().filter(|p| part_at(p) == middle).count();
-        Some(if 10 * same >= 7 * held.len() { middle } else { "" })
+        (10 * same >= 7 * held.len()).then_some(middle)
     }
 }
 
@@ -457,7 +458,7 @@ impl Robot<'_> {
         let Ok(crop) = Crop::of_view(view, self.network.crop_options()) else {
             return Ok(None);
         };
-        let known = pupil.part(camera_from_object, grasp, view, self.gripper).filter(|p| !p.is_empty());
+        let known = pupil.part(camera_from_object, grasp, view, self.gripper);
         let part = if pupil.made.is_some() { known } else { self.a.part.as_deref() };
         let provenance = format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, self.a.seed);
         let experience =
@@ -515,7 +516,7 @@ mod tests {
         assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
         // From above, the tips at the upper end of the handle, the body between the fingers.
         let above = Vec3::new(middle.x, middle.y, top - 0.025);
-        assert_eq!(part(above, -Vec3::z()), Some(""));
+        assert_eq!(part(above, -Vec3::z()), None);
         // Across the body before the handle.
         let body = on("body");
         let front = body.iter().map(|p| p.x).fold(f64::MIN, f64::max);

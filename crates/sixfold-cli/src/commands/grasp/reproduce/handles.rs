@@ -7,8 +7,10 @@ use serde::{Deserialize, Serialize};
 use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_on_part};
-use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps};
+use sixfold_geometry::Vec3;
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps, middle_between_pads,
+};
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 
@@ -115,8 +117,7 @@ impl Handles<'_> {
         let geometry = sixfold_grasp::antipodal_grasps(view, gripper, &planner)?;
         let first = rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes);
         let plain = sixfold_grasp::cluster_grasps(&geometry, &clusters);
-        // What is a centimetre behind the tips, midway between the pads.
-        let holds = |g: &Grasp| on(&held_point(&g.camera_from_gripper));
+        let holds = |g: &Grasp| on(&middle_between_pads(&g.camera_from_gripper));
         let row = Row {
             object: name.to_owned(),
             number,
@@ -142,9 +143,4 @@ impl Handles<'_> {
         write_rgb(&folder.join(format!("{}-{number}.png", file_name(name))), &image)?;
         Ok(Some(row))
     }
-}
-
-/// The point that a grasp holds, in the camera's frame.
-fn held_point(camera_from_gripper: &Pose) -> Vec3 {
-    camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
 }
