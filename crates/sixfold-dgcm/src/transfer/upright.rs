@@ -301,6 +301,37 @@ mod tests {
     }
 
     #[test]
+    fn a_handle_tells_more_of_a_turn_than_the_wall() {
+        let mug = seen(Family::Mug, 31, -0.3);
+        let shape = Shape::new(&mug.crop);
+        let ones = || vec![1.0; shape.points.len()];
+        let mut pair =
+            Pair { here: &shape, there: &shape, held: &[], telling_here: ones(), telling_there: ones() };
+        // Turned about the mug's own axis.
+        let axis = shape.table_from_camera.transform_point(&mug.camera_from_object.translation());
+        let anywhere: Vec<Upright> = (0..TURNS)
+            .map(|k| {
+                let yaw = TAU * k as f64 / TURNS as f64;
+                let mut turned = Upright { yaw, stretch: [1.0; 2], shift: Vec3::zeros(), fit: 0.0 };
+                turned.shift = axis - turned.map(&axis);
+                turned
+            })
+            .collect();
+        pair.weigh(&anywhere);
+        let camera_from_table = shape.table_from_camera.inverse();
+        for telling in [&pair.telling_here, &pair.telling_there] {
+            let mean = |part: &str| {
+                let of = |p: &Vec3| mug.part_at(&camera_from_table.transform_point(p)) == part;
+                let some: Vec<f64> =
+                    shape.points.iter().zip(telling).filter(|(p, _)| of(p)).map(|(_, w)| *w).collect();
+                assert!(some.len() > 10, "{part}: {}", some.len());
+                some.iter().sum::<f64>() / some.len() as f64
+            };
+            assert!(mean("handle") > 1.5 * mean("body"), "{} {}", mean("handle"), mean("body"));
+        }
+    }
+
+    #[test]
     fn without_a_table_nothing_is_said() {
         let [a, b] = [1, 2].map(|seed| seen(Family::Mug, seed, 0.0));
         let lying = Crop { table: None, ..b.crop.clone() };
