@@ -39,6 +39,6 @@ pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
 pub use pile::{PileOptions, drop_objects};
 pub use settle::{settle, settle_in_middle};
-pub use statistics::wilson_interval;
+pub use statistics::{wilson_interval, wilson_interval_of_share};
 pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};
 pub use view::{SimulatedView, ViewPoint, simulate_view};

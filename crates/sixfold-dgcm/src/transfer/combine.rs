@@ -85,7 +85,7 @@ pub fn rank_as_printed(
 }
 
 /// Ranks grasps of both kinds by their chance to hold, best first, one of each cluster. The score is that chance. With a
-/// model that has seen no attempt, quality and agreement with experience decide, as in [`rank`].
+/// model that has seen no attempt, what simulated attempts taught beforehand decides.
 pub fn rank_by_outcome(
     geometry: &[Grasp],
     experience: &[Proposal],
@@ -131,32 +131,31 @@ pub fn rank_on_part(
 const REFINED: usize = 6;
 
 /// Moves a grasp by small steps while that raises its chance to hold: forth and back, along the pads, and turned about each of
-/// its axes.
+/// its axes. When none does, the steps are halved, once.
 fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
-    const ROUNDS: usize = 4;
+    const ROUNDS: usize = 5;
     const STEP: f64 = 0.006;
     let turn = 8f64.to_radians();
-    let moves: Vec<Pose> = (1..6)
-        .flat_map(|axis| [-1.0, 1.0].map(|sign| (axis, sign)))
-        .map(|(axis, sign)| {
-            let mut twist = [0.0; 6];
-            twist[axis] = sign * if axis < 3 { STEP } else { turn };
-            Pose::exp(&twist.into())
-        })
-        .collect();
+    let mut size = 1.0;
     for _ in 0..ROUNDS {
         let start = c.grasp.camera_from_gripper;
         let mut better = None;
-        for step in &moves {
-            let Some(grasp) = fitter.fit(&(start * *step), c.grasp.opening) else { continue };
+        for (axis, sign) in (1..6).flat_map(|axis| [-size, size].map(|sign| (axis, sign))) {
+            let mut twist = [0.0; 6];
+            twist[axis] = sign * if axis < 3 { STEP } else { turn };
+            let moved = start * Pose::exp(&twist.into());
+            let Some(grasp) = fitter.fit(&moved, c.grasp.opening) else { continue };
             let score = c.promise(&grasp, fitter, outcomes);
             if score > c.score + 1e-6 {
                 c.score = score;
                 better = Some(grasp);
             }
         }
-        let Some(grasp) = better else { break };
-        c.grasp = grasp;
+        match better {
+            Some(grasp) => c.grasp = grasp,
+            None if size < 1.0 => break,
+            None => size = 0.5,
+        }
     }
 }
 

@@ -25,7 +25,7 @@ use sixfold_mesh::Mesh;
 use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{
-    AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval,
+    AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval_of_share,
 };
 
 use super::arguments::PhysicsArguments;
@@ -59,6 +59,10 @@ pub(crate) struct CompareArguments {
     /// deviations on each axis), pads with a friction of 0.25 where the planner believes the gripper's file, objects of 0.5 kg
     #[arg(long)]
     pub hard: bool,
+    /// Try each grasp so many times, each time with another error of the hand (with --hard; an exact hand does the same again):
+    /// the share that holds depends less on luck
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub tries: usize,
     #[command(flatten)]
     pub physics: PhysicsArguments,
     #[command(flatten)]
@@ -130,8 +134,10 @@ struct Row {
     object: String,
     number: u64,
     method: String,
+    /// How the first try ended.
     ending: String,
-    held: bool,
+    /// Tries that held.
+    held: usize,
     /// Whether the object came to rest: else it was no attempt.
     counts: bool,
     /// Distance of the nearest experience's feature.
@@ -148,6 +154,7 @@ struct Row {
 struct Recorded<'a> {
     objects: Vec<&'a str>,
     trials: u64,
+    tries: usize,
     hard: bool,
     seed: u64,
     network: String,
@@ -161,6 +168,8 @@ struct Recorded<'a> {
 #[derive(Serialize)]
 pub(super) struct Whole {
     hard: bool,
+    /// Tries of each grasp.
+    tries: usize,
     experiences: usize,
     outcomes: usize,
     friction: f64,
@@ -194,6 +203,12 @@ pub(super) fn compare(a: &CompareArguments) -> Result<Whole> {
     if a.trials == 0 {
         bail!("--trials: found 0, expected at least 1");
     }
+    if a.tries == 0 || a.tries > 1 && !a.hard {
+        bail!(
+            "--tries: found {}, expected at least 1, and 1 without --hard: an exact hand does the same every time",
+            a.tries
+        );
+    }
     let setting = hardness(&a.physics, a.hard)?;
     let Hardness { gripper, real, options, .. } = &setting;
     let network = model(&a.network)?;
@@ -202,6 +217,7 @@ pub(super) fn compare(a: &CompareArguments) -> Result<Whole> {
     let recorded = Recorded {
         objects: objects.iter().map(|o| o.1.as_str()).collect(),
         trials: a.trials,
+        tries: a.tries,
         hard: a.hard,
         seed: a.seed,
         network: network.fingerprint(),
@@ -237,11 +253,12 @@ pub(super) fn compare(a: &CompareArguments) -> Result<Whole> {
     progress.finish();
     let whole = Whole {
         hard: a.hard,
+        tries: a.tries,
         experiences: memory.len(),
         outcomes: memory.outcomes(&gripper.name).attempts,
         friction: real.friction,
         mass: options.trial.mass,
-        classes: classes(&rows),
+        classes: classes(&rows, a.tries),
         median_seconds: METHODS.map(|m| {
             let mut seconds: Vec<f64> =
                 rows.iter().filter(|r| r.method == m && r.counts).map(|r| r.seconds).collect();
@@ -279,7 +296,7 @@ impl Scenes<'_> {
             number,
             method: String::new(),
             ending: ending_name(scene.ending),
-            held: false,
+            held: 0,
             counts: scene.ending != Ending::NoRest,
             nearest: None,
             candidates: (0, 0),
@@ -326,18 +343,22 @@ impl Scenes<'_> {
             if let Some(best) = ranked.first() {
                 let began = Instant::now();
                 let sent = seen.world_from_camera * best.grasp.camera_from_gripper;
-                let tried = try_grasp(
-                    parts,
-                    &scene.world_from_object,
-                    &self.setting.real,
-                    &self.setting.reached(&sent, scene.noise),
-                    best.grasp.opening,
-                    &self.options.trial,
-                )?;
-                row.trial_seconds = began.elapsed().as_secs_f64();
-                let ending = Ending::Tried(tried.outcome);
-                row.ending = ending_name(ending);
-                row.held = ending.is_success();
+                for k in 0..self.a.tries {
+                    let tried = try_grasp(
+                        parts,
+                        &scene.world_from_object,
+                        &self.setting.real,
+                        &self.setting.reached(&sent, scene.noise.wrapping_add(k as u64)),
+                        best.grasp.opening,
+                        &self.options.trial,
+                    )?;
+                    let ending = Ending::Tried(tried.outcome);
+                    row.held += usize::from(ending.is_success());
+                    if k == 0 {
+                        row.trial_seconds = began.elapsed().as_secs_f64();
+                        row.ending = ending_name(ending);
+                    }
+                }
                 row.transferred = best.proposal.is_some();
                 if number < PICTURES {
                     self.picture(&row, seen, best)?;
@@ -348,9 +369,9 @@ impl Scenes<'_> {
         Ok(out)
     }
 
-    /// The view with the gripper that was tried: green when it held, red when not.
+    /// The view with the gripper that was tried: green when it held more often than not, red when not.
     fn picture(&self, row: &Row, seen: &sixfold_simulation::SimulatedView, best: &Ranked) -> Result<()> {
-        let color = if row.held { [60, 220, 80] } else { [235, 70, 60] };
+        let color = if 2 * row.held > self.a.tries { [60, 220, 80] } else { [235, 70, 60] };
         let grasp = &best.grasp;
         let drawn =
             [DrawnGrasp { camera_from_gripper: grasp.camera_from_gripper, opening: grasp.opening, color }];
@@ -361,7 +382,7 @@ impl Scenes<'_> {
     }
 }
 
-fn classes(rows: &[Row]) -> Vec<Class> {
+fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
     let mut names: Vec<&str> = vec![];
     for row in rows {
         if !names.contains(&row.class.as_str()) {
@@ -375,10 +396,10 @@ fn classes(rows: &[Row]) -> Vec<Class> {
         for (k, method) in METHODS.iter().enumerate() {
             let mine: Vec<&Row> =
                 rows.iter().filter(|r| r.method == *method && r.counts && wanted(r)).collect();
-            let held = mine.iter().filter(|r| r.held).count();
+            let held: usize = mine.iter().map(|r| r.held).sum();
             trials = mine.len();
-            rates[k] = held as f64 / trials.max(1) as f64;
-            intervals[k] = wilson_interval(held, trials);
+            rates[k] = held as f64 / (tries * trials).max(1) as f64;
+            intervals[k] = wilson_interval_of_share(rates[k], trials);
         }
         Class { class: name.to_owned(), trials, rates, intervals }
     };
@@ -402,7 +423,7 @@ fn print_table(whole: &Whole) {
     let seconds: Vec<String> = whole.median_seconds.iter().map(|s| format!("{s:.3}")).collect();
     println!("median seconds from depth to ranked grasps: {}", seconds.join(", "));
     println!(
-        "{} experiences, {} outcomes; friction {}, {} kg; 95 % intervals after Wilson",
-        whole.experiences, whole.outcomes, whole.friction, whole.mass
+        "{} experiences, {} outcomes; friction {}, {} kg; each grasp tried {} times; 95 % intervals after Wilson, by scenes",
+        whole.experiences, whole.outcomes, whole.friction, whole.mass, whole.tries
     );
 }

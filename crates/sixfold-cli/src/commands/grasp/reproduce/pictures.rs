@@ -88,13 +88,13 @@ pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>])
     canvas.finish()
 }
 
-/// Success and nearest feature distance over the attempts: one strip per object.
-pub(super) fn incremental(curves: &[Curve], near: f64) -> image::RgbImage {
+/// Success and nearest feature distance over the attempts: one strip per object and setting.
+pub(super) fn incremental(curves: &[(&str, &Curve)], near: f64) -> image::RgbImage {
     let (left, width, height, gap) = (80.0, 480.0, 110.0, 66.0);
     let mut canvas = Canvas::new(620, (40.0 + (height + gap) * curves.len() as f64) as u32);
-    for (i, curve) in curves.iter().enumerate() {
+    for (i, (setting, curve)) in curves.iter().enumerate() {
         let top = 34.0 + (height + gap) * i as f64;
-        canvas.text(left, top - 22.0, 2.0, &curve.object, INK);
+        canvas.text(left, top - 22.0, 2.0, &format!("{}, {setting} setting", curve.object), INK);
         let largest = curve.nearest.iter().flatten().fold(2.0 * near, |a, b| a.max(*b)).min(6.0);
         let n = curve.held.len().max(1) as f64;
         let x = |k: usize| left + width * (k as f64 + 0.5) / n;
