@@ -46,6 +46,9 @@ pub struct AntipodalOptions {
     pub approaches: usize,
     /// Room between the object and each pad when the gripper comes, metres.
     pub clearance: f64,
+    /// As much more room where a contact is assumed and not seen, or half of it, if there is any, metres: an object is seldom
+    /// as symmetric as it looks.
+    pub doubt: f64,
     /// Points this near to the outermost ones belong to the contact, metres.
     pub contact_depth: f64,
     /// Largest angle of the approach from straight down, radians. Without a table: from the viewing direction.
@@ -65,6 +68,7 @@ impl Default for AntipodalOptions {
             closings: 3,
             approaches: 7,
             clearance: 0.012,
+            doubt: 0.015,
             contact_depth: 0.004,
             max_tilt: FRAC_PI_2,
             completion: Some(CompletionOptions::default()),
@@ -91,6 +95,7 @@ impl AntipodalOptions {
         }
         for (field, found, low, high, expected) in [
             ("clearance", self.clearance, 0.0, 0.1, "0 to 0.1 m"),
+            ("doubt", self.doubt, 0.0, 0.1, "0 to 0.1 m"),
             ("contact_depth", self.contact_depth, 1e-4, 0.05, "0.0001 to 0.05 m"),
             ("max_tilt", self.max_tilt, 0.0, std::f64::consts::PI, "0 to pi radians"),
         ] {
@@ -157,6 +162,9 @@ fn search(
     grasps
 }
 
+/// Objects are taken to be this thick behind what is seen of them, metres, where the palm is concerned.
+const THICKNESS: f64 = 0.02;
+
 pub(crate) struct Planner<'a> {
     pub gripper: &'a Gripper,
     pub options: &'a AntipodalOptions,
@@ -187,7 +195,8 @@ impl<'a> Planner<'a> {
             down: view.table.map_or_else(Vec3::z, |t| -t.normal),
             centre: object.cloud.centroid().unwrap_or_else(Vec3::zeros),
             tree: KdTree::new(&object.cloud.points),
-            scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table),
+            scene: CollisionScene::new(&[&object.cloud, &view.obstacles], view.table)
+                .with_thickness(&view.object.points, THICKNESS),
             object,
             cone: gripper.friction.atan(),
             step: view.step,
@@ -316,7 +325,19 @@ impl<'a> Planner<'a> {
         }
         let between = self.between(&centred, opening);
         let quality = self.judge(&between, &centred)?;
+        let opening = if quality.observed < 0.9 { self.widened(&centred, opening, width) } else { opening };
         Some(Grasp { camera_from_gripper: centred, opening, width, quality })
+    }
+
+    /// The opening with room for what is assumed wrongly, if the fingers stand free then with nothing else between them.
+    fn widened(&self, pose: &Pose, opening: f64, width: f64) -> f64 {
+        let wider = |share: f64| (opening + 2.0 * share * self.options.doubt).min(self.gripper.max_opening);
+        let fits = |wider: &f64| {
+            let extent = self.extent(&self.between(pose, *wider));
+            extent.is_some_and(|(low, high)| high - low < width + 0.002)
+                && self.scene.hit(self.gripper, pose, *wider).is_none()
+        };
+        [1.0, 0.5].map(wider).into_iter().find(fits).unwrap_or(opening)
     }
 
     /// Points between the pads, in the gripper's frame: index and point.

@@ -22,6 +22,8 @@ pub enum Hit {
 #[derive(Debug, Clone, Default)]
 pub struct CollisionScene {
     points: Vec<Vec3>,
+    /// What lies close behind seen points: the palm must not be there.
+    behind: Vec<Vec3>,
     table: Option<Plane>,
     /// Points nearer to a part of the gripper than this are hit, metres.
     pub margin: f64,
@@ -38,7 +40,18 @@ impl CollisionScene {
     pub fn new(clouds: &[&PointCloud], table: Option<Plane>) -> CollisionScene {
         let points = clouds.iter().flat_map(|cloud| cloud.points.iter().copied()).collect();
         let all = PointCloud { points, normals: vec![] }.voxel_downsample(Self::STEP, 1.0);
-        CollisionScene { points: all.points, table, margin: 0.002, table_clearance: 0.003 }
+        CollisionScene { points: all.points, behind: vec![], table, margin: 0.002, table_clearance: 0.003 }
+    }
+
+    /// With the object this thick behind every seen point, metres: nobody saw that the palm could be there. Fingers may, for
+    /// they have to reach round the object.
+    pub fn with_thickness(mut self, seen: &[Vec3], thickness: f64) -> CollisionScene {
+        let steps = (thickness / Self::STEP).floor() as usize;
+        let behind = |p: &Vec3, k: usize| p + p.normalize() * (k as f64 * Self::STEP);
+        let points =
+            seen.iter().filter(|p| p.z > 0.0).flat_map(|p| (1..=steps).map(move |k| behind(p, k))).collect();
+        self.behind = PointCloud { points, normals: vec![] }.voxel_downsample(Self::STEP, 1.0).points;
+        self
     }
 
     /// The points.
@@ -79,7 +92,9 @@ impl CollisionScene {
             }
             boxes[2].contains(&p, self.margin).then_some(Hit::Palm)
         };
-        self.points.iter().find_map(|p| inside(rotation * (p - origin)))
+        let palm = |p: &Vec3| boxes[2].contains(&(rotation * (p - origin)), self.margin);
+        let hit = self.points.iter().find_map(|p| inside(rotation * (p - origin)));
+        hit.or_else(|| self.behind.iter().any(palm).then_some(Hit::Palm))
     }
 }
 
@@ -87,6 +102,35 @@ impl CollisionScene {
 mod tests {
     use super::*;
     use crate::gripper_pose;
+
+    #[test]
+    fn the_palm_keeps_out_of_what_nobody_saw_behind_a_surface() {
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        // The camera looks along z at a plate half a metre away, without anything behind it.
+        let mut plate = vec![];
+        for i in -20..=20 {
+            for j in -20..=20 {
+                plate.push(Vec3::new(0.003 * f64::from(i), 0.003 * f64::from(j), 0.5));
+            }
+        }
+        let cloud = PointCloud { points: plate.clone(), normals: vec![] };
+        let free = |behind: f64, thickness: f64| {
+            // From behind the plate towards the camera, with the palm's front that far behind it and the fingers beside it.
+            let tip = Vec3::new(0.0, 0.1, 0.5 + behind - gripper.finger_length);
+            let pose = gripper_pose(&tip, &-Vec3::z(), &Vec3::x()).unwrap();
+            let at_plate = Pose::from_translation(Vec3::new(0.0, -0.1, 0.0)) * pose;
+            let scene = CollisionScene::new(&[], None).with_thickness(&cloud.points, thickness);
+            scene.hit(&gripper, &at_plate, 0.06)
+        };
+        assert_eq!(free(0.01, 0.0), None);
+        assert_eq!(free(0.01, 0.02), Some(Hit::Palm));
+        assert_eq!(free(0.03, 0.02), None);
+        // Fingers may be there: only their tips are behind the plate, the palm is before it.
+        let tip = Vec3::new(0.0, 0.0, 0.515);
+        let pose = gripper_pose(&tip, &Vec3::z(), &Vec3::x()).unwrap();
+        let scene = CollisionScene::new(&[], None).with_thickness(&plate, 0.02);
+        assert_eq!(scene.hit(&gripper, &pose, 0.06), None);
+    }
 
     #[test]
     fn points_between_the_fingers_are_free_and_others_are_hit() {

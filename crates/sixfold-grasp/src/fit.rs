@@ -90,3 +90,66 @@ impl<'a> GraspFitter<'a> {
         depths.min_by(f64::total_cmp)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
+
+    use super::*;
+    use crate::gripper_pose;
+
+    /// A wall of 2 cm on a table seen from above, of which the camera saw the side at y = 1 cm alone when `half`.
+    fn wall(half: bool) -> GraspView {
+        let mut object = PointCloud::default();
+        for side in [1.0, -1.0] {
+            for i in 0..=60 {
+                for k in 0..=20 {
+                    let (x, z) = (0.0025 * f64::from(i) - 0.075, 0.6 - 0.0025 * f64::from(k));
+                    if side > 0.0 || !half {
+                        object.points.push(Vec3::new(x, 0.01 * side, z));
+                        object.normals.push(Vec3::y() * side);
+                    }
+                }
+            }
+        }
+        GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: Some(Plane { normal: -Vec3::z(), offset: -0.6 }),
+            object,
+            obstacles: PointCloud::default(),
+            step: 0.0025,
+            cut_by_edge: false,
+        }
+    }
+
+    #[test]
+    fn what_is_assumed_gets_more_room_where_there_is_any() {
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        let options = AntipodalOptions::default();
+        let tip = Vec3::new(0.0, 0.0, 0.58);
+        let pose = gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap();
+        let opening = |view: &GraspView, seen: usize| {
+            let object = CompletedObject { cloud: wall(false).object, observed: seen, planes: vec![] };
+            let fitter = GraspFitter { view, planner: Planner::new(view, &gripper, object, &options) };
+            fitter.fit(&pose, 0.05).map(|g| g.opening)
+        };
+        let (both, half) = (wall(false), wall(true));
+        let all = both.object.len();
+        let seen = opening(&both, all).unwrap();
+        assert!((seen - 0.02 - 2.0 * options.clearance).abs() < 1e-6, "{seen}");
+        let assumed = opening(&half, half.object.len()).unwrap();
+        assert!((assumed - seen - 2.0 * options.doubt).abs() < 1e-6, "{assumed} {seen}");
+        // Something stands where the finger would be then, or even with half of that room.
+        for (place, more) in [(-0.044, options.doubt), (-0.0385, 0.0)] {
+            let mut narrow = wall(true);
+            for k in 0..=10 {
+                narrow.obstacles.points.push(Vec3::new(0.0, place, 0.6 - 0.004 * f64::from(k)));
+                narrow.obstacles.normals.push(Vec3::y());
+            }
+            let beside = opening(&narrow, half.object.len()).unwrap();
+            assert!((beside - seen - more).abs() < 1e-6, "{place}: {beside} {seen}");
+        }
+    }
+}

@@ -103,17 +103,27 @@ impl Scenery<'_> {
         }
     }
 
+    /// Hides all that a part of the crop shows.
+    pub fn hide(&self, composition: &mut Composition, cover: &Coverage, random: &mut Random) {
+        composition.image.blend(&self.material(random), cover);
+        composition.visible.remove(cover);
+    }
+
+    fn material(&self, random: &mut Random) -> Patch {
+        let size = self.options.size;
+        match random.random_range(0..10u32) {
+            0..=1 => Patch::filled(size, size, std::array::from_fn(|_| random.random())),
+            2..=4 => procedural_texture(size, size, random),
+            _ => self.background(random),
+        }
+    }
+
     fn shape(&self, visible: &Coverage, fraction: f32, random: &mut Random) -> Option<(Patch, Coverage)> {
         let size = self.options.size;
         // Centred on the object as often as at its rim: any pixel of the crop's middle part.
         let centre = [0, 1].map(|_| uniform(random, [0.1, 0.9]) * size as f32);
         let cover = occluder_of_fraction(&Shape::random(random), centre, visible, fraction)?;
-        let patch = match random.random_range(0..10u32) {
-            0..=1 => Patch::filled(size, size, std::array::from_fn(|_| random.random())),
-            2..=4 => procedural_texture(size, size, random),
-            _ => self.background(random),
-        };
-        Some((patch, cover))
+        Some((self.material(random), cover))
     }
 }
 

@@ -25,6 +25,11 @@ pub struct SampleOptions {
     pub size_jitter: f64,
     /// Chance that the box is that of the visible part; otherwise that of the whole object.
     pub visible_box_chance: f32,
+    /// Chance that something hides one side of the object and the box is that of the rest: so detections see an object that is
+    /// partly hidden, larger in its crop than a whole one.
+    pub cut_chance: f32,
+    /// How much of the box's side is cut off then, smallest and largest fraction.
+    pub cut: [f32; 2],
     /// Largest turn in the image plane to either side, radians (table 3.3: 45 degrees).
     pub rotation: f32,
     /// Chance that a photograph keeps its own background.
@@ -83,6 +88,8 @@ impl Default for SampleOptions {
             centre_jitter: 0.07,
             size_jitter: 0.2,
             visible_box_chance: 0.5,
+            cut_chance: 0.3,
+            cut: [0.1, 0.55],
             rotation: FRAC_PI_4,
             keep_background_chance: 0.5,
             occlusion_chance: 0.7,
@@ -142,6 +149,7 @@ impl SampleOptions {
         for (field, value) in [
             ("render_share", self.render_share),
             ("visible_box_chance", self.visible_box_chance),
+            ("cut_chance", self.cut_chance),
             ("keep_background_chance", self.keep_background_chance),
             ("occlusion_chance", self.occlusion_chance),
             ("object_occluder_chance", self.object_occluder_chance),
@@ -167,6 +175,7 @@ impl SampleOptions {
             }
         }
         let ranges = [
+            ("cut", self.cut, 0.0, 0.9, "two fractions in order from 0 to 0.9"),
             ("occlusion", self.occlusion, 0.0, 0.95, "two fractions in order from 0 to 0.95"),
             ("paste_gain", self.paste_gain, 0.0, 4.0, "two factors in order from 0 to 4"),
             ("border_blur", self.border_blur, 0.0, 8.0, "two sigmas in order from 0 to 8 pixels"),

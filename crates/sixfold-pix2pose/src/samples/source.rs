@@ -169,12 +169,15 @@ impl SampleSource {
             can_render && (object.real.is_empty() || random.random::<f32>() < options.render_share);
         let scenery =
             Scenery { options, backgrounds: &self.backgrounds, cutouts: &self.cutouts, object_index };
-        let (mut composition, coordinates, object_mask) = if rendered {
+        let (mut composition, coordinates, object_mask, hidden) = if rendered {
             self.render(object, &scenery, &mut random)
         } else {
             self.photograph(object, &scenery, &mut random)
         };
-        scenery.occlude(&mut composition, &mut random);
+        match hidden {
+            Some(cover) => scenery.hide(&mut composition, &cover, &mut random),
+            None => scenery.occlude(&mut composition, &mut random),
+        }
         let Composition { mut image, visible } = composition;
         options.color.apply(&mut image, &mut random);
         if options.is_second_stage(number, &mut random) {
@@ -194,7 +197,7 @@ impl SampleSource {
         object: &Prepared,
         scenery: &Scenery<'_>,
         random: &mut Random,
-    ) -> (Composition, Vec<f32>, Coverage) {
+    ) -> (Composition, Vec<f32>, Coverage, Option<Coverage>) {
         let options = &self.options;
         let crop = &object.real[random.random_range(0..object.real.len())];
         let camera = crop.camera();
@@ -205,7 +208,7 @@ impl SampleSource {
         let extent = if random.random::<f32>() < options.visible_box_chance { of_visible() } else { None };
         let extent =
             extent.or(whole).or_else(of_visible).unwrap_or(Extent::at(Vec2::new(camera.cx, camera.cy)));
-        let window = window_around(&extent, options, random);
+        let (window, hidden) = self.window(extent, random);
         let map = window.map(camera, options.size, turn);
         let (mut patch, inside) =
             Patch::warp(crop.image(), &map, options.size, options.size, [second_stage::GREY; 3]);
@@ -222,7 +225,7 @@ impl SampleSource {
             gain(&mut patch, uniform(random, options.paste_gain));
             scenery.paste(&patch, visible, random)
         };
-        (composition, coordinates, mask)
+        (composition, coordinates, mask, hidden)
     }
 
     fn render(
@@ -230,13 +233,13 @@ impl SampleSource {
         object: &Prepared,
         scenery: &Scenery<'_>,
         random: &mut Random,
-    ) -> (Composition, Vec<f32>, Coverage) {
+    ) -> (Composition, Vec<f32>, Coverage, Option<Coverage>) {
         let options = &self.options;
         let pose = object.pose_range().draw(options, random);
         let extent = object
             .extent(&object.camera, &pose)
             .unwrap_or(Extent::at(Vec2::new(object.camera.cx, object.camera.cy)));
-        let window = window_around(&extent, options, random);
+        let (window, hidden) = self.window(extent, random);
         let (coordinates, mask) = targets(
             &object.mesh,
             &object.scale,
@@ -257,7 +260,18 @@ impl SampleSource {
         if enlarged > 1.0 && random.random::<f32>() < 0.7 {
             composition.image.blur((0.4 * enlarged) as f32);
         }
-        (composition, coordinates, mask)
+        (composition, coordinates, mask, hidden)
+    }
+
+    /// The crop's window about an object's box, and what it hides of the object.
+    fn window(&self, extent: Extent, random: &mut Random) -> (Window, Option<Coverage>) {
+        let options = &self.options;
+        if random.random::<f32>() >= options.cut_chance {
+            return (window_around(&extent, options, random), None);
+        }
+        let (rest, cut) = extent.cut(options, random);
+        let window = window_around(&rest, options, random);
+        (window, Some(cut.beyond(&window, options.size)))
     }
 
     /// The visible parts of photographs and a few renders of each object.

@@ -90,6 +90,7 @@ fn plain() -> SampleOptions {
         color: ColorAugmentation::none(),
         render_color: ColorAugmentation::none(),
         occlusion_chance: 0.0,
+        cut_chance: 0.0,
         second_stage_share: 0.0,
         rotation: std::f32::consts::PI,
         border_blur: [0.0; 2],
@@ -252,6 +253,41 @@ fn occluders_change_what_is_visible_and_nothing_else() {
 }
 
 #[test]
+fn what_is_left_of_a_cut_object_fills_the_crop_as_a_whole_one_does() {
+    let still = SampleOptions { centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
+    let whole = source(SampleOptions { render_share: 1.0, visible_box_chance: 1.0, ..still.clone() });
+    let cut = source(SampleOptions {
+        render_share: 1.0,
+        visible_box_chance: 1.0,
+        cut_chance: 1.0,
+        cut: [0.3, 0.3],
+        ..still
+    });
+    let longest = |sample: &Sample| {
+        let seen = |at: &dyn Fn(usize, usize) -> usize| {
+            let lines = (0..64).filter(|a| (0..64).any(|b| sample.visible[at(*a, b)] > 0.5));
+            let (first, last) = lines.fold((64, 0), |(f, l), a| (a.min(f), a.max(l)));
+            last + 1 - first
+        };
+        seen(&|a, b| 64 * a + b).max(seen(&|a, b| 64 * b + a)) as f32
+    };
+    let (mut shown, mut filled, mut fills) = (0.0, 0.0, 0.0);
+    for number in 0..60 {
+        let (a, b) = (whole.sample(0, 9, number), cut.sample(0, 9, number));
+        shown += b.visible.iter().sum::<f32>() / b.object.iter().sum::<f32>() / 60.0;
+        fills += longest(&a) / 60.0;
+        filled += longest(&b) / 60.0;
+        // What hides it changes neither its coordinates nor what is seen of it.
+        for (u, v) in inner(&b, 64, 1) {
+            assert!(b.object[v * 64 + u] > 0.5 && b.coordinates[v * 64 + u] != 0.0);
+        }
+    }
+    // Three tenths of the box hold about as much of the object, what of it the crop still shows.
+    assert!((0.62..0.85).contains(&shown), "{shown}");
+    assert!((filled / fills - 1.0).abs() < 0.1, "{filled} of {fills}");
+}
+
+#[test]
 fn the_second_stage_is_grey_outside_a_mask() {
     let source =
         source(SampleOptions { second_stage_share: 1.0, color: ColorAugmentation::none(), ..plain() });
@@ -374,6 +410,8 @@ fn what_cannot_be_trained_is_said() {
         (SampleOptions { size: 4, ..default() }, "size"),
         (SampleOptions { target_size: Some(0), ..default() }, "target_size"),
         (SampleOptions { occlusion: [0.5, 0.2], ..default() }, "occlusion"),
+        (SampleOptions { cut: [0.1, 0.95], ..default() }, "cut"),
+        (SampleOptions { cut_chance: 1.5, ..default() }, "cut_chance"),
         (SampleOptions { render_share: f32::NAN, ..default() }, "render_share"),
         (SampleOptions { crop_factor: 0.0, ..default() }, "crop_factor"),
         (SampleOptions { distance: Some([0.0, 1.0]), ..default() }, "distance"),

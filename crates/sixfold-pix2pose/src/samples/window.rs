@@ -5,7 +5,7 @@
 //! rendered at `R_z P` with the window's camera, and nothing but colour is ever interpolated.
 
 use rand::RngExt;
-use sixfold_augment::{Random, Window};
+use sixfold_augment::{Coverage, Random, Window, uniform};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
 
@@ -34,9 +34,47 @@ impl Extent {
         (self.high - self.low).max()
     }
 
+    /// The box without a part at one of its sides, and where that part begins.
+    pub(super) fn cut(&self, options: &SampleOptions, random: &mut Random) -> (Extent, Cut) {
+        let axis = random.random_range(0..2usize);
+        let share = f64::from(uniform(random, options.cut));
+        let mut rest = *self;
+        let mut outwards = Vec2::zeros();
+        let mut point = self.centre();
+        if random.random::<bool>() {
+            rest.high[axis] -= share * (self.high[axis] - self.low[axis]);
+            (outwards[axis], point[axis]) = (1.0, rest.high[axis]);
+        } else {
+            rest.low[axis] += share * (self.high[axis] - self.low[axis]);
+            (outwards[axis], point[axis]) = (-1.0, rest.low[axis]);
+        }
+        let (s, c) = f64::from(uniform(random, [-0.4, 0.4])).sin_cos();
+        let outwards = Vec2::new(c * outwards.x - s * outwards.y, s * outwards.x + c * outwards.y);
+        (rest, Cut { point, outwards })
+    }
+
     /// A box of one point, for want of a better one.
     pub fn at(point: Vec2) -> Extent {
         Extent { low: point, high: point }
+    }
+}
+
+/// A straight border of what hides a part of the object.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Cut {
+    point: Vec2,
+    outwards: Vec2,
+}
+
+impl Cut {
+    /// What lies beyond it in a crop.
+    pub fn beyond(&self, window: &Window, size: usize) -> Coverage {
+        let step = window.side / size as f64;
+        let corner = window.centre - Vec2::repeat(0.5 * window.side - 0.5 * step);
+        Coverage::from_fn(size, size, |x, y| {
+            let pixel = corner + Vec2::new(x as f64, y as f64) * step;
+            ((pixel - self.point).dot(&self.outwards) / step + 0.5).clamp(0.0, 1.0) as f32
+        })
     }
 }
 
@@ -55,7 +93,7 @@ pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
 }
 
 /// Where a pixel of the photograph lies after its turn about the principal point.
-pub(super) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
+pub(crate) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
     let (s, c) = turn.sin_cos();
     let (x, y) = ((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy);
     Vec2::new(camera.cx + camera.fx * (c * x - s * y), camera.cy + camera.fy * (s * x + c * y))
