@@ -23,14 +23,6 @@ impl AffineMap {
         [self.x[0] * x + self.x[1] * y + self.x[2], self.y[0] * x + self.y[1] * y + self.y[2]]
     }
 
-    /// From image pixels to patch pixels. A map of one point (scale 0) has none: numbers that are not finite.
-    pub fn inverse(&self) -> AffineMap {
-        let determinant = self.x[0] * self.y[1] - self.x[1] * self.y[0];
-        let [a, b] = [self.y[1] / determinant, -self.x[1] / determinant];
-        let [c, d] = [-self.y[0] / determinant, self.x[0] / determinant];
-        AffineMap { x: [a, b, -(a * self.x[2] + b * self.y[2])], y: [c, d, -(c * self.x[2] + d * self.y[2])] }
-    }
-
     /// Image pixels per patch pixel along a side.
     pub fn scale(&self) -> f32 {
         (self.x[0] * self.y[1] - self.x[1] * self.y[0]).abs().sqrt()
@@ -218,14 +210,6 @@ mod tests {
         }
         assert_eq!(back[(8, 0)], [128; 3]);
         assert_eq!(inside.area(), 28.0);
-    }
-
-    #[test]
-    fn there_and_back() {
-        let map = AffineMap { x: [1.5, -0.4, 3.0], y: [0.3, 1.2, -2.0] };
-        let [x, y] = map.apply(7.0, -4.0);
-        let [u, v] = map.inverse().apply(x, y);
-        assert!((u - 7.0).abs() < 1e-4 && (v + 4.0).abs() < 1e-4, "{u} {v}");
     }
 
     #[test]

@@ -19,7 +19,6 @@ struct Case {
     camera: Camera,
     truth: Pose,
     region: Rect,
-    visible: f64,
     found: Found,
 }
 
@@ -57,8 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let options = EstimateOptions::default();
             if let Some(found) = estimate(&model, &image, &camera, truth.obj_id, &region, &options)? {
                 let (object, truth, image) = (truth.obj_id, truth.camera_from_object, image.clone());
-                let visible = visible.info.visib_fract;
-                cases.push(Case { object, image, camera, truth, region, visible, found });
+                cases.push(Case { object, image, camera, truth, region, found });
             }
         }
     }
@@ -116,11 +114,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         cases.iter().map(|c| measured(c, &c.found.hypotheses[0].camera_from_object)).collect();
     println!("{} cases", cases.len());
     print("PnP", &before);
-    let degrees = |turns: &[f64]| turns.iter().map(|t| t.to_radians()).collect::<Vec<f64>>();
-    for (looks, turns) in [(1, vec![]), (1, vec![-12.0, 12.0])] {
+    for (looks, shape, line) in
+        [(1, 30.0, 0.3), (2, 30.0, 0.3), (3, 30.0, 0.3), (2, 10.0, 0.3), (3, 10.0, 0.3), (2, 15.0, 0.5)]
+    {
         let options = AlignOptions {
             looks,
-            estimate: EstimateOptions { turns: degrees(&turns), ..EstimateOptions::default() },
+            refine: RefineOptions { shape, line, ..base.clone() },
             ..AlignOptions::default()
         };
         let errors: Vec<_> = cases
@@ -133,22 +132,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 measured(c, &pose)
             })
             .collect();
-        if std::env::var_os("DETAIL").is_some() {
-            for ((c, e), b) in cases.iter().zip(&errors).zip(&before) {
-                println!(
-                    "D {} {} {:.3} {:.4} {:.2} {:.1} before {:.4} {:.2}",
-                    turns.len(),
-                    c.object,
-                    c.visible,
-                    e.0,
-                    e.1,
-                    1e3 * c.truth.translation().z,
-                    b.0,
-                    b.1
-                );
-            }
-        }
-        print(&format!("looks {looks} turns {turns:?}"), &errors);
+        print(&format!("looks {looks} shape {shape} line {line}"), &errors);
     }
     if arguments.len() > 3 {
         return Ok(());

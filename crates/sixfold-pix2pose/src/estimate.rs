@@ -7,11 +7,9 @@
 use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
 use crate::samples::second_stage::GREY;
-use crate::samples::window::turned_pixel;
 use rayon::prelude::*;
-use sixfold_augment::{AffineMap, Patch, Window};
+use sixfold_augment::{Patch, Window};
 use sixfold_geometry::{Camera, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac};
-use sixfold_outline::sample;
 
 /// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,9 +22,6 @@ pub struct EstimateOptions {
     pub crop_factor: f64,
     /// Inlier threshold of PnP in pixels of the network's output; at least 1.5 image pixels are allowed.
     pub reprojection: f64,
-    /// Further passes see the second crop turned in the image plane by these angles, radians. Their correspondences join those
-    /// of the best candidate: they err apart.
-    pub turns: Vec<f64>,
     /// Seed of RANSAC.
     pub seed: u64,
     /// The author's bugs, one by one.
@@ -40,7 +35,6 @@ impl Default for EstimateOptions {
             two_stages: true,
             crop_factor: 1.5,
             reprojection: 1.5,
-            turns: Vec::new(),
             seed: 0,
             quirks: Quirks::default(),
         }
@@ -197,25 +191,14 @@ pub fn estimate(
     }
     // The last of the batch keeps its background; it is a candidate too.
     candidates.push((thresholds.iter().copied().fold(0.0, f32::max), scaled));
-    let turned: Vec<Turned> = options
-        .turns
-        .iter()
-        .map(|turn| Turned::cut(image, camera, window, *turn, model.sizes().input))
-        .collect();
-    let crops = candidates.iter().map(|(_, crop)| &crop.pixels).chain(turned.iter().map(|t| &t.pixels));
-    let batch: Vec<f32> = crops.flatten().copied().collect();
-    let mut predictions = model.predict(index, &batch);
-    let of_turned = predictions.split_off(candidates.len().min(predictions.len()));
+    let batch: Vec<f32> = candidates.iter().flat_map(|(_, crop)| crop.pixels.iter().copied()).collect();
+    let predictions = model.predict(index, &batch);
     let views: Vec<(f32, Crop, Prediction)> =
         candidates.into_iter().zip(predictions).map(|((t, crop), p)| (t, crop, p)).collect();
     let Some(open) = views.last().map(|(_, crop, prediction)| view(crop, prediction)) else {
         return Ok(None);
     };
-    let mut best = context.best(views, first_view, open);
-    if let Some(found) = &mut best {
-        context.join(found, turned.iter().zip(&of_turned));
-    }
-    Ok(best)
+    Ok(context.best(views, first_view, open))
 }
 
 fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), EstimateError> {
@@ -341,28 +324,6 @@ impl Crop {
     }
 }
 
-/// A crop turned in the image plane.
-struct Turned {
-    /// From its pixels to the image's.
-    map: AffineMap,
-    side: usize,
-    pixels: Vec<f32>,
-}
-
-impl Turned {
-    fn cut(image: &RgbImage, camera: &Camera, window: Window, turn: f64, side: usize) -> Turned {
-        let there = Window { centre: turned_pixel(camera, &window.centre, turn), side: window.side };
-        let map = there.map(camera, side, turn);
-        let (patch, _) = Patch::warp(image, &map, side, side, [GREY; 3]);
-        Turned { map, side, pixels: patch.data }
-    }
-}
-
-fn logit(p: f32) -> f32 {
-    let p = p.clamp(0.01, 0.99);
-    (p / (1.0 - p)).ln()
-}
-
 struct Context<'a> {
     camera: &'a Camera,
     object: &'a ObjectEntry,
@@ -404,53 +365,6 @@ impl Context<'_> {
             image_points: first.0.image_points.clone(),
             hypotheses: all.into_iter().map(|(candidate, _)| candidate.hypothesis).collect(),
         })
-    }
-
-    /// Adds the correspondences of turned crops to those of the best hypothesis, and solves for its pose again.
-    fn join<'t>(&self, found: &mut Found, turned: impl Iterator<Item = (&'t Turned, &'t Prediction)>) {
-        let Some(threshold) = found.hypotheses.first().map(|h| h.threshold) else { return };
-        let scale = self.object.scale();
-        let before = found.object_points.len();
-        let r = found.open_view.window;
-        let side = found.open_view.prediction.side;
-        let mut logits: Vec<f32> = found.open_view.prediction.visible.iter().map(|p| logit(*p)).collect();
-        let mut count = 1.0;
-        for (crop, prediction) in turned {
-            let ratio = crop.side as f64 / prediction.side as f64;
-            let mask = object_mask(prediction, threshold.max(0.3));
-            for index in (0..mask.len()).filter(|i| mask[*i]) {
-                let n = prediction.coordinates[index].map(f64::from);
-                let at = |v: usize| ((v as f64 + 0.5) * ratio - 0.5) as f32;
-                let [x, y] = crop.map.apply(at(index % prediction.side), at(index / prediction.side));
-                found.object_points.push(scale.restore(&Vec3::from(n)));
-                found.image_points.push(Vec2::new(x.into(), y.into()));
-            }
-            let back = crop.map.inverse();
-            for (i, logit_) in logits.iter_mut().enumerate() {
-                let at = |v: usize| (v as f64 + 0.5) / side as f64;
-                let (u, v) = (r.x + at(i % side) * r.width, r.y + at(i / side) * r.height);
-                let [x, y] = back.apply(u as f32, v as f32);
-                let to = |v: f32| (f64::from(v) + 0.5) / ratio - 0.5;
-                *logit_ += logit(sample(&prediction.visible, prediction.side, to(x), to(y)));
-            }
-            count += 1.0;
-        }
-        if found.object_points.len() == before {
-            return;
-        }
-        for (p, l) in found.open_view.prediction.visible.iter_mut().zip(&logits) {
-            *p = 1.0 / (1.0 + (-l / count).exp());
-        }
-        let step = r.width / side as f64;
-        let pnp = PnpOptions {
-            threshold_px: (self.options.reprojection * step).max(1.5),
-            max_iterations: 1000,
-            seed: self.options.seed,
-            ..PnpOptions::default()
-        };
-        if let Ok(report) = pnp_ransac(&found.object_points, &found.image_points, self.camera, &pnp) {
-            found.hypotheses[0].camera_from_object = report.camera_from_object;
-        }
     }
 
     fn pose(&self, threshold: f32, crop: &Crop, prediction: &Prediction) -> Option<Candidate> {
@@ -505,47 +419,5 @@ impl Context<'_> {
             image_points,
             off_centre: (centre - centroid).norm(),
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_turned_crop_shows_the_same_place() {
-        // Off the principal point, with pixels that are not square.
-        let camera = Camera::new(600.0, 500.0, 300.0, 200.0, 640, 480).unwrap();
-        let window = Window { centre: Vec2::new(420.0, 130.0), side: 96.0 };
-        // Columns and rows can be read off the colours.
-        let image = RgbImage::from_fn(640, 480, |x, y| [(x / 3) as u8, (y / 2) as u8, 0]);
-        let side = 64;
-        for turn in [-0.4, 0.2f64] {
-            let turned = Turned::cut(&image, &camera, window, turn, side);
-            let middle = 0.5 * (side as f32 - 1.0);
-            let [x, y] = turned.map.apply(middle, middle);
-            assert!((x - 420.0).abs() < 1e-2 && (y - 130.0).abs() < 1e-2, "{x} {y}");
-            for (u, v) in [(10, 20), (50, 33)] {
-                let [x, y] = turned.map.apply(u as f32, v as f32);
-                let seen = [0, 1].map(|c| 255.0 * turned.pixels[c * side * side + v * side + u]);
-                assert!(
-                    (seen[0] - x / 3.0).abs() < 1.0 && (seen[1] - y / 2.0).abs() < 1.0,
-                    "{seen:?} {x} {y}"
-                );
-            }
-            // What an object turned about the camera's axis by as much looks like: its points lie where the crop's pixels do.
-            let point = Vec3::new(0.21, -0.13, 1.0);
-            let (s, c) = turn.sin_cos();
-            let before = Vec3::new(c * point.x + s * point.y, -s * point.x + c * point.y, point.z);
-            let there = camera.project(&point).unwrap();
-            let here = camera.project(&before).unwrap();
-            let corner = turned_pixel(&camera, &window.centre, turn) - Vec2::repeat(48.0);
-            let pixel = (there - corner) * (side as f64 / 96.0) - Vec2::repeat(0.5);
-            let [x, y] = turned.map.apply(pixel.x as f32, pixel.y as f32);
-            assert!(
-                (f64::from(x) - here.x).abs() < 0.05 && (f64::from(y) - here.y).abs() < 0.05,
-                "{x} {y} {here}"
-            );
-        }
     }
 }

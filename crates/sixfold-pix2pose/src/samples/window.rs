@@ -93,7 +93,7 @@ pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
 }
 
 /// Where a pixel of the photograph lies after its turn about the principal point.
-pub(crate) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
+pub(super) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
     let (s, c) = turn.sin_cos();
     let (x, y) = ((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy);
     Vec2::new(camera.cx + camera.fx * (c * x - s * y), camera.cy + camera.fy * (s * x + c * y))
