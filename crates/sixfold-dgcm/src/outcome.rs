@@ -4,8 +4,9 @@
 //! experience", section 6.2.1), and ranks by how near an experience is. Failures do say something: how much worse than the
 //! planner believes a grasp on the edge of its friction cone is, or one far from the object's middle, with this hand and
 //! these pads. So every attempt is kept with a dozen numbers that were known before, and a logistic regression with a normal
-//! prior (Cox 1958; MAP by Newton's method) foretells the next one. The prior is what simulated attempts taught: without an attempt of its own, a hand ranks by the
-//! quality of the contacts and the agreement with experience, as section 6.3.2 does, and keeps away from the table.
+//! prior (Cox 1958; MAP by Newton's method) foretells the next one. The prior is what simulated attempts taught: without an
+//! attempt of its own, a hand ranks by the quality of the contacts and the agreement with experience, as section 6.3.2 does,
+//! and keeps away from the table.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{SMatrix, SVector};
@@ -93,7 +94,7 @@ const PRECISION_OF_CONSTANT: f64 = 0.01;
 const ROOM: (f64, f64) = (0.003, 0.1);
 /// And once more below this, metres: a hand that is off by millimetres meets the table.
 const SCARCE: f64 = 0.01;
-/// With the object's middle this far off along the closing direction, metres, something at its side is held: from, surely.
+/// With the object's middle this far off along the closing direction, metres, something at its side is held: from where on, and where surely.
 const WALL: (f64, f64) = (0.015, 0.035);
 
 /// What is known of a grasp, each number in about -1 to 1.

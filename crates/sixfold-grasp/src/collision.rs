@@ -113,14 +113,12 @@ mod tests {
                 plate.push(Vec3::new(0.003 * f64::from(i), 0.003 * f64::from(j), 0.5));
             }
         }
-        let cloud = PointCloud { points: plate.clone(), normals: vec![] };
         let free = |behind: f64, thickness: f64| {
-            // From behind the plate towards the camera, with the palm's front that far behind it and the fingers beside it.
-            let tip = Vec3::new(0.0, 0.1, 0.5 + behind - gripper.finger_length);
+            // From behind the plate towards the camera, with the palm's front that far behind it.
+            let tip = Vec3::new(0.0, 0.0, 0.5 + behind - gripper.finger_length);
             let pose = gripper_pose(&tip, &-Vec3::z(), &Vec3::x()).unwrap();
-            let at_plate = Pose::from_translation(Vec3::new(0.0, -0.1, 0.0)) * pose;
-            let scene = CollisionScene::new(&[], None).with_thickness(&cloud.points, thickness);
-            scene.hit(&gripper, &at_plate, 0.06)
+            let scene = CollisionScene::new(&[], None).with_thickness(&plate, thickness);
+            scene.hit(&gripper, &pose, 0.06)
         };
         assert_eq!(free(0.01, 0.0), None);
         assert_eq!(free(0.01, 0.02), Some(Hit::Palm));

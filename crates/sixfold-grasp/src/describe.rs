@@ -44,7 +44,7 @@ impl GraspFitter<'_> {
 
 #[cfg(test)]
 mod tests {
-    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud};
+    use sixfold_geometry::PointCloud;
 
     use super::*;
     use crate::{AntipodalOptions, GraspView, Gripper, gripper_pose};
@@ -62,16 +62,7 @@ mod tests {
                 }
             }
         }
-        let view = GraspView {
-            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
-            depth: DepthImage::filled(64, 64, 0.0),
-            mask: Mask::filled(64, 64, false),
-            table: Some(Plane { normal: -Vec3::z(), offset: -0.5 }),
-            object,
-            obstacles: PointCloud::default(),
-            step: 0.002,
-            cut_by_edge: false,
-        };
+        let view = GraspView::from_above(object, 0.5, 0.002);
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
         let fitter = GraspFitter::new(&view, &gripper, &options).unwrap();

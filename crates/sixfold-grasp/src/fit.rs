@@ -93,7 +93,7 @@ impl<'a> GraspFitter<'a> {
 
 #[cfg(test)]
 mod tests {
-    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
+    use sixfold_geometry::{PointCloud, Vec3};
 
     use super::*;
     use crate::gripper_pose;
@@ -112,16 +112,7 @@ mod tests {
                 }
             }
         }
-        GraspView {
-            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
-            depth: DepthImage::filled(64, 64, 0.0),
-            mask: Mask::filled(64, 64, false),
-            table: Some(Plane { normal: -Vec3::z(), offset: -0.6 }),
-            object,
-            obstacles: PointCloud::default(),
-            step: 0.0025,
-            cut_by_edge: false,
-        }
+        GraspView::from_above(object, 0.6, 0.0025)
     }
 
     #[test]

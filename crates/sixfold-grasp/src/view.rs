@@ -132,6 +132,23 @@ pub struct GraspView {
     pub cut_by_edge: bool,
 }
 
+#[cfg(test)]
+impl GraspView {
+    /// Points on a table that lies `table` metres before a camera that looks straight down, without an image of them.
+    pub(crate) fn from_above(object: PointCloud, table: f64, step: f64) -> GraspView {
+        GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: Some(Plane { normal: -Vec3::z(), offset: -table }),
+            object,
+            obstacles: PointCloud::default(),
+            step,
+            cut_by_edge: false,
+        }
+    }
+}
+
 impl GraspView {
     /// Prepares the view of the object in `mask`, from a depth image in metres of a camera without distortion (undo it
     /// first).
