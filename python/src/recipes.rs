@@ -17,10 +17,12 @@ use crate::training::{Source, kind, run, share, steps_of, summary, turn};
 /// model.safetensors, and in training/ checkpoints, log.jsonl and curves.png. ids: objects of the dataset, all if None;
 /// frames: pairs (scene_id, im_id) of photographs to learn from, all of the split if None; renders_only=True opens none.
 /// network: "compact", which trains on two cores, or the dissertation's "paper" and "resnet50" for one object; steps,
-/// per_object (images of every object in a step) and learning_rate have its defaults if None. render_share and
+/// per_object (images of every object in a step) and learning_rate have its defaults if None. adversarial: against a
+/// discriminator; if None, all but the compact network. render_share and
 /// near_photographs: share of renders, and of those near a photograph's pose; rotation: largest turn of photographs in the
 /// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to go on from; encoder: torchvision's ResNet-50
-/// weights for "resnet50"; backgrounds: a folder of photographs; lmo_thresholds: the dissertation's for LM-O.
+/// weights for "resnet50"; backgrounds: a folder of photographs; preset: symmetries, thresholds
+/// and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless".
 ///
 /// progress: called with a dict: stage ("training" or "measuring"), done, total, and while training seconds,
 /// learning_rate, samples_per_second, losses. Ctrl-C, or an error of the callback, ends the training after the current
@@ -32,7 +34,7 @@ use crate::training::{Source, kind, run, share, steps_of, summary, turn};
 /// >>> trained = train_pix2pose("data/demo", "out/pix2pose", ids=[8], steps=200, progress=print)  # doctest: +SKIP
 /// >>> pix2pose = Pix2Pose.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network="compact", steps=None, per_object=None, learning_rate=None, adversarial=true, frozen_stages=2, render_share=0.5, near_photographs=0.5, rotation=None, size=128, init=None, encoder=None, backgrounds=None, mesh_colors=true, convex_hull=false, transformer_loss=true, view_limits=false, lmo_thresholds=false, progress=None, seed=0))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network="compact", steps=None, per_object=None, learning_rate=None, adversarial=None, frozen_stages=2, render_share=0.5, near_photographs=0.5, rotation=None, size=128, init=None, encoder=None, backgrounds=None, mesh_colors=true, convex_hull=false, transformer_loss=true, view_limits=false, preset=None, progress=None, seed=0))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_pix2pose<'py>(
     py: Python<'py>,
@@ -46,7 +48,7 @@ pub(crate) fn train_pix2pose<'py>(
     steps: Option<i64>,
     per_object: Option<i64>,
     learning_rate: Option<f64>,
-    adversarial: bool,
+    adversarial: Option<bool>,
     frozen_stages: i64,
     render_share: f64,
     near_photographs: f64,
@@ -59,13 +61,14 @@ pub(crate) fn train_pix2pose<'py>(
     convex_hull: bool,
     transformer_loss: bool,
     view_limits: bool,
-    lmo_thresholds: bool,
+    preset: Option<&str>,
     progress: Option<Py<PyAny>>,
     seed: i64,
 ) -> PyResult<Bound<'py, PyDict>> {
+    use sixfold_pix2pose::preset::Preset;
     use sixfold_pix2pose::recipe::{LEAST_VISIBLE, NetworkKind, Recipe};
     let recipe = Recipe {
-        network: kind(network, NetworkKind::ALL, NetworkKind::name)?,
+        network: kind("network", network, NetworkKind::ALL, NetworkKind::name)?,
         steps: steps_of(steps)?,
         per_object: per_object.map(|n| whole("per_object", n, 1)).transpose()?,
         learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
@@ -81,7 +84,7 @@ pub(crate) fn train_pix2pose<'py>(
         convex_hull,
         transformer_loss,
         view_limits,
-        lmo_thresholds,
+        preset: preset.map(|name| kind("preset", name, Preset::ALL, Preset::name)).transpose()?,
         backgrounds,
         seed: self::seed(seed)?,
         command: "sixfold.train_pix2pose".to_owned(),
@@ -138,7 +141,7 @@ pub(crate) fn train_detector<'py>(
     use sixfold_detect::recipe::{DetectorKind, LEAST_VISIBLE, Recipe};
     share("encoder_share", encoder_share)?;
     let recipe = Recipe {
-        network: kind(network, DetectorKind::ALL, DetectorKind::name)?,
+        network: kind("network", network, DetectorKind::ALL, DetectorKind::name)?,
         steps: whole("steps", steps, 1)? as u64,
         batch: whole("batch", batch, 1)?,
         learning_rate: positive("learning_rate", learning_rate)?,
@@ -191,7 +194,7 @@ pub(crate) fn train_dgcm<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold_dgcm::recipe::{DgcmKind, Recipe};
     let recipe = Recipe {
-        network: kind(network, DgcmKind::ALL, DgcmKind::name)?,
+        network: kind("network", network, DgcmKind::ALL, DgcmKind::name)?,
         encoder,
         steps: steps_of(steps)?,
         pairs: pairs.map(|n| whole("pairs", n, 1)).transpose()?,
@@ -238,7 +241,7 @@ pub(crate) fn train_mttm<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold_mttm::recipe::{MttmKind, Recipe};
     let recipe = Recipe {
-        network: kind(network, MttmKind::ALL, MttmKind::name)?,
+        network: kind("network", network, MttmKind::ALL, MttmKind::name)?,
         encoder,
         steps: steps_of(steps)?,
         anchors: anchors.map(|n| whole("anchors", n, 2)).transpose()?,
@@ -285,7 +288,7 @@ pub(crate) fn train_nol<'py>(
     use sixfold_nol::network::{IntegratorKind, Parts};
     use sixfold_nol::recipe::{NolKind, Recipe};
     let recipe = Recipe {
-        network: kind(network, NolKind::ALL, NolKind::name)?,
+        network: kind("network", network, NolKind::ALL, NolKind::name)?,
         encoder,
         parts: Parts {
             integrator: if lstm { IntegratorKind::Lstm } else { IntegratorKind::Average },

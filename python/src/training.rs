@@ -125,6 +125,7 @@ pub(crate) fn summary<'py>(py: Python<'py>, trained: Trained) -> PyResult<Bound<
 
 /// One of the names of a kind of network.
 pub(crate) fn kind<K: Copy, const N: usize>(
+    argument: &str,
     name: &str,
     all: [K; N],
     name_of: impl Fn(K) -> &'static str,
@@ -132,7 +133,7 @@ pub(crate) fn kind<K: Copy, const N: usize>(
     let expected = || all.map(&name_of).join(" or ");
     all.into_iter()
         .find(|k| name_of(*k) == name)
-        .ok_or_else(|| bad("network", expected(), format!("{name:?}")))
+        .ok_or_else(|| bad(argument, expected(), format!("{name:?}")))
 }
 
 /// 0 to 1.

@@ -575,6 +575,31 @@ impl NetworkKind {
     }
 }
 
+/// An experiment of the dissertation's chapter 3.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Preset {
+    /// The entries to the BOP challenges: three thresholds, symmetries of the dataset
+    Bop,
+    /// LineMOD
+    Linemod,
+    /// LineMOD Occlusion
+    Lmo,
+    /// T-LESS
+    Tless,
+}
+
+impl Preset {
+    /// As the library has it.
+    pub fn preset(self) -> sixfold_pix2pose::preset::Preset {
+        match self {
+            Preset::Bop => sixfold_pix2pose::preset::Preset::Bop,
+            Preset::Linemod => sixfold_pix2pose::preset::Preset::Linemod,
+            Preset::Lmo => sixfold_pix2pose::preset::Preset::Lmo,
+            Preset::Tless => sixfold_pix2pose::preset::Preset::Tless,
+        }
+    }
+}
+
 /// What a training learns from.
 #[derive(Debug, Args)]
 pub(crate) struct MaterialArguments {
@@ -617,7 +642,8 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Which network learns
     #[arg(long, value_enum, default_value = "compact")]
     pub network: NetworkKind,
-    /// Training steps; each takes so many images of every object (default: 8000; the dissertation's networks: 25000)
+    /// Training steps; each takes so many images of every object (default: 8000; the dissertation's networks: 25000). 0: the
+    /// weights of --init as they are, with their alignment's constant error measured anew
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
     /// Images of every object in a step (default: 4; the dissertation's networks: 50)
@@ -626,6 +652,9 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Highest learning rate (default: 0.002; the dissertation's networks: 0.0001)
     #[arg(long, value_name = "RATE")]
     pub learning_rate: Option<f64>,
+    /// Train the compact network against discriminators, one an object, as the dissertation's are
+    #[arg(long, conflicts_with = "no_adversarial")]
+    pub adversarial: bool,
     /// Train a network of the dissertation without its discriminator
     #[arg(long)]
     pub no_adversarial: bool,
@@ -662,9 +691,10 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Plain L1 with one side of a symmetric object standing for all, instead of the transformer loss
     #[arg(long)]
     pub view_limits: bool,
-    /// Outlier thresholds of the dissertation's LM-O experiment instead of the three of its BOP entry
-    #[arg(long)]
-    pub lmo_thresholds: bool,
+    /// Symmetric poses, outlier thresholds and occlusion of an experiment of the dissertation (its appendix A) (default:
+    /// symmetries of the dataset, thresholds of the BOP entries)
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
     /// Train no further: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,

@@ -47,6 +47,8 @@ pub struct Outline<'a> {
     frame: Frame,
     crop: Camera,
     odds: Vec<f32>,
+    /// Change of brightness along x and y at every pixel, and its weight.
+    edges: Option<(Vec<[f32; 2]>, f64)>,
     side: usize,
 }
 
@@ -58,7 +60,16 @@ impl<'a> Outline<'a> {
     /// When `odds` has not as many numbers as the crop has pixels.
     pub fn new(mesh: &'a Mesh, crop: &Camera, odds: Vec<f32>) -> Self {
         assert_eq!(odds.len(), crop.width * crop.height, "one number per pixel of a square crop");
-        Outline { mesh, frame: Frame::new(crop), crop: *crop, odds, side: crop.width }
+        Outline { mesh, frame: Frame::new(crop), crop: *crop, odds, edges: None, side: crop.width }
+    }
+
+    /// The same where borders are rather there where colours change: `weight` is what the log likelihood of a border gains at a
+    /// sharp edge of the image, whose pixels are those of the odds.
+    pub fn with_edges(mut self, patch: &Patch, weight: f64) -> Self {
+        if weight > 0.0 {
+            self.edges = Some((gradients(patch), weight));
+        }
+        self
     }
 
     /// Lines across the rendered outline, with the most likely border on each.
@@ -129,6 +140,13 @@ impl<'a> Outline<'a> {
             sum += f64::from(*o) * STEP;
             likelihood.push(sum);
         }
+        if let Some((gradients, weight)) = &self.edges {
+            for (k, l) in likelihood.iter_mut().enumerate() {
+                let p = start + normal * (at(k) - 0.5 * STEP);
+                let change = change_along(gradients, self.side, &p, normal);
+                *l += weight * change * change / (change * change + EDGE * EDGE);
+            }
+        }
         let best = likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
         for (k, l) in likelihood.iter().enumerate() {
@@ -141,6 +159,43 @@ impl<'a> Outline<'a> {
         let mean = first / total;
         Some((mean, (second / total - mean * mean).max(0.1)))
     }
+}
+
+/// Change of colour across a pixel (0 to 1, the root of the squares' mean over the channels) that is half an edge.
+const EDGE: f64 = 0.06;
+
+/// The change along x and y of the channel that changes most, at every pixel.
+fn gradients(patch: &Patch) -> Vec<[f32; 2]> {
+    let (width, height) = (patch.width, patch.height);
+    let area = width * height;
+    (0..area)
+        .map(|i| {
+            let (x, y) = (i % width, i / width);
+            let (left, right) = (i - usize::from(x > 0), i + usize::from(x + 1 < width));
+            let (above, below) =
+                (if y > 0 { i - width } else { i }, if y + 1 < height { i + width } else { i });
+            (0..3)
+                .map(|c| {
+                    let plane = &patch.data[c * area..(c + 1) * area];
+                    [0.5 * (plane[right] - plane[left]), 0.5 * (plane[below] - plane[above])]
+                })
+                .max_by(|a, b| (a[0] * a[0] + a[1] * a[1]).total_cmp(&(b[0] * b[0] + b[1] * b[1])))
+                .unwrap_or_default()
+        })
+        .collect()
+}
+
+/// Change along a direction at a place between pixels.
+fn change_along(gradients: &[[f32; 2]], side: usize, p: &Vec2, normal: &Vec2) -> f64 {
+    let last = (side - 1) as f64;
+    let (x, y) = (p.x.clamp(0.0, last), p.y.clamp(0.0, last));
+    let (x0, y0) = (x.floor().min(last - 1.0), y.floor().min(last - 1.0));
+    let (fx, fy) = (x - x0, y - y0);
+    let at = |dx: usize, dy: usize| {
+        let [gx, gy] = gradients[(y0 as usize + dy) * side + x0 as usize + dx];
+        (f64::from(gx) * normal.x + f64::from(gy) * normal.y).abs()
+    };
+    (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
 }
 
 /// Adds the distances of lines to the normal equations of a twist about `centre` (camera frame). `line` is the weight of a line
@@ -193,4 +248,55 @@ pub fn motion(camera: &Camera, point: &Vec3, centre: &Vec3) -> [[f64; 6]; 2] {
 pub fn tukey(r: f64) -> f64 {
     let t = r / 4.685;
     if t.abs() >= 1.0 { 0.0 } else { (1.0 - t * t).powi(2) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A square plate at 1 m that covers the crop's pixels 20 to 59.
+    fn plate() -> (Mesh, Camera) {
+        let camera = Camera::new(400.0, 400.0, 39.5, 39.5, 80, 80).unwrap();
+        let corner = |x: f64, y: f64| Vec3::new(x * 0.05, y * 0.05, 0.0);
+        let vertices = vec![corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
+        (Mesh::new(vertices, vec![[0, 2, 1], [0, 3, 2], [0, 1, 2], [0, 2, 3]]).unwrap(), camera)
+    }
+
+    /// Mean distance outwards of the borders that are found, where odds change at `odds` pixels outside the outline and colours
+    /// at `colors` pixels.
+    fn found(odds: f64, colors: f64, weight: f64) -> f64 {
+        let (mesh, camera) = plate();
+        let outside = |i: usize, by: f64| {
+            let (x, y) = ((i % 80) as f64 - 39.5, (i / 80) as f64 - 39.5);
+            x.abs().max(y.abs()) > 20.0 + by
+        };
+        // Odds as a network's and a histogram's are: unsure about the border.
+        let map: Vec<f32> = (0..80 * 80)
+            .map(|i| {
+                let (x, y) = ((i % 80) as f64 - 39.5, (i / 80) as f64 - 39.5);
+                (20.0 + odds - x.abs().max(y.abs())).clamp(-3.0, 3.0) as f32 * 0.7
+            })
+            .collect();
+        let mut patch = Patch::filled(80, 80, [0.6; 3]);
+        for i in (0..80 * 80).filter(|i| outside(*i, colors)) {
+            patch.data[80 * 80 + i] = 0.2;
+        }
+        let mut outline = Outline::new(&mesh, &camera, map).with_edges(&patch, weight);
+        let lines = outline.lines(5.0, &Pose::from_translation(Vec3::new(0.0, 0.0, 1.0)));
+        assert!(lines.len() > 100, "{}", lines.len());
+        lines.iter().map(|line| line.offset).sum::<f64>() / lines.len() as f64
+    }
+
+    #[test]
+    fn an_edge_near_the_border_of_the_odds_says_where_it_is() {
+        // By odds alone the border is where they change their sign.
+        let alone = found(2.0, 0.0, 0.0);
+        assert!((alone - 2.0).abs() < 0.3, "{alone}");
+        // The edge two pixels further in draws it there, and the stronger the heavier it weighs.
+        let (little, much) = (found(2.0, 0.0, 2.0), found(2.0, 0.0, 8.0));
+        assert!(much < little && little < alone && much.abs() < 0.4, "{alone} {little} {much}");
+        // One far away does not.
+        let far = found(0.0, 15.0, 8.0);
+        assert!(far.abs() < 0.3, "{far}");
+    }
 }

@@ -4,10 +4,10 @@
 //! Each iteration teaches the discriminator on rendered and on generated coordinate images, then the generator on
 //! `lambda_1 * reconstruction + lambda_2 * error + adversarial`.
 
+use crate::critic::Critic;
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::{paper_input, resnet_input};
 use crate::networks::ResNet50Generator;
-use crate::networks::{Discriminator, DiscriminatorConfig};
 use crate::networks::{GeneratorOutput, PaperGenerator};
 use crate::object::SymmetryMap;
 use crate::samples::{Sample, SampleSource};
@@ -15,8 +15,6 @@ use crate::training::{TrainingError, TrainingOutcome};
 use burn::module::Module;
 use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use sixfold_nn::schedule::LearningRate;
@@ -100,9 +98,8 @@ impl Generator for ResNet50Generator {
 /// What is trained, and what trains it.
 struct State<'a, G> {
     generator: G,
-    discriminator: Discriminator,
+    critic: Critic,
     generator_optimiser: ModuleOptimizer,
-    discriminator_optimiser: ModuleOptimizer,
     pool: &'a [SymmetryMap],
     /// Of the images, pixels.
     side: usize,
@@ -134,7 +131,8 @@ impl<G: Generator> Trainee for State<'_, G> {
         if options.adversarial {
             let real =
                 Tensor::<4>::from_data(TensorData::new(coordinates.clone(), [count, 3, side, side]), device);
-            let teaching = self.teach(real, output.coordinates.clone().detach(), options, step, rate, device);
+            let generated = output.coordinates.clone().detach();
+            let teaching = self.critic.teach(generated, real, step, rate, device);
             losses.insert("discriminator".to_string(), teaching);
         }
         let joined = Tensor::cat(vec![output.coordinates.clone(), output.error], 1);
@@ -156,10 +154,10 @@ impl<G: Generator> Trainee for State<'_, G> {
         let gradient = Tensor::<4>::from_data(TensorData::new(value.gradient, joined.dims()), device);
         let mut total = (joined * gradient).sum();
         if options.adversarial {
-            let fooled = entropy(self.discriminator.forward(output.coordinates), 1.0);
-            let known = fooled.clone().inner().into_scalar::<f32>();
+            let doubt = self.critic.doubt(output.coordinates);
+            let known = doubt.clone().inner().into_scalar::<f32>();
             losses.insert("adversarial".to_string(), f64::from(known));
-            total = total + fooled;
+            total = total + doubt;
         }
         let gradients = GradientsParams::from_grads(total.backward(), &self.generator);
         self.generator = self.generator_optimiser.step(rate, self.generator.clone(), gradients);
@@ -167,61 +165,20 @@ impl<G: Generator> Trainee for State<'_, G> {
     }
 
     fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        checkpoint
+        let checkpoint = checkpoint
             .module("generator", &self.generator)?
-            .module("discriminator", &self.discriminator)?
-            .optimiser("generator", &self.generator_optimiser)?
-            .optimiser("discriminator", &self.discriminator_optimiser)
+            .optimiser("generator", &self.generator_optimiser)?;
+        self.critic.save(checkpoint)
     }
 
     fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
         Ok(State {
             generator: checkpoint.module("generator", self.generator)?,
-            discriminator: checkpoint.module("discriminator", self.discriminator)?,
+            critic: self.critic.restore(checkpoint)?,
             generator_optimiser: checkpoint.optimiser("generator", self.generator_optimiser)?,
-            discriminator_optimiser: checkpoint.optimiser("discriminator", self.discriminator_optimiser)?,
             ..self
         })
     }
-}
-
-impl<G: Generator> State<'_, G> {
-    /// One step of the discriminator on generated, then on rendered coordinates; its mean loss.
-    fn teach(
-        &mut self,
-        real: Tensor<4>,
-        generated: Tensor<4>,
-        options: &AdversarialOptions,
-        step: u64,
-        rate: f64,
-        device: &Device,
-    ) -> f64 {
-        // Soft labels, now and then turned round for a whole batch, as in the author's code.
-        let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-        random.set_stream(step + 1);
-        let mut sum = 0.0;
-        for (images, true_label) in [(generated, false), (real, true)] {
-            let label = if true_label != (random.random::<f32>() < 0.2) {
-                random.random_range(0.9..1.0)
-            } else {
-                random.random_range(0.0..0.1)
-            };
-            let images = Tensor::from_data(images.into_data(), device);
-            let loss = entropy(self.discriminator.forward(images), label);
-            sum += 0.5 * f64::from(loss.clone().inner().into_scalar::<f32>());
-            let gradients = GradientsParams::from_grads(loss.backward(), &self.discriminator);
-            self.discriminator =
-                self.discriminator_optimiser.step(rate, self.discriminator.clone(), gradients);
-        }
-        sum
-    }
-}
-
-/// Mean binary cross entropy of logits against one label.
-fn entropy(logits: Tensor<2>, label: f32) -> Tensor<1> {
-    let positive = logits.clone().clamp_min(0.0);
-    let rest = logits.clone().abs().neg().exp().log1p();
-    (positive - logits.mul_scalar(label) + rest).mean()
 }
 
 /// Trains a generator for the one object of `source`; as [`crate::training::train`] otherwise.
@@ -256,12 +213,10 @@ pub fn train_adversarial<G: Generator>(
             return wrong(field, "at least 1", "0".to_string());
         }
     }
-    let optimiser = || AdamConfig::new().init();
     let state = State {
         generator,
-        discriminator: DiscriminatorConfig { seed: options.seed }.init(device),
-        generator_optimiser: optimiser(),
-        discriminator_optimiser: optimiser(),
+        critic: Critic::new("discriminator", options.seed, device),
+        generator_optimiser: AdamConfig::new().init(),
         pool: if options.transformer_loss { pool } else { &pool[..1] },
         side,
         options,

@@ -3,6 +3,7 @@
 
 pub mod adversarial;
 pub mod aligned;
+mod critic;
 pub mod depth;
 pub mod estimate;
 pub mod loss;
@@ -10,6 +11,7 @@ pub mod material;
 pub mod model;
 pub mod networks;
 pub mod object;
+pub mod preset;
 pub mod recipe;
 pub mod refine;
 pub mod samples;

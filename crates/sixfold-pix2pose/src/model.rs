@@ -137,6 +137,11 @@ impl Pix2PoseModel {
         Self { network: network.for_inference(), objects, sizes, card, device: Device::flex() }
     }
 
+    /// The same with another card; what it says of objects and sizes has to be this model's.
+    pub(crate) fn with_card(self, card: ModelCard) -> Self {
+        Self { card, ..self }
+    }
+
     /// Reads a weight file.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let device = Device::flex();

@@ -110,15 +110,6 @@ impl Correction {
 /// Outlier thresholds of the entries to the BOP challenge (section 3.4.4).
 pub const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
 
-/// Outlier thresholds of appendix A.2 for the objects of LM-O, by BOP's object ids.
-pub fn lmo_threshold(id: u32) -> Option<f32> {
-    match id {
-        1 | 9 | 10 => Some(0.2),
-        5 | 6 | 8 | 11 | 12 => Some(0.3),
-        _ => None,
-    }
-}
-
 /// A symmetry as a map of normalised coordinates: `linear * n + offset`.
 ///
 /// The transformation is applied in metres and normalised again, because the axes have different scales; multiplying

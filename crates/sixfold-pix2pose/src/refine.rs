@@ -3,9 +3,9 @@
 //! Coordinates fix a pose well across the image and badly along the view axis: one per cent of scale is ten millimetres
 //! at a metre. The outline knows better, at the image's full resolution. The network says where the object is visible;
 //! colour histograms of that part and of its surroundings, learnt from this one crop, sharpen it. Along the normals of
-//! the rendered outline the most likely border is found, and Gauss-Newton moves the pose there (region-based tracking:
-//! Prisacariu and Reid 2012, with the sparse lines of Stoiber et al. 2020), with the network's correspondences as a
-//! second term. Lines whose inner side is not the object's are left out: something covers it there.
+//! the rendered outline the most likely border is found, rather where the image has an edge, and Gauss-Newton moves the
+//! pose there (region-based tracking: Prisacariu and Reid 2012, with the sparse lines of Stoiber et al. 2020), with the
+//! network's correspondences as a second term. Lines whose inner side is not the object's are left out: something covers it there.
 //!
 //! It goes beyond the dissertation, whose poses from colour end with PnP, and needs no colours of the mesh.
 
@@ -23,6 +23,8 @@ pub struct RefineOptions {
     pub reaches: Vec<f64>,
     /// Most steps at each reach.
     pub iterations: usize,
+    /// Shortest side of the crop in pixels; smaller ones are enlarged.
+    pub smallest: usize,
     /// Longest side of the crop in pixels.
     pub largest: usize,
     /// Weight of the correspondences as a whole, in independent measurements.
@@ -39,6 +41,8 @@ pub struct RefineOptions {
     pub first_pass: f32,
     /// Weight of colour against the network in telling object from background.
     pub color: f32,
+    /// What the log likelihood of a border gains where colours change sharply; 0 for odds alone.
+    pub edges: f64,
 }
 
 impl Default for RefineOptions {
@@ -46,6 +50,7 @@ impl Default for RefineOptions {
         Self {
             reaches: vec![8.0, 5.0, 3.0],
             iterations: 5,
+            smallest: 128,
             largest: 200,
             correspondences: 5.0,
             shape: 30.0,
@@ -53,6 +58,7 @@ impl Default for RefineOptions {
             robust: 1.0,
             first_pass: 0.5,
             color: 2.0,
+            edges: 8.0,
         }
     }
 }
@@ -88,7 +94,7 @@ pub fn refine(
     }
     let r = &found.open_view.window;
     let window = Window { centre: Vec2::new(r.x + 0.5 * r.width, r.y + 0.5 * r.height), side: r.width };
-    let side = (window.side.round() as usize).clamp(64, options.largest.max(64));
+    let side = (window.side.round() as usize).clamp(options.smallest, options.largest.max(options.smallest));
     let crop = window.camera(camera, side);
     let (patch, inside) = Patch::warp(image, &window.map(camera, side, 0.0), side, side, [GREY; 3]);
     let network: Vec<f32> = (0..side * side)
@@ -114,7 +120,8 @@ pub fn refine(
     let (low, high) = mesh.bounding_box();
     let mut aligner = Aligner {
         camera,
-        outline: Outline::new(mesh, &crop, log_odds(&patch, &network, options.color)),
+        outline: Outline::new(mesh, &crop, log_odds(&patch, &network, options.color))
+            .with_edges(&patch, options.edges),
         crop,
         centre: (low + high) * 0.5,
         correspondences: found

@@ -1,5 +1,6 @@
 //! The training of the compact network: what a step is, and the samples that it learns from.
 
+use crate::critic::Critic;
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::{Network, network_input};
 use crate::networks::Compact;
@@ -36,6 +37,10 @@ pub struct TrainingOptions {
     pub frozen_stages: usize,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
+    /// Weight of the adversarial loss (equation 3.4) against that of the coordinates; 0 trains without discriminators. The
+    /// dissertation's is 0.01. A discriminator, one an object, sees coordinates within the object's whole silhouette.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub adversarial: f32,
     /// Seed of weights and samples.
     pub seed: u64,
     /// Steps between checkpoints.
@@ -44,6 +49,11 @@ pub struct TrainingOptions {
     pub log_every: u64,
     /// Threads that make samples beside the training itself.
     pub sample_threads: usize,
+}
+
+/// Cards and checkpoints do not mention what is not used.
+fn is_zero(weight: &f32) -> bool {
+    *weight == 0.0
 }
 
 impl Default for TrainingOptions {
@@ -57,6 +67,7 @@ impl Default for TrainingOptions {
             weight_decay: 1e-4,
             frozen_stages: 2,
             transformer_loss: true,
+            adversarial: 0.0,
             seed: 0,
             checkpoint_every: 250,
             log_every: 25,
@@ -76,10 +87,11 @@ struct Batch {
     coordinates: Vec<f32>,
     object: Vec<f32>,
     visible: Vec<f32>,
+    step: u64,
 }
 
 fn make_batch(source: &SampleSource, options: &TrainingOptions, step: u64) -> Batch {
-    let mut batch = Batch { rgb: vec![], coordinates: vec![], object: vec![], visible: vec![] };
+    let mut batch = Batch { rgb: vec![], coordinates: vec![], object: vec![], visible: vec![], step };
     for object in 0..source.objects() {
         for image in 0..options.per_object {
             let sample = source.sample(object, options.seed, step * options.per_object as u64 + image as u64);
@@ -96,6 +108,8 @@ struct State<'a> {
     network: Compact,
     encoder: ModuleOptimizer,
     decoders: ModuleOptimizer,
+    /// One an object, or none.
+    critics: Vec<Critic>,
     pools: &'a [Vec<SymmetryMap>],
     /// Of the input, pixels.
     side: usize,
@@ -113,6 +127,7 @@ impl Trainee for State<'_> {
         let kind = OutputKind::Compact;
         let loss_options = LossOptions::of(kind);
         let mut sums = [0.0; 3];
+        let mut adversarial = [0.0; 2];
         // One object after another: their images together would not fit the processor's caches, and memory is what this
         // network waits for.
         let mut encoder_gradients = GradientsAccumulator::new();
@@ -139,7 +154,23 @@ impl Trainee for State<'_> {
                 *sum += term / pools.len() as f64;
             }
             let gradient = Tensor::<4>::from_data(TensorData::new(value.gradient, dims), device);
-            let mut gradients = (output * gradient).sum().backward();
+            let mut total = (output.clone() * gradient).sum();
+            if let Some(critic) = self.critics.get_mut(object) {
+                let [_, _, height, width] = dims;
+                let of = |values: &[f32], channels: usize| {
+                    let shape = [count, channels, height, width];
+                    Tensor::<4>::from_data(TensorData::new(values.to_vec(), shape), device)
+                };
+                let silhouette = of(targets.object, 1);
+                let rendered = of(targets.coordinates, 3) * silhouette.clone();
+                let generated = output.narrow(1, 0, 3) * silhouette;
+                adversarial[0] +=
+                    critic.teach(generated.clone().detach(), rendered, batch.step, rate, device);
+                let doubt = critic.doubt(generated);
+                adversarial[1] += f64::from(doubt.clone().inner().into_scalar::<f32>());
+                total = total + doubt.mul_scalar(options.adversarial * count as f32 / images as f32);
+            }
+            let mut gradients = total.backward();
             let of_encoder = GradientsParams::from_module(&mut gradients, &self.network.encoder);
             let of_decoders = GradientsParams::from_module(&mut gradients, &self.network.decoders);
             encoder_gradients.accumulate(&self.network.encoder, of_encoder);
@@ -152,16 +183,24 @@ impl Trainee for State<'_> {
         );
         self.network.decoders =
             self.decoders.step(rate, self.network.decoders.clone(), decoder_gradients.grads());
-        [("coordinates", sums[0]), ("error", sums[1]), ("visibility", sums[2])]
-            .map(|(name, value)| (name.to_string(), value))
-            .into()
+        let mut losses = BTreeMap::from(
+            [("coordinates", sums[0]), ("error", sums[1]), ("visibility", sums[2])]
+                .map(|(name, value)| (name.to_string(), value)),
+        );
+        if !self.critics.is_empty() {
+            let [discriminator, doubt] = adversarial.map(|sum| sum / pools.len() as f64);
+            losses.insert("discriminator".to_string(), discriminator);
+            losses.insert("adversarial".to_string(), doubt);
+        }
+        losses
     }
 
     fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        checkpoint
+        let checkpoint = checkpoint
             .module("network", &self.network)?
             .optimiser("encoder", &self.encoder)?
-            .optimiser("decoders", &self.decoders)
+            .optimiser("decoders", &self.decoders)?;
+        self.critics.iter().try_fold(checkpoint, |checkpoint, critic| critic.save(checkpoint))
     }
 
     fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
@@ -169,6 +208,7 @@ impl Trainee for State<'_> {
             network: checkpoint.module("network", self.network)?.freeze(self.options.frozen_stages),
             encoder: checkpoint.optimiser("encoder", self.encoder)?,
             decoders: checkpoint.optimiser("decoders", self.decoders)?,
+            critics: self.critics.into_iter().map(|c| c.restore(checkpoint)).collect::<Result<_, _>>()?,
             ..self
         })
     }
@@ -202,6 +242,13 @@ pub fn train(
         network: network.freeze(options.frozen_stages),
         encoder: optimiser(),
         decoders: optimiser(),
+        critics: if options.adversarial > 0.0 {
+            (0..pools.len())
+                .map(|o| Critic::new(format!("discriminator-{o}"), options.seed, device))
+                .collect()
+        } else {
+            vec![]
+        },
         pools,
         side: source.options().size,
         options,
@@ -256,6 +303,9 @@ fn check(
     }
     if options.per_object == 0 {
         return wrong("per_object", "at least 1", "0".to_string());
+    }
+    if !(options.adversarial >= 0.0 && options.adversarial.is_finite()) {
+        return wrong("adversarial", "0 or more", options.adversarial.to_string());
     }
     if !(0.0..=1.0).contains(&options.encoder_share) {
         return wrong("encoder_share", "0 to 1", options.encoder_share.to_string());

@@ -85,6 +85,16 @@ fn interrupted_and_resumed_it_ends_with_the_same_bytes() {
     let shorter = TrainingOptions { steps: 2, ..options.clone() };
     assert_ne!(straight, run(&folder.path().join("c"), &shorter, None).unwrap().unwrap());
 
+    // The same against discriminators, which are part of the checkpoints.
+    let against = TrainingOptions { adversarial: 0.01, ..options.clone() };
+    let contested = run(&folder.path().join("d"), &against, None).unwrap().unwrap();
+    assert_ne!(contested, straight);
+    assert!(run(&folder.path().join("e"), &against, Some(3)).unwrap().is_none());
+    assert_eq!(run(&folder.path().join("e"), &against, None).unwrap().unwrap(), contested);
+    let negative = TrainingOptions { adversarial: -1.0, ..options.clone() };
+    let error = run(&folder.path().join("f"), &negative, None).unwrap_err().to_string();
+    assert!(error.contains("adversarial"), "{error}");
+
     let other = TrainingOptions { learning_rate: 0.1, ..options };
     let error = run(&folder.path().join("b"), &other, None).unwrap_err().to_string();
     assert!(error.contains("learning_rate was 0.002, is 0.1"), "{error}");

@@ -790,7 +790,7 @@ def train_pix2pose(
     steps: int | None = None,
     per_object: int | None = None,
     learning_rate: float | None = None,
-    adversarial: bool = True,
+    adversarial: bool | None = None,
     frozen_stages: int = 2,
     render_share: float = 0.5,
     near_photographs: float = 0.5,
@@ -803,7 +803,7 @@ def train_pix2pose(
     convex_hull: bool = False,
     transformer_loss: bool = True,
     view_limits: bool = False,
-    lmo_thresholds: bool = False,
+    preset: Literal["bop", "linemod", "lmo", "tless"] | None = None,
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...

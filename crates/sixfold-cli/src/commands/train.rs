@@ -7,7 +7,7 @@ use sixfold_pix2pose::recipe::{LEAST_VISIBLE, Recipe};
 use super::material::{Shown, Summary, command_line, interrupted_after, loss, material};
 use super::train_detector::train_detector;
 use crate::Outcome;
-use crate::arguments::{TrainArguments, TrainCommand, TrainPix2PoseArguments};
+use crate::arguments::{Preset, TrainArguments, TrainCommand, TrainPix2PoseArguments};
 use crate::output::report;
 use crate::progress::interrupted;
 
@@ -99,7 +99,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         steps: a.steps,
         per_object: a.per_object,
         learning_rate: a.learning_rate,
-        adversarial: !a.no_adversarial,
+        adversarial: a.adversarial.then_some(true).or(a.no_adversarial.then_some(false)),
         encoder: a.encoder.clone(),
         frozen_stages: a.frozen_stages,
         render_share: a.render_share,
@@ -111,7 +111,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
         convex_hull: a.convex_hull,
         transformer_loss: !a.no_transformer_loss,
         view_limits: a.view_limits,
-        lmo_thresholds: a.lmo_thresholds,
+        preset: a.preset.map(Preset::preset),
         backgrounds: a.material.backgrounds.clone(),
         seed: a.seed,
         command: command_line(),

@@ -5,6 +5,7 @@ use std::path::Path;
 use serde_json::Value;
 use sixfold_bop::read_results;
 use sixfold_mesh::ModelsInfo;
+use sixfold_pix2pose::model::Pix2PoseModel;
 
 use crate::support::*;
 
@@ -49,6 +50,16 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     assert!(image::open(tiny.path().join("trained/training/curves.png")).is_ok());
     let card = std::fs::read_to_string(tiny.path().join("trained/model.md")).unwrap();
     assert!(card.contains("7/0 7/4 7/11"), "{card}");
+
+    // Without a further step: the same weights, the alignment measured once more with the same result.
+    let again = train(0).replace("--out trained", &format!("--init {WEIGHTS} --out again"));
+    sixfold(tiny.path(), &again).expect(0);
+    let both = [WEIGHTS, "again/model.safetensors"]
+        .map(|file| Pix2PoseModel::load(&tiny.path().join(file)).unwrap());
+    assert_eq!(both[0].objects(), both[1].objects());
+    assert!(both[1].card().extra["corrections"]["command"].as_str().unwrap().contains("--steps 0"));
+    let grey = vec![0.5; 3 * 64 * 64];
+    assert_eq!(both[0].predict(0, &grey), both[1].predict(0, &grey));
 
     // One image: pose, all hypotheses, both pictures.
     let run = sixfold(tiny.path(), &format!("{} --out one --json", one_image(&tiny))).expect(0);
@@ -169,7 +180,35 @@ fn trainings_that_cannot_be() {
     std::fs::write(tiny.path().join("empty.json"), "[]").unwrap();
     fails(tiny.path(), &format!("{} --frames empty.json", train(3)), &["frames", "--renders-only"]);
     fails(tiny.path(), &format!("{} --init none.safetensors", train(3)), &["none.safetensors"]);
+    fails(tiny.path(), &train(0), &["steps", "found 0", "1 or more"]);
+    let other = train(3).replace("--ids 1", "--ids 2");
+    fails(tiny.path(), &format!("{other} --preset lmo"), &["preset", "object 2", "1, 5, 6, 8 to 12"]);
     assert!(!tiny.path().join(WEIGHTS).exists());
+}
+
+#[test]
+fn a_preset_brings_its_thresholds_and_symmetries() {
+    let tiny = Tiny::coloured();
+    let model = |preset: &str| {
+        let out = format!("--out {preset} --preset {preset}");
+        let run = sixfold(tiny.path(), &train(1).replace("--out trained", &out)).expect(0);
+        let model = Pix2PoseModel::load(&tiny.path().join(preset).join("model.safetensors")).unwrap();
+        (model, run.stderr)
+    };
+    let (lmo, quiet) = model("lmo");
+    assert_eq!(lmo.objects()[0].thresholds, [0.2]);
+    assert!(lmo.card().data.contains("parameters for lmo"), "{}", lmo.card().data);
+    assert!(!quiet.contains("appendix A"), "{quiet}");
+    // Object 1 of T-LESS turns about z as it likes; this one, which is no cylinder, does not.
+    let (tless, told) = model("tless");
+    assert_eq!(tless.objects()[0].thresholds, [0.1]);
+    assert!(
+        told.contains(
+            "0 discrete and 1 continuous symmetries of appendix A in place of the dataset's 0 and 0"
+        )
+    );
+    assert!(told.contains("warning: object 1: under a declared symmetry"), "{told}");
+    assert_eq!(model("bop").0.objects()[0].thresholds, [0.15, 0.25, 0.35]);
 }
 
 #[test]

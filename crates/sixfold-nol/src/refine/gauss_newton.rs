@@ -123,7 +123,8 @@ pub fn refine_scene(
         if options.line > 0.0 {
             working.par_iter_mut().zip(sources).for_each(|(w, source)| {
                 let odds = color_odds(&w.view.patch, &prior(&w.view));
-                w.outline = Some(Outline::new(&objects[source.object].simple, &w.view.camera, odds));
+                let outline = Outline::new(&objects[source.object].simple, &w.view.camera, odds);
+                w.outline = Some(outline.with_edges(&w.view.patch, options.edges));
             });
         }
         for step in 0..options.steps {

@@ -26,6 +26,8 @@ pub struct RefineOptions {
     pub colors: f64,
     /// Weight of a line of the outline, in independent measurements; 0 leaves the outline out.
     pub line: f64,
+    /// What the log likelihood of a border gains where colours change sharply; 0 for colours' odds alone.
+    pub edges: f64,
     /// Whether the objects stood still while the photographs were taken. Their places relative to each other are then the same
     /// in all of them, which says more about a pose than its own pixels do.
     pub scene: SceneKind,
@@ -51,6 +53,7 @@ impl Default for RefineOptions {
             shared: 0,
             colors: 40.0,
             line: 0.01,
+            edges: 8.0,
             scene: SceneKind::Judge,
             rough: [0.006, 0.03],
             most_moved: 6.0,
@@ -128,7 +131,9 @@ impl RefineOptions {
                 format!("{:?}", self.reaches),
             );
         }
-        for (field, value) in [("refine.colors", self.colors), ("refine.line", self.line)] {
+        for (field, value) in
+            [("refine.colors", self.colors), ("refine.line", self.line), ("refine.edges", self.edges)]
+        {
             if !(value >= 0.0 && value.is_finite()) {
                 return wrong(field, "0 or more", value.to_string());
             }

@@ -53,10 +53,13 @@ struct Stage {
 }
 
 impl Discriminator {
-    /// Coordinates in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones.
+    /// Coordinates in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones. Smaller images, of at
+    /// least 16 pixels, have come down to one pixel before the last stages, which are then left out.
     pub fn forward(&self, coordinates: Tensor<4>) -> Tensor<2> {
-        let stages = self.stages.iter();
-        let x = stages.fold(coordinates, |x, stage| stage.conv.forward_norm(x, &stage.norm, None, SLOPE));
+        let x = self.stages.iter().fold(coordinates, |x, stage| match x.dims() {
+            [_, _, 1, 1] => x,
+            _ => stage.conv.forward_norm(x, &stage.norm, None, SLOPE),
+        });
         let [batch, channels, height, width] = x.dims();
         self.judge.forward(x.reshape([batch, channels * height * width]))
     }
@@ -78,5 +81,13 @@ mod tests {
         let gradients = logits.square().mean().backward();
         assert!(x.grad(&gradients).unwrap().abs().max().into_scalar::<f32>() > 0.0);
         assert_eq!(GradientsParams::from_grads(gradients, &network).len(), 7 * 3 + 2);
+        // The compact network's images, and its smallest.
+        for (side, stages) in [(64, 6), (16, 4)] {
+            let x = Tensor::<4>::random([2, 3, side, side], burn::tensor::Distribution::Default, &device);
+            let logits = network.forward(x);
+            assert_eq!(logits.dims(), [2, 1]);
+            let gradients = GradientsParams::from_grads(logits.square().mean().backward(), &network);
+            assert_eq!(gradients.len(), stages * 3 + 2);
+        }
     }
 }

@@ -13,7 +13,7 @@ use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::ModelCard;
+use sixfold_nn::weights::{ModelCard, WeightsError};
 use sixfold_outline::outline_mesh;
 
 pub use self::error::RecipeError;
@@ -22,7 +22,8 @@ use crate::aligned::measure_corrections;
 use crate::material::{Material, backgrounds};
 use crate::model::{ImageSizes, Network, Pix2PoseModel};
 use crate::networks::{Compact, CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
-use crate::object::{ObjectEntry, SymmetryMap, lmo_threshold, symmetry_deviation};
+use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
+use crate::preset::Preset;
 use crate::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
 use crate::training::{TrainingOptions, last_checkpoint, train};
 
@@ -63,8 +64,8 @@ pub struct Recipe {
     pub per_object: Option<usize>,
     /// Highest learning rate; `None`: 0.002, the dissertation's networks 0.0001.
     pub learning_rate: Option<f64>,
-    /// Train a network of the dissertation with its discriminator.
-    pub adversarial: bool,
+    /// Train against a discriminator; `None`: the dissertation's networks with one, the compact one without.
+    pub adversarial: Option<bool>,
     /// torchvision's ResNet-50 weights for [`NetworkKind::ResNet50`]; random ones without.
     pub encoder: Option<PathBuf>,
     /// Stages of the ImageNet encoder that stay as they are, of five.
@@ -87,8 +88,9 @@ pub struct Recipe {
     pub transformer_loss: bool,
     /// Plain L1 with one side of a symmetric object standing for all.
     pub view_limits: bool,
-    /// Outlier thresholds of the dissertation's LM-O experiment instead of the three of its BOP entry.
-    pub lmo_thresholds: bool,
+    /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as they
+    /// are stated, the thresholds of its BOP entries.
+    pub preset: Option<Preset>,
     /// Folder of photographs for backgrounds; made-up textures without.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
@@ -104,7 +106,7 @@ impl Default for Recipe {
             steps: None,
             per_object: None,
             learning_rate: None,
-            adversarial: true,
+            adversarial: None,
             encoder: None,
             frozen_stages: 2,
             render_share: 0.5,
@@ -116,7 +118,7 @@ impl Default for Recipe {
             convex_hull: false,
             transformer_loss: true,
             view_limits: false,
-            lmo_thresholds: false,
+            preset: None,
             backgrounds: None,
             seed: 0,
             command: String::new(),
@@ -126,6 +128,9 @@ impl Default for Recipe {
 
 /// Instances of a photograph that are less visible teach more confusion than shape.
 pub const LEAST_VISIBLE: f64 = 0.25;
+
+/// Weight of the compact network's adversarial loss: the dissertation's lambda_1 is 100.
+const ADVERSARIAL: f32 = 0.01;
 
 /// Everything that stands before the first step.
 struct Prepared {
@@ -152,6 +157,9 @@ impl Recipe {
         stop: &AtomicBool,
         hear: &mut Listener<'_>,
     ) -> Result<Ending<Trained>, RecipeError> {
+        if self.steps == Some(0) {
+            return Ok(Ending::Finished(self.measure_anew(material, out, hear)?));
+        }
         let Prepared { objects, real, entries, network, mut card, sizes, device, folder, path } =
             self.prepare(material, out, hear)?;
         let outlines = outlines(&objects, &real);
@@ -167,6 +175,7 @@ impl Recipe {
             rotation: self.rotation,
             random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
             view_limits: self.view_limits,
+            occlusion: self.preset.map_or(SampleOptions::default().occlusion, Preset::occlusion),
             seed: self.seed,
             ..SampleOptions::default()
         };
@@ -237,6 +246,32 @@ impl Recipe {
         Ok(Trained { model: p.path, steps: step, seconds: None, losses: BTreeMap::new() })
     }
 
+    /// The model to begin with as it is, with what its aligned poses are off by measured anew: the alignment may have changed
+    /// since it was trained.
+    fn measure_anew(
+        &self,
+        material: Material,
+        out: &Path,
+        hear: &mut Listener<'_>,
+    ) -> Result<Trained, RecipeError> {
+        let Some(file) = &self.init else {
+            return Err(wrong(
+                "steps",
+                0,
+                "1 or more, or weights to begin with, whose alignment is then measured anew",
+            ));
+        };
+        let model = Pix2PoseModel::load(file)?;
+        let (steps, mut card) = (model.card().steps, model.card().clone());
+        let p = self.prepare(material, out, hear)?;
+        card.extra["corrections"] = serde_json::json!({ "command": self.command, "data": p.card.data });
+        let model = model.with_card(card);
+        std::fs::create_dir_all(out)
+            .map_err(|source| WeightsError::Write { file: p.path.clone(), source })?;
+        save_corrected(model, &p.path, &p.real, &outlines(&p.objects, &p.real), hear)?;
+        Ok(Trained { model: p.path, steps, seconds: None, losses: BTreeMap::new() })
+    }
+
     /// Steps in all.
     pub fn steps(&self) -> u64 {
         if self.network == NetworkKind::Compact {
@@ -254,6 +289,7 @@ impl Recipe {
             learning_rate: self.learning_rate.unwrap_or(default.learning_rate),
             frozen_stages: self.frozen_stages,
             transformer_loss: self.transformer_loss && !self.view_limits,
+            adversarial: if self.adversarial == Some(true) { ADVERSARIAL } else { 0.0 },
             seed: self.seed,
             ..default
         }
@@ -264,7 +300,7 @@ impl Recipe {
             steps: self.steps.unwrap_or(25_000),
             batch: self.per_object.unwrap_or(50),
             learning_rate: self.learning_rate.unwrap_or(1e-4),
-            adversarial: self.adversarial,
+            adversarial: self.adversarial.unwrap_or(true),
             transformer_loss: self.transformer_loss && !self.view_limits,
             seed: self.seed,
             ..AdversarialOptions::default()
@@ -298,6 +334,12 @@ impl Recipe {
     ) -> Result<Prepared, RecipeError> {
         let Material { mut objects, real, mut description, .. } = material;
         self.check(objects.len())?;
+        if let Some(preset) = self.preset {
+            for object in &mut objects {
+                apply(preset, object, hear)?;
+            }
+            description += &format!("; the dissertation's parameters for {}", preset.name());
+        }
         for object in &objects {
             warn_of_symmetry(object, hear);
         }
@@ -315,8 +357,8 @@ impl Recipe {
             .iter()
             .map(|o| {
                 let mut entry = ObjectEntry::new(o.id, &o.info, &o.scale);
-                if let (true, Some(threshold)) = (self.lmo_thresholds, lmo_threshold(o.id)) {
-                    entry.thresholds = vec![threshold];
+                if let Some(thresholds) = self.preset.and_then(|preset| preset.thresholds(o.id)) {
+                    entry.thresholds = thresholds;
                 }
                 entry
             })
@@ -379,6 +421,28 @@ fn save_corrected(
 }
 
 /// A symmetry that the mesh does not have misleads the training: say how far the surface is off.
+/// Gives an object the symmetries of a preset, which must have the object.
+fn apply(preset: Preset, object: &mut TrainingObject, hear: &mut Listener<'_>) -> Result<(), RecipeError> {
+    if preset.thresholds(object.id).is_none() {
+        let found = format!("{} with object {}", preset.name(), object.id);
+        return Err(wrong("preset", found, preset.objects()));
+    }
+    let pooled = preset.with_pool(object.id, &object.info);
+    let stated = std::mem::replace(&mut object.info, pooled);
+    let count = |info: &ModelInfo| (info.symmetries_discrete.len(), info.symmetries_continuous.len());
+    if count(&stated) != count(&object.info) {
+        hear(News::Note(&format!(
+            "object {}: {} discrete and {} continuous symmetries of appendix A in place of the dataset's {} and {}",
+            object.id,
+            object.info.symmetries_discrete.len(),
+            object.info.symmetries_continuous.len(),
+            stated.symmetries_discrete.len(),
+            stated.symmetries_continuous.len()
+        )));
+    }
+    Ok(())
+}
+
 fn warn_of_symmetry(object: &TrainingObject, hear: &mut Listener<'_>) {
     for pose in object.info.symmetry_poses(0.1).iter().skip(1) {
         let deviation = symmetry_deviation(&object.mesh, pose);

@@ -186,6 +186,11 @@ fn settings(bench: &Bench) -> Vec<Setting> {
         },
         Setting {
             refine: true,
+            edges: false,
+            ..plain("no-edges", "default, borders by network and colour histograms alone, not by edges")
+        },
+        Setting {
+            refine: true,
             looks: 2,
             ..plain("two-looks", "default, with a second look into the box of the aligned pose")
         },

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{Estimate, EvalOptions, Target, evaluate, write_results};
-use sixfold_geometry::Rect;
+use sixfold_geometry::{Image, Rect, RgbImage};
 use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::estimate::EstimateOptions;
 
@@ -32,8 +32,12 @@ pub(super) struct Setting {
     pub looks: usize,
     /// With it: whether what the model is known to be off by is taken out.
     pub correct: bool,
+    /// With it: whether borders are drawn to edges of the image.
+    pub edges: bool,
     /// Ground-truth boxes are moved and scaled by up to this share of their size.
     pub noise: Option<f64>,
+    /// Half of every box, at one of its sides, is made black, as in the dissertation's figure 3.12.
+    pub half_black: bool,
     /// Boxes of this file of detections instead of the ground truth's.
     pub detections: Option<usize>,
 }
@@ -123,19 +127,24 @@ impl Setting {
             refine: false,
             looks: AlignOptions::default().looks,
             correct: true,
+            edges: true,
             noise: None,
+            half_black: false,
             detections: None,
         }
     }
 
     /// The model used in this way.
     pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
-        let options = AlignOptions {
+        let mut options = AlignOptions {
             estimate: EstimateOptions { seed, ..self.options.clone() },
             looks: self.looks,
             correct: self.correct,
             ..AlignOptions::default()
         };
+        if !self.edges {
+            options.refine.edges = 0.0;
+        }
         pix2pose.varied(options, self.refine)
     }
 }
@@ -175,10 +184,15 @@ impl Bench {
                         ),
                         None => *region,
                     };
+                    let covered = setting.half_black.then(|| {
+                        let side = self.seed + u64::from(*im_id) + u64::from(o.obj_id);
+                        half_black(&image, &region, side % 4)
+                    });
+                    let image = covered.as_ref().unwrap_or(&image);
                     regions += 1;
                     let start = Instant::now();
                     let posed =
-                        pix2pose.estimate(&image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
+                        pix2pose.estimate(image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
                     times.push(start.elapsed().as_secs_f64());
                     match posed {
                         Ok(Some(p)) => estimates.push(Estimate::new(
@@ -296,6 +310,23 @@ fn overlap(a: &Rect, b: &Rect) -> f64 {
     common / (a.width * a.height + b.width * b.height - common)
 }
 
+/// The image with the left, right, upper or lower half of a box black.
+fn half_black(image: &RgbImage, region: &Rect, side: u64) -> RgbImage {
+    let (middle_x, middle_y) = (region.x + 0.5 * region.width, region.y + 0.5 * region.height);
+    Image::from_fn(image.width(), image.height(), |x, y| {
+        let (u, v) = (x as f64, y as f64);
+        let inside =
+            u >= region.x && v >= region.y && u < region.x + region.width && v < region.y + region.height;
+        let half = match side {
+            0 => u < middle_x,
+            1 => u >= middle_x,
+            2 => v < middle_y,
+            _ => v >= middle_y,
+        };
+        if inside && half { [0; 3] } else { image[(x, y)] }
+    })
+}
+
 /// The box with centre and sides moved by up to `share` of its sides; a box and a seed always give the same.
 fn moved(region: &Rect, share: f64, seed: [u64; 5]) -> Rect {
     let number = seed.iter().fold(0u64, |sum, v| sum.wrapping_mul(1_000_003).wrapping_add(*v));
@@ -321,6 +352,22 @@ mod tests {
         assert_eq!(overlap(&of(0.0, 10.0), &of(0.0, 10.0)), 1.0);
         assert!((overlap(&of(0.0, 10.0), &of(5.0, 10.0)) - 1.0 / 3.0).abs() < 1e-12);
         assert_eq!(overlap(&of(0.0, 10.0), &of(20.0, 10.0)), 0.0);
+    }
+
+    #[test]
+    fn half_of_a_box_turns_black() {
+        let image = RgbImage::from_fn(20, 20, |_, _| [200; 3]);
+        let region = Rect { x: 4.0, y: 6.0, width: 8.0, height: 10.0 };
+        let halves = [(4..8, 6..16), (8..12, 6..16), (4..12, 6..11), (4..12, 11..16)];
+        for (side, (columns, rows)) in halves.into_iter().enumerate() {
+            let covered = half_black(&image, &region, side as u64);
+            for y in 0..20 {
+                for x in 0..20 {
+                    let black = columns.contains(&x) && rows.contains(&y);
+                    assert_eq!(covered[(x, y)] == [0; 3], black, "{side} {x} {y}");
+                }
+            }
+        }
     }
 
     #[test]

@@ -1,7 +1,6 @@
 //! Networks trained for a comparison: symmetric objects with the transformer loss, with L1 and view limits, and with
-//! plain L1 (table 3.1), and two others with their convex hulls in place of the meshes, from photographs alone.
-//!
-//! Not here yet: training against a discriminator.
+//! plain L1 (table 3.1), and two others with their convex hulls in place of the meshes, from photographs alone, and with a
+//! discriminator and without (figure 3.12), on whole boxes and on boxes of which half is black.
 
 use std::path::Path;
 
@@ -40,7 +39,7 @@ const fn training(key: &'static str, title: &'static str, of: Of, more: &'static
     Training { key, title, of, more }
 }
 
-const TRAININGS: [Training; 8] = [
+const TRAININGS: [Training; 9] = [
     training("trained-transformer-loss", "transformer loss", Of::Symmetric, &[]),
     training("trained-view-limits", "L1 with view limits", Of::Symmetric, &["--view-limits"]),
     training("trained-plain-l1", "L1", Of::Symmetric, &["--no-transformer-loss"]),
@@ -48,6 +47,12 @@ const TRAININGS: [Training; 8] = [
     training("fourfold-view-limits", "L1 with view limits", Of::Fourfold, &["--view-limits"]),
     training("fourfold-plain-l1", "L1", Of::Fourfold, &["--no-transformer-loss"]),
     training("trained-mesh", "meshes, photographs only", Of::Others, &["--render-share", "0"]),
+    training(
+        "trained-discriminator",
+        "meshes, photographs only, with discriminators",
+        Of::Others,
+        &["--render-share", "0", "--adversarial"],
+    ),
     training(
         "trained-convex-hull",
         "convex hulls, photographs only",
@@ -83,23 +88,30 @@ pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<
             fourfold::write(&fourfold_folder, a.seed)?;
             fourfold_bench = Some(Bench::of_dataset(&fourfold_folder, a.seed)?);
         }
-        rows.push(row::kept_or_made(&a.out, &key, || {
-            let dataset = if made { &fourfold_folder } else { &a.dataset };
-            let words = arguments(a, dataset, made, &names, &folder, training.more)?;
-            let model = train_pix2pose(&words)?.model;
-            let what = if made {
-                "object with four equal sides".into()
-            } else {
-                format!("objects {}", names.join(" and "))
-            };
-            let title = format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title);
-            let setting = Setting::plain(&key, &title);
-            let trained = setting.of(&Pix2Pose::load(Path::new(&model))?, a.seed);
-            match &fourfold_bench {
-                Some(bench) if made => bench.measure(&trained, &setting, &a.out),
-                _ => bench.of_objects(&ids).measure(&trained, &setting, &a.out),
-            }
-        })?);
+        let what = if made {
+            "object with four equal sides".into()
+        } else {
+            format!("objects {}", names.join(" and "))
+        };
+        let title = format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title);
+        let mut settings = vec![Setting::plain(&key, &title)];
+        if training.of == Of::Others {
+            let plain =
+                Setting::plain(&format!("{key}-half-black"), &format!("{title}; half of every box black"));
+            settings.push(Setting { half_black: true, ..plain });
+        }
+        for setting in settings {
+            rows.push(row::kept_or_made(&a.out, &setting.key, || {
+                let dataset = if made { &fourfold_folder } else { &a.dataset };
+                let words = arguments(a, dataset, made, &names, &folder, training.more)?;
+                let model = train_pix2pose(&words)?.model;
+                let trained = setting.of(&Pix2Pose::load(Path::new(&model))?, a.seed);
+                match &fourfold_bench {
+                    Some(bench) if made => bench.measure(&trained, &setting, &a.out),
+                    _ => bench.of_objects(&ids).measure(&trained, &setting, &a.out),
+                }
+            })?);
+        }
     }
     Ok(rows)
 }
