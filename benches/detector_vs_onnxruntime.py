@@ -18,9 +18,8 @@ import tempfile
 import time
 
 import numpy as np
-import onnx
 import onnxruntime
-from onnx import TensorProto, helper, numpy_helper
+from onnx_graph import Graph
 from safetensors import safe_open
 
 THREADS = 2
@@ -30,27 +29,12 @@ CALLS = 10
 STAGES = [(1, 3, 1, 32, 16), (2, 3, 2, 16, 24), (2, 5, 2, 24, 40), (3, 3, 2, 40, 80), (3, 5, 1, 80, 112)]
 
 
-class Graph:
-    """Nodes of an ONNX graph over the tensors of a weight file."""
-
-    def __init__(self, weights):
-        self.weights, self.nodes, self.tensors, self.count = weights, [], [], 0
-
-    def node(self, kind, inputs, **attributes):
-        self.count += 1
-        name = f"{kind}_{self.count}"
-        self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
-        return name
-
-    def constant(self, value):
-        self.count += 1
-        name = f"constant_{self.count}"
-        self.tensors.append(numpy_helper.from_array(value, name))
-        return name
+class Detector(Graph):
+    """The layers of the compact detector."""
 
     def conv(self, name, x, stride=1, activation=None, depthwise=False, zeros=None):
-        weight = self.weights.get_tensor(f"{name}.weight").astype(np.float32)
-        bias = self.weights.get_tensor(f"{name}.bias").astype(np.float32)
+        weight = self.tensor(f"{name}.weight")
+        bias = self.tensor(f"{name}.bias")
         kernel = weight.shape[2]
         # SAME as TensorFlow has it for an even side: one zero more after than before where the stride is 2.
         total = kernel - stride if stride > 1 else kernel - 1
@@ -77,7 +61,7 @@ class Graph:
 
 
 def detector(weights, height, width):
-    graph = Graph(weights)
+    graph = Detector(weights)
     x = graph.conv("encoder.Lite0.stem", "image", 2, "relu6")
     maps, block = [], 0
     for blocks, kernel, first, inputs, outputs in STAGES:
@@ -101,15 +85,7 @@ def detector(weights, height, width):
         common = graph.conv("shared.0", level, 1, "relu")
         scores.append(graph.conv("scores", graph.conv("score_tower.0", common, 1, "relu")))
         boxes.append(graph.conv("boxes", graph.conv("box_tower.0", common, 1, "relu")))
-    outputs = [helper.make_tensor_value_info(n, TensorProto.FLOAT, [None] * 4) for n in [*scores, *boxes, prototypes]]
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, height, width])
-    model = helper.make_model(
-        helper.make_graph(graph.nodes, "detector", [image], outputs, graph.tensors),
-        opset_imports=[helper.make_opsetid("", 17)],
-    )
-    model.ir_version = 8
-    onnx.checker.check_model(model)
-    return model
+    return graph.model([1, 3, height, width], [*scores, *boxes, prototypes])
 
 
 def main():

@@ -21,9 +21,8 @@ import time
 
 import cv2
 import numpy as np
-import onnx
 import onnxruntime
-from onnx import TensorProto, helper, numpy_helper
+from onnx_graph import Graph
 from safetensors import safe_open
 
 THREADS = 2
@@ -33,26 +32,8 @@ SIDE = 128
 CROPS = 3
 
 
-class Graph:
-    """Nodes of an ONNX graph over the tensors of a weight file."""
-
-    def __init__(self, weights):
-        self.weights, self.nodes, self.tensors, self.count = weights, [], [], 0
-
-    def tensor(self, name):
-        return self.weights.get_tensor(name).astype(np.float32)
-
-    def node(self, kind, inputs, **attributes):
-        self.count += 1
-        name = f"{kind}_{self.count}"
-        self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
-        return name
-
-    def constant(self, value):
-        self.count += 1
-        name = f"constant_{self.count}"
-        self.tensors.append(numpy_helper.from_array(value, name))
-        return name
+class Generator(Graph):
+    """The layers of the dissertation's generator."""
 
     def norm(self, name, x):
         parts = [self.constant(self.tensor(f"{name}.{part}")) for part in ("weight", "bias", "running_mean", "running_var")]
@@ -84,7 +65,7 @@ class Graph:
 
 
 def generator(weights):
-    graph = Graph(weights)
+    graph = Generator(weights)
     e1 = graph.stage("e1", "image", 2)
     e2 = graph.stage("e2", e1, 2)
     e3 = graph.stage("e3", e2, 2)
@@ -98,15 +79,7 @@ def generator(weights):
     coordinates = graph.node("Tanh", [graph.up("decoder.coordinates", x, bias=True)])
     error = graph.node("Sigmoid", [graph.up("decoder.error", x, bias=True)])
     joined = graph.node("Concat", [coordinates, error], axis=1)
-    output = helper.make_tensor_value_info(joined, TensorProto.FLOAT, ["batch", 4, SIDE, SIDE])
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["batch", 3, SIDE, SIDE])
-    model = helper.make_model(
-        helper.make_graph(graph.nodes, "generator", [image], [output], graph.tensors),
-        opset_imports=[helper.make_opsetid("", 17)],
-    )
-    model.ir_version = 8
-    onnx.checker.check_model(model)
-    return model
+    return graph.model(["batch", 3, SIDE, SIDE], [joined])
 
 
 def opencv_pose(numbers):
