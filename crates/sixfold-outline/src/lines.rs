@@ -1,4 +1,6 @@
-//! Lines across the rendered outline, and the border of the object found on each (Stoiber et al. 2020).
+//! Lines across the rendered outline, and the border of the object found on each (Stoiber et al. 2020). Beside the odds of the
+//! pixels on either side, which are theirs, an edge of the image speaks for a border (ours): `w g^2 / (g^2 + EDGE^2)` is added to
+//! its log likelihood, where `g` is the change of colour across it and `w` the weight of [`Outline::with_edges`].
 
 use sixfold_augment::Patch;
 use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
@@ -19,12 +21,18 @@ pub fn outline_mesh(mesh: &Mesh) -> Mesh {
 
 /// Value of a square map at pixel `(x, y)`.
 pub fn sample(map: &[f32], side: usize, x: f64, y: f64) -> f32 {
+    let (first, fx, fy) = cell(side, x, y);
+    let (fx, fy) = (fx as f32, fy as f32);
+    let at = |dx: usize, dy: usize| map[first + dy * side + dx];
+    (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
+}
+
+/// The first of the four pixels about a place in a square map, and how far the place is from it along both axes, 0 to 1.
+fn cell(side: usize, x: f64, y: f64) -> (usize, f64, f64) {
     let last = (side - 1) as f64;
     let (x, y) = (x.clamp(0.0, last), y.clamp(0.0, last));
     let (x0, y0) = (x.floor().min(last - 1.0), y.floor().min(last - 1.0));
-    let (fx, fy) = ((x - x0) as f32, (y - y0) as f32);
-    let at = |dx: usize, dy: usize| map[(y0 as usize + dy) * side + x0 as usize + dx];
-    (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
+    (y0 as usize * side + x0 as usize, x - x0, y - y0)
 }
 
 /// A line across the outline on which the border was found.
@@ -47,7 +55,7 @@ pub struct Outline<'a> {
     frame: Frame,
     crop: Camera,
     odds: Vec<f32>,
-    /// Change of brightness along x and y at every pixel, and its weight.
+    /// Change of colour along x and y at every pixel, and its weight.
     edges: Option<(Vec<[f32; 2]>, f64)>,
     side: usize,
 }
@@ -161,7 +169,7 @@ impl<'a> Outline<'a> {
     }
 }
 
-/// Change of colour across a pixel (0 to 1, the root of the squares' mean over the channels) that is half an edge.
+/// Change of the channel that changes most from one pixel to the next (0 to 1) that is half an edge.
 const EDGE: f64 = 0.06;
 
 /// The change along x and y of the channel that changes most, at every pixel.
@@ -187,12 +195,9 @@ fn gradients(patch: &Patch) -> Vec<[f32; 2]> {
 
 /// Change along a direction at a place between pixels.
 fn change_along(gradients: &[[f32; 2]], side: usize, p: &Vec2, normal: &Vec2) -> f64 {
-    let last = (side - 1) as f64;
-    let (x, y) = (p.x.clamp(0.0, last), p.y.clamp(0.0, last));
-    let (x0, y0) = (x.floor().min(last - 1.0), y.floor().min(last - 1.0));
-    let (fx, fy) = (x - x0, y - y0);
+    let (first, fx, fy) = cell(side, p.x, p.y);
     let at = |dx: usize, dy: usize| {
-        let [gx, gy] = gradients[(y0 as usize + dy) * side + x0 as usize + dx];
+        let [gx, gy] = gradients[first + dy * side + dx];
         (f64::from(gx) * normal.x + f64::from(gy) * normal.y).abs()
     };
     (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
