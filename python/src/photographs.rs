@@ -87,6 +87,13 @@ impl RefinedPoses {
         self.refinement.still
     }
 
+    /// At how many places the objects stood: as many as objects where nothing moved, or nothing is known of it; more where some
+    /// were moved between some of the photographs.
+    #[getter]
+    fn places(&self) -> usize {
+        self.refinement.places
+    }
+
     /// How far the given poses are from one common arrangement, 1 for what their roughness explains; None where there is
     /// nothing to compare.
     #[getter]

@@ -132,6 +132,56 @@ pub fn in_light_of(image: &Patch, truth: &Patch, mask: &Mask) -> Patch {
     lit
 }
 
+/// The pixels of a mask about which everything within `reach` pixels along both axes is in it as well.
+pub fn without_border(mask: &Mask, reach: usize) -> Mask {
+    let (width, height) = mask.size();
+    Mask::from_fn(width, height, |x, y| {
+        x >= reach
+            && y >= reach
+            && x + reach < width
+            && y + reach < height
+            && (y - reach..=y + reach).all(|v| (x - reach..=x + reach).all(|u| mask[(u, v)]))
+    })
+}
+
+/// The image moved by whole pixels, up to `reach` along both axes, to where it is most like the truth in the pixels of a mask that
+/// keeps as far from the image's border ([`without_border`]). Poses of photographs are annotated within a few
+/// pixels; renderings can then be compared by what they show.
+pub fn in_place_of(image: &Patch, truth: &Patch, mask: &Mask, reach: usize) -> Patch {
+    let (width, height) = mask.size();
+    let area = width * height;
+    let inside: Vec<usize> = (0..area).filter(|at| mask.as_slice()[*at]).collect();
+    let reach = reach as isize;
+    let moved = |at: usize, [dx, dy]: [isize; 2]| (at as isize + dy * width as isize + dx) as usize;
+    let error = |shift: [isize; 2]| -> f64 {
+        inside
+            .iter()
+            .map(|at| {
+                let from = moved(*at, shift);
+                (0..3)
+                    .map(|c| f64::from(image.data[c * area + from] - truth.data[c * area + at]).powi(2))
+                    .sum::<f64>()
+            })
+            .sum()
+    };
+    let mut best = ([0, 0], error([0, 0]));
+    for dy in -reach..=reach {
+        for dx in -reach..=reach {
+            let error = error([dx, dy]);
+            if error < best.1 {
+                best = ([dx, dy], error);
+            }
+        }
+    }
+    let mut placed = image.clone();
+    for at in inside {
+        for c in 0..3 {
+            placed.data[c * area + at] = image.data[c * area + moved(at, best.0)];
+        }
+    }
+    placed
+}
+
 /// Compares renderings with photographs.
 #[derive(Debug)]
 pub struct Judge {
@@ -265,6 +315,26 @@ mod tests {
         assert!((psnr_within(&image, &truth, &left).unwrap() - 23.0103).abs() < 1e-3);
         assert_eq!(psnr_within(&truth, &truth, &left), Some(100.0));
         assert_eq!(psnr_within(&truth, &truth, &Mask::filled(32, 32, false)), None);
+    }
+
+    #[test]
+    fn a_rendering_that_is_off_by_pixels_is_put_in_its_place() {
+        let board = |x: usize, y: usize| 0.5 + 0.3 * ((x as f32 * 0.7).sin() * (y as f32 * 0.45).cos());
+        let truth = patch(board);
+        let image = patch(|x, y| board(x + 3, y.saturating_sub(2)));
+        let middle = without_border(&Mask::filled(32, 32, true), 4);
+        assert_eq!(middle.as_slice().iter().filter(|m| **m).count(), 24 * 24);
+        assert!(middle[(4, 4)] && middle[(27, 27)] && !middle[(3, 10)] && !middle[(10, 28)]);
+        let before = psnr_within(&image, &truth, &middle).unwrap();
+        let placed = in_place_of(&image, &truth, &middle, 4);
+        assert_eq!(psnr_within(&placed, &truth, &middle), Some(100.0), "{before}");
+        assert!(before < 30.0);
+        // No further than it may: the nearest place that it can reach is not this one.
+        let near = in_place_of(&image, &truth, &middle, 1);
+        assert!(psnr_within(&near, &truth, &middle).unwrap() < 60.0);
+        // A hole in a mask is a border.
+        let hole = Mask::from_fn(32, 32, |x, y| (x, y) != (16, 16));
+        assert!(!without_border(&hole, 2)[(14, 18)] && without_border(&hole, 2)[(13, 16)]);
     }
 
     #[test]

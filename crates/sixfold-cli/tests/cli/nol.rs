@@ -11,9 +11,15 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     let reproduce = "reproduce nol --dataset tiny --frames frames.json --quick --json --out reproduced";
     let whole = sixfold(dir, reproduce).expect(0).json();
     let poses = whole["poses"].as_array().unwrap();
-    // The disturbed poses, the printed rule without a network, and three of ours.
-    assert_eq!(poses.len(), 5, "{whole}");
+    // The disturbed poses, the printed rule without a network, three of ours, and one begun at the annotated poses.
+    assert_eq!(poses.len(), 6, "{whole}");
     let of = |k: usize, field: &str| poses[k]["all"][field].as_f64().unwrap();
+    assert!(of(5, "millimetres") < of(4, "millimetres") && poses[5]["all"]["improved"].is_null(), "{whole}");
+    // The same disturbances on frames drawn anew, whose light and background are others.
+    let drawn = whole["drawn_poses"].as_array().unwrap();
+    let of_drawn = |k: usize| drawn[k]["all"]["millimetres"].as_f64().unwrap();
+    assert_eq!(of_drawn(0), of(0, "millimetres"), "{whole}");
+    assert!(of_drawn(4) < of_drawn(0) && of_drawn(4) != of(4, "millimetres"), "{whole}");
     assert_eq!(of(0, "sources"), 4.0);
     assert!(of(0, "millimetres") > 2.0 && of(0, "degrees") > 0.5, "{whole}");
     assert!(of(4, "millimetres") < of(0, "millimetres"), "{whole}");
@@ -28,7 +34,7 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     assert!(whole["speed"]["refinement"].as_f64().unwrap() > 0.0);
     let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
     assert!(table.contains("vertices 1 mm off") && table.contains("ours, both"), "{table}");
-    for picture in ["views.png", "geometry.png"] {
+    for picture in ["views.png", "geometry.png", "drawn.png"] {
         assert!(dir.join("reproduced").join(picture).is_file(), "{picture}");
     }
     // Kept rows are not made again: nor is the time that they took.

@@ -44,22 +44,34 @@ fn since(given: &Pose, pose: &Pose, centre: &Vec3) -> [f64; 6] {
     [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
 }
 
-/// Root of the mean square of such an offset in units of the deviations of rough poses.
-fn off(offset: &[f64; 6], options: &RefineOptions) -> f64 {
-    let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / options.rough[k / 3]).powi(2)).sum();
+/// How far a pose is from another: root of the mean square over shift of the centre and turn, six numbers in units of the
+/// deviations of rough poses.
+pub(super) fn off(from: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2]) -> f64 {
+    size(&since(from, pose, centre), rough)
+}
+
+fn size(offset: &[f64; 6], rough: [f64; 2]) -> f64 {
+    let square: f64 = offset.iter().enumerate().map(|(k, v)| (v / rough[k / 3]).powi(2)).sum();
     (square / 6.0).sqrt()
 }
 
 /// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are taken
 /// by themselves.
-fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], options: &RefineOptions) {
-    let trust = 1.0 / (1.0 + off(offset, options).powi(2) / 6.0);
+fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], rough: [f64; 2]) {
+    let trust = 1.0 / (1.0 + size(offset, rough).powi(2) / 6.0);
     for (k, offset) in offset.iter().enumerate() {
         let mut row = [0.0; 6];
         row[k] = 1.0;
-        let deviation = options.rough[k / 3];
+        let deviation = rough[k / 3];
         equations.add(&row, *offset, trust / (deviation * deviation));
     }
+}
+
+/// What a pose of this roughness alone wants of the present one.
+pub(super) fn wanted_by(given: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2]) -> Wanted {
+    let mut equations = NormalEquations::default();
+    add_given(&mut equations, &since(given, pose, centre), rough);
+    Wanted { equations, centre: pose.transform_point(centre) }
 }
 
 impl Working<'_> {
@@ -104,40 +116,20 @@ impl Working<'_> {
         if lines.len() >= LEAST_LINES {
             add_lines(&mut equations, &lines, &self.view.camera, &centre, terms.reach, options.line, 1.0);
         }
-        self.add_given(&mut equations, terms.centre, options);
+        add_given(&mut equations, &since(&self.given, &pose, terms.centre), options.rough);
         Wanted { equations, centre }
     }
 
     /// Outline and given pose without the colours.
     pub fn measure_anchors(&mut self, centre: &Vec3, reach: f64, options: &RefineOptions) -> Wanted {
-        let mut wanted = self.measure_given(centre, options);
         let pose = self.pose;
+        let mut wanted = wanted_by(&self.given, &pose, centre, options.rough);
         let lines = self.outline.as_mut().map(|outline| outline.lines(reach, &pose)).unwrap_or_default();
         if lines.len() >= LEAST_LINES {
             let camera = &self.view.camera;
             add_lines(&mut wanted.equations, &lines, camera, &wanted.centre, reach, options.line, 1.0);
         }
         wanted
-    }
-
-    /// The given pose alone.
-    pub fn measure_given(&self, centre: &Vec3, options: &RefineOptions) -> Wanted {
-        let mut equations = NormalEquations::default();
-        self.add_given(&mut equations, centre, options);
-        Wanted { equations, centre: self.pose.transform_point(centre) }
-    }
-
-    fn add_given(&self, equations: &mut NormalEquations, centre: &Vec3, options: &RefineOptions) {
-        add_given(equations, &self.since_given(centre), options);
-    }
-
-    /// How far the present pose is from the given one: root of the mean square over six numbers in units of their deviation.
-    pub fn off(&self, centre: &Vec3, options: &RefineOptions) -> f64 {
-        off(&self.since_given(centre), options)
-    }
-
-    fn since_given(&self, centre: &Vec3) -> [f64; 6] {
-        since(&self.given, &self.pose, centre)
     }
 
     fn add_colors(
@@ -196,7 +188,7 @@ impl Working<'_> {
 
     pub fn report(&self, centre: &Vec3, difference: [f64; 2], options: &RefineOptions) -> SourceReport {
         let pose = &self.pose;
-        let offset = self.since_given(centre);
+        let offset = since(&self.given, pose, centre);
         let far = |range: std::ops::Range<usize>, deviation: f64| {
             offset[range].iter().map(|v| v * v).sum::<f64>().sqrt() / deviation
         };
@@ -249,7 +241,7 @@ mod tests {
         assert!((before[3] - 0.02).abs() < 1e-9 && (before[5] + 0.01).abs() < 1e-9, "{before:?}");
         let options = RefineOptions::default();
         let mut equations = NormalEquations::default();
-        add_given(&mut equations, &before, &options);
+        add_given(&mut equations, &before, options.rough);
         let step = equations.solve(0.0).unwrap();
         let about = Pose::from_translation(pose.transform_point(&centre));
         let back = moved(step.into(), pose, about);
@@ -258,7 +250,7 @@ mod tests {
         // What is far off is trusted less.
         let weight = |scale: f64| {
             let mut equations = NormalEquations::default();
-            add_given(&mut equations, &before.map(|v| v * scale), &options);
+            add_given(&mut equations, &before.map(|v| v * scale), options.rough);
             equations.parts().0[(0, 0)]
         };
         assert!(weight(10.0) < 0.9 * weight(1.0) && weight(1.0) < weight(0.0));

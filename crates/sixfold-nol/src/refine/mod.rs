@@ -2,8 +2,10 @@
 //!
 //! [`refine_scene`] is the default: robust Gauss-Newton on SE(3) over the difference between what one photograph shows
 //! on the surface and what the others show there, with the outline as a second measurement, and one camera for all objects of
-//! an image where they stood still. [`printed_rule`] is the dissertation's gradient step over the same difference.
+//! an image that stood still between some of the photographs. [`printed_rule`] is the dissertation's gradient step over the same
+//! difference.
 
+mod alignment;
 mod appearance;
 mod arrangement;
 mod common_error;
@@ -12,6 +14,7 @@ mod measure;
 mod options;
 mod printed;
 mod printed_poses;
+mod stillness;
 #[cfg(test)]
 pub(crate) mod tests;
 

@@ -51,9 +51,9 @@ impl Default for RefineOptions {
             steps: 5,
             wide: 4.0,
             shared: 0,
-            colors: 40.0,
-            line: 0.01,
-            edges: 8.0,
+            colors: 10.0,
+            line: 0.02,
+            edges: 60.0,
             scene: SceneKind::Judge,
             rough: [0.006, 0.03],
             most_moved: 6.0,
@@ -66,7 +66,8 @@ impl Default for RefineOptions {
 /// Whether objects moved between photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SceneKind {
-    /// By the given poses: whether they agree with one arrangement as well as poses of their roughness would.
+    /// By the given poses: whether they agree with one arrangement as well as poses of their roughness would; if not, which
+    /// objects stayed where they were between which of the images.
     #[default]
     Judge,
     /// Nothing moved but the camera.
@@ -97,8 +98,11 @@ pub struct SourceReport {
 pub struct Refinement {
     /// One report per source, in their order.
     pub sources: Vec<SourceReport>,
-    /// Whether the objects were taken to have stood still.
+    /// Whether the objects were taken to have stood still in all photographs.
     pub still: bool,
+    /// At how many places they stood: as many as there are objects where nothing moved, or nothing is known of it; more where
+    /// some were moved between some of the photographs.
+    pub places: usize,
     /// How far the given poses are from one common arrangement, in units of what their roughness explains (1: as expected);
     /// `None` where there is nothing to compare.
     pub disagreement: Option<f64>,

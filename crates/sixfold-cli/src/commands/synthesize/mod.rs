@@ -42,6 +42,7 @@ struct Summary {
     objects: Vec<ObjectSummary>,
     refined: bool,
     still: bool,
+    places: usize,
     disagreement: Option<f64>,
     seconds: f64,
 }
@@ -140,6 +141,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         objects,
         refined: poses.refined,
         still: poses.still,
+        places: poses.places,
         disagreement: poses.disagreement,
         seconds: start.elapsed().as_secs_f64(),
     };
@@ -160,6 +162,15 @@ fn table(a: &SynthesizeArguments, summary: &Summary) {
             o.images,
             100.0 * o.pixels_unseen
         );
+    }
+    match summary.places {
+        _ if summary.still => {
+            println!("the objects stood still in all photographs, so these share their cameras")
+        }
+        places if places > summary.objects.len() => {
+            println!("between photographs objects were moved: they stood at {places} places");
+        }
+        _ => {}
     }
     let out = a.out.display();
     println!("{out}/preview.png: new views; {out}/poses.png: outlines at the given and the refined poses");

@@ -45,6 +45,9 @@ pub(super) struct PoseRecord {
 pub(super) struct PoseFile {
     pub refined: bool,
     pub still: bool,
+    /// At how many places the objects stood; as many as objects if nothing moved, or nothing is known of it.
+    #[serde(default)]
+    pub places: usize,
     /// Disagreement of the given poses with one arrangement, in units of what their roughness explains.
     pub disagreement: Option<f64>,
     pub photographs: Vec<PoseRecord>,
@@ -75,6 +78,7 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
     let mut poses = PoseFile {
         refined: !a.no_refine,
         still: false,
+        places: input.subjects.len(),
         disagreement: None,
         photographs: sources.iter().map(unrefined).collect(),
     };
@@ -121,6 +125,7 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
         return Ok(None);
     }
     poses.still = refined.still;
+    poses.places = refined.places;
     poses.disagreement = refined.disagreement;
     for (record, report) in poses.photographs.iter_mut().zip(&refined.sources) {
         record.camera_from_object = pose_rows(&report.camera_from_object);

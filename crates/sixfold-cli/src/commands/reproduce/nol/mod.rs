@@ -2,6 +2,7 @@
 //! (section 4.2.3), views beside real pixels (table 4.6), wrong meshes (section 4.4.3), another lamp, and times.
 
 pub(crate) mod arguments;
+mod drawn;
 mod lamps;
 mod material;
 mod picture;
@@ -71,6 +72,8 @@ struct Whole {
     quick: bool,
     disturbances: u64,
     poses: Vec<PosesSummary>,
+    /// The same of drawn frames, whose poses are exact.
+    drawn_poses: Vec<PosesSummary>,
     /// Targets that were compared, and that were left out.
     targets_of_views: [usize; 2],
     views: Vec<ViewsSummary>,
@@ -116,7 +119,13 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
     let disturbances = if a.quick { 1 } else { DISTURBANCES };
     let mut rows = vec![];
     for seed in a.seed..a.seed + disturbances {
-        rows.extend(bench.poses(seed)?);
+        rows.extend(bench.poses(&bench.material, "poses", seed)?);
+    }
+    let drawn = drawn::drawn(&bench.material, a.seed)?;
+    drawn::picture(&drawn, &a.out.join("drawn.png"))?;
+    let mut drawn_rows = vec![];
+    for seed in a.seed..a.seed + disturbances {
+        drawn_rows.extend(bench.poses(&drawn, "drawn", seed)?);
     }
     let view_rows = bench.views(&rows)?;
     let lamp_rows = match &a.hope {
@@ -134,6 +143,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         quick: a.quick,
         disturbances,
         poses: poses::summaries(&rows),
+        drawn_poses: poses::summaries(&drawn_rows),
         targets_of_views: [view_rows.len() - left_out, left_out],
         views: views::summaries(&view_rows),
         lamps: views::summaries(&lamp_rows),
@@ -151,8 +161,8 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
 
 impl Bench<'_> {
     /// All ways of refinement on one disturbance.
-    fn poses(&self, seed: u64) -> Result<Vec<PosesRow>> {
-        let sources = self.material.photographs(&self.material.disturbed(seed))?;
+    fn poses(&self, material: &Material, what: &str, seed: u64) -> Result<Vec<PosesRow>> {
+        let sources = material.photographs(&material.disturbed(seed))?;
         if sources.is_empty() {
             bail!("--frames: none of the frames shows enough of an object");
         }
@@ -164,9 +174,13 @@ impl Bench<'_> {
                 continue;
             }
             check_interrupt(GO_ON)?;
-            let key = format!("poses-{way}-{seed}");
-            rows.push(kept_or_made(&self.a.out, &key, || {
-                poses::refine(&self.material, &sources, way, model, seed)
+            let key = format!("{what}-{way}-{seed}");
+            rows.push(kept_or_made(&self.a.out, &key, || match way {
+                poses::ANNOTATED => {
+                    let sources = material.at_poses(&sources, &material.true_poses())?;
+                    poses::refine(material, &sources, way, model, seed)
+                }
+                _ => poses::refine(material, &sources, way, model, seed),
             })?);
         }
         Ok(rows)

@@ -16,13 +16,16 @@ use super::material::{Material, Poses, Source};
 use crate::output::pose_rows;
 
 /// Ways of refinement: key and title.
-pub(super) const WAYS: [(&str, &str); 5] = [
+pub(super) const WAYS: [(&str, &str); 6] = [
     ("printed", "printed rule, the network's rendering"),
     ("printed-average", "printed rule, mean of the colours"),
     ("colours", "ours, colours only"),
     ("outline", "ours, outline only"),
     ("both", "ours, both"),
+    (ANNOTATED, "ours, both, begun at the annotated poses"),
 ];
+/// Starts from the true poses, so that its errors are what photographs and annotations disagree by.
+pub(super) const ANNOTATED: &str = "annotated";
 /// The way whose poses the views are rendered from.
 pub(super) const BEST: &str = "both";
 /// Others behind the printed rule's first rendering.
@@ -179,8 +182,8 @@ pub(super) struct Medians {
     pub millimetres_across: f64,
     pub millimetres_along: f64,
     pub degrees: f64,
-    /// Share of the sources whose box's corners came nearer to their places.
-    pub improved: f64,
+    /// Share of the disturbed sources whose box's corners came nearer to their places.
+    pub improved: Option<f64>,
 }
 
 /// The disturbed poses, then every way.
@@ -208,6 +211,7 @@ fn summary(title: &str, rows: &[&PosesRow], error: impl Fn(&RefinedSource) -> Po
     }
     let medians = |of: &[&RefinedSource]| {
         let over = |f: &dyn Fn(PoseError) -> f64| median(of.iter().map(|s| f(error(s))).collect());
+        let disturbed = of.iter().filter(|s| s.before.corners > 0.0).count();
         let improved = of.iter().filter(|s| error(s).corners < s.before.corners).count();
         Medians {
             sources: of.len(),
@@ -215,7 +219,7 @@ fn summary(title: &str, rows: &[&PosesRow], error: impl Fn(&RefinedSource) -> Po
             millimetres_across: 1e3 * over(&|e| e.across),
             millimetres_along: 1e3 * over(&|e| e.along),
             degrees: over(&|e| e.turned).to_degrees(),
-            improved: improved as f64 / of.len().max(1) as f64,
+            improved: (disturbed > 0).then(|| improved as f64 / disturbed as f64),
         }
     };
     PosesSummary {

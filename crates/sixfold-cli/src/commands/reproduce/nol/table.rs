@@ -17,7 +17,13 @@ pub(super) fn markdown(whole: &Whole) -> String {
         whole.disturbances,
         if whole.quick { " **Quick: one disturbance, a quarter of the views.**" } else { "" }
     );
+    out += "\n## Poses\n\nMedians over photographs of objects: how far the middle of the object's box is from its place, across and along the \
+        optical axis; the angle; the share whose box came nearer to its place. The last row says how far annotations and photographs \
+        disagree: no refinement can be nearer to the annotations than the photographs are.\n";
     poses(&mut out, &whole.poses);
+    out += "\n## Poses of drawn frames\n\nThe same frames, poses and disturbances with exact poses: the coloured models drawn over other \
+        frames' photographs, light and colours changed from frame to frame.\n";
+    poses(&mut out, &whole.drawn_poses);
     views(&mut out, &whole.views, &whole.targets_of_views);
     if !whole.lamps.is_empty() {
         out += "\n## Another lamp\n\nThe same scene under several lamps by a camera that stood still: each photograph from the others. No method here \
@@ -38,13 +44,12 @@ pub(super) fn markdown(whole: &Whole) -> String {
 }
 
 fn poses(out: &mut String, rows: &[PosesSummary]) {
-    *out += "\n## Poses\n\nMedians over photographs of objects: how far the middle of the object's box is from its place, across and along the \
-        optical axis; the angle; the share whose box came nearer to its place.\n\n";
-    *out += "| | photographs | mm | across | along | degrees | nearer | dropped | s, all objects of all frames |\n|---|---|---|---|---|---|---|---|---|\n";
+    *out += "\n| | photographs | mm | across | along | degrees | nearer | dropped | s, all objects of all frames |\n|---|---|---|---|---|---|---|---|---|\n";
     for r in rows {
         let a = &r.all;
         let seconds = r.seconds.map_or("-".to_owned(), |s| format!("{s:.0}"));
-        let nearer = r.seconds.map_or("-".to_owned(), |_| format!("{:.0} %", 100.0 * a.improved));
+        let nearer = a.improved.filter(|_| r.seconds.is_some());
+        let nearer = nearer.map_or("-".to_owned(), |share| format!("{:.0} %", 100.0 * share));
         let _ = writeln!(
             out,
             "| {} | {} | {:.2} | {:.2} | {:.2} | {:.2} | {nearer} | {} | {seconds} |",
@@ -82,7 +87,8 @@ fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
         "\n## Views\n\n{} targets in frames that are no sources, at their true poses, beside the real pixels ({} more were left out: too little of \
          them is shown by all). Compared where the object is visible and every way shows it. Things in front of the object that the ground truth does not name count against all. PSNR in dB; SSIM; perceptual: mean squared \
          difference of the first three EfficientNet-Lite0 features, each of length 1 at every place, without learned weights. \
-         *In its light*: after the gain and offset per channel that fit best. *Better*: share of the targets on which the perceptual distance \
+         *In its light*: after the gain and offset per channel that fit best. *And place*: moved as well, by up to 6 pixels along each axis, to where \
+         it fits best, away from the object's border: annotated poses of targets are off by pixels. *Better*: share of the targets on which the perceptual distance \
          is smaller than averaging's from the same photographs. *Unseen*: share of the object that no photograph behind the view shows. \
          *Agreeing*: \
          what the other photographs do not agree with is taken out of each before (things in front of the object that no mask knows of). \
@@ -93,12 +99,12 @@ fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
 }
 
 fn measures(out: &mut String, rows: &[ViewsSummary]) {
-    *out += "\n| from | | targets | PSNR | SSIM | perceptual | in its light: PSNR | SSIM | perceptual | better | unseen |\n|---|---|---|---|---|---|---|---|---|---|---|\n";
+    *out += "\n| from | | targets | PSNR | SSIM | perceptual | in its light: PSNR | SSIM | perceptual | and place: PSNR | SSIM | perceptual | better | unseen |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n";
     for r in rows {
         let better = r.better_than_average.map_or("-".to_owned(), |b| format!("{:.0} %", 100.0 * b));
         let _ = writeln!(
             out,
-            "| {} | {} | {} | {:.2} | {:.3} | {:.4} | {:.2} | {:.3} | {:.4} | {better} | {:.1} % |",
+            "| {} | {} | {} | {:.2} | {:.3} | {:.4} | {:.2} | {:.3} | {:.4} | {:.2} | {:.3} | {:.4} | {better} | {:.1} % |",
             r.set,
             r.method,
             r.targets,
@@ -108,6 +114,9 @@ fn measures(out: &mut String, rows: &[ViewsSummary]) {
             r.lit.psnr,
             r.lit.ssim,
             r.lit.perceptual,
+            r.placed.psnr,
+            r.placed.ssim,
+            r.placed.perceptual,
             100.0 * r.unseen
         );
     }

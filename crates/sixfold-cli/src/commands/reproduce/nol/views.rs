@@ -10,7 +10,7 @@ use sixfold_mesh::{Mesh, simplify};
 use sixfold_nn::layers::normal;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
-use sixfold_nol::similarity::{Judge, Similarity, in_light_of};
+use sixfold_nol::similarity::{Judge, Similarity, in_light_of, in_place_of, without_border};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
@@ -19,6 +19,8 @@ use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObje
 pub(super) const PER_VIEW: usize = 6;
 /// Targets with fewer pixels that all ways show are left out.
 const LEAST_PIXELS: usize = 200;
+/// Views are moved by up to this many pixels of the crop to where they are most like the photograph.
+pub(super) const MOVED: usize = 6;
 /// The model's own colours are no view from photographs.
 pub(super) const MODEL: &str = "model";
 
@@ -43,6 +45,8 @@ pub(super) struct Cell {
     pub plain: Similarity,
     /// After a gain and an offset per channel that fit best.
     pub lit: Similarity,
+    /// After that and a shift, away from the border; `None` where too little is left of the object there.
+    pub placed: Option<Similarity>,
     /// Share of the object's pixels that no source shows.
     pub unseen: f64,
 }
@@ -122,11 +126,24 @@ pub(super) fn compare(target: &Target<'_>, ways: &[Way<'_>], judge: &Judge) -> R
     };
     let mut pictures = vec![real.patch.clone()];
     let truth = judge.truth(&real.patch, &common);
+    let middle = without_border(&common, MOVED);
+    let large = middle.as_slice().iter().filter(|m| **m).count() >= LEAST_PIXELS;
+    let truth_in_middle = judge.truth(&real.patch, &middle);
     let mut add = |set: &str, method: &str, patch: &Patch, mask: &Mask, unseen: f64| {
         pictures.push(on_grey(patch, mask));
-        let lit = in_light_of(patch, &real.patch, &common);
-        if let (Some(plain), Some(lit)) = (judge.compare(patch, &truth), judge.compare(&lit, &truth)) {
-            row.cells.push(Cell { set: set.to_owned(), method: method.to_owned(), plain, lit, unseen });
+        let lit_patch = in_light_of(patch, &real.patch, &common);
+        if let (Some(plain), Some(lit)) = (judge.compare(patch, &truth), judge.compare(&lit_patch, &truth)) {
+            let placed = large
+                .then(|| in_place_of(&lit_patch, &real.patch, &middle, MOVED))
+                .and_then(|placed| judge.compare(&placed, &truth_in_middle));
+            row.cells.push(Cell {
+                set: set.to_owned(),
+                method: method.to_owned(),
+                plain,
+                lit,
+                placed,
+                unseen,
+            });
         }
     };
     if target.mesh.colors().is_some() || target.mesh.texture().is_some() {
@@ -180,6 +197,8 @@ pub(super) struct ViewsSummary {
     pub targets: usize,
     pub plain: Similarity,
     pub lit: Similarity,
+    /// Over those targets that are large enough.
+    pub placed: Similarity,
     pub unseen: f64,
     /// Share of the targets on which it is perceptually nearer to the photograph than averaging from the same sources.
     pub better_than_average: Option<f64>,
@@ -198,9 +217,10 @@ pub(super) fn summaries(rows: &[ViewRow]) -> Vec<ViewsSummary> {
     let find = |row: &ViewRow, set: &str, method: &str| {
         row.cells.iter().find(|c| c.set == set && c.method == method).cloned()
     };
-    let mean = |cells: &[Cell], f: &dyn Fn(&Cell) -> Similarity| {
+    let mean = |cells: &[Cell], f: &dyn Fn(&Cell) -> Option<Similarity>| {
+        let known: Vec<Similarity> = cells.iter().filter_map(f).collect();
         let of = |g: &dyn Fn(Similarity) -> f64| {
-            cells.iter().map(|c| g(f(c))).sum::<f64>() / cells.len().max(1) as f64
+            known.iter().map(|s| g(*s)).sum::<f64>() / known.len().max(1) as f64
         };
         Similarity { psnr: of(&|s| s.psnr), ssim: of(&|s| s.ssim), perceptual: of(&|s| s.perceptual) }
     };
@@ -220,8 +240,9 @@ pub(super) fn summaries(rows: &[ViewRow]) -> Vec<ViewsSummary> {
                 set: set.to_owned(),
                 method: method.to_owned(),
                 targets: cells.len(),
-                plain: mean(&cells, &|c| c.plain),
-                lit: mean(&cells, &|c| c.lit),
+                plain: mean(&cells, &|c| Some(c.plain)),
+                lit: mean(&cells, &|c| Some(c.lit)),
+                placed: mean(&cells, &|c| c.placed),
                 unseen: cells.iter().map(|c| c.unseen).sum::<f64>() / cells.len().max(1) as f64,
                 better_than_average: (method != "average" && !pairs.is_empty()).then_some(better),
             }

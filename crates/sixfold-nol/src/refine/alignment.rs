@@ -1,0 +1,319 @@
+//! The steps of the default refinement, from coarse to fine: every pose by itself, or cameras and the places of objects that
+//! stood still. Which did, [`Places`] says by what a first refinement leaves of the errors.
+
+use std::collections::BTreeSet;
+
+use rayon::prelude::*;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_outline::{Outline, color_odds};
+
+use super::appearance::{Common, Light, Shown, look};
+use super::arrangement::{Arrangement, Wanted};
+use super::common_error::Shared;
+use super::gauss_newton::SceneSource;
+use super::measure::{Terms, Working, off, prior, wanted_by};
+use super::options::{RefineOptions, SceneKind};
+use super::stillness::{Joined, Places};
+use crate::maps::Maps;
+
+/// Disagreement of poses, in units of what their roughness explains, from which objects are taken to have moved.
+const MOVED: f64 = 2.0;
+
+/// Four fifths of the means of six squared unit normal numbers are below this.
+const EXPECTED: f64 = 1.43;
+
+/// What belongs to an object.
+pub(super) struct Object {
+    pub points: Vec<Vec3>,
+    pub normals: Vec<Vec3>,
+    /// With no more faces than its outline needs.
+    pub simple: Mesh,
+    pub centre: Vec3,
+    /// Numbers of its sources.
+    pub sources: Vec<usize>,
+}
+
+/// Where the objects were found to have stood.
+pub(super) struct Standing {
+    /// The places of every object.
+    pub places: Vec<Vec<usize>>,
+    /// Whether each had one place in all images.
+    pub still: bool,
+    /// How far the given poses are from that, in units of what their roughness explains; `None` where there is nothing to
+    /// compare.
+    pub disagreement: Option<f64>,
+}
+
+/// Everything while its poses are made better.
+pub(super) struct Scene<'a, 'b> {
+    pub sources: &'a [SceneSource<'b>],
+    pub meshes: &'a [Mesh],
+    pub objects: &'a [Object],
+    pub options: &'a RefineOptions,
+    pub working: Vec<Working<'a>>,
+    pub progress: &'a mut dyn FnMut(f64) -> bool,
+}
+
+/// How rough poses still are after a first refinement, of what the given ones were.
+const LEFT: f64 = 0.6;
+/// The level from which they are refined again in places.
+const AGAIN: usize = 1;
+
+impl Scene<'_, '_> {
+    /// Makes the poses better: in one arrangement if all objects stood still by their given poses; otherwise every source by
+    /// itself, and then in the places where objects stood in some of the images by these better poses.
+    pub fn refine(&mut self) -> Standing {
+        let given: Vec<Pose> = self.working.iter().map(|w| w.given).collect();
+        let pairs: Vec<[usize; 2]> = self.sources.iter().map(|s| [s.image, s.object]).collect();
+        let each: Vec<Vec<usize>> = (0..self.objects.len()).map(|object| vec![object]).collect();
+        let mut disagreement = None;
+        if self.options.scene != SceneKind::Moving
+            && let Some((mut arrangement, off)) =
+                self.fit(&pairs, self.objects.len(), &given, self.options.rough)
+        {
+            disagreement = Some(off);
+            if self.options.scene == SceneKind::Still || off <= MOVED {
+                self.align(&mut arrangement, &each, 0, [0.0, 1.0]);
+                return Standing { places: each, still: true, disagreement };
+            }
+        }
+        let judge = self.options.scene == SceneKind::Judge && disagreement.is_some();
+        // A camera for every source: an object's one place is then no more than where its poses start from.
+        let apart = pairs.iter().enumerate().map(|(k, [_, object])| [k, *object]).collect();
+        let mut arrangement = Arrangement::new(apart, &given, given.len(), self.objects.len());
+        let share = if judge { 0.5 } else { 1.0 };
+        if !self.align(&mut arrangement, &each, 0, [0.0, share]) || !judge {
+            return Standing { places: each, still: false, disagreement };
+        }
+        let better: Vec<Pose> = self.working.iter().map(|w| w.pose).collect();
+        let rough = self.options.rough.map(|deviation| LEFT * deviation);
+        let centres: Vec<Vec3> = self.objects.iter().map(|o| o.centre).collect();
+        let found = Places::new(&pairs, &better, &centres, rough);
+        let placed: Vec<[usize; 2]> =
+            pairs.iter().zip(&found.of_source).map(|([image, _], place)| [*image, *place]).collect();
+        if let Some((mut arrangement, off)) = self.fit(&placed, found.count, &better, rough)
+            && off <= MOVED
+        {
+            let mut places = vec![BTreeSet::new(); self.objects.len()];
+            for ([_, object], place) in pairs.iter().zip(&found.of_source) {
+                places[*object].insert(*place);
+            }
+            let places: Vec<Vec<usize>> = places.into_iter().map(|of| of.into_iter().collect()).collect();
+            self.align(&mut arrangement, &places, AGAIN, [share, 1.0]);
+            return Standing { places, still: false, disagreement };
+        }
+        Standing { places: each, still: false, disagreement }
+    }
+
+    /// Cameras and places (`pairs` of image and place for every source) fitted to poses of this roughness; and by how
+    /// much the poses disagree with that, in units of what their roughness explains. `None` where there is nothing to compare.
+    fn fit(
+        &self,
+        pairs: &[[usize; 2]],
+        places: usize,
+        poses: &[Pose],
+        rough: [f64; 2],
+    ) -> Option<(Arrangement, f64)> {
+        let images = pairs.iter().map(|[image, _]| image + 1).max().unwrap_or(0);
+        let used = |which: usize| pairs.iter().map(|p| p[which]).collect::<BTreeSet<_>>().len();
+        // Six numbers of every pair against those of every camera and place, less a common frame of each part that hangs together.
+        let free = 6.0 * ((pairs.len() + parts(pairs, images, places)) as f64 - (used(0) + used(1)) as f64);
+        if free <= 0.0 {
+            return None;
+        }
+        let centre = |k: usize| &self.objects[self.sources[k].object].centre;
+        let mut arrangement = Arrangement::new(pairs.to_vec(), poses, images, places);
+        for _ in 0..20 {
+            let wanted: Vec<Wanted> = poses
+                .iter()
+                .enumerate()
+                .map(|(k, pose)| wanted_by(pose, &arrangement.camera_from_object(k), centre(k), rough))
+                .collect();
+            if !arrangement.step(&wanted, 1e-6) {
+                break;
+            }
+        }
+        let mut off: Vec<f64> = poses
+            .iter()
+            .enumerate()
+            .map(|(k, pose)| off(pose, &arrangement.camera_from_object(k), centre(k), rough).powi(2))
+            .collect();
+        // Nearly all poses must agree: with few of them, some always do.
+        let most = (off.len() * 4 / 5).min(off.len() - 1);
+        let usual = *off.select_nth_unstable_by(most, f64::total_cmp).1 / EXPECTED;
+        Some((arrangement, (usual * 6.0 * pairs.len() as f64 / free).sqrt()))
+    }
+
+    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` hears numbers in a range. `false`
+    /// when that stopped it.
+    fn align(
+        &mut self,
+        arrangement: &mut Arrangement,
+        places: &[Vec<usize>],
+        first: usize,
+        range: [f64; 2],
+    ) -> bool {
+        let Scene { sources, objects, options, .. } = *self;
+        self.follow(arrangement);
+        let first = first.min(options.blurs.len() - 1);
+        let all = ((options.blurs.len() - first) * options.steps).max(1) as f64;
+        for (level, blur) in options.blurs.iter().enumerate().skip(first) {
+            let maps: Vec<Maps> = self.working.par_iter().map(|w| w.maps(*blur, options)).collect();
+            if options.line > 0.0 {
+                self.working.par_iter_mut().zip(sources).for_each(|(w, source)| {
+                    let odds = color_odds(&w.view.patch, &prior(&w.view));
+                    let outline = Outline::new(&objects[source.object].simple, &w.view.camera, odds);
+                    w.outline = Some(outline.with_edges(&w.view.patch, options.edges));
+                });
+            }
+            for step in 0..options.steps {
+                let done = ((level - first) * options.steps + step) as f64 / all;
+                if !(self.progress)(range[0] + done * (range[1] - range[0])) {
+                    return false;
+                }
+                let working = &mut self.working;
+                working.par_iter_mut().for_each(|w| w.allow(*blur));
+                let shown = shown(working, &maps, objects);
+                let reach = options.reaches[level.min(options.reaches.len() - 1)];
+                let wanted: Vec<Wanted> = working
+                    .par_iter_mut()
+                    .enumerate()
+                    .map(|(k, w)| {
+                        let object = &objects[sources[k].object];
+                        let (target, known) = &shown.others[k];
+                        let (points, normals, centre) = (&object.points, &object.normals, &object.centre);
+                        w.measure(
+                            &Terms { maps: &maps[k], points, normals, target, known, centre, reach },
+                            options,
+                        )
+                    })
+                    .collect();
+                if !arrangement.step(&wanted, 1e-3) {
+                    break;
+                }
+                self.follow(arrangement);
+                if step + options.shared >= options.steps && options.colors > 0.0 {
+                    for (number, object) in objects.iter().enumerate() {
+                        let motion = shared_motion(object, &mut self.working, &maps, reach, *blur, options);
+                        if let Some(motion) = motion {
+                            places[number].iter().for_each(|place| arrangement.move_object(*place, &motion));
+                        }
+                    }
+                    self.follow(arrangement);
+                }
+            }
+        }
+        true
+    }
+
+    /// Takes the poses of the arrangement over.
+    fn follow(&mut self, arrangement: &Arrangement) {
+        let (sources, meshes) = (self.sources, self.meshes);
+        self.working.par_iter_mut().enumerate().for_each(|(k, w)| {
+            let pose = arrangement.camera_from_object(k);
+            if pose.translation().z > 0.01 {
+                w.pose = pose;
+                w.view.set_pose(&meshes[sources[k].object], pose, &mut w.frame);
+            }
+        });
+    }
+}
+
+/// The motion of one object that all its photographs ask for.
+fn shared_motion(
+    object: &Object,
+    working: &mut [Working<'_>],
+    maps: &[Maps],
+    reach: f64,
+    blur: f32,
+    options: &RefineOptions,
+) -> Option<Pose> {
+    if object.sources.len() < 3 {
+        return None;
+    }
+    let anchors = object
+        .sources
+        .iter()
+        .map(|k| working[*k].measure_anchors(&object.centre, reach, options).equations.parts())
+        .collect();
+    let working: Vec<&Working<'_>> = object.sources.iter().map(|k| &working[*k]).collect();
+    // A blur's width on the surface, seen from the usual distance.
+    let mut pixels: Vec<f64> = working.iter().map(|w| w.pose.translation().z / w.view.camera.fx).collect();
+    pixels.sort_by(f64::total_cmp);
+    let step = f64::from(blur) * pixels[pixels.len() / 2];
+    let radius = object.points.iter().map(|p| (p - object.centre).norm()).fold(1e-6, f64::max);
+    let shared = Shared {
+        working,
+        maps: object.sources.iter().map(|k| &maps[*k]).collect(),
+        points: &object.points,
+        normals: &object.normals,
+        centre: object.centre,
+        reach: [step, step / (0.6 * radius)],
+        anchors,
+    };
+    shared.solve(options)
+}
+
+/// How many parts images and places fall into that no source joins.
+fn parts(pairs: &[[usize; 2]], images: usize, places: usize) -> usize {
+    let mut joined = Joined::new(images + places);
+    for [image, place] in pairs {
+        joined.join(*image, images + place);
+    }
+    pairs.iter().map(|[image, _]| joined.root(*image)).collect::<BTreeSet<_>>().len()
+}
+
+/// What all sources show, in a common light.
+pub(super) struct AllShown {
+    pub shown: Vec<Shown>,
+    /// Per source: what the other sources of its object show, and the weight behind it.
+    pub others: Vec<(Vec<f32>, Vec<f32>)>,
+}
+
+/// Colours of all sources at all points of their objects.
+pub(super) fn shown(working: &mut [Working<'_>], maps: &[Maps], objects: &[Object]) -> AllShown {
+    let mut all = AllShown { shown: vec![], others: vec![] };
+    all.shown.resize_with(working.len(), Shown::default);
+    all.others.resize_with(working.len(), Default::default);
+    for object in objects {
+        let raw: Vec<Shown> = object
+            .sources
+            .par_iter()
+            .map(|k| {
+                let w = &working[*k];
+                look(&w.view, &maps[*k], &w.allowed, &object.points, &object.normals)
+            })
+            .collect();
+        // The light twice: fitted to colours in the light of before, then the colours in the new one.
+        for round in 0..2 {
+            let lit: Vec<Shown> = raw
+                .par_iter()
+                .zip(&object.sources)
+                .map(|(raw, k)| {
+                    let mut shown = raw.clone();
+                    working[*k].light.apply(&mut shown.values);
+                    shown
+                })
+                .collect();
+            let common = Common::new(&lit, 3);
+            let others: Vec<_> = (0..lit.len()).into_par_iter().map(|i| common.without(i, &lit[i])).collect();
+            if round == 0 {
+                let lights: Vec<Light> = raw
+                    .par_iter()
+                    .zip(&others)
+                    .map(|(raw, (target, known))| Light::fit(raw, target, known, 3))
+                    .collect();
+                for (k, light) in object.sources.iter().zip(lights) {
+                    working[*k].light = light;
+                }
+                continue;
+            }
+            for ((k, lit), others) in object.sources.iter().zip(lit).zip(others) {
+                all.shown[*k] = lit;
+                all.others[*k] = others;
+            }
+        }
+    }
+    all
+}
