@@ -1,5 +1,5 @@
-//! The same frames with poses that are exact: the coloured models drawn over photographs of other frames, under a lamp that stays
-//! where it is while the camera moves, and with table 4.1's changes of colour.
+//! The same frames with poses that are exact: the coloured models drawn over photographs of other frames, under a lamp above the
+//! first object (so it stays with that object when the camera moves), and with table 4.1's changes of colour.
 //!
 //! Annotated poses of real photographs are off by pixels. Nothing can be nearer to them than they are to what the
 //! photographs show, and only of drawn objects is it known where they are.
@@ -66,16 +66,13 @@ fn draw(material: &Material, frame: &PosedFrame, backgrounds: &Backgrounds, rand
     let surface = Surface { specular: 0.2, ..Surface::default() };
     let colors = Patch::from_rgb(&shade(&fine, &objects, &lights, &surface, None));
     let covered: Vec<f32> = fine.inverse_depth().iter().map(|z| f32::from(u8::from(*z > 0.0))).collect();
-    let mut coverage = Coverage { width, height, data: coarse(&covered, width, height) };
+    let coverage = Coverage { width, height, data: coarse(&covered, width, height) };
     let mut over = Patch::filled(width, height, [0.0; 3]);
-
     for (plane, fine) in over.planes_mut().zip(colors.data.chunks_exact(covered.len())) {
         // What is not covered is black, and counts as nothing.
         plane.copy_from_slice(&coarse(fine, width, height));
         plane.iter_mut().zip(&coverage.data).filter(|(_, c)| **c > 0.0).for_each(|(v, c)| *v /= c);
     }
-
-    coverage.data.iter_mut().for_each(|c| *c = c.min(1.0));
     picture.blend(&over, &coverage);
     picture.blur(LENS);
     ColorAugmentation::table_4_1().apply(&mut picture, random);

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::Whole;
 use super::poses::PosesSummary;
-use super::views::ViewsSummary;
+use super::views::{MOVED, ViewsSummary};
 
 pub(super) fn markdown(whole: &Whole) -> String {
     let i = &whole.inputs;
@@ -87,13 +87,13 @@ fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
         "\n## Views\n\n{} targets in frames that are no sources, at their true poses, beside the real pixels ({} more were left out: too little of \
          them is shown by all). Compared where the object is visible and every way shows it. Things in front of the object that the ground truth does not name count against all. PSNR in dB; SSIM; perceptual: mean squared \
          difference of the first three EfficientNet-Lite0 features, each of length 1 at every place, without learned weights. \
-         *In its light*: after the gain and offset per channel that fit best. *And place*: moved as well, by up to 6 pixels along each axis, to where \
+         *In its light*: after the gain and offset per channel that fit best. *And place*: moved as well, by up to {} pixels along each axis, to where \
          it fits best, away from the object's border: annotated poses of targets are off by pixels. *Better*: share of the targets on which the perceptual distance \
          is smaller than averaging's from the same photographs. *Unseen*: share of the object that no photograph behind the view shows. \
          *Agreeing*: \
          what the other photographs do not agree with is taken out of each before (things in front of the object that no mask knows of). \
          *500 faces* and *vertices 1 mm off*: true poses, the mesh simplified, and with vertices moved by N(0, 1 mm) along each axis.",
-        targets[0], targets[1]
+        targets[0], targets[1], MOVED
     );
     measures(out, rows);
 }
