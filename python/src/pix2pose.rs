@@ -11,7 +11,7 @@ use pyo3::types::{PyDict, PyList, PyType};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
-use sixfold_outline::outline_mesh;
+use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found, estimate};

@@ -130,6 +130,19 @@ impl<T> Image<T> {
 }
 
 impl Image<bool> {
+    /// The smallest box that holds all pixels of the mask, `[x, y, width, height]`; `None` for an empty mask.
+    pub fn bounding_box(&self) -> Option<[usize; 4]> {
+        let (mut x0, mut y0, mut x1, mut y1) = (usize::MAX, usize::MAX, 0, 0);
+        for y in 0..self.height {
+            let row = self.row(y);
+            let (Some(first), Some(last)) = (row.iter().position(|m| *m), row.iter().rposition(|m| *m)) else {
+                continue;
+            };
+            (x0, y0, x1, y1) = (x0.min(first), y0.min(y), x1.max(last + 1), y + 1);
+        }
+        (x1 > x0).then(|| [x0, y0, x1 - x0, y1 - y0])
+    }
+
     /// The mask with all pixels that lie at most so many columns and rows from one of its own.
     pub fn grown(&self, pixels: usize) -> Image<bool> {
         let spread = |line: &[bool]| -> Vec<bool> {

@@ -8,10 +8,10 @@ use std::path::Path;
 
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{KdTree, Pose, Vec3};
-use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
+use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, Stages, TemplateOptions,
+    MttmOptions, KnownObject, MatchedBy, ObjectTemplates, Search, Stages, TemplateOptions,
 };
 use sixfold_render::render_depth;
 
@@ -37,7 +37,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         if let std::collections::btree_map::Entry::Vacant(place) = known.entry(id) {
             let mesh = dataset.model(id, Models::Rendering)?;
             let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default())?;
-            let model = ObjectModel::new(&mesh, &infos.0[&id].symmetry_poses(0.1), &ModelOptions::default())?;
+            let model = verification_mesh(&mesh)?;
             let mut object = KnownObject::new(templates, Some(model));
             if let Some(network) = &network {
                 object = object.with_network(network.clone());
@@ -46,16 +46,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     println!("{:.1} s for {} objects", started.elapsed().as_secs_f64(), known.len());
-    let plain = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
-    let by = |matched_by, predicted_pose| EstimateOptions { matched_by, predicted_pose, ..plain };
-    let all: Vec<(&str, bool, EstimateOptions)> = vec![
+    let plain = MttmOptions { min_score: 0.0, ..MttmOptions::default() };
+    let by = |matched_by, predicted_pose| MttmOptions { matched_by, predicted_pose, ..plain };
+    let all: Vec<(&str, bool, MttmOptions)> = vec![
         ("points", true, by(MatchedBy::Points, true)),
         ("points, no mesh", false, by(MatchedBy::Points, true)),
-        ("nearest", false, EstimateOptions { align: false, ..by(MatchedBy::Points, true) }),
+        ("nearest", false, MttmOptions { align: false, ..by(MatchedBy::Points, true) }),
         ("network", true, by(MatchedBy::Network, true)),
         ("network, template's pose", true, by(MatchedBy::Network, false)),
         ("network, no mesh", false, by(MatchedBy::Network, true)),
-        ("network's nearest", false, EstimateOptions { align: false, ..by(MatchedBy::Network, false) }),
+        ("network's nearest", false, MttmOptions { align: false, ..by(MatchedBy::Network, false) }),
         ("both", true, by(MatchedBy::Both, true)),
         ("both, template's pose", true, by(MatchedBy::Both, false)),
         ("both, no mesh", false, by(MatchedBy::Both, true)),
@@ -75,7 +75,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let scene = dataset.scene(*scene_id)?;
         let image = scene.image(*im_id)?;
         let (camera, Some(depth)) = (scene.camera(*im_id)?, scene.depth(*im_id)?) else { continue };
-        let prepared = Scene::new(&depth, &camera, None, &SceneOptions::default())?;
+        let prepared = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default())?;
         done += 1;
         for (v, (name, with_mesh, options)) in variants.iter().enumerate() {
             let search = Search::new(&prepared);

@@ -5,11 +5,11 @@
 //! nowhere: first along the ray, then by ICP.
 
 use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2, Vec3, icp};
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 /// Lays a template's points (view frame) on the scene, starting from a pose that is right within a few times `tolerance`
 /// metres.
-pub fn align(scene: &Scene, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
+pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
     let start = along_the_ray(scene, cloud, camera_from_view, tolerance);
     let target = DepthTarget { depth: scene.depth(), normals: scene.normals(), camera: scene.camera() };
     let level =
@@ -31,7 +31,7 @@ pub fn align(scene: &Scene, cloud: &PointCloud, camera_from_view: &Pose, toleran
 }
 
 /// Moves the points along the ray by the median of the differences to the scene that are small enough to be the object's.
-fn along_the_ray(scene: &Scene, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
+fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
     let camera = scene.camera();
     let centre = camera_from_view.translation();
     let ray = centre.normalize();

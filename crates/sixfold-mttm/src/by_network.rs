@@ -3,10 +3,10 @@
 
 use rayon::prelude::*;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 use crate::align::camera_from_view;
-use crate::estimate::{EstimateOptions, KnownObject, MatchedBy, Placed, Stages, apart, is_known, place_at};
+use crate::estimate::{MttmOptions, KnownObject, MatchedBy, Placed, Stages, apart, is_known, place_at};
 use crate::learned::Learned;
 use crate::matching::Entry;
 use crate::model::{Encoded, PairSays};
@@ -26,11 +26,11 @@ const LEAST_TRUST: f64 = 0.1;
 /// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene where the network
 /// says. With `MatchedBy::Both` each is also matched by points there, and what agrees better with the scene is kept.
 pub(crate) fn first_matching(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     learned: &Learned,
     cache: &RegionCache,
-    options: &EstimateOptions,
+    options: &MttmOptions,
     stages: &mut Stages,
 ) -> Vec<Placed> {
     let diameter = object.templates.diameter;
@@ -88,10 +88,10 @@ pub(crate) fn first_matching(
 /// Matches regions again, centred where their seeds (the first of `found` of each) say and without their background, and
 /// adds the nearest templates that differ, laid on the scene.
 pub(crate) fn second_matching(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     learned: &Learned,
-    options: &EstimateOptions,
+    options: &MttmOptions,
     found: &mut [Vec<Placed>],
 ) {
     let seeds: Vec<Placed> = found.iter().filter_map(|f| f.first().cloned()).collect();
@@ -160,7 +160,7 @@ pub(crate) fn second_matching(
     }
 }
 
-fn encode(scene: &Scene, learned: &Learned, rois: &[Roi]) -> Encoded {
+fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
     let (size, side) = (learned.size(), learned.model().side());
     let patches: Vec<Patch> =
         rois.iter().map(|roi| Patch::of_scene(scene, roi, size, side, |_| true)).collect();
@@ -173,7 +173,7 @@ fn start(
     camera_from_roi: &Pose,
     entry: &Entry,
     says: &PairSays,
-    options: &EstimateOptions,
+    options: &MttmOptions,
 ) -> Pose {
     if options.predicted_pose {
         learned.camera_from_view(camera_from_roi, entry.turn, says)

@@ -7,10 +7,9 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::Serialize;
+use sixfold_align::{DepthRegion, VerificationOptions, VerificationScore, verify};
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_match::estimate::{EstimateOptions as VerifyOptions, verify};
-use sixfold_match::voting::Hypothesis as Candidate;
-use sixfold_match::{ObjectModel, Scene, VerificationOptions, VerificationScore};
+use sixfold_mesh::Mesh;
 
 use crate::align::{align, camera_from_view};
 use crate::by_network;
@@ -37,7 +36,7 @@ pub enum MatchedBy {
 
 /// How objects are searched.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EstimateOptions {
+pub struct MttmOptions {
     /// Who matches; without a network it is points alone.
     pub matched_by: MatchedBy,
     /// Take the rotation and the place that the network predicts for a matched template (dissertation, table 5.2: with and
@@ -65,9 +64,9 @@ pub struct EstimateOptions {
     pub min_score: f64,
 }
 
-impl Default for EstimateOptions {
+impl Default for MttmOptions {
     fn default() -> Self {
-        EstimateOptions {
+        MttmOptions {
             matched_by: MatchedBy::Both,
             predicted_pose: true,
             proposals: ProposalOptions::default(),
@@ -90,7 +89,7 @@ pub struct KnownObject {
     pub(crate) templates: ObjectTemplates,
     pub(crate) matcher: Matcher,
     pub(crate) surfaces: Vec<Surface>,
-    model: Option<ObjectModel>,
+    mesh: Option<Mesh>,
     pub(crate) learned: Option<Learned>,
 }
 
@@ -98,12 +97,12 @@ pub struct KnownObject {
 const ICP_POINTS: usize = 160;
 
 impl KnownObject {
-    /// Prepares templates; `model` is what verification draws, `None` to judge by the templates alone.
-    pub fn new(templates: ObjectTemplates, model: Option<ObjectModel>) -> KnownObject {
+    /// Prepares templates; `mesh` is what verification renders ([`sixfold_align::verification_mesh`]), `None` to judge by the templates alone.
+    pub fn new(templates: ObjectTemplates, mesh: Option<Mesh>) -> KnownObject {
         let matcher = Matcher::new(&templates, &MatchOptions::default());
         let surfaces =
             templates.templates.par_iter().map(|t| Surface::new(t, templates.size, ICP_POINTS)).collect();
-        KnownObject { templates, matcher, surfaces, model, learned: None }
+        KnownObject { templates, matcher, surfaces, mesh, learned: None }
     }
 
     /// The same object as a network knows it too.
@@ -141,19 +140,19 @@ impl KnownObject {
 
     /// Whether poses are verified with a mesh.
     pub fn has_mesh(&self) -> bool {
-        self.model.is_some()
+        self.mesh.is_some()
     }
 
     /// The same object without its mesh.
     pub fn without_mesh(mut self) -> KnownObject {
-        self.model = None;
+        self.mesh = None;
         self
     }
 }
 
 /// A pose with what speaks for it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Estimate {
+pub struct MttmEstimate {
     /// The pose. Templates cut out of depth images without poses give that of the matched template's own frame.
     pub camera_from_object: Pose,
     /// What decides between estimates, 0 to 1.
@@ -204,34 +203,35 @@ pub(crate) struct Placed {
 /// size.
 #[derive(Debug)]
 pub struct Search<'a> {
-    scene: &'a Scene,
+    scene: &'a DepthRegion,
     regions: RegionCache,
 }
 
 impl<'a> Search<'a> {
     /// Nothing is searched yet.
-    pub fn new(scene: &'a Scene) -> Search<'a> {
+    pub fn new(scene: &'a DepthRegion) -> Search<'a> {
         Search { scene, regions: RegionCache::default() }
     }
 
     /// Finds an object, as [`estimate`] does and with the same outcome.
-    pub fn estimate(&self, object: &KnownObject, options: &EstimateOptions) -> (Vec<Estimate>, Stages) {
+    pub fn estimate(&self, object: &KnownObject, options: &MttmOptions) -> (Vec<MttmEstimate>, Stages) {
         search(self.scene, &self.regions, object, options)
     }
 }
 
 /// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives the same output at
 /// any number of threads. For several objects in one scene [`Search`] is faster.
-pub fn estimate(scene: &Scene, object: &KnownObject, options: &EstimateOptions) -> (Vec<Estimate>, Stages) {
+pub fn estimate(scene: &DepthRegion, object: &KnownObject, options: &MttmOptions) -> (Vec<MttmEstimate>, Stages) {
     Search::new(scene).estimate(object, options)
 }
 
-fn search(
-    scene: &Scene,
+/// As [`estimate`], with what the network says of the image's regions kept in `regions`.
+pub(crate) fn search(
+    scene: &DepthRegion,
     regions: &RegionCache,
     object: &KnownObject,
-    options: &EstimateOptions,
-) -> (Vec<Estimate>, Stages) {
+    options: &MttmOptions,
+) -> (Vec<MttmEstimate>, Stages) {
     let mut stages = Stages::default();
     let mut clock = Instant::now();
     let mut lap = || {
@@ -275,9 +275,9 @@ fn search(
 
 /// Samples regions, matches them, and lays the best matches on the scene.
 fn first_matching(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
-    options: &EstimateOptions,
+    options: &MttmOptions,
     stages: &mut Stages,
 ) -> Vec<Placed> {
     let size = object.templates.size;
@@ -306,11 +306,11 @@ pub(crate) fn apart(rois: &[Roi], order: Vec<usize>, distance: f64, most: usize)
 
 /// Lays a matched template on the scene.
 pub(crate) fn place(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     roi: &Roi,
     matched: Match,
-    options: &EstimateOptions,
+    options: &MttmOptions,
 ) -> Placed {
     let entry = object.matcher.entries()[matched.entry];
     let start = camera_from_view(&roi.camera_from_roi(), entry.turn);
@@ -319,12 +319,12 @@ pub(crate) fn place(
 
 /// Lays a template on the scene from a pose that is about right; `trust` (0 to 1) is in the match it came from.
 pub(crate) fn place_at(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     template: usize,
     start: Pose,
     trust: f64,
-    options: &EstimateOptions,
+    options: &MttmOptions,
 ) -> Placed {
     let surface = &object.surfaces[template];
     let mut pose = start;
@@ -352,10 +352,10 @@ const STRIDE: usize = 2;
 
 /// The masks of the placed templates, without those that overlap a better one by more than half.
 fn merge(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     placed: &[Placed],
-    options: &EstimateOptions,
+    options: &MttmOptions,
 ) -> Vec<(Placed, Pixels)> {
     let tolerance = object.matcher.tolerance();
     let mut order: Vec<usize> = (0..placed.len()).collect();
@@ -385,10 +385,10 @@ fn merge(
 /// Matches a region again, centred where its template says and without its background, and lays the nearest templates
 /// that differ on the scene.
 fn second_matching(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     mask: &Pixels,
-    options: &EstimateOptions,
+    options: &MttmOptions,
     found: &mut Vec<Placed>,
 ) {
     let Some(seed) = found.first().cloned() else { return };
@@ -432,38 +432,32 @@ fn second_matching(
 
 /// The last word, by the mesh where there is one, and no two estimates of the same pixels.
 fn judge_all(
-    scene: &Scene,
+    scene: &DepthRegion,
     object: &KnownObject,
     hypotheses: &[Placed],
-    options: &EstimateOptions,
-) -> Vec<Estimate> {
+    options: &MttmOptions,
+) -> Vec<MttmEstimate> {
     let templates = &object.templates;
     let threshold = options.verification.threshold_for(templates.diameter);
     let most = options.verified.max(2 * options.max_instances);
     let kept: Vec<&Placed> = hypotheses.iter().take(most).collect();
     let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
-    let mut judged: Vec<(Pose, f64, VerificationScore, usize)> = match &object.model {
-        None => kept.iter().enumerate().map(|(i, p)| (pose_of(p), p.support, p.score, i)).collect(),
-        Some(model) => {
-            let verify_options = VerifyOptions {
-                verification: options.verification,
-                vote_power: 0.0,
-                ..VerifyOptions::default()
-            };
-            kept.par_iter()
-                .enumerate()
-                .filter_map(|(i, p)| {
-                    let candidate = Candidate { camera_from_object: pose_of(p), votes: 1.0 };
-                    let e = verify(scene, model, &[candidate], threshold, &verify_options).pop()?;
-                    // Two witnesses: the drawn mesh, and the template it came from.
-                    let confidence = e.score.ranking() * p.support.clamp(0.0, 1.0).powf(0.2);
-                    Some((e.camera_from_object, confidence, e.score, i))
-                })
-                .collect()
-        }
+    let poses: Vec<Pose> = kept.iter().map(|p| pose_of(p)).collect();
+    let mut judged: Vec<(Pose, f64, VerificationScore, usize)> = match &object.mesh {
+        None => kept.iter().zip(poses).enumerate().map(|(i, (p, pose))| (pose, p.support, p.score, i)).collect(),
+        Some(mesh) => verify(scene, mesh, &poses, threshold, &options.verification)
+            .into_iter()
+            .zip(&kept)
+            .enumerate()
+            .map(|(i, (v, p))| {
+                // Two witnesses: the rendered mesh, and the template it came from.
+                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(0.2);
+                (v.camera_from_object, confidence, v.score, i)
+            })
+            .collect(),
     };
     judged.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.3.cmp(&b.3)));
-    let mut estimates: Vec<Estimate> = vec![];
+    let mut estimates: Vec<MttmEstimate> = vec![];
     for (camera_from_object, confidence, score, i) in judged {
         if estimates.len() >= options.max_instances || confidence < options.min_score {
             break;
@@ -477,11 +471,11 @@ fn judge_all(
             object.matcher.tolerance(),
             1,
         );
-        let shared = |other: &Estimate| 10 * common(&mask, &other.mask) > 3 * mask.len();
+        let shared = |other: &MttmEstimate| 10 * common(&mask, &other.mask) > 3 * mask.len();
         if mask.is_empty() || estimates.iter().any(shared) {
             continue;
         }
-        estimates.push(Estimate { camera_from_object, confidence, score, template, mask });
+        estimates.push(MttmEstimate { camera_from_object, confidence, score, template, mask });
     }
     estimates
 }

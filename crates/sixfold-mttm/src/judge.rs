@@ -2,8 +2,8 @@
 //! matched in place of a rendering (what its section 5.4 leaves for the future).
 
 use sixfold_geometry::{PointCloud, Pose};
-use sixfold_match::verification::{Agreement, pierced};
-use sixfold_match::{Scene, VerificationOptions, VerificationScore};
+use sixfold_align::verification::{Agreement, pierced};
+use sixfold_align::{PreparedDepth, VerificationOptions, VerificationScore};
 
 use crate::template::{SIDE, Template};
 
@@ -54,7 +54,7 @@ impl Surface {
 
 /// Scores a template at a pose. `threshold` is the depth inlier threshold in metres.
 pub fn judge(
-    scene: &Scene,
+    scene: &PreparedDepth,
     surface: &Surface,
     camera_from_view: &Pose,
     threshold: f64,

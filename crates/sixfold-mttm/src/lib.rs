@@ -15,6 +15,7 @@ mod by_network;
 mod descriptor_file;
 mod error;
 pub mod estimate;
+mod estimator;
 pub mod from_depth;
 pub mod from_mesh;
 pub mod judge;
@@ -38,7 +39,8 @@ pub mod training;
 mod views;
 
 pub use error::{StoreError, TemplateError};
-pub use estimate::{Estimate, EstimateOptions, KnownObject, MatchedBy, Search, Stages, estimate};
+pub use estimate::{MttmEstimate, MttmOptions, KnownObject, MatchedBy, Search, Stages, estimate};
+pub use estimator::{MttmEstimator, MttmObject};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
 pub use views::{Coverage, view_directions, view_rotation};

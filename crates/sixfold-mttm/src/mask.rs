@@ -1,7 +1,7 @@
 //! Which pixels of the scene belong to an object, by the template that lies on it.
 
 use sixfold_geometry::{Mask, Pose, Vec2, Vec3};
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 use crate::template::{SIDE, Template};
 
@@ -10,7 +10,7 @@ pub type Pixels = Vec<u32>;
 
 /// The pixels whose depth agrees with the template within `tolerance` metres, every `stride`-th of every `stride`-th row.
 pub fn template_mask(
-    scene: &Scene,
+    scene: &DepthRegion,
     template: &Template,
     size: f64,
     camera_from_view: &Pose,

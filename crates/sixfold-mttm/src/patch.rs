@@ -3,7 +3,7 @@
 //! Five planes: the normal in the region's frame (dissertation, section 5.2.2), the depth along the region's axis relative to its
 //! centre as a share of half the patch, from -1 to 1, and whether anything was measured. Where nothing was, all are zero.
 
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 use crate::roi::{Cell, Roi};
 use crate::template::{SIDE, Template};
@@ -30,7 +30,7 @@ impl Patch {
 
     /// The region about `roi`'s centre, `size` metres wide. Pixels (numbers in the image) that `seen` refuses are not
     /// measured.
-    pub fn of_scene(scene: &Scene, roi: &Roi, size: f64, side: usize, seen: impl Fn(usize) -> bool) -> Patch {
+    pub fn of_scene(scene: &DepthRegion, roi: &Roi, size: f64, side: usize, seen: impl Fn(usize) -> bool) -> Patch {
         Patch::of_cells(&roi.look(scene, size, side, seen), size, side)
     }
 
@@ -105,7 +105,7 @@ mod tests {
     use crate::align::camera_from_view;
     use crate::template::{ObjectTemplates, TemplateOptions};
     use sixfold_geometry::{Camera, Vec3};
-    use sixfold_match::SceneOptions;
+    use sixfold_align::DepthOptions;
     use sixfold_mesh::Mesh;
     use sixfold_render::render_depth;
 
@@ -135,8 +135,8 @@ mod tests {
             // The object where the template's reference point falls on the region's centre.
             let pose = camera_from_view(&roi.camera_from_roi(), turn) * template.view_from_object;
             let depth = render_depth(&mesh, &pose, &camera);
-            let options = SceneOptions { remove_plane: false, ..SceneOptions::default() };
-            let scene = Scene::new(&depth, &camera, None, &options).unwrap();
+            let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+            let scene = DepthRegion::from_depth(&depth, &camera, None, &options).unwrap();
             let seen = Patch::of_scene(&scene, &roi, size, 28, |_| true);
             let drawn = TemplateSurface::new(template, object.size).patch(turn, size, 28);
             let (mut both, mut either, mut alike) = (0, 0, 0);

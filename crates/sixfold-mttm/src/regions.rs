@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 use crate::learned::Learned;
 use crate::model::{Descriptor, Encoded};
@@ -39,7 +39,7 @@ pub(crate) struct Regions {
 }
 
 impl Regions {
-    fn new(scene: &Scene, learned: &Learned) -> Regions {
+    fn new(scene: &DepthRegion, learned: &Learned) -> Regions {
         let options = ProposalOptions { step: STEP, layer: STEP, most: MOST };
         let sampled = propose(scene, learned.size() / REACH, &options);
         let (size, side) = (learned.size(), learned.model().side());
@@ -87,7 +87,7 @@ pub(crate) struct RegionCache {
 
 impl RegionCache {
     /// Those for an object's size; described now if they are asked for the first time.
-    pub fn of(&self, scene: &Scene, learned: &Learned) -> Arc<Regions> {
+    pub fn of(&self, scene: &DepthRegion, learned: &Learned) -> Arc<Regions> {
         let key = (learned.model().fingerprint(), learned.size().to_bits());
         let known = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(regions) = known().get(&key) {

@@ -6,7 +6,7 @@
 
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 
 /// Cells along a side of a region.
 pub const GRID: usize = 20;
@@ -39,12 +39,12 @@ impl Roi {
 
     /// The cells, row by row. `size` is the region's side in metres; pixels (numbers in the image) that `seen` refuses are
     /// unknown.
-    pub fn cells(&self, scene: &Scene, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
+    pub fn cells(&self, scene: &DepthRegion, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
         self.look(scene, size, GRID, seen)
     }
 
     /// The same on a grid of `grid x grid` cells.
-    pub fn look(&self, scene: &Scene, size: f64, grid: usize, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
+    pub fn look(&self, scene: &DepthRegion, size: f64, grid: usize, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
         let camera = scene.camera();
         let rotation = ray_rotation(&self.centre);
         let (axis, back) = (self.centre.normalize(), rotation.inverse().to_rotation_matrix().cast::<f32>());
@@ -93,7 +93,7 @@ impl Default for ProposalOptions {
 
 /// Regions whose centres lie on a grid of the image, wherever something off the table is near. An object's middle may be hidden
 /// by another thing: each place has a centre for every depth that occurs around it, not only for the one seen there.
-pub fn propose(scene: &Scene, diameter: f64, options: &ProposalOptions) -> Vec<Roi> {
+pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) -> Vec<Roi> {
     let camera = scene.camera();
     let focal = 0.5 * (camera.fx + camera.fy);
     let mut depths: Vec<f64> = scene.cloud().points.iter().map(|p| p.z).collect();
@@ -115,7 +115,7 @@ pub fn propose(scene: &Scene, diameter: f64, options: &ProposalOptions) -> Vec<R
 }
 
 /// Centres every `step` pixels, of near layers every `wanted / depth` pixels.
-fn sample(scene: &Scene, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
+fn sample(scene: &DepthRegion, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
     let camera = scene.camera();
     let columns = (camera.width as f64 / step).ceil() as usize;
     let rows = (camera.height as f64 / step).ceil() as usize;
@@ -162,17 +162,17 @@ fn sample(scene: &Scene, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
 mod tests {
     use super::*;
     use sixfold_geometry::{Camera, DepthImage};
-    use sixfold_match::SceneOptions;
+    use sixfold_align::DepthOptions;
 
     /// A tilted table with a near and a far box on it that face the camera, 640x480.
-    fn scene() -> Scene {
+    fn scene() -> DepthRegion {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
         let depth = DepthImage::from_fn(640, 480, |x, y| match (x, y) {
             (100..200, 300..380) => 0.6,
             (400..450, 100..150) => 1.0,
             _ => 0.5 / (0.3 + 0.001 * y as f32),
         });
-        Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap()
+        DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap()
     }
 
     #[test]

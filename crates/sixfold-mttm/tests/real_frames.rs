@@ -9,11 +9,11 @@ use std::sync::Arc;
 
 use sixfold_bop::{BopDataset, Models, read_depth, read_mask};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
-use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
+use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    Coverage, DepthView, EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions,
+    Coverage, DepthView, MttmOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions,
 };
 
 fn data() -> Option<PathBuf> {
@@ -41,7 +41,7 @@ fn error(points: &[Vec3], estimated: &Pose, truth: &Pose, symmetric: bool) -> f6
 fn known(mesh: &Mesh, symmetries: &[Pose], coverage: Coverage, network: &Arc<MttmModel>) -> KnownObject {
     let options = TemplateOptions { coverage, ..TemplateOptions::default() };
     let templates = ObjectTemplates::from_mesh(mesh, &options).unwrap();
-    let model = ObjectModel::new(mesh, symmetries, &ModelOptions::default()).unwrap();
+    let model = verification_mesh(mesh).unwrap();
     KnownObject::new(templates, Some(model)).with_network(network.clone())
 }
 
@@ -55,7 +55,7 @@ fn objects_of_lmo_frame_3_in_clutter() {
     let dataset = BopDataset::open(&data.join("lmo"), "test").unwrap();
     let frame = dataset.scene(2).unwrap();
     let depth = frame.depth(3).unwrap().unwrap();
-    let scene = Scene::new(&depth, &frame.camera(3).unwrap(), None, &SceneOptions::default()).unwrap();
+    let scene = DepthRegion::from_depth(&depth, &frame.camera(3).unwrap(), None, &DepthOptions::default()).unwrap();
     let infos = dataset.models_info(Models::Rendering).unwrap().unwrap();
     let network = network();
     let ways = [MatchedBy::Points, MatchedBy::Network, MatchedBy::Both];
@@ -69,7 +69,7 @@ fn objects_of_lmo_frame_3_in_clutter() {
         let truth =
             frame.image(3).unwrap().ground_truth.iter().find(|g| g.obj_id == id).unwrap().camera_from_object;
         for (k, matched_by) in ways.into_iter().enumerate() {
-            let options = EstimateOptions { matched_by, min_score: 0.0, ..EstimateOptions::default() };
+            let options = MttmOptions { matched_by, min_score: 0.0, ..MttmOptions::default() };
             let (found, _) = searches[k].estimate(&object, &options);
             let off = found.first().map_or(f64::INFINITY, |e| {
                 error(mesh.vertices(), &e.camera_from_object, &truth, info.is_symmetric()) / info.diameter
@@ -104,7 +104,7 @@ fn objects_of_two_ycbv_frames() {
     for im_id in frames.image_ids() {
         let depth = frames.depth(im_id).unwrap().unwrap();
         let scene =
-            Scene::new(&depth, &frames.camera(im_id).unwrap(), None, &SceneOptions::default()).unwrap();
+            DepthRegion::from_depth(&depth, &frames.camera(im_id).unwrap(), None, &DepthOptions::default()).unwrap();
         let search = Search::new(&scene);
         for g in &frames.image(im_id).unwrap().ground_truth {
             let name = names.iter().find(|n| n.0 == g.obj_id).unwrap().1;
@@ -112,7 +112,7 @@ fn objects_of_two_ycbv_frames() {
                 read_mesh(data.join(format!("ycbv_keyframe_poses/points/{name}/points.xyz")), Unit::Metre)
                     .unwrap();
             let object = known(&points.surfels().unwrap(), &[], Coverage::Around, &network);
-            let (found, _) = search.estimate(&object, &EstimateOptions::default());
+            let (found, _) = search.estimate(&object, &MttmOptions::default());
             let off = found.first().map_or(f64::INFINITY, |e| {
                 error(points.vertices(), &e.camera_from_object, &g.camera_from_object, true)
                     / points.diameter()
@@ -134,10 +134,10 @@ fn the_object_of_the_tyol_frame() {
     let dataset = BopDataset::open(&data.join("tyol_frame"), "test").unwrap();
     let frames = dataset.scene(dataset.scene_ids()[0]).unwrap();
     let depth = frames.depth(10).unwrap().unwrap();
-    let scene = Scene::new(&depth, &frames.camera(10).unwrap(), None, &SceneOptions::default()).unwrap();
+    let scene = DepthRegion::from_depth(&depth, &frames.camera(10).unwrap(), None, &DepthOptions::default()).unwrap();
     let mesh = read_mesh(data.join("tyol_frame/obj.ply"), Unit::Millimetre).unwrap();
     let object = known(&mesh, &[], Coverage::Around, &network());
-    let options = EstimateOptions { max_instances: 5, ..EstimateOptions::default() };
+    let options = MttmOptions { max_instances: 5, ..MttmOptions::default() };
     let (found, _) = Search::new(&scene).estimate(&object, &options);
     let truth = frames.image(10).unwrap().ground_truth[0].camera_from_object;
     let off: Vec<f64> = found
@@ -161,8 +161,8 @@ fn cups_in_bins() {
     let mut best = [0f64; 3];
     for bin in 1..=3 {
         let depth = read_depth(&folder.join(format!("{bin}/depth/0000.png")), 1e-3).unwrap();
-        let scene = Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap();
-        let options = EstimateOptions { max_instances: 8, ..EstimateOptions::default() };
+        let scene = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap();
+        let options = MttmOptions { max_instances: 8, ..MttmOptions::default() };
         let (found, _) = Search::new(&scene).estimate(&object, &options);
         let each: Vec<String> = found.iter().map(|e| format!("{:.2}", e.confidence)).collect();
         println!("bin {bin}: {}", each.join(", "));
@@ -191,9 +191,9 @@ fn objects_seen_once_and_tables_without_them() {
         let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: None };
         let templates = ObjectTemplates::from_depth(&[view], &TemplateOptions::default()).unwrap();
         objects.push(KnownObject::new(templates, None).with_network(network.clone()));
-        scenes.push(Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap());
+        scenes.push(DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap());
     }
-    let options = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
+    let options = MttmOptions { min_score: 0.0, ..MttmOptions::default() };
     let sure = |search: &Search<'_>, object: &KnownObject| {
         search.estimate(object, &options).0.first().map_or(0.0, |e| e.confidence)
     };
@@ -210,7 +210,7 @@ fn objects_seen_once_and_tables_without_them() {
     let mut highest = vec![];
     for folder in tables.iter().step_by(4) {
         let depth = read_depth(&folder.join("depth.png"), 1e-3).unwrap();
-        let scene = Scene::new(&depth, &kinect, None, &SceneOptions::default()).unwrap();
+        let scene = DepthRegion::from_depth(&depth, &kinect, None, &DepthOptions::default()).unwrap();
         let search = Search::new(&scene);
         let best = objects.iter().map(|o| sure(&search, o)).fold(0.0, f64::max);
         highest.push(best);

@@ -2,7 +2,7 @@
 
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec3};
-use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions, VerificationOptions};
+use sixfold_align::{DepthOptions, DepthRegion, VerificationOptions, verification_mesh};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::align::camera_from_view;
 use sixfold_mttm::judge::{Surface, judge};
@@ -13,7 +13,7 @@ use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::patch::Patch;
 use sixfold_mttm::roi::Roi;
 use sixfold_mttm::{
-    DepthView, Estimate, EstimateOptions, KnownObject, ObjectTemplates, Search, Template, TemplateOptions,
+    DepthView, MttmEstimate, MttmOptions, KnownObject, ObjectTemplates, Search, Template, TemplateOptions,
     estimate,
 };
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
@@ -63,14 +63,14 @@ fn look(objects: &[(&Mesh, Pose)], seed: u64) -> (DepthImage, Mask) {
     (depth, frame.mask(0))
 }
 
-fn prepared(depth: &DepthImage) -> Scene {
-    Scene::new(depth, &camera(), None, &SceneOptions::default()).unwrap()
+fn prepared(depth: &DepthImage) -> DepthRegion {
+    DepthRegion::from_depth(depth, &camera(), None, &DepthOptions::default()).unwrap()
 }
 
 fn known(with_mesh: bool) -> KnownObject {
     let mesh = part();
     let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
-    let model = with_mesh.then(|| ObjectModel::new(&mesh, &[], &ModelOptions::default()).unwrap());
+    let model = with_mesh.then(|| verification_mesh(&mesh).unwrap());
     KnownObject::new(templates, model)
 }
 
@@ -80,12 +80,12 @@ fn both_ways(object: KnownObject) -> [KnownObject; 2] {
     [object.clone(), object.with_network(model)]
 }
 
-fn off(found: &Estimate, truth: &Pose) -> (f64, f64) {
+fn off(found: &MttmEstimate, truth: &Pose) -> (f64, f64) {
     let pose = &found.camera_from_object;
     (1000.0 * pose.distance_to(truth), pose.rotation_angle_to(truth).to_degrees())
 }
 
-fn iou(found: &Estimate, visible: &Mask, depth: &DepthImage) -> f64 {
+fn iou(found: &MttmEstimate, visible: &Mask, depth: &DepthImage) -> f64 {
     let mask = to_image(&found.mask, 640, 480);
     let (mut common, mut either) = (0, 0);
     for ((m, v), z) in mask.as_slice().iter().zip(visible.as_slice()).zip(depth.as_slice()) {
@@ -99,7 +99,7 @@ fn iou(found: &Estimate, visible: &Mask, depth: &DepthImage) -> f64 {
 #[test]
 fn found_from_all_sides_with_its_mask() {
     let (alone, with_mesh) = (both_ways(known(false)), both_ways(known(true)));
-    let options = EstimateOptions::default();
+    let options = MttmOptions::default();
     for (i, (x, y, yaw)) in [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4)].into_iter().enumerate()
     {
         let truth = on_table(x, y, yaw);
@@ -241,7 +241,7 @@ fn a_hidden_half_does_not_shift_the_pose() {
     let share = count(&visible) / count(&whole);
     assert!((0.3..0.8).contains(&share), "the screen hides {share}");
     // The screen itself resembles parts of the object: it may be named as well, but the object must be among the first.
-    let options = EstimateOptions { max_instances: 3, ..EstimateOptions::default() };
+    let options = MttmOptions { max_instances: 3, ..MttmOptions::default() };
     for object in both_ways(known(true)) {
         let (found, _) = estimate(&prepared(&depth), &object, &options);
         let all: Vec<(f64, f64)> = found.iter().map(|e| off(e, &truth)).collect();
@@ -255,18 +255,18 @@ fn a_hidden_half_does_not_shift_the_pose() {
 #[test]
 fn what_is_not_there_is_not_surely_found() {
     let box_alone = cuboid([-0.1, -0.07, 0.0], [0.1, 0.07, 0.09]);
-    let sure = |found: &[Estimate]| found.first().map_or(0.0, |e| e.confidence);
+    let sure = |found: &[MttmEstimate]| found.first().map_or(0.0, |e| e.confidence);
     for object in both_ways(known(true)) {
         let (depth, _) = look(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
-        let (wrong, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        let (wrong, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         let truth = on_table(0.1, 0.0, 1.0);
         let (depth, _) = look(&[(&part(), truth)], 3);
-        let (right, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        let (right, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
         // An empty table: nothing at all.
         let (depth, _) = look(&[], 3);
         let (nothing, stages) =
-            estimate(&prepared(&depth), &object.without_mesh(), &EstimateOptions::default());
+            estimate(&prepared(&depth), &object.without_mesh(), &MttmOptions::default());
         assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
         assert!(stages.sampled < 400, "{}", stages.sampled);
     }
@@ -283,7 +283,7 @@ fn one_masked_view_is_enough_to_find_it_elsewhere() {
     let other = cuboid([-0.04, -0.04, 0.0], [0.04, 0.04, 0.12]);
     let (depth, visible) = look(&[(&part(), truth), (&other, on_table(-0.12, 0.0, 0.2))], 9);
     for object in both_ways(KnownObject::new(templates, None)) {
-        let (found, _) = estimate(&prepared(&depth), &object, &EstimateOptions::default());
+        let (found, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         let best = found.first().expect("found");
         let (t, r) = off(best, &truth);
         assert!(t < 12.0 && r < 8.0, "{t:.1} mm, {r:.1} degrees");
@@ -298,15 +298,15 @@ fn same_result_at_any_number_of_threads() {
     for object in both_ways(known(true)) {
         let with = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| estimate(&scene, &object, &EstimateOptions::default()).0)
+            pool.install(|| estimate(&scene, &object, &MttmOptions::default()).0)
         };
         let alone = with(1);
         assert_eq!(alone, with(3));
         // Nor does it matter what else is searched in the scene.
         let search = Search::new(&scene);
-        let first = search.estimate(&object, &EstimateOptions::default()).0;
+        let first = search.estimate(&object, &MttmOptions::default()).0;
         assert_eq!(first, alone);
-        assert_eq!(search.estimate(&object, &EstimateOptions::default()).0, alone);
+        assert_eq!(search.estimate(&object, &MttmOptions::default()).0, alone);
     }
 }
 
@@ -314,7 +314,7 @@ fn same_result_at_any_number_of_threads() {
 fn two_of_a_kind_are_two() {
     let poses = [on_table(-0.12, 0.0, 0.4), on_table(0.13, 0.02, 2.2)];
     let (depth, _) = look(&[(&part(), poses[0]), (&part(), poses[1])], 6);
-    let options = EstimateOptions { max_instances: 2, ..EstimateOptions::default() };
+    let options = MttmOptions { max_instances: 2, ..MttmOptions::default() };
     for object in both_ways(known(true)) {
         let (mut found, _) = estimate(&prepared(&depth), &object, &options);
         assert_eq!(found.len(), 2);

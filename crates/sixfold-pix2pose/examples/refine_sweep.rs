@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 use sixfold_bop::{BopDataset, ModelPoints, Models, Placement, add, adi, ground_truth_visibility};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
-use sixfold_outline::outline_mesh;
+use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;

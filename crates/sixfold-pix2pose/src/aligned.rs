@@ -51,7 +51,7 @@ pub struct Aligned {
     pub found: Found,
 }
 
-/// Looks for one object in a box of a pinhole image and aligns it; `mesh` as [`sixfold_outline::outline_mesh`] makes it. `None`
+/// Looks for one object in a box of a pinhole image and aligns it; `mesh` as [`sixfold_align::outline::outline_mesh`] makes it. `None`
 /// if its pixels are not in the box.
 ///
 /// # Errors
@@ -129,7 +129,7 @@ const SYMMETRY_STEP: f64 = 0.1;
 
 /// What aligned poses are off by on posed photographs, object by object. The shift is one for all, for it lies in camera and
 /// annotations; distances are drawn towards zero as far as their scatter does not tell them from it (empirical Bayes, James
-/// and Stein 1961). `objects` are meshes as [`sixfold_outline::outline_mesh`] makes them, with their symmetries.
+/// and Stein 1961). `objects` are meshes as [`sixfold_align::outline::outline_mesh`] makes them, with their symmetries.
 ///
 /// # Errors
 /// As [`estimate`], for objects that the model does not know.

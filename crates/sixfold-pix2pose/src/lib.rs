@@ -6,6 +6,7 @@ pub mod aligned;
 mod critic;
 pub mod depth;
 pub mod estimate;
+pub mod estimator;
 pub mod loss;
 pub mod material;
 pub mod model;

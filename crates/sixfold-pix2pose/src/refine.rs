@@ -14,7 +14,7 @@ use crate::samples::second_stage::GREY;
 use sixfold_augment::{Patch, Window};
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
+use sixfold_align::outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
 
 /// How poses are aligned.
 #[derive(Debug, Clone, PartialEq)]

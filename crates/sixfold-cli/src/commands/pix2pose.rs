@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_geometry::{Camera, Image, Mask, Pose, Rect, RgbImage};
 use sixfold_mesh::Mesh;
-use sixfold_outline::outline_mesh;
+use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::depth::{AlignedToDepth, DepthScene};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, View, estimate};

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::{Mask, Pose, Vec3};
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
 use sixfold_mesh::Mesh;
 
 use crate::from_mesh::draw_rotated;
@@ -128,7 +128,7 @@ pub struct Anchor {
 ///
 /// `visible` are the object's pixels in the scene. `None` when the object cannot be drawn from there.
 pub(super) fn anchor(
-    scene: &Scene,
+    scene: &DepthRegion,
     (number, mesh): (usize, &Mesh),
     camera_from_object: &Pose,
     visible: &Mask,
@@ -187,7 +187,7 @@ pub(super) fn anchor(
 }
 
 /// A region about a point where no object is looked for, as if for an object of `diameter` metres.
-pub(super) fn without_object(scene: &Scene, point: &Vec3, diameter: f64, options: &AnchorOptions) -> Anchor {
+pub(super) fn without_object(scene: &DepthRegion, point: &Vec3, diameter: f64, options: &AnchorOptions) -> Anchor {
     let (size, kept) = (REACH * diameter, options.kept_side());
     let cells = Roi { centre: *point }.look(scene, size * kept as f64 / options.side as f64, kept, |_| true);
     Anchor {
@@ -200,7 +200,7 @@ pub(super) fn without_object(scene: &Scene, point: &Vec3, diameter: f64, options
 }
 
 /// Which cells of a region look at pixels of a kind.
-fn looks_at(scene: &Scene, roi: &Roi, size: f64, side: usize, of_kind: impl Fn(usize) -> bool) -> Vec<bool> {
+fn looks_at(scene: &DepthRegion, roi: &Roi, size: f64, side: usize, of_kind: impl Fn(usize) -> bool) -> Vec<bool> {
     roi.look(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
 }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Vec3};
-use sixfold_match::{Scene, SceneOptions};
+use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
@@ -153,8 +153,8 @@ fn see(
         Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), sensor, noise_seed),
         None => ideal,
     };
-    let prepared = SceneOptions { remove_plane: false, ..SceneOptions::default() };
-    let Ok(scene) = Scene::new(&depth, &camera, None, &prepared) else { return vec![] };
+    let prepared = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+    let Ok(scene) = DepthRegion::from_depth(&depth, &camera, None, &prepared) else { return vec![] };
     let masks: Vec<_> = (0..arrangement.len()).map(|k| frame.mask(k)).collect();
     let mut anchors = vec![];
     for (k, (number, pose)) in arrangement.iter().enumerate() {

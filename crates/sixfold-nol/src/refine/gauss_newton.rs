@@ -7,7 +7,7 @@
 
 use rayon::prelude::*;
 use sixfold_mesh::Mesh;
-use sixfold_outline::outline_mesh;
+use sixfold_align::outline::outline_mesh;
 use sixfold_render::Frame;
 
 use super::alignment::{Object, Scene, shown};

@@ -2,7 +2,7 @@
 
 use sixfold_augment::Coverage;
 use sixfold_geometry::{NormalEquations, Pose, Vec3};
-use sixfold_outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
+use sixfold_align::outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
 use sixfold_render::Frame;
 
 use super::appearance::Light;

@@ -9,7 +9,7 @@
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_outline::motion;
+use sixfold_align::outline::motion;
 use sixfold_render::Frame;
 
 use crate::maps::Maps;

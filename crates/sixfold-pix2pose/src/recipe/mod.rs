@@ -14,7 +14,7 @@ use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::{ModelCard, WeightsError};
-use sixfold_outline::outline_mesh;
+use sixfold_align::outline::outline_mesh;
 
 pub use self::error::RecipeError;
 use crate::adversarial::{AdversarialOptions, train_adversarial};

@@ -12,7 +12,7 @@ use sixfold_geometry::{Camera, Pose, Rect, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
-use crate::scene::Scene;
+use crate::prepared::PreparedDepth;
 
 /// Thresholds of the verification.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -116,7 +116,7 @@ impl Default for Verifier {
 
 /// A point seen at a pixel of a rendered pose.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct RenderedPoint {
+pub struct RenderedPoint {
     /// In the object's frame, metres.
     pub point: Vec3,
     /// Unit normal in the object's frame.
@@ -128,8 +128,8 @@ pub(crate) struct RenderedPoint {
 impl Verifier {
     /// Renders the mesh into the part of the image it projects to; the corner of that part, or `None` when nothing
     /// of it is in the image.
-    fn render(&mut self, scene: &Scene, mesh: &Mesh, pose: &Pose) -> Option<(usize, usize)> {
-        let camera = &scene.camera;
+    fn render(&mut self, image: &PreparedDepth, mesh: &Mesh, pose: &Pose) -> Option<(usize, usize)> {
+        let camera = image.camera();
         let (mut x0, mut y0, mut x1, mut y1) =
             (f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY);
         let (low, high) = mesh.bounding_box();
@@ -158,14 +158,14 @@ impl Verifier {
     /// Scores a pose. `threshold` is the depth inlier threshold in metres.
     pub fn score(
         &mut self,
-        scene: &Scene,
+        image: &PreparedDepth,
         mesh: &Mesh,
         camera_from_object: &Pose,
         threshold: f64,
         options: &VerificationOptions,
     ) -> VerificationScore {
         let mut score = VerificationScore::default();
-        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return score };
+        let Some((x0, y0)) = self.render(image, mesh, camera_from_object) else { return score };
         let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
         let normals = self.frame.normals(&objects);
         let cosine = options.normal_angle.cos() as f32;
@@ -183,7 +183,7 @@ impl Verifier {
                 }
                 score.rendered += 1;
                 let (sx, sy) = (x + x0, y + y0);
-                let measured = scene.depth[(sx, sy)];
+                let measured = image.depth()[(sx, sy)];
                 let difference = f64::from(measured) - 1.0 / f64::from(inverse[index]);
                 let occluded = measured > 0.0 && difference < -threshold;
                 if occluded {
@@ -193,9 +193,9 @@ impl Verifier {
                     score.outliers += 1;
                 } else if measured > 0.0 {
                     score.inliers += 1;
-                    let on_edge = scene.edge_distance[(sx, sy)] <= options.boundary_distance;
+                    let on_edge = image.edge_distance()[(sx, sy)] <= options.boundary_distance;
                     self.agreement[index] = Agreement::Inlier { on_edge };
-                    let (a, b) = (normals[(x, y)], scene.normals[(sx, sy)]);
+                    let (a, b) = (normals[(x, y)], image.normals()[(sx, sy)]);
                     if b != [0.0; 3] {
                         with_normal += 1;
                         good_normals += usize::from(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] > cosine);
@@ -213,7 +213,7 @@ impl Verifier {
                     && (empty(ix - 1, iy) || empty(ix + 1, iy) || empty(ix, iy - 1) || empty(ix, iy + 1))
                 {
                     contour += 1;
-                    on_edge += usize::from(scene.edge_distance[(sx, sy)] <= options.boundary_distance);
+                    on_edge += usize::from(image.edge_distance()[(sx, sy)] <= options.boundary_distance);
                 }
             }
         }
@@ -230,15 +230,15 @@ impl Verifier {
     }
 
     /// About `count` of the points that would be seen at a pose, evenly over the image.
-    pub(crate) fn visible_points(
+    pub fn visible_points(
         &mut self,
-        scene: &Scene,
+        image: &PreparedDepth,
         mesh: &Mesh,
         camera_from_object: &Pose,
         threshold: f64,
         count: usize,
     ) -> Vec<RenderedPoint> {
-        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return vec![] };
+        let Some((x0, y0)) = self.render(image, mesh, camera_from_object) else { return vec![] };
         let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
         let inverse = self.frame.inverse_depth();
         let total = inverse.iter().filter(|&&d| d > 0.0).count();
@@ -258,7 +258,7 @@ impl Verifier {
                 if normal[2] > -0.15 {
                     continue;
                 }
-                let measured = f64::from(scene.depth[(x + x0, y + y0)]);
+                let measured = f64::from(image.depth()[(x + x0, y + y0)]);
                 let z = 1.0 / f64::from(inverse[index]);
                 points.push(RenderedPoint {
                     point: Vec3::from(coordinates[(x, y)].map(f64::from)),
@@ -271,23 +271,23 @@ impl Verifier {
     }
 
     /// The pixels (numbers in the scene image) where the pose's rendering agrees with the scene.
-    pub(crate) fn explained_pixels(
+    pub fn explained_pixels(
         &mut self,
-        scene: &Scene,
+        image: &PreparedDepth,
         mesh: &Mesh,
         camera_from_object: &Pose,
         threshold: f64,
     ) -> Vec<u32> {
-        let Some((x0, y0)) = self.render(scene, mesh, camera_from_object) else { return vec![] };
+        let Some((x0, y0)) = self.render(image, mesh, camera_from_object) else { return vec![] };
         let inverse = self.frame.inverse_depth();
         let width = self.frame.width();
         let mut pixels = vec![];
         for (index, &inverse) in inverse.iter().enumerate() {
             if inverse > 0.0 {
                 let (sx, sy) = (index % width + x0, index / width + y0);
-                let measured = f64::from(scene.depth[(sx, sy)]);
+                let measured = f64::from(image.depth()[(sx, sy)]);
                 if measured > 0.0 && (measured - 1.0 / f64::from(inverse)).abs() < threshold {
-                    pixels.push((sy * scene.camera.width + sx) as u32);
+                    pixels.push((sy * image.camera().width + sx) as u32);
                 }
             }
         }

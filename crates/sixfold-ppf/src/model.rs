@@ -8,8 +8,9 @@
 //!   one depth image cannot show them.
 
 use rayon::prelude::*;
+use sixfold_align::verification_mesh;
 use sixfold_geometry::{Camera, PointCloud, Pose, Vec3, sphere_directions};
-use sixfold_mesh::{Mesh, simplify};
+use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 use thiserror::Error;
 
@@ -86,10 +87,6 @@ impl ModelOptions {
 /// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each.
 pub const VIEWS: usize = 64;
 const VIEW_PIXELS: usize = 160;
-
-/// Finer meshes are simplified to this many faces for verification: at 4,000 the surface moves by less than a
-/// thousandth of the diameter, and rendering costs a fifth.
-const RENDERED_FACES: usize = 4000;
 
 /// An object ready to be matched.
 #[derive(Debug, Clone)]
@@ -225,9 +222,7 @@ impl ObjectModel {
         let mut dense = PointCloud::default();
         let mut views = Vec::with_capacity(VIEWS);
         let mut frame = Frame::new(&camera);
-        let bare = Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())
-            .map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
-        let flat = if bare.faces().len() > RENDERED_FACES { simplify(&bare, RENDERED_FACES) } else { bare };
+        let flat = verification_mesh(mesh).map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
         for direction in &directions {
             let pose = look_at(&centre, direction, distance);
             let objects = [SceneObject { mesh: &flat, camera_from_object: pose }];

@@ -1,11 +1,12 @@
 //! The whole matching on rendered scenes, where the truth is known exactly.
 
 use sixfold_geometry::{Camera, DepthImage, DepthImageError, Mask, Pose, Vec3};
-use sixfold_match::clustering::{ClusterOptions, cluster};
-use sixfold_match::voting::{Hypothesis, VotingOptions, vote};
-use sixfold_match::{
-    EstimateOptions, ModelError, ModelFileError, ModelOptions, ObjectModel, Scene, SceneError, SceneOptions,
-    VerificationOptions, Verifier, estimate,
+use sixfold_align::{DepthOptions, DepthRegion, PreparedDepthError, VerificationOptions, Verifier};
+use sixfold_ppf::clustering::{ClusterOptions, cluster};
+use sixfold_ppf::voting::{Hypothesis, VotingOptions, vote};
+use sixfold_ppf::{
+    PpfOptions, ModelError, ModelFileError, ModelOptions, ObjectModel,
+    estimate,
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
@@ -77,8 +78,8 @@ fn depth_of(objects: &[(&Mesh, Pose)], noise: Option<u64>) -> DepthImage {
     }
 }
 
-fn prepared(depth: &DepthImage) -> Scene {
-    Scene::new(depth, &camera(), None, &SceneOptions::default()).unwrap()
+fn prepared(depth: &DepthImage) -> DepthRegion {
+    DepthRegion::from_depth(depth, &camera(), None, &DepthOptions::default()).unwrap()
 }
 
 fn model() -> ObjectModel {
@@ -92,7 +93,7 @@ fn a_noisy_partly_hidden_object_is_found_where_it_is() {
     for (seed, turn) in [(1, 0.4), (2, 2.0), (3, 1.2)] {
         let truth = on_table(-0.05, 0.02, turn);
         let depth = depth_of(&[(&mesh, truth), (&hider, on_table(0.02, -0.09, 0.3))], Some(seed));
-        let found = estimate(&prepared(&depth), &model, &EstimateOptions::default());
+        let found = estimate(&prepared(&depth), &model, &PpfOptions::default());
         let e = found.first().expect("a pose");
         assert!(e.camera_from_object.distance_to(&truth) < 0.004, "seed {seed}: {e:?}");
         assert!(e.camera_from_object.rotation_angle_to(&truth) < 0.05, "seed {seed}: {e:?}");
@@ -112,7 +113,7 @@ fn three_instances_are_found_and_no_fourth() {
     let model = ObjectModel::new(&mesh, &[], &ModelOptions::default()).unwrap();
     let truths = [on_table(-0.17, 0.0, 0.2), on_table(0.0, 0.06, 1.9), on_table(0.1, -0.08, -2.2)];
     let depth = depth_of(&truths.map(|t| (&mesh, t)), Some(5));
-    let options = EstimateOptions { max_instances: 6, min_score: 0.3, ..EstimateOptions::default() };
+    let options = PpfOptions { max_instances: 6, min_score: 0.3, ..PpfOptions::default() };
     let found = estimate(&prepared(&depth), &model, &options);
     for t in &truths {
         let hits = found
@@ -133,7 +134,7 @@ fn one_thread_and_two_give_the_same_bytes() {
     let depth = depth_of(&[(&mesh, on_table(0.0, 0.0, 1.0))], Some(9));
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| estimate(&prepared(&depth), &model, &EstimateOptions::default()))
+        pool.install(|| estimate(&prepared(&depth), &model, &PpfOptions::default()))
     };
     let (one, two) = (run(1), run(2));
     assert!(!one.is_empty());
@@ -142,7 +143,7 @@ fn one_thread_and_two_give_the_same_bytes() {
 
 #[test]
 fn an_empty_table_has_no_object() {
-    let found = estimate(&prepared(&depth_of(&[], Some(3))), &model(), &EstimateOptions::default());
+    let found = estimate(&prepared(&depth_of(&[], Some(3))), &model(), &PpfOptions::default());
     assert!(found.is_empty(), "{found:?}");
 }
 
@@ -151,7 +152,7 @@ fn scores_of_exact_shifted_and_hidden_poses() {
     let mesh = bracket();
     let truth = on_table(0.0, 0.0, 0.7);
     let scene = prepared(&depth_of(&[(&mesh, truth)], None));
-    let score = |scene: &Scene, pose: &Pose| {
+    let score = |scene: &DepthRegion, pose: &Pose| {
         Verifier::default().score(scene, &mesh, pose, 0.005, &VerificationOptions::default())
     };
     let exact = score(&scene, &truth);
@@ -187,8 +188,8 @@ fn what_hides_an_object_has_an_outline() {
     let options = VerificationOptions::default();
     let printed = VerificationOptions { occluders_have_edges: false, ..options };
     let score = |depth: &DepthImage, pose: &Pose, options| {
-        let whole = SceneOptions { remove_plane: false, ..SceneOptions::default() };
-        let scene = Scene::new(depth, &camera(), None, &whole).unwrap();
+        let whole = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+        let scene = DepthRegion::from_depth(depth, &camera(), None, &whole).unwrap();
         Verifier::default().score(&scene, &block, pose, 0.01, options)
     };
     // Sunk into the table, its top a little askew in the table's plane: one edge of it agrees, the rest would lie below
@@ -257,8 +258,8 @@ fn a_mask_keeps_the_other_instance_out() {
     let depth = depth_of(&[(&mesh, left), (&mesh, right)], Some(5));
     for (truth, side) in [(left, false), (right, true)] {
         let mask = Mask::from_fn(400, 300, |x, _| (x >= 200) == side);
-        let scene = Scene::new(&depth, &camera(), Some(&mask), &SceneOptions::default()).unwrap();
-        let found = estimate(&scene, &model, &EstimateOptions::default());
+        let scene = DepthRegion::from_depth(&depth, &camera(), Some(&mask), &DepthOptions::default()).unwrap();
+        let found = estimate(&scene, &model, &PpfOptions::default());
         assert!(found[0].camera_from_object.distance_to(&truth) < 0.005, "{found:?}");
     }
 }
@@ -297,22 +298,22 @@ fn unusable_input_is_named() {
     let camera = camera();
     let empty = DepthImage::filled(400, 300, 0.0);
     let new =
-        |depth: &DepthImage, mask: Option<&Mask>| Scene::new(depth, &camera, mask, &SceneOptions::default());
+        |depth: &DepthImage, mask: Option<&Mask>| DepthRegion::from_depth(depth, &camera, mask, &DepthOptions::default());
     assert!(matches!(
         new(&empty, None),
-        Err(SceneError::Depth(DepthImageError::NoDepth { pixels: 120_000 }))
+        Err(PreparedDepthError::Depth(DepthImageError::NoDepth { pixels: 120_000 }))
     ));
     let nan = DepthImage::filled(400, 300, f32::NAN);
-    assert!(matches!(new(&nan, None), Err(SceneError::Depth(DepthImageError::NoDepth { .. }))));
+    assert!(matches!(new(&nan, None), Err(PreparedDepthError::Depth(DepthImageError::NoDepth { .. }))));
     let millimetres = DepthImage::filled(400, 300, 700.0);
     let message = new(&millimetres, None).unwrap_err().to_string();
     assert!(message.contains("factor of 1000"), "{message}");
     let small = DepthImage::filled(40, 30, 0.7);
-    assert!(matches!(new(&small, None), Err(SceneError::Camera(_))));
+    assert!(matches!(new(&small, None), Err(PreparedDepthError::Camera(_))));
     let good = DepthImage::filled(400, 300, 0.7);
-    assert!(matches!(new(&good, Some(&Mask::filled(3, 3, true))), Err(SceneError::MaskSize { .. })));
+    assert!(matches!(new(&good, Some(&Mask::filled(3, 3, true))), Err(PreparedDepthError::MaskSize { .. })));
     // A wall and nothing else: no panic, no object.
-    assert!(estimate(&new(&good, None).unwrap(), &model(), &EstimateOptions::default()).is_empty());
+    assert!(estimate(&new(&good, None).unwrap(), &model(), &PpfOptions::default()).is_empty());
     let points = Mesh::new(vec![Vec3::zeros(), Vec3::x()], vec![]).unwrap();
     let described = |mesh: &Mesh, options: &ModelOptions| ObjectModel::new(mesh, &[], options).map(|_| ());
     assert_eq!(described(&points, &ModelOptions::default()), Err(ModelError::NoSurface { faces: 0 }));

@@ -6,18 +6,17 @@
 
 use rayon::prelude::*;
 use serde::Serialize;
-use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, icp};
+use sixfold_align::{DepthRegion, VerificationOptions, VerificationScore, Verifier, verify};
+use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, icp};
 
 use crate::V3;
 use crate::clustering::{ClusterOptions, cluster};
 use crate::model::ObjectModel;
-use crate::scene::Scene;
-use crate::verification::{VerificationOptions, VerificationScore, Verifier};
 use crate::voting::{Hypothesis, VotingOptions, vote};
 
 /// How poses are estimated.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EstimateOptions {
+pub struct PpfOptions {
     /// Voting.
     pub voting: VotingOptions,
     /// Joining.
@@ -32,13 +31,13 @@ pub struct EstimateOptions {
     pub vote_power: f64,
     /// Most instances of the object returned.
     pub max_instances: usize,
-    /// Estimates whose [`Estimate::confidence`] is lower are not returned.
+    /// Estimates whose [`PpfEstimate::confidence`] is lower are not returned.
     pub min_score: f64,
 }
 
-impl Default for EstimateOptions {
+impl Default for PpfOptions {
     fn default() -> Self {
-        EstimateOptions {
+        PpfOptions {
             voting: VotingOptions::default(),
             clustering: ClusterOptions::default(),
             verification: VerificationOptions::default(),
@@ -53,7 +52,7 @@ impl Default for EstimateOptions {
 
 /// A pose with its score.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate {
+pub struct PpfEstimate {
     /// The pose.
     pub camera_from_object: Pose,
     /// What the verification says.
@@ -61,7 +60,7 @@ pub struct Estimate {
     /// Votes of the hypothesis it came from.
     pub votes: f32,
     /// What decides between estimates, in `0..=1`: [`VerificationScore::ranking`] times the share of the most votes, to the
-    /// power [`EstimateOptions::vote_power`].
+    /// power [`PpfOptions::vote_power`].
     pub confidence: f64,
 }
 
@@ -80,38 +79,35 @@ pub struct Timing {
 
 /// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives
 /// the same output at any number of threads.
-pub fn estimate(scene: &Scene, model: &ObjectModel, options: &EstimateOptions) -> Vec<Estimate> {
+pub fn estimate(scene: &DepthRegion, model: &ObjectModel, options: &PpfOptions) -> Vec<PpfEstimate> {
     estimate_timed(scene, model, options).0
 }
 
 /// As [`estimate`], and where the time went.
 pub fn estimate_timed(
-    scene: &Scene,
+    scene: &DepthRegion,
     model: &ObjectModel,
-    options: &EstimateOptions,
-) -> (Vec<Estimate>, Timing) {
+    options: &PpfOptions,
+) -> (Vec<PpfEstimate>, Timing) {
     let mut timing = Timing::default();
     let threshold = options.verification.threshold_for(model.diameter);
-    let target = match IndexedCloud::new(scene.cloud.clone()) {
-        Ok(target) => target,
-        Err(_) => return (vec![], timing),
-    };
-    let mut found: Vec<Estimate> = vec![];
+    let Some(target) = scene.indexed_cloud() else { return (vec![], timing) };
+    let mut found: Vec<PpfEstimate> = vec![];
     let mut taken: Vec<u32> = vec![];
     // Several instances hide each other's votes: after each round the explained points are taken out.
     for round in 0..options.max_instances.max(1) {
         let start = std::time::Instant::now();
         let cloud;
         let voters = if round == 0 {
-            &scene.cloud
+            scene.cloud()
         } else {
-            let width = scene.camera.width;
+            let width = scene.camera().width;
             let explained: Vec<_> = taken
                 .iter()
                 .map(|&i| {
                     let (x, y) = (i as usize % width, i as usize / width);
-                    let z = f64::from(scene.depth[(x, y)]);
-                    scene.camera.unproject(&sixfold_geometry::Vec2::new(x as f64, y as f64), z)
+                    let z = f64::from(scene.depth()[(x, y)]);
+                    scene.camera().unproject(&sixfold_geometry::Vec2::new(x as f64, y as f64), z)
                 })
                 .collect();
             cloud = scene.cloud_without(&explained, 0.003);
@@ -123,10 +119,10 @@ pub fn estimate_timed(
         let clusters = cluster(&votes, &model.centre, model.diameter, &model.symmetries, &options.clustering);
         timing.clustering += start.elapsed().as_secs_f64();
         let start = std::time::Instant::now();
-        let refined = screen(scene, model, &target, &clusters, options);
+        let refined = screen(scene, model, target, &clusters, options);
         timing.screening += start.elapsed().as_secs_f64();
         let start = std::time::Instant::now();
-        let verified = verify(scene, model, &refined, threshold, options);
+        let verified = verified(scene, model, &refined, threshold, options);
         timing.verification += start.elapsed().as_secs_f64();
         let before = found.len();
         let mut verifier = Verifier::default();
@@ -162,12 +158,12 @@ fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usi
 
 /// How well the visible samples agree with the depth image, in 0..=1.
 #[doc(hidden)]
-pub fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
+pub fn screening_score(scene: &DepthRegion, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
     let rotation = pose.rotation_matrix().cast::<f32>();
     let t: V3 = pose.translation().cast();
-    let (fx, fy) = (scene.camera.fx as f32, scene.camera.fy as f32);
-    let (cx, cy) = (scene.camera.cx as f32, scene.camera.cy as f32);
-    let (width, height) = (scene.camera.width as f32, scene.camera.height as f32);
+    let (fx, fy) = (scene.camera().fx as f32, scene.camera().fy as f32);
+    let (cx, cy) = (scene.camera().cx as f32, scene.camera().cy as f32);
+    let (width, height) = (scene.camera().width as f32, scene.camera().height as f32);
     let (mut total, mut good, mut occluded, mut out) = (0f32, 0f32, 0f32, 0f32);
     for i in visible_samples(model, pose) {
         let p = rotation * model.samples.points[i].cast::<f32>() + t;
@@ -183,7 +179,7 @@ pub fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, toleranc
             continue;
         }
         let pixel = (x as usize, y as usize);
-        let z = scene.depth[pixel];
+        let z = scene.depth()[pixel];
         if z <= 0.0 {
             continue;
         }
@@ -195,7 +191,7 @@ pub fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, toleranc
         } else if difference < -tolerance {
             occluded += 1.0;
         } else {
-            let m = scene.normals[pixel];
+            let m = scene.normals()[pixel];
             let agreement = n.x * m[0] + n.y * m[1] + n.z * m[2];
             good += if agreement > cosine { 1.0 } else { 0.2 };
         }
@@ -208,13 +204,13 @@ pub fn screening_score(scene: &Scene, model: &ObjectModel, pose: &Pose, toleranc
 }
 
 /// The first sieve: the samples of every hypothesis against the depth image, a short ICP for the best
-/// [`EstimateOptions::refined`], and what is left without repetitions, best first.
+/// [`PpfOptions::refined`], and what is left without repetitions, best first.
 pub fn screen(
-    scene: &Scene,
+    scene: &DepthRegion,
     model: &ObjectModel,
     target: &IndexedCloud,
     clusters: &[Hypothesis],
-    options: &EstimateOptions,
+    options: &PpfOptions,
 ) -> Vec<Hypothesis> {
     let step = model.diameter * model.options.sampling_step;
     let coarse = (1.5 * step).max(0.006) as f32;
@@ -279,53 +275,26 @@ pub fn screen(
     kept
 }
 
-/// The second sieve: ICP of the rendered object against the depth image and the scores of
-/// [`crate::verification`], best [`VerificationScore::ranking`] first. `threshold` is the depth inlier threshold in
-/// metres.
-pub fn verify(
-    scene: &Scene,
+/// The second sieve: refined and verified with the mesh, the most confident first.
+fn verified(
+    scene: &DepthRegion,
     model: &ObjectModel,
     hypotheses: &[Hypothesis],
     threshold: f64,
-    options: &EstimateOptions,
-) -> Vec<Estimate> {
+    options: &PpfOptions,
+) -> Vec<PpfEstimate> {
     let most_votes = hypotheses.iter().map(|h| h.votes).fold(0.0, f32::max);
-    let mut verified: Vec<Estimate> = hypotheses
-        .par_iter()
-        .map_init(Verifier::default, |verifier, h| {
-            let pose = refine(verifier, scene, model, &h.camera_from_object, threshold);
-            let score = verifier.score(scene, &model.mesh, &pose, threshold, &options.verification);
+    let poses: Vec<Pose> = hypotheses.iter().map(|h| h.camera_from_object).collect();
+    let mut verified: Vec<PpfEstimate> = verify(scene, &model.mesh, &poses, threshold, &options.verification)
+        .into_iter()
+        .zip(hypotheses)
+        .map(|(v, h)| {
             let support = f64::from(h.votes / most_votes.max(1.0)).clamp(0.0, 1.0);
-            let confidence = score.ranking() * support.powf(options.vote_power);
-            Estimate { camera_from_object: pose, score, votes: h.votes, confidence }
+            let confidence = v.score.ranking() * support.powf(options.vote_power);
+            PpfEstimate { camera_from_object: v.camera_from_object, score: v.score, votes: h.votes, confidence }
         })
         .collect();
     // A stable sort: equal scores stay in the order of the screening.
     verified.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
     verified
-}
-
-/// ICP of the rendered points against the depth image, rendered anew between the levels.
-fn refine(verifier: &mut Verifier, scene: &Scene, model: &ObjectModel, start: &Pose, threshold: f64) -> Pose {
-    let target = DepthTarget { depth: &scene.depth, normals: &scene.normals, camera: &scene.camera };
-    let mut pose = *start;
-    for (distance, iterations) in [(2.0 * threshold, 5), (1.2 * threshold, 5), (0.8 * threshold, 8)] {
-        let points = verifier.visible_points(scene, &model.mesh, &pose, 2.0 * distance, 600);
-        let mut source = PointCloud::default();
-        for p in points.iter().filter(|p| p.inlier) {
-            source.points.push(p.point);
-            source.normals.push(p.normal);
-        }
-        let options = IcpOptions {
-            levels: vec![IcpLevel { rejection_distance: distance, iterations, stride: 1 }],
-            max_angle: 45f64.to_radians(),
-            convergence: 1e-5,
-            min_correspondences: 12,
-        };
-        match icp(&source, &target, &pose, &options) {
-            Ok(report) => pose = report.target_from_source,
-            Err(_) => break,
-        }
-    }
-    pose
 }

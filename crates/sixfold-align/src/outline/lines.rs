@@ -61,7 +61,7 @@ pub struct Outline<'a> {
 }
 
 impl<'a> Outline<'a> {
-    /// `odds` are the log odds of the object at every pixel of a square crop, row by row ([`crate::log_odds`]); `mesh` is
+    /// `odds` are the log odds of the object at every pixel of a square crop, row by row ([`log_odds`](super::log_odds)); `mesh` is
     /// best one of [`outline_mesh`].
     ///
     /// # Panics

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 
 use sixfold_bop::{BopDataset, Models, read_depth};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
-use sixfold_match::{Estimate, EstimateOptions, ModelOptions, ObjectModel, Scene, SceneOptions, estimate};
+use sixfold_align::{DepthOptions, DepthRegion};
+use sixfold_ppf::{PpfEstimate, PpfOptions, ModelOptions, ObjectModel, estimate};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 
 fn data() -> Option<PathBuf> {
@@ -33,9 +34,9 @@ fn adi(points: &[Vec3], estimated: &Pose, truth: &Pose) -> f64 {
         / points.len() as f64
 }
 
-fn find(scene: &Scene, mesh: &Mesh, instances: usize, symmetries: &[Pose]) -> (Vec<Estimate>, ObjectModel) {
+fn find(scene: &DepthRegion, mesh: &Mesh, instances: usize, symmetries: &[Pose]) -> (Vec<PpfEstimate>, ObjectModel) {
     let model = ObjectModel::new(mesh, symmetries, &ModelOptions::default()).unwrap();
-    let options = EstimateOptions { max_instances: instances, ..EstimateOptions::default() };
+    let options = PpfOptions { max_instances: instances, ..PpfOptions::default() };
     (estimate(scene, &model, &options), model)
 }
 
@@ -46,7 +47,7 @@ fn five_of_the_six_well_visible_objects_of_lmo_frame_3() {
     let frame = dataset.scene(2).unwrap();
     let camera = frame.camera(3).unwrap();
     let depth = frame.depth(3).unwrap().unwrap();
-    let scene = Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap();
+    let scene = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap();
     let infos = dataset.models_info(Models::Rendering).unwrap().unwrap();
     let mut correct = 0;
     // The ape (1) is 9 % and the egg box (10) 40 % visible: not counted, but told.
@@ -91,7 +92,7 @@ fn six_of_the_seven_objects_of_two_ycbv_frames() {
     for im_id in frames.image_ids() {
         let camera = frames.camera(im_id).unwrap();
         let depth = frames.depth(im_id).unwrap().unwrap();
-        let scene = Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap();
+        let scene = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap();
         for g in &frames.image(im_id).unwrap().ground_truth {
             let name = names.iter().find(|n| n.0 == g.obj_id).unwrap().1;
             let points =
@@ -125,7 +126,7 @@ fn the_object_of_the_tyol_frame() {
     let frames = dataset.scene(dataset.scene_ids()[0]).unwrap();
     let camera = frames.camera(10).unwrap();
     let scene =
-        Scene::new(&frames.depth(10).unwrap().unwrap(), &camera, None, &SceneOptions::default()).unwrap();
+        DepthRegion::from_depth(&frames.depth(10).unwrap().unwrap(), &camera, None, &DepthOptions::default()).unwrap();
     let mesh = read_mesh(data.join("tyol_frame/obj.ply"), Unit::Millimetre).unwrap();
     let (found, model) = find(&scene, &mesh, 1, &[]);
     let truth = frames.image(10).unwrap().ground_truth[0].camera_from_object;
@@ -155,7 +156,7 @@ fn four_cups_in_each_bin_that_holds_cups() {
     for bin in 1..=3 {
         for frame in 0..3 {
             let depth = read_depth(&folder.join(format!("{bin}/depth/{frame:04}.png")), 1e-3).unwrap();
-            let scene = Scene::new(&depth, &camera, None, &SceneOptions::default()).unwrap();
+            let scene = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default()).unwrap();
             let (found, _) = find(&scene, &mesh, 8, &[]);
             let sure: Vec<_> = found.iter().filter(|e| e.confidence > SURE).collect();
             let each: Vec<_> = found

@@ -10,8 +10,9 @@ use std::time::Instant;
 use serde_json::{Value, json};
 use sixfold_bop::{BopDataset, ModelPoints, Models, Target, mssd};
 use sixfold_geometry::{PointCloud, Pose};
-use sixfold_match::estimate::estimate_timed;
-use sixfold_match::{EstimateOptions, ModelOptions, ObjectModel, Scene, SceneOptions};
+use sixfold_align::{DepthOptions, DepthRegion};
+use sixfold_ppf::estimate::estimate_timed;
+use sixfold_ppf::{PpfOptions, ModelOptions, ObjectModel};
 
 fn rows(pose: &Pose) -> Value {
     let m = pose.to_matrix();
@@ -56,7 +57,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let camera = scene.camera(im_id)?;
             let depth = scene.depth(im_id)?.ok_or("an image has no depth")?;
             let start = Instant::now();
-            let prepared = Scene::new(&depth, &camera, None, &SceneOptions::default())?;
+            let prepared = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default())?;
             let preparation = start.elapsed().as_secs_f64();
             write(&out.join(format!("clouds/{scene_id}_{im_id}.f32")), prepared.cloud())?;
             images.push(json!({ "scene": scene_id, "image": im_id, "preparation": preparation }));
@@ -64,7 +65,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 let Some(o) = t.object else { continue };
                 let Some((_, model, points, _)) = models.iter().find(|m| m.0 == o.obj_id) else { continue };
                 let start = Instant::now();
-                let (found, timing) = estimate_timed(&prepared, model, &EstimateOptions::default());
+                let (found, timing) = estimate_timed(&prepared, model, &PpfOptions::default());
                 let seconds = start.elapsed().as_secs_f64();
                 let image = scene.image(im_id)?;
                 let Some(truth) = image.ground_truth.iter().find(|g| g.obj_id == o.obj_id) else { continue };

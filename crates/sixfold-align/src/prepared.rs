@@ -1,0 +1,365 @@
+//! A depth image prepared once for every method: in-painting, normals, table plane, depth edges. A [`DepthRegion`] is a view on
+//! it: the points in which an object is searched.
+
+use std::ops::Deref;
+use std::sync::{Arc, OnceLock};
+
+use rayon::prelude::*;
+use sixfold_geometry::{
+    Camera, CameraError, DepthImage, DepthImageError, Image, IndexedCloud, Mask, NormalImage, NormalOptions,
+    Plane, PlaneOptions, PointCloud, Vec2, Vec3, dominant_plane, inpaint_depth, normals_from_depth,
+    usable_depth,
+};
+use thiserror::Error;
+
+/// Why a depth image or a region of it cannot be used.
+#[derive(Debug, Error, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum PreparedDepthError {
+    /// The image does not belong to the camera.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The mask does not belong to the image.
+    #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}")]
+    MaskSize {
+        /// Width of the mask.
+        found_width: usize,
+        /// Height of the mask.
+        found_height: usize,
+        /// Width of the depth image.
+        width: usize,
+        /// Height of the depth image.
+        height: usize,
+    },
+    /// The depth image holds nothing that could be an object.
+    #[error(transparent)]
+    Depth(#[from] DepthImageError),
+    /// An option is out of range.
+    #[error("option {option}: found {found}, expected {expected}")]
+    Option {
+        /// Name of the option.
+        option: &'static str,
+        /// Its value.
+        found: f64,
+        /// What it should be.
+        expected: &'static str,
+    },
+}
+
+/// How a depth image is prepared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthOptions {
+    /// How normals are computed.
+    pub normals: NormalOptions,
+    /// Rounds of in-painting before normals are computed (dissertation, section 5.3.1).
+    pub inpaint_rounds: usize,
+    /// Find the dominant plane and leave its points out of the search.
+    pub remove_plane: bool,
+    /// How the plane is searched.
+    pub plane: PlaneOptions,
+    /// Points further away than this are left out, metres.
+    pub max_depth: f64,
+    /// Seed of the plane search.
+    pub seed: u64,
+}
+
+/// Radius in pixels within which a normal is fitted for matching: wider than for ICP, as features need smooth normals.
+const MATCHING_NORMAL_RADIUS: usize = 4;
+
+impl Default for DepthOptions {
+    fn default() -> Self {
+        DepthOptions {
+            normals: NormalOptions { radius: MATCHING_NORMAL_RADIUS, ..NormalOptions::default() },
+            inpaint_rounds: 2,
+            remove_plane: true,
+            plane: PlaneOptions::default(),
+            max_depth: 5.0,
+            seed: 0,
+        }
+    }
+}
+
+impl DepthOptions {
+    /// Tests every field.
+    ///
+    /// # Errors
+    /// [`PreparedDepthError::Option`].
+    pub fn check(&self) -> Result<(), PreparedDepthError> {
+        if !(self.max_depth > 0.0) {
+            let (option, found) = ("max_depth", self.max_depth);
+            return Err(PreparedDepthError::Option { option, found, expected: "metres above 0" });
+        }
+        Ok(())
+    }
+}
+
+/// A depth image with what methods derive from it, computed once. Plane and edges are computed when first asked for.
+#[derive(Debug)]
+pub struct PreparedDepth {
+    camera: Camera,
+    /// As measured, invalid pixels 0.
+    depth: DepthImage,
+    filled: DepthImage,
+    normals: NormalImage,
+    options: DepthOptions,
+    plane: OnceLock<Option<Plane>>,
+    edge_distance: OnceLock<Image<u8>>,
+}
+
+/// Points of a region are thinned to this first, metres: about the noise of depth cameras at a metre.
+const BASE_STEP: f64 = 0.002;
+/// Normals further apart than this stay apart when points are thinned, radians.
+const BASE_ANGLE: f64 = 1.0;
+
+impl PreparedDepth {
+    /// Prepares a depth image (metres, 0 where nothing was measured) of a pinhole camera.
+    ///
+    /// # Errors
+    /// [`PreparedDepthError`] where the image does not belong to the camera or cannot be depth in metres.
+    pub fn new(
+        depth: &DepthImage,
+        camera: &Camera,
+        options: &DepthOptions,
+    ) -> Result<Arc<PreparedDepth>, PreparedDepthError> {
+        options.check()?;
+        camera.check()?;
+        camera.check_image(depth.width(), depth.height())?;
+        let depth = usable_depth(depth)?;
+        let filled = inpaint_depth(&depth, options.inpaint_rounds);
+        let mut normals = normals_from_depth(&filled, camera, &options.normals);
+        for (n, z) in normals.as_mut_slice().iter_mut().zip(depth.as_slice()) {
+            if *z == 0.0 {
+                *n = [0.0; 3];
+            }
+        }
+        Ok(Arc::new(PreparedDepth {
+            camera: *camera,
+            depth,
+            filled,
+            normals,
+            options: *options,
+            plane: OnceLock::new(),
+            edge_distance: OnceLock::new(),
+        }))
+    }
+
+    /// The camera.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// The depth as measured, 0 where invalid.
+    pub fn depth(&self) -> &DepthImage {
+        &self.depth
+    }
+
+    /// Normals per pixel, zero where there is none.
+    pub fn normals(&self) -> &NormalImage {
+        &self.normals
+    }
+
+    /// The table plane, if one was looked for and found; its normal points to the camera.
+    pub fn plane(&self) -> Option<&Plane> {
+        let find = || {
+            let near = |z: &f32| if f64::from(*z) < self.options.max_depth { *z } else { 0.0 };
+            let all = PointCloud::from_depth(&self.depth.map(near), Some(&self.normals), &self.camera);
+            dominant_plane(&all, &self.options.plane, self.options.seed)
+        };
+        if !self.options.remove_plane {
+            return None;
+        }
+        self.plane.get_or_init(find).as_ref()
+    }
+
+    /// Distance in pixels to the nearest depth edge or hole, at most 255.
+    pub fn edge_distance(&self) -> &Image<u8> {
+        self.edge_distance.get_or_init(|| edge_distances(&self.filled, &self.normals))
+    }
+
+    /// The points off the plane, row by row, of the pixels that `inside` accepts within columns and rows of `bounds`
+    /// (`[x0, y0, x1, y1]`, the ends excluded).
+    fn points(&self, [x0, y0, x1, y1]: [usize; 4], inside: impl Fn(usize, usize) -> bool) -> PointCloud {
+        let plane = self.plane();
+        let margin = self.options.plane.threshold;
+        let mut cloud = PointCloud::default();
+        for y in y0..y1 {
+            for x in x0..x1 {
+                let z = f64::from(self.depth[(x, y)]);
+                let n = self.normals[(x, y)];
+                if z <= 0.0 || z > self.options.max_depth || n == [0.0; 3] || !inside(x, y) {
+                    continue;
+                }
+                let p = self.camera.unproject(&Vec2::new(x as f64, y as f64), z);
+                if plane.is_none_or(|plane| plane.distance(&p) >= margin) {
+                    cloud.points.push(p);
+                    cloud.normals.push(Vec3::from(n.map(f64::from)));
+                }
+            }
+        }
+        cloud.voxel_downsample(BASE_STEP, BASE_ANGLE)
+    }
+}
+
+/// A view on a prepared depth image: an object is searched in its points alone, and the rest of the image still hides and
+/// supports.
+#[derive(Debug)]
+pub struct DepthRegion {
+    image: Arc<PreparedDepth>,
+    /// Points off the plane, thinned.
+    cloud: PointCloud,
+    indexed: OnceLock<Option<IndexedCloud>>,
+}
+
+impl Deref for DepthRegion {
+    type Target = PreparedDepth;
+
+    fn deref(&self) -> &PreparedDepth {
+        &self.image
+    }
+}
+
+impl DepthRegion {
+    /// Prepares a depth image for one search: all of it, or the pixels of a mask. For several regions prepare the image once with
+    /// [`PreparedDepth::new`].
+    ///
+    /// # Errors
+    /// [`PreparedDepthError`].
+    pub fn from_depth(
+        depth: &DepthImage,
+        camera: &Camera,
+        mask: Option<&Mask>,
+        options: &DepthOptions,
+    ) -> Result<DepthRegion, PreparedDepthError> {
+        let image = PreparedDepth::new(depth, camera, options)?;
+        match mask {
+            Some(mask) => DepthRegion::new(&image, mask),
+            None => Ok(DepthRegion::whole(&image)),
+        }
+    }
+
+    /// The whole image.
+    pub fn whole(image: &Arc<PreparedDepth>) -> DepthRegion {
+        let (width, height) = image.depth.size();
+        DepthRegion::of(image, image.points([0, 0, width, height], |_, _| true))
+    }
+
+    /// The pixels of a mask of the image's size.
+    ///
+    /// # Errors
+    /// [`PreparedDepthError::MaskSize`].
+    pub fn new(image: &Arc<PreparedDepth>, mask: &Mask) -> Result<DepthRegion, PreparedDepthError> {
+        if mask.size() != image.depth.size() {
+            return Err(PreparedDepthError::MaskSize {
+                found_width: mask.width(),
+                found_height: mask.height(),
+                width: image.depth.width(),
+                height: image.depth.height(),
+            });
+        }
+        let bounds = mask.bounding_box().map_or([0; 4], |[x, y, width, height]| [x, y, x + width, y + height]);
+        Ok(DepthRegion::of(image, image.points(bounds, |x, y| mask[(x, y)])))
+    }
+
+    fn of(image: &Arc<PreparedDepth>, cloud: PointCloud) -> DepthRegion {
+        DepthRegion { image: image.clone(), cloud, indexed: OnceLock::new() }
+    }
+
+    /// The image that it is a view on.
+    pub fn image(&self) -> &Arc<PreparedDepth> {
+        &self.image
+    }
+
+    /// The points that are searched: off the plane and inside the mask.
+    pub fn cloud(&self) -> &PointCloud {
+        &self.cloud
+    }
+
+    /// These points with a search tree, made when first asked for; `None` where there is no point.
+    pub fn indexed_cloud(&self) -> Option<&IndexedCloud> {
+        self.indexed.get_or_init(|| IndexedCloud::new(self.cloud.clone()).ok()).as_ref()
+    }
+
+    /// The points further than `distance` metres from all of the given ones: what was explained is not matched again.
+    pub fn cloud_without(&self, explained: &[Vec3], distance: f64) -> PointCloud {
+        let tree = sixfold_geometry::KdTree::new(explained);
+        let keep: Vec<bool> = self
+            .cloud
+            .points
+            .par_iter()
+            .map(|p| tree.nearest(p).is_none_or(|n| n.distance > distance))
+            .collect();
+        let mut cloud = PointCloud::default();
+        for (i, keep) in keep.into_iter().enumerate() {
+            if keep {
+                cloud.points.push(self.cloud.points[i]);
+                cloud.normals.push(self.cloud.normals[i]);
+            }
+        }
+        cloud
+    }
+}
+
+/// Distance in pixels (8-neighbour steps) to the nearest depth edge, at most 255: a jump of more than 1.5 % of
+/// the depth plus 5 mm between neighbours, or a crease of more than 35 degrees between the normals four pixels to both
+/// sides (an object on a table has no jump where it stands).
+fn edge_distances(depth: &DepthImage, normals: &NormalImage) -> Image<u8> {
+    const REACH: usize = 4;
+    let crease = |a: [f32; 3], b: [f32; 3]| {
+        a != [0.0; 3] && b != [0.0; 3] && a[0] * b[0] + a[1] * b[1] + a[2] * b[2] < 0.82
+    };
+    let (width, height) = depth.size();
+    let jump = |a: f32, b: f32| (a > 0.0) != (b > 0.0) || (a - b).abs() > 0.005 + 0.015 * a.min(b);
+    let mut distance = Image::from_fn(width, height, |x, y| {
+        let z = depth[(x, y)];
+        let right = x + 1 < width && jump(z, depth[(x + 1, y)]);
+        let left = x > 0 && jump(z, depth[(x - 1, y)]);
+        let down = y + 1 < height && jump(z, depth[(x, y + 1)]);
+        let up = y > 0 && jump(z, depth[(x, y - 1)]);
+        let bent = (x >= REACH
+            && x + REACH < width
+            && crease(normals[(x - REACH, y)], normals[(x + REACH, y)]))
+            || (y >= REACH && y + REACH < height && crease(normals[(x, y - REACH)], normals[(x, y + REACH)]));
+        if right || left || down || up || bent { 0u8 } else { 255 }
+    });
+    // Two sweeps of the chessboard distance (Rosenfeld and Pfaltz 1966).
+    let data = distance.as_mut_slice();
+    for y in 0..height {
+        for x in 0..width {
+            let i = y * width + x;
+            let mut best = data[i];
+            if x > 0 {
+                best = best.min(data[i - 1].saturating_add(1));
+            }
+            if y > 0 {
+                best = best.min(data[i - width].saturating_add(1));
+                if x > 0 {
+                    best = best.min(data[i - width - 1].saturating_add(1));
+                }
+                if x + 1 < width {
+                    best = best.min(data[i - width + 1].saturating_add(1));
+                }
+            }
+            data[i] = best;
+        }
+    }
+    for y in (0..height).rev() {
+        for x in (0..width).rev() {
+            let i = y * width + x;
+            let mut best = data[i];
+            if x + 1 < width {
+                best = best.min(data[i + 1].saturating_add(1));
+            }
+            if y + 1 < height {
+                best = best.min(data[i + width].saturating_add(1));
+                if x > 0 {
+                    best = best.min(data[i + width - 1].saturating_add(1));
+                }
+                if x + 1 < width {
+                    best = best.min(data[i + width + 1].saturating_add(1));
+                }
+            }
+            data[i] = best;
+        }
+    }
+    distance
+}

@@ -1,0 +1,83 @@
+//! The last sieve of every method on depth: ICP of the rendered mesh against the depth image, then the scores of
+//! [`crate::verification`].
+
+use rayon::prelude::*;
+use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, icp};
+use sixfold_mesh::Mesh;
+
+use crate::prepared::PreparedDepth;
+use crate::verification::{VerificationOptions, VerificationScore, Verifier};
+
+/// A pose after ICP, with its scores.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VerifiedPose {
+    /// The pose after ICP.
+    pub camera_from_object: Pose,
+    /// What the verification says.
+    pub score: VerificationScore,
+}
+
+/// Levels of the ICP: rejection distance as a multiple of the depth inlier threshold, and iterations. The dissertation takes 30
+/// iterations (chapter 5); the mesh is rendered again between these levels, so fewer do.
+const LEVELS: [(f64, usize); 3] = [(2.0, 5), (1.2, 5), (0.8, 8)];
+/// Points rendered for a level, about.
+const POINTS: usize = 600;
+/// Rendered points this many rejection distances off the measured surface are not the object's.
+const NEAR: f64 = 2.0;
+/// Normals of a correspondence agree within this angle, degrees.
+const MAX_ANGLE: f64 = 45.0;
+/// A level ends at steps smaller than this, metres and radians.
+const CONVERGENCE: f64 = 1e-5;
+/// Fewer correspondences do not hold six degrees of freedom twice over.
+const MIN_CORRESPONDENCES: usize = 12;
+
+/// Refines and scores poses of a mesh; in the order of `poses`. `threshold` is the depth inlier threshold in metres
+/// ([`VerificationOptions::threshold_for`]); `mesh` is best one of [`crate::verification_mesh`].
+pub fn verify(
+    image: &PreparedDepth,
+    mesh: &Mesh,
+    poses: &[Pose],
+    threshold: f64,
+    options: &VerificationOptions,
+) -> Vec<VerifiedPose> {
+    poses
+        .par_iter()
+        .map_init(Verifier::default, |verifier, start| {
+            let pose = refine(verifier, image, mesh, start, threshold);
+            let score = verifier.score(image, mesh, &pose, threshold, options);
+            VerifiedPose { camera_from_object: pose, score }
+        })
+        .collect()
+}
+
+/// ICP of the rendered points against the depth image, rendered again between the levels. `threshold` in metres.
+pub fn refine(
+    verifier: &mut Verifier,
+    image: &PreparedDepth,
+    mesh: &Mesh,
+    start: &Pose,
+    threshold: f64,
+) -> Pose {
+    let target = DepthTarget { depth: image.depth(), normals: image.normals(), camera: image.camera() };
+    let mut pose = *start;
+    for (factor, iterations) in LEVELS {
+        let distance = factor * threshold;
+        let points = verifier.visible_points(image, mesh, &pose, NEAR * distance, POINTS);
+        let mut source = PointCloud::default();
+        for p in points.iter().filter(|p| p.inlier) {
+            source.points.push(p.point);
+            source.normals.push(p.normal);
+        }
+        let options = IcpOptions {
+            levels: vec![IcpLevel { rejection_distance: distance, iterations, stride: 1 }],
+            max_angle: MAX_ANGLE.to_radians(),
+            convergence: CONVERGENCE,
+            min_correspondences: MIN_CORRESPONDENCES,
+        };
+        match icp(&source, &target, &pose, &options) {
+            Ok(report) => pose = report.target_from_source,
+            Err(_) => break,
+        }
+    }
+    pose
+}

@@ -1,0 +1,26 @@
+//! What a pose estimation method is. A method implements [`PoseEstimator`]: it prepares an [`Object`] once and answers a
+//! [`Query`] (an image, and where to look in it) with [`PoseEstimate`]s. Runners, programs and other languages know methods by
+//! this trait alone; no method is known here.
+//!
+//! Objects come from mesh files or from an [`ObjectStore`], a folder of named objects. What methods derive from an object
+//! (descriptions, templates) is kept in its folder there, or for a mesh file in a [`Cache`].
+
+mod cache;
+mod detector;
+mod error;
+mod estimate;
+mod method;
+mod object;
+mod query;
+mod region;
+mod store;
+
+pub use cache::{Cache, CacheError};
+pub use detector::{DetectedObject, ObjectDetector};
+pub use error::EstimatorError;
+pub use estimate::{Diagnostic, PoseEstimate};
+pub use method::{MinConfidence, Need, Needs, PoseEstimator, PreparedObject, downcast};
+pub use object::Object;
+pub use query::{Memo, Query};
+pub use region::Region;
+pub use store::{FreeAxis, NewObject, ObjectRecord, ObjectStore, StoreError};

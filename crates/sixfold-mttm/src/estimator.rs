@@ -1,0 +1,176 @@
+//! Template matching as a [`PoseEstimator`].
+
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+use sixfold_align::{DepthOptions, VerificationMesh};
+use sixfold_estimator::{
+    EstimatorError, MinConfidence, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
+    downcast,
+};
+use sixfold_mesh::Mesh;
+
+use crate::estimate::{KnownObject, MttmEstimate, MttmOptions, Stages, search};
+use crate::model::MttmModel;
+use crate::regions::RegionCache;
+use crate::template::{ObjectTemplates, Source, TemplateOptions};
+
+const METHOD: &str = "mttm";
+/// Where an object's templates are kept in its folder.
+pub const TEMPLATES_FILE: &str = "templates.bin";
+/// Where the network's descriptors of the templates are kept.
+const DESCRIPTORS_FILE: &str = "descriptors.bin";
+/// Where the mesh that verification renders is kept.
+const MESH_FILE: &str = "verification-mesh.bin";
+
+/// Objects never trained on, found in depth by their templates (dissertation, chapter 5).
+#[derive(Debug, Clone, Default)]
+pub struct MttmEstimator {
+    /// How depth images are prepared.
+    pub depth: DepthOptions,
+    /// How objects are searched; instances and the least confidence are the query's.
+    pub options: MttmOptions,
+    /// Which templates are rendered from a mesh, where its folder holds none yet.
+    pub templates: TemplateOptions,
+    /// The network; without one, points match alone.
+    pub network: Option<Arc<MttmModel>>,
+    /// Judge poses by the matched templates alone, as if there were no mesh.
+    pub templates_only: bool,
+}
+
+/// An object as template matching knows it.
+pub struct MttmObject {
+    name: String,
+    mesh: Option<Arc<Mesh>>,
+    object: KnownObject,
+    notes: Vec<String>,
+}
+
+impl MttmObject {
+    /// Its templates, ready to be searched.
+    pub fn known(&self) -> &KnownObject {
+        &self.object
+    }
+}
+
+impl PreparedObject for MttmObject {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn mesh(&self) -> Option<&Mesh> {
+        self.mesh.as_deref()
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
+    }
+}
+
+impl MttmEstimator {
+    /// The object's templates: those in its folder, or rendered from its mesh with [`MttmEstimator::templates`].
+    fn templates(&self, object: &Object, notes: &mut Vec<String>) -> Result<ObjectTemplates, EstimatorError> {
+        let wrap = |source| EstimatorError::Object { object: object.name.clone(), source };
+        let file = object.file(TEMPLATES_FILE);
+        let Some(mesh) = &object.mesh else {
+            let file = file.ok_or_else(|| EstimatorError::Lacks {
+                object: object.name.clone(),
+                what: "mesh and no templates",
+                method: METHOD,
+                advice: "add it with `sixfold object add`",
+            })?;
+            return ObjectTemplates::read(&file).map_err(|e| wrap(Box::new(e)));
+        };
+        let Some(file) = file else {
+            return ObjectTemplates::from_mesh(mesh, &self.templates).map_err(|e| wrap(Box::new(e)));
+        };
+        // Templates that were asked for with other views stay as they are.
+        let options = ObjectTemplates::read(&file).map_or(self.templates, |kept| kept.options);
+        let (templates, note) =
+            ObjectTemplates::cached(&file, mesh, &options).map_err(|e| wrap(Box::new(e)))?;
+        notes.extend(note.map(|n| format!("templates of {} not kept, or computed again: {n}", object.name)));
+        Ok(templates)
+    }
+}
+
+impl PoseEstimator for MttmEstimator {
+    fn name(&self) -> &'static str {
+        METHOD
+    }
+
+    fn needs(&self) -> Needs {
+        Needs { depth: Need::Required, rgb: Need::Unused, region: Need::Optional, object: Need::Required }
+    }
+
+    fn depth_options(&self) -> DepthOptions {
+        self.depth
+    }
+
+    /// Right poses in real frames have confidences of 0.36 to 0.73, wrong ones to 0.54 (LM-O frame 3, by
+    /// `cargo test --release -p sixfold-mttm --test real_frames -- --nocapture`).
+    fn min_confidence(&self) -> MinConfidence {
+        MinConfidence { image: 0.45, dataset: MttmOptions::default().min_score }
+    }
+
+    fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
+        let mut notes = vec![];
+        let templates = self.templates(object, &mut notes)?;
+        let mut rendered = None;
+        if let Some(mesh) = object.mesh.as_ref().filter(|_| !self.templates_only) {
+            let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
+            let wrap = |e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) };
+            let kept = kept.map_err(wrap)?;
+            notes.extend(kept.note.map(|n| format!("mesh of {} not kept, or simplified again: {n}", object.name)));
+            rendered = Some(kept.mesh);
+        }
+        let mut known = KnownObject::new(templates, rendered);
+        if let Some(network) = &self.network {
+            known = match object.file(DESCRIPTORS_FILE) {
+                None => known.with_network(network.clone()),
+                Some(file) => {
+                    let (known, note) = known.with_network_cached(network.clone(), &file);
+                    let say = |n| format!("descriptors of {} not kept, or computed again: {n}", object.name);
+                    notes.extend(note.map(say));
+                    known
+                }
+            };
+        }
+        Ok(Box::new(MttmObject { name: object.name.clone(), mesh: object.mesh.clone(), object: known, notes }))
+    }
+
+    fn estimate(
+        &self,
+        object: &dyn PreparedObject,
+        query: &Query<'_>,
+    ) -> Result<Vec<PoseEstimate>, EstimatorError> {
+        let object: &MttmObject = downcast(object, METHOD)?;
+        let options = MttmOptions {
+            max_instances: query.max_instances,
+            min_score: query.min_confidence,
+            ..self.options
+        };
+        let regions = query.memo.get_or_default::<RegionCache>();
+        let (found, stages) = search(query.depth_region(METHOD)?, &regions, &object.object, &options);
+        let pose = |e: MttmEstimate| PoseEstimate {
+            verification: Some(e.score),
+            details: details(&object.object, &e, &stages),
+            mask: Some(e.mask),
+            ..PoseEstimate::new(e.camera_from_object, e.confidence)
+        };
+        Ok(found.into_iter().map(pose).collect())
+    }
+}
+
+/// What is said of an estimate besides: the matched template (from 0 on; with views without poses the pose is that of this view's
+/// frame), whether the pose is that of the object's frame (a mesh, or views with poses) or only of the matched view's, what it
+/// was verified by, and where the time went.
+fn details(object: &KnownObject, e: &MttmEstimate, stages: &Stages) -> Map<String, Value> {
+    let of_view = object.templates().source == Source::Depth;
+    Map::from_iter([
+        ("template".to_owned(), e.template.into()),
+        ("frame".to_owned(), if of_view { "view" } else { "object" }.into()),
+        ("verified_by".to_owned(), if object.has_mesh() { "mesh" } else { "template" }.into()),
+        ("mask_pixels".to_owned(), e.mask.len().into()),
+        ("seconds".to_owned(), json!(stages)),
+    ])
+}

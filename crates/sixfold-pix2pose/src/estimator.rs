@@ -1,0 +1,291 @@
+//! Pix2Pose as a [`PoseEstimator`].
+
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use serde_json::{Map, Value, json};
+use sixfold_align::outline::outline_mesh;
+use sixfold_align::DepthOptions;
+use sixfold_estimator::{
+    Diagnostic, EstimatorError, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
+    Region, downcast,
+};
+use sixfold_geometry::{Image, NormalOptions, Pose, RgbImage, Vec3};
+use sixfold_mesh::Mesh;
+
+use crate::aligned::{AlignOptions, estimate_aligned};
+use crate::depth::align;
+use crate::estimate::{EstimateError, Found, View, estimate};
+use crate::model::Pix2PoseModel;
+use crate::object::ObjectEntry;
+
+const METHOD: &str = "pix2pose";
+
+/// Poses from colour in given regions by a trained network (dissertation, chapter 3).
+#[derive(Clone)]
+pub struct Pix2PoseEstimator {
+    /// The trained network.
+    pub model: Pix2PoseModel,
+    /// Both passes, PnP and the alignment of the outline.
+    pub options: AlignOptions,
+    /// Align the rendered outline with the image where there is a mesh.
+    pub refine: bool,
+    /// Align poses with the depth image.
+    pub icp: bool,
+    /// Which of the model's objects is meant where the object itself does not say; `None` is its only one.
+    pub object_id: Option<u32>,
+}
+
+impl Pix2PoseEstimator {
+    /// The model of a weight file with default options.
+    ///
+    /// # Errors
+    /// As [`Pix2PoseModel::load`].
+    pub fn load(weights: &Path) -> Result<Pix2PoseEstimator, crate::model::ModelError> {
+        Ok(Pix2PoseEstimator::new(Pix2PoseModel::load(weights)?))
+    }
+
+    /// A model with default options.
+    pub fn new(model: Pix2PoseModel) -> Pix2PoseEstimator {
+        Pix2PoseEstimator { model, options: AlignOptions::default(), refine: true, icp: false, object_id: None }
+    }
+
+    /// What the model knows of an object; without an id, of its only one.
+    ///
+    /// # Errors
+    /// [`EstimatorError::Method`] for an object that it does not know, or several and no id.
+    pub fn entry(&self, id: Option<u32>) -> Result<&ObjectEntry, EstimatorError> {
+        match (id, self.model.objects()) {
+            (Some(id), _) => Ok(self.model.object(id).map_err(EstimatorError::method)?.1),
+            (None, [only]) => Ok(only),
+            (None, several) => {
+                let ids: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
+                let text = format!("--object-id N is missing: the model knows the objects {}", ids.join(", "));
+                Err(EstimatorError::method(text))
+            }
+        }
+    }
+
+    fn found(
+        &self,
+        object: &Pix2PoseObject,
+        query: &Query<'_>,
+        region: &Region,
+    ) -> Result<Option<Posed>, EstimateError> {
+        let (Some(image), id, camera) = (query.rgb, object.id, query.camera) else { return Ok(None) };
+        if let (true, Some(mesh)) = (self.refine, &object.mesh) {
+            let outline = object.outline.get_or_init(|| outline_mesh(mesh));
+            let (model, options) = (&self.model, &self.options);
+            let aligned = estimate_aligned(model, image, camera, id, &region.bbox, outline, options)?;
+            return Ok(aligned.map(|a| Posed {
+                camera_from_object: a.camera_from_object,
+                score: a.score,
+                refined: a.improved,
+                found: a.found,
+            }));
+        }
+        let found = estimate(&self.model, image, camera, id, &region.bbox, &self.options.estimate)?;
+        Ok(found.and_then(|found| {
+            let best = found.hypotheses.first()?;
+            let (score, camera_from_object) = (best.score, best.camera_from_object);
+            Some(Posed { camera_from_object, score, refined: false, found })
+        }))
+    }
+}
+
+/// A pose before ICP.
+struct Posed {
+    camera_from_object: Pose,
+    score: f64,
+    /// Whether the outline was aligned with the image.
+    refined: bool,
+    found: Found,
+}
+
+/// An object as a trained network knows it.
+pub struct Pix2PoseObject {
+    name: String,
+    id: u32,
+    diameter: f64,
+    mesh: Option<Arc<Mesh>>,
+    /// The box of the model's coordinates, for overlays without a mesh.
+    solid: Option<Mesh>,
+    outline: OnceLock<Mesh>,
+    notes: Vec<String>,
+}
+
+impl PreparedObject for Pix2PoseObject {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn mesh(&self) -> Option<&Mesh> {
+        self.mesh.as_deref().or(self.solid.as_ref())
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
+    }
+}
+
+impl PoseEstimator for Pix2PoseEstimator {
+    fn name(&self) -> &'static str {
+        METHOD
+    }
+
+    fn needs(&self) -> Needs {
+        let depth = if self.icp { Need::Required } else { Need::Unused };
+        let object = if self.icp { Need::Required } else { Need::Optional };
+        Needs { depth, rgb: Need::Required, region: Need::Required, object }
+    }
+
+    fn depth_options(&self) -> DepthOptions {
+        DepthOptions { normals: NormalOptions::default(), remove_plane: false, ..DepthOptions::default() }
+    }
+
+    fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
+        let entry = self.entry(object.id.or(self.object_id))?;
+        let mut notes = vec![];
+        match &object.mesh {
+            Some(mesh) => entry.check_mesh(mesh).map_err(|e| EstimatorError::Object {
+                object: object.name.clone(),
+                source: Box::new(e),
+            })?,
+            None => notes.push("without a mesh the outline is not aligned, and the overlay shows a box".to_owned()),
+        }
+        let name = if object.name.is_empty() { format!("object {}", entry.id) } else { object.name.clone() };
+        Ok(Box::new(Pix2PoseObject {
+            name,
+            id: entry.id,
+            diameter: entry.diameter,
+            mesh: object.mesh.clone(),
+            solid: if object.mesh.is_none() { box_of(entry) } else { None },
+            outline: OnceLock::new(),
+            notes,
+        }))
+    }
+
+    fn estimate(
+        &self,
+        object: &dyn PreparedObject,
+        query: &Query<'_>,
+    ) -> Result<Vec<PoseEstimate>, EstimatorError> {
+        let object: &Pix2PoseObject = downcast(object, METHOD)?;
+        query.rgb(METHOD)?;
+        let region = query.region.ok_or(EstimatorError::Input {
+            what: "region that says where the object is",
+            method: METHOD,
+            advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
+        })?;
+        let posed = match self.found(object, query, region) {
+            Ok(Some(posed)) => posed,
+            Ok(None) => return Ok(vec![]),
+            // Only the box is to blame.
+            Err(error @ (EstimateError::Box(_) | EstimateError::Outside { .. })) => {
+                return Err(EstimatorError::Region { source: Box::new(error) });
+            }
+            Err(error) => return Err(EstimatorError::method(error)),
+        };
+        let confidence = posed.score * region.score;
+        if confidence < query.min_confidence {
+            return Ok(vec![]);
+        }
+        let mut estimate = PoseEstimate::new(posed.camera_from_object, confidence);
+        let mut icp = Value::Null;
+        if let (true, Some(mesh)) = (self.icp, &object.mesh) {
+            let depth = query.depth.ok_or(EstimatorError::Input {
+                what: "depth image",
+                method: METHOD,
+                advice: "give one, or leave out --icp",
+            })?;
+            let seen = region.pixels_for_icp();
+            match align(depth, mesh, object.diameter, &posed.camera_from_object, &posed.found, seen.as_ref()) {
+                Ok(aligned) => {
+                    estimate.camera_from_object = aligned.camera_from_object;
+                    icp = json!({ "inliers": aligned.inliers, "rms_mm": 1000.0 * aligned.rms });
+                }
+                Err(_) => estimate.notes.push(format!(
+                    "too little depth is measured on {}: its pose is that from colour",
+                    object.name
+                )),
+            }
+        }
+        estimate.details = details(object.id, &posed, icp);
+        if query.diagnostics {
+            let image = view_image(&posed.found.view);
+            estimate.diagnostics.push(Diagnostic { name: "coordinates", image });
+        }
+        Ok(vec![estimate])
+    }
+}
+
+/// What is said of an estimate besides: whether the outline was aligned, ICP, the square of the image that the last pass saw (x, y,
+/// side), and all hypotheses as PnP left them, best first.
+fn details(id: u32, posed: &Posed, icp: Value) -> Map<String, Value> {
+    let rows = |pose: &Pose| -> [[f64; 4]; 4] {
+        let m = pose.to_matrix();
+        std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+    };
+    let window = &posed.found.view.window;
+    let hypothesis = |h: &crate::estimate::Hypothesis| {
+        json!({
+            "camera_from_object": rows(&h.camera_from_object),
+            "confidence": h.score,
+            "inliers": h.inliers,
+            "threshold": h.threshold,
+        })
+    };
+    let hypotheses: Vec<Value> = posed.found.hypotheses.iter().map(hypothesis).collect();
+    Map::from_iter([
+        ("object_id".to_owned(), id.into()),
+        ("refined".to_owned(), posed.refined.into()),
+        ("icp".to_owned(), icp),
+        ("window".to_owned(), json!([window.x, window.y, window.width])),
+        ("hypotheses".to_owned(), hypotheses.into()),
+    ])
+}
+
+/// The box of the model's coordinates.
+fn box_of(entry: &ObjectEntry) -> Option<Mesh> {
+    let scale = entry.scale();
+    let corner =
+        |i: usize| scale.restore(&Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { -1.0 } else { 1.0 }));
+    let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = sides.iter().flat_map(|s| [[s[0], s[1], s[2]], [s[0], s[2], s[3]]]).collect();
+    Mesh::new((0..8).map(corner).collect(), faces).ok()
+}
+
+/// Side of each of the four tiles of [`view_image`], pixels.
+const TILE: usize = 256;
+/// Pixels between tiles.
+const GAP: usize = 4;
+/// From this probability on a pixel counts as visible.
+const VISIBLE: f32 = 0.5;
+
+/// What the network saw and returned: input, coordinates (black where the object is not seen), expected error and visibility
+/// (black 0, white 1), side by side.
+pub fn view_image(view: &View) -> RgbImage {
+    let (input, p) = (&view.input, &view.prediction);
+    Image::from_fn(4 * TILE + 3 * GAP, TILE, |x, y| {
+        let (tile, x) = (x / (TILE + GAP), x % (TILE + GAP));
+        if x >= TILE {
+            return [255; 3];
+        }
+        let at = |side: usize| (x * side / TILE, y * side / TILE);
+        let (px, py) = at(p.side);
+        let index = py * p.side + px;
+        let grey = |v: f32| [(255.0 * v).clamp(0.0, 255.0) as u8; 3];
+        match tile {
+            0 => {
+                let (ix, iy) = (x * input.width() / TILE, y * input.height() / TILE);
+                input[(ix, iy)]
+            }
+            1 if p.visible[index] > VISIBLE => {
+                p.coordinates[index].map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8)
+            }
+            1 => [0; 3],
+            2 => grey(p.error[index]),
+            _ => grey(p.visible[index]),
+        }
+    })
+}
