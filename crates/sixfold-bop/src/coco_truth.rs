@@ -6,12 +6,12 @@ use std::path::Path;
 
 use serde::Serialize;
 use serde_json::json;
+use sixfold_io::write_atomically;
 use sixfold_mesh::Mesh;
 
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
 use crate::dataset::{BopDataset, MaskKind, Models};
 use crate::dataset_error::DatasetError;
-use crate::files::write_atomically;
 use crate::rle::Rle;
 use crate::visibility::ground_truth_visibility;
 

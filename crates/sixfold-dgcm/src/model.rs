@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_io::fnv1a;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -134,11 +135,7 @@ impl DgcmModel {
 
     /// A name that tells this network's features from those of another: its architecture and a hash of its card.
     pub fn fingerprint(&self) -> String {
-        // FNV-1a, which is the same everywhere.
-        let text = serde_json::to_string(&self.card).unwrap_or_default();
-        let hash = text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-        });
+        let hash = fnv1a(serde_json::to_string(&self.card).unwrap_or_default().as_bytes());
         format!("{}-{hash:016x}", self.card.architecture)
     }
 

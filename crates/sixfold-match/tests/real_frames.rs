@@ -5,8 +5,9 @@
 
 use std::path::{Path, PathBuf};
 
-use sixfold_bop::{BopDataset, Models, read_depth};
+use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
+use sixfold_io::read_depth;
 use sixfold_match::{Estimate, EstimateOptions, ModelOptions, ObjectModel, Scene, SceneOptions, estimate};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 

@@ -10,7 +10,7 @@ use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use sixfold_bop::{DatasetError, write_rgb};
+use sixfold_io::{ImageFileError, write_rgb};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_nn::checkpoint::Checkpoint;
 use sixfold_nn::pretrained::PretrainedError;
@@ -116,7 +116,7 @@ pub enum RecipeError {
     Simulation(#[from] SimulationError),
     /// The picture of the first samples.
     #[error(transparent)]
-    Picture(Box<DatasetError>),
+    Picture(#[from] ImageFileError),
     /// The model file.
     #[error(transparent)]
     Model(#[from] ModelError),
@@ -160,8 +160,7 @@ impl Recipe {
         };
         hear(News::Note(&format!("scenes: {} regions with an object", pool.with_object().len())));
         let first = Batch::of_step(&pool, &options.batch, options.seed, 0);
-        write_rgb(&out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))
-            .map_err(|error| RecipeError::Picture(Box::new(error)))?;
+        write_rgb(&out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))?;
         let mut last = TrainingRecord::default();
         let shown = |record: &TrainingRecord| {
             hear(News::Steps(record, options.steps));

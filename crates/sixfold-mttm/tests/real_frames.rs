@@ -7,8 +7,9 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sixfold_bop::{BopDataset, Models, read_depth, read_mask};
+use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
+use sixfold_io::{read_depth, read_mask};
 use sixfold_match::{ModelOptions, ObjectModel, Scene, SceneOptions};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_mttm::model::MttmModel;

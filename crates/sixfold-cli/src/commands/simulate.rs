@@ -6,10 +6,10 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde_json::json;
 use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_rgb,
-    write_targets,
+    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
 };
 use sixfold_geometry::Pose;
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
 

@@ -11,7 +11,6 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::{
@@ -21,6 +20,7 @@ use sixfold_geometry::Pose;
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps,
 };
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;

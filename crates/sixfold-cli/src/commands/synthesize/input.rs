@@ -8,11 +8,10 @@ use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use sixfold_bop::{
-    BopDataset, CameraFile, Detection, MaskKind, Models, Rle, ground_truth_visibility, read_mask, read_rgb,
-};
+use sixfold_bop::{BopDataset, Detection, MaskKind, Models, Rle, ground_truth_visibility};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
+use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 use sixfold_nol::Photograph;
 

@@ -9,8 +9,8 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use sixfold_augment::{Backgrounds, ColorAugmentation, Coverage, Patch, Random, stream, uniform};
-use sixfold_bop::write_rgb;
 use sixfold_geometry::{RgbImage, Vec3};
+use sixfold_io::write_rgb;
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
 
 use super::material::{Material, PosedFrame};

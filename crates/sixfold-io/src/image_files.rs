@@ -1,4 +1,4 @@
-//! Image files of a scene: depth, masks and colour, decoded without trusting their headers.
+//! Depth, masks and colour of image files, decoded without trusting their headers.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -6,30 +6,41 @@ use std::path::Path;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use sixfold_geometry::{DepthImage, Image, Mask, RgbImage};
 
-use crate::dataset_error::DatasetError;
+use crate::error::ImageFileError;
 use crate::files::write_atomically;
 
 /// Neither PNG nor JPEG packs more than about this many bytes of pixels into one byte of file.
 const LARGEST_EXPANSION: u64 = 2048;
 const LARGEST_SIDE: u32 = 1 << 15;
 
-pub(crate) struct ImageFile<'a> {
-    pub path: &'a Path,
-    pub im_id: u32,
+/// An image file (PNG or JPEG) that is still to be read.
+#[derive(Debug, Clone)]
+pub struct ImageFile<'a> {
+    path: &'a Path,
     /// Size the image must have and what says so.
-    pub expected: Option<((usize, usize), String)>,
+    expected: Option<((usize, usize), String)>,
 }
 
-impl ImageFile<'_> {
-    fn error(&self, reason: impl Into<String>) -> DatasetError {
-        DatasetError::Image { path: self.path.to_owned(), im_id: self.im_id, reason: reason.into() }
+impl<'a> ImageFile<'a> {
+    /// A file of any size.
+    pub fn new(path: &'a Path) -> Self {
+        ImageFile { path, expected: None }
     }
 
-    fn bytes(&self) -> Result<Vec<u8>, DatasetError> {
-        std::fs::read(self.path).map_err(|source| DatasetError::Read { path: self.path.to_owned(), source })
+    /// A file that must be of this width and height; `size_from` is for the message: who says so.
+    pub fn of_size(path: &'a Path, expected: (usize, usize), size_from: impl Into<String>) -> Self {
+        ImageFile { path, expected: Some((expected, size_from.into())) }
     }
 
-    fn decode(&self) -> Result<DynamicImage, DatasetError> {
+    fn error(&self, reason: impl Into<String>) -> ImageFileError {
+        ImageFileError::Content { path: self.path.to_owned(), reason: reason.into() }
+    }
+
+    fn bytes(&self) -> Result<Vec<u8>, ImageFileError> {
+        std::fs::read(self.path).map_err(|source| ImageFileError::Read { path: self.path.to_owned(), source })
+    }
+
+    fn decode(&self) -> Result<DynamicImage, ImageFileError> {
         let bytes = self.bytes()?;
         let format = image::guess_format(&bytes).map_err(|_| self.error("neither PNG nor JPEG"))?;
         if !matches!(format, ImageFormat::Png | ImageFormat::Jpeg) {
@@ -45,9 +56,8 @@ impl ImageFile<'_> {
         if let Some((expected, size_from)) = &self.expected
             && *expected != (width as usize, height as usize)
         {
-            return Err(DatasetError::ImageSize {
+            return Err(ImageFileError::Size {
                 path: self.path.to_owned(),
-                im_id: self.im_id,
                 expected: *expected,
                 found: (width as usize, height as usize),
                 size_from: size_from.clone(),
@@ -62,7 +72,11 @@ impl ImageFile<'_> {
         DynamicImage::from_decoder(decoder).map_err(|e| self.error(format!("{e} (cut off or damaged)")))
     }
 
-    pub(crate) fn depth(&self, metres_per_unit: f64) -> Result<DepthImage, DatasetError> {
+    /// Depth in metres, of one channel of 16 bits; zero where nothing was measured.
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file.
+    pub fn depth(&self, metres_per_unit: f64) -> Result<DepthImage, ImageFileError> {
         let DynamicImage::ImageLuma16(pixels) = self.decode()? else {
             return Err(self.error("a depth image has one channel of 16 bits; this is a picture of depth"));
         };
@@ -71,14 +85,22 @@ impl ImageFile<'_> {
         Image::from_vec(width, height, data).map_err(|e| self.error(e.to_string()))
     }
 
-    pub(crate) fn mask(&self) -> Result<Mask, DatasetError> {
+    /// A mask: every pixel above zero belongs to it.
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file.
+    pub fn mask(&self) -> Result<Mask, ImageFileError> {
         let pixels = self.decode()?.into_luma8();
         let (width, height) = (pixels.width() as usize, pixels.height() as usize);
         let data = pixels.as_raw().iter().map(|&v| v > 0).collect();
         Image::from_vec(width, height, data).map_err(|e| self.error(e.to_string()))
     }
 
-    pub(crate) fn rgb(&self) -> Result<RgbImage, DatasetError> {
+    /// A colour image; grey becomes colour, alpha is dropped.
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file.
+    pub fn rgb(&self) -> Result<RgbImage, ImageFileError> {
         let pixels = match self.decode()? {
             // Sixteen bits of grey (some industrial cameras) keep their upper eight.
             DynamicImage::ImageLuma16(p) => DynamicImage::ImageLuma16(p).into_rgb8(),
@@ -90,20 +112,23 @@ impl ImageFile<'_> {
     }
 
     /// Width and height from the header alone.
-    pub(crate) fn size(&self) -> Result<(usize, usize), DatasetError> {
-        let read = |source| DatasetError::Read { path: self.path.to_owned(), source };
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file.
+    pub fn size(&self) -> Result<(usize, usize), ImageFileError> {
+        let read = |source| ImageFileError::Read { path: self.path.to_owned(), source };
         let reader = ImageReader::open(self.path).map_err(read)?.with_guessed_format().map_err(read)?;
         let (width, height) = reader.into_dimensions().map_err(|e| self.error(e.to_string()))?;
         Ok((width as usize, height as usize))
     }
 }
 
-pub(crate) fn write_png(path: &Path, image: DynamicImage) -> Result<(), DatasetError> {
+pub(crate) fn write_png(path: &Path, image: DynamicImage) -> Result<(), ImageFileError> {
     let mut bytes = Cursor::new(Vec::new());
     let written = image.write_to(&mut bytes, ImageFormat::Png).map_err(std::io::Error::other);
     written
         .and_then(|()| write_atomically(path, bytes.get_ref()))
-        .map_err(|source| DatasetError::Write { path: path.to_owned(), source })
+        .map_err(|source| ImageFileError::Write { path: path.to_owned(), source })
 }
 
 pub(crate) fn png_of_rgb(image: &RgbImage) -> Option<DynamicImage> {
@@ -133,7 +158,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn file(path: &Path) -> ImageFile<'_> {
-        ImageFile { path, im_id: 7, expected: None }
+        ImageFile::new(path)
     }
 
     fn depth_png() -> Vec<u8> {
@@ -161,7 +186,7 @@ mod tests {
         let png = depth_png();
         std::fs::write(&path, &png[..png.len() / 2]).unwrap();
         let message = file(&path).depth(1e-3).unwrap_err().to_string();
-        assert!(message.contains("000007.png") && message.contains("im_id 7"), "{message}");
+        assert!(message.contains("000007.png") && message.contains("not a readable image"), "{message}");
 
         // A header of 30000 x 30000 (with its own right checksum) before the same few bytes.
         let mut lying = png.clone();
@@ -181,7 +206,7 @@ mod tests {
         let grey = DynamicImage::from(image::GrayImage::new(20, 10));
         write_png(&path, grey).unwrap();
         assert!(file(&path).depth(1e-3).unwrap_err().to_string().contains("16 bits"));
-        let sized = ImageFile { path: &path, im_id: 7, expected: Some(((640, 480), "camera.json".into())) };
+        let sized = ImageFile::of_size(&path, (640, 480), "camera.json");
         let message = sized.rgb().unwrap_err().to_string();
         assert!(message.contains("20x10") && message.contains("640x480"), "{message}");
     }
