@@ -9,8 +9,8 @@ use sixfold_geometry::{Image, Rect, RgbImage};
 
 use crate::error::AugmentError;
 use crate::patch::{AffineMap, Patch};
-use crate::random::{Random, uniform};
 use crate::texture::procedural_texture;
+use sixfold_geometry::random::{Random, uniform};
 
 /// How a folder of photographs is read.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -178,7 +178,7 @@ impl Source {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     #[test]
     fn photographs_of_a_folder() {

@@ -5,7 +5,7 @@ use rand::seq::SliceRandom;
 
 use crate::error::AugmentError;
 use crate::patch::Patch;
-use crate::random::{Random, uniform};
+use sixfold_geometry::random::{Random, uniform};
 
 /// Ranges and chances of each change. Values are those of images in 0..1; a range of two equal neutral numbers turns
 /// its change off.
@@ -285,7 +285,7 @@ fn raise(patch: &mut Patch, gamma: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     fn ramp() -> Patch {
         Patch { width: 16, height: 4, data: (0..192).map(|i| (i % 64) as f32 / 64.0).collect() }

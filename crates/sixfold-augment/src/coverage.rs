@@ -1,8 +1,8 @@
 //! One channel over a patch: how much of each pixel something covers, in 0..1.
 
 use crate::blur::gaussian;
-use crate::random::Random;
 use rand::RngExt;
+use sixfold_geometry::random::Random;
 
 /// Row-major coverage in 0..1.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,7 +93,7 @@ impl Coverage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     #[test]
     fn half_the_resolution_is_the_mean_of_blocks() {

@@ -5,7 +5,7 @@ use sixfold_geometry::{Mask, RgbImage};
 
 use crate::coverage::Coverage;
 use crate::patch::Patch;
-use crate::random::{Random, uniform};
+use sixfold_geometry::random::{Random, uniform};
 
 /// A small picture with coverage, 8 bits each.
 #[derive(Debug, Clone, PartialEq)]
@@ -175,7 +175,7 @@ impl Cutout {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     fn square() -> Cutout {
         let image = RgbImage::from_fn(40, 40, |x, y| [x as u8 * 6, y as u8 * 6, 9]);

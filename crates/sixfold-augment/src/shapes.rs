@@ -8,7 +8,7 @@
 use rand::RngExt;
 
 use crate::coverage::Coverage;
-use crate::random::{Random, uniform};
+use sixfold_geometry::random::{Random, uniform};
 
 /// A shape about a centre, without its size.
 #[derive(Debug, Clone, PartialEq)]
@@ -146,7 +146,7 @@ pub fn occluder_of_fraction(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     #[test]
     fn shapes_hide_what_they_should() {

@@ -5,8 +5,8 @@ use rand::RngExt;
 
 use crate::coverage::Coverage;
 use crate::patch::Patch;
-use crate::random::{Random, uniform};
 use crate::shapes::Shape;
+use sixfold_geometry::random::{Random, uniform};
 
 /// Smooth noise in 0..1: random numbers on a grid of `cells` by `cells`, blended between with a smooth step.
 pub(crate) fn value_noise(width: usize, height: usize, cells: usize, random: &mut Random) -> Vec<f32> {
@@ -158,7 +158,7 @@ fn layer(width: usize, height: usize, random: &mut Random) -> Patch {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::stream;
+    use sixfold_geometry::random::stream;
 
     #[test]
     fn textures_are_valid_different_and_repeatable() {

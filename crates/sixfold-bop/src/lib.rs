@@ -50,5 +50,5 @@ pub use scene_files::{
 pub use score::{
     area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
 };
-pub use visibility::{ObjectVisibility, ground_truth_visibility};
+pub use visibility::{ObjectVisibility, VISIBILITY_DELTA, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

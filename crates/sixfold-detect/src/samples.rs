@@ -12,9 +12,9 @@ use crate::solids::{random_solid, random_turn};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sixfold_augment::{
-    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream,
-    uniform,
+    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Shape, procedural_texture,
 };
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch, randomly_colored};

@@ -6,7 +6,8 @@
 use std::f64::consts::{PI, TAU};
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Random, procedural_texture};
+use sixfold_augment::{Backgrounds, procedural_texture};
+use sixfold_geometry::random::Random;
 use sixfold_geometry::{Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::samples::randomly_colored;
@@ -256,7 +257,7 @@ fn handle(radius: f64, random: &mut Random) -> Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sixfold_augment::stream;
+    use sixfold_geometry::random::stream;
 
     /// Six times the volume that the faces enclose: positive where they look outwards.
     fn volume(mesh: &Mesh) -> f64 {

@@ -7,9 +7,9 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use burn::tensor::Device;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::RngExt;
 use rayon::prelude::*;
+use sixfold_geometry::random::stream;
 use sixfold_io::{ImageFileError, write_rgb};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_nn::checkpoint::Checkpoint;
@@ -288,8 +288,7 @@ fn make_pool(
     let objects: Vec<(Mesh, ConvexParts)> = (0..objects)
         .into_par_iter()
         .map(|number| -> Result<_, RecipeError> {
-            let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-            random.set_stream(number as u64);
+            let mut random = stream(options.seed, number as u64);
             let mesh = match number % 2 {
                 0 => member(Family::ALL[number / 2 % Family::ALL.len()], &mut random)?.mesh,
                 _ => toy(&mut random)?,
@@ -325,8 +324,7 @@ fn make_pool(
 
 /// Some of the objects, fallen.
 fn arrange(hulls: &[ConvexParts], pile: &PileOptions, seed: u64, scene: u64) -> Arrangement {
-    let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5ce7e);
-    random.set_stream(scene);
+    let mut random = stream(seed ^ 0x5ce7e, scene);
     let count = random.random_range(OBJECTS.0..=OBJECTS.1);
     let mut chosen: Vec<usize> = vec![];
     while chosen.len() < count {

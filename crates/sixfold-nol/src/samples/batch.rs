@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sixfold_augment::{Backgrounds, Patch, stream};
+use sixfold_augment::{Backgrounds, Patch};
+use sixfold_geometry::random::stream;
 use sixfold_nn::kernels::{Place, Places, neighbours};
 
 use super::view::{Sample, SampleOptions, make_sample};

@@ -1,8 +1,9 @@
 //! A made-up object with a random surface, and what a camera sees of it under a lamp.
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Coverage, Patch, Random, procedural_texture};
+use sixfold_augment::{Backgrounds, Coverage, Patch, procedural_texture};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::random::Random;
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};

@@ -2,8 +2,9 @@
 
 use rand::RngExt;
 use sixfold_augment::{
-    Backgrounds, Coverage, Cutout, Patch, Random, Shape, occluder_of_fraction, procedural_texture, uniform,
+    Backgrounds, Coverage, Cutout, Patch, Shape, occluder_of_fraction, procedural_texture,
 };
+use sixfold_geometry::random::{Random, uniform};
 
 use super::options::SampleOptions;
 

@@ -1,7 +1,8 @@
 //! Drawing an object: its coordinates and silhouette as targets, and its colours under random light.
 
 use rand::RngExt;
-use sixfold_augment::{Coverage, Patch, Random, uniform};
+use sixfold_augment::{Coverage, Patch};
+use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};

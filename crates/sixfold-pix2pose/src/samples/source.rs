@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, Window, stream, uniform};
+use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Window};
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, simplify};
 use sixfold_render::BoundingBoxScale;

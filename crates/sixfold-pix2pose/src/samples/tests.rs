@@ -345,7 +345,7 @@ fn same_numbers_same_bytes_on_any_thread() {
 #[test]
 fn both_stages_in_blocks_or_mixed() {
     let second_stages = |options: SampleOptions| -> Vec<bool> {
-        let mut random = sixfold_augment::stream(1, 1);
+        let mut random = sixfold_geometry::random::stream(1, 1);
         (0..200).map(|n| options.is_second_stage(n, &mut random)).collect()
     };
     let blocks = second_stages(SampleOptions { second_stage_block: Some(50), ..SampleOptions::default() });

@@ -4,9 +4,10 @@ use std::f64::consts::{FRAC_PI_4, TAU};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use sixfold_augment::{Backgrounds, Coverage, Patch, stream, uniform};
+use sixfold_augment::{Backgrounds, Coverage, Patch};
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;

@@ -1,9 +1,9 @@
-//! Random numbers: one ChaCha stream per sample.
+//! Random numbers: one ChaCha stream per sample, so that a sample is a function of seed and number alone.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The generator of this crate.
+/// The generator of the whole house.
 pub type Random = ChaCha8Rng;
 
 /// The generator of sample `number` under `seed`: the same numbers on any thread and machine.
