@@ -5,7 +5,7 @@ use numpy::PyArray2;
 use pyo3::prelude::*;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sixfold_shapes::{Family, member, toy};
+use sixfold_synth::shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PileOptions};
 
 use crate::arrays::{self, about, bad};

@@ -2,9 +2,9 @@
 
 use crate::loss::{distance, middle};
 use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
-use sixfold_augment::{AffineMap, Patch};
 use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
+use sixfold_synth::augment::{AffineMap, Patch};
 
 /// Which detections are given.
 #[derive(Debug, Clone, Copy, PartialEq)]

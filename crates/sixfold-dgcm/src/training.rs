@@ -18,7 +18,7 @@ use sixfold_nn::training_log::TrainingRecord;
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
 use crate::networks::Network;
 use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
-use sixfold_shapes::Family;
+use sixfold_synth::shapes::Family;
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -18,7 +18,7 @@ use sixfold_grasp::{
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
-use sixfold_shapes::{Family, Member, member};
+use sixfold_synth::shapes::{Family, Member, member};
 
 /// A made-up mug on a table, 0.7 m from a camera that looks down by 40 degrees.
 struct Seen {

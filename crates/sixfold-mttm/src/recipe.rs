@@ -17,8 +17,8 @@ use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PileOptions, SimulationError, drop_objects};
+use sixfold_synth::shapes::{Family, member, toy};
 use thiserror::Error;
 
 use crate::model::{ModelError, MttmModel};

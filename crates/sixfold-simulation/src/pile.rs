@@ -216,9 +216,9 @@ fn any_turn(random: &mut impl Rng) -> UnitQuaternion<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shapes;
     use crate::world::to_engine;
     use rapier3d::parry::query::contact;
+    use sixfold_synth::primitives as shapes;
 
     fn objects() -> Vec<ConvexParts> {
         let mut list = vec![];

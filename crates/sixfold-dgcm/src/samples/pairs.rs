@@ -11,7 +11,7 @@ use sixfold_nn::layers::normal;
 
 use super::pool::{Pool, View};
 use sixfold_geometry::random::stream;
-use sixfold_shapes::Family;
+use sixfold_synth::shapes::Family;
 
 /// How pairs are drawn and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

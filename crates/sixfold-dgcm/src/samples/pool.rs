@@ -14,7 +14,7 @@ use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_de
 
 use crate::crop::{Crop, CropOptions};
 use crate::vd_noc::Extent;
-use sixfold_shapes::{Family, Rest, member};
+use sixfold_synth::shapes::{Family, Rest, member};
 
 /// How views are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

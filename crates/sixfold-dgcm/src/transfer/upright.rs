@@ -197,7 +197,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::{Camera, Mask, Mat3, Plane};
     use sixfold_render::{Frame, RenderOptions, SceneObject};
-    use sixfold_shapes::{Family, Member, member};
+    use sixfold_synth::shapes::{Family, Member, member};
 
     use super::*;
     use crate::crop::{Crop, CropOptions};

@@ -1,10 +1,10 @@
 //! From an object's picture to an input image: background, clutter behind, occluders in front.
 
 use rand::RngExt;
-use sixfold_augment::{
+use sixfold_geometry::random::{Random, uniform};
+use sixfold_synth::augment::{
     Backgrounds, Coverage, Cutout, Patch, Shape, occluder_of_fraction, procedural_texture,
 };
-use sixfold_geometry::random::{Random, uniform};
 
 use super::options::SampleOptions;
 

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use sixfold_augment::{AffineMap, Coverage, Cutout};
 use sixfold_bop::{BopDataset, MaskKind, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
+use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 
 use super::error::SampleError;
 

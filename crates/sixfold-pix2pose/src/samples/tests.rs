@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use sixfold_augment::{Backgrounds, ColorAugmentation};
 use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo};
 use sixfold_render::{BoundingBoxScale, Light, Material};
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
 
 use super::rendering::{colors, targets};
 use super::*;
@@ -369,7 +369,7 @@ fn a_freely_turning_object_has_one_target() {
         // The same photograph and mask, the pose turned about the axis.
         let crop = photograph(7, poses()[0]);
         let silhouette =
-            crop.visible(&sixfold_augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
+            crop.visible(&sixfold_synth::augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
         let mask = Mask::from_fn(320, 240, |x, y| silhouette.data[y * 320 + x] > 0.5);
         let crop = RealCrop::new(7, crop.image().clone(), camera(), pose, &mask).unwrap();
         SampleSource::new(vec![turning.clone()], vec![crop], grey_background(), options.clone()).unwrap()

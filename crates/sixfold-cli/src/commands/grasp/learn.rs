@@ -18,11 +18,11 @@ use sixfold_grasp::{
     middle_between_pads,
 };
 use sixfold_mesh::Mesh;
-use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
     AttemptOptions, ConvexParts, Ending, PartsOptions, Scene, SimulatedView, scene, try_grasp,
     wilson_interval,
 };
+use sixfold_synth::shapes::{Family, Member, Rest, member};
 
 use super::arguments::PhysicsArguments;
 use super::compare::{Hardness, hardness};

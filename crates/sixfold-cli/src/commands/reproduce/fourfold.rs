@@ -5,7 +5,6 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use rand::RngExt;
-use sixfold_augment::Backgrounds;
 use sixfold_bop::{
     GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility,
     write_targets,
@@ -15,6 +14,7 @@ use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
 use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_synth::augment::Backgrounds;
 
 use crate::progress::{Progress, check_interrupt};
 

@@ -8,8 +8,8 @@ use serde_json::{Value, json};
 use sixfold_geometry::Camera;
 use sixfold_io::CameraFile;
 use sixfold_mesh::Unit;
-use sixfold_shapes::Family;
 use sixfold_simulation::PileOptions;
+use sixfold_synth::shapes::Family;
 
 use crate::arguments::{JsonArguments, Sensor};
 

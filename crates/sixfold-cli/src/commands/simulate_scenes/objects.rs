@@ -10,8 +10,8 @@ use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, read_mesh, write_ply};
-use sixfold_shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PartsOptions};
+use sixfold_synth::shapes::{Family, member, toy};
 
 use super::arguments::SimulateScenesArguments;
 use crate::objects::find;

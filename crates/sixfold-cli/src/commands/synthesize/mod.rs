@@ -12,7 +12,6 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use serde_json::{Value, json};
-use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::write_camera;
 use sixfold_geometry::Camera;
 use sixfold_geometry::stats::upper_median;
@@ -22,6 +21,7 @@ use sixfold_nol::model::NolModel;
 use sixfold_nol::select::{choose_by_surface, shown_points};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_nol::{NolError, SourceView};
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use self::arguments::{SynthesizeArguments, WeightingKind};
 use self::input::{Input, Subject};

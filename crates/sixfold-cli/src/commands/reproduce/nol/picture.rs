@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
-use sixfold_augment::Patch;
 use sixfold_geometry::RgbImage;
 use sixfold_io::{read_rgb, write_rgb};
 use sixfold_plot::Canvas;
+use sixfold_synth::augment::Patch;
 
 use super::views::ViewRow;
 

@@ -1,6 +1,6 @@
 //! One channel over a patch: how much of each pixel something covers, in 0..1.
 
-use crate::blur::gaussian;
+use super::blur::gaussian;
 use rand::RngExt;
 use sixfold_geometry::random::Random;
 
@@ -80,7 +80,7 @@ impl Coverage {
         let mut soft = self.clone();
         soft.blur(reach.min(8.0));
         let field =
-            crate::texture::value_noise(self.width, self.height, 6 + random.random_range(0..10), random);
+            super::noise::value_noise(self.width, self.height, 6 + random.random_range(0..10), random);
         let slope = 1.0 / (2.5 * reach.min(8.0));
         for (v, n) in soft.data.iter_mut().zip(&field) {
             let moved = *v + (grow + wobble * (2.0 * n - 1.0)) * slope;

@@ -3,8 +3,8 @@
 use rand::RngExt;
 use rand::seq::SliceRandom;
 
-use crate::error::AugmentError;
-use crate::patch::Patch;
+use super::error::AugmentError;
+use super::patch::Patch;
 use sixfold_geometry::random::{Random, uniform};
 
 /// Ranges and chances of each change. Values are those of images in 0..1; a range of two equal neutral numbers turns

@@ -2,7 +2,7 @@
 
 use sixfold_geometry::{Camera, Vec2};
 
-use crate::patch::AffineMap;
+use super::patch::AffineMap;
 
 /// A square part of the image plane, pixels; pixel centres at whole numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]

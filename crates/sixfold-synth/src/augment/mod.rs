@@ -1,7 +1,8 @@
 //! Image augmentation, occluders, procedural backgrounds and textures for training networks on few images.
 //!
 //! Works on small patches of colour ([`Patch`], planar `f32` in 0..1) and of one channel ([`Coverage`]): a network's
-//! input, not a photograph. Everything random takes the caller's generator ([`sixfold_geometry::random::stream`] makes one per sample), so that a
+//! input, not a photograph. Everything random takes the caller's generator
+//! ([`stream`](sixfold_geometry::random::stream) makes one per sample), so that a
 //! sample is a function of seed and number alone, whatever thread draws it.
 //!
 //! Colour augmentation after K. Park, dissertation, table 3.2; occluders after table 3.3.
@@ -12,6 +13,7 @@ mod color;
 mod coverage;
 mod cutout;
 mod error;
+mod noise;
 mod patch;
 mod shapes;
 mod texture;

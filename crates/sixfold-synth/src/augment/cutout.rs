@@ -3,8 +3,8 @@
 use rand::RngExt;
 use sixfold_geometry::{Mask, RgbImage};
 
-use crate::coverage::Coverage;
-use crate::patch::Patch;
+use super::coverage::Coverage;
+use super::patch::Patch;
 use sixfold_geometry::random::{Random, uniform};
 
 /// A small picture with coverage, 8 bits each.

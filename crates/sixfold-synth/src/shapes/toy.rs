@@ -11,8 +11,8 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 
-use crate::solids::Builder;
-use crate::sweep::Sweep;
+use super::solids::Builder;
+use super::sweep::Sweep;
 
 /// Range of a toy's diameter, metres.
 pub const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);

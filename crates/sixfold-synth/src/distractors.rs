@@ -6,11 +6,12 @@
 use std::f64::consts::{PI, TAU};
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, procedural_texture};
 use sixfold_geometry::random::Random;
 use sixfold_geometry::{Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_pix2pose::samples::randomly_colored;
+
+use crate::augment::{Backgrounds, procedural_texture};
+use crate::{profiles, randomly_colored};
 
 /// Corners around a turned solid.
 const AROUND: u32 = 24;
@@ -19,7 +20,7 @@ const TEXTURE: usize = 96;
 
 /// A random solid about the origin with a bounding box whose longest side is 1. Half of the plain ones have a colour out of
 /// `palette`, where the objects' own belong: colour alone must not tell an object.
-pub(crate) fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Random) -> Mesh {
+pub fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Random) -> Mesh {
     let parts = if random.random::<f32>() < 0.25 { random.random_range(2..=3u32) } else { 1 };
     let parts: Vec<Mesh> = (0..parts)
         .map(|number| {
@@ -40,7 +41,7 @@ pub(crate) fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: 
 }
 
 /// A rotation, each as likely as any other (Shoemake 1992).
-pub(crate) fn random_turn(random: &mut Random) -> Pose {
+pub fn random_turn(random: &mut Random) -> Pose {
     let [u, v, w] = [0; 3].map(|_| between(random, 0.0, 1.0));
     let about = |angle: f64, axis: Vec3| {
         Pose::exp(&[0.0, 0.0, 0.0, angle * axis.x, angle * axis.y, angle * axis.z].into())
@@ -139,17 +140,10 @@ fn household(random: &mut Random) -> Mesh {
     let radius = between(random, 0.2, 0.55);
     let wall = 0.04;
     match random.random_range(0..5u32) {
-        0 => turned(&[[0.0, 0.0], [radius, 0.0], [radius, 1.0], [0.0, 1.0]]),
+        0 => turned(&profiles::cylinder(radius, 1.0)),
         1 => {
             let foot = radius * between(random, 0.6, 1.0);
-            let cup = turned(&[
-                [0.0, 0.0],
-                [foot, 0.0],
-                [radius, 1.0],
-                [radius - wall, 1.0],
-                [foot - wall, wall],
-                [0.0, wall],
-            ]);
+            let cup = turned(&profiles::cup(foot, radius, 1.0, wall, wall));
             if random.random::<bool>() { merged(&[cup, handle(0.5 * (foot + radius), random)]) } else { cup }
         }
         2 => {
@@ -157,10 +151,10 @@ fn household(random: &mut Random) -> Mesh {
             let curve = |shrink: f64| {
                 (0..=6).map(move |i| {
                     let angle = 0.5 * PI * f64::from(i) / 6.0;
-                    [(radius - shrink) * angle.sin(), shrink + (height - shrink) * (1.0 - angle.cos())]
+                    ((radius - shrink) * angle.sin(), shrink + (height - shrink) * (1.0 - angle.cos()))
                 })
             };
-            let mut profile: Vec<[f64; 2]> = curve(0.0).collect();
+            let mut profile: Vec<(f64, f64)> = curve(0.0).collect();
             profile.extend(curve(wall).collect::<Vec<_>>().into_iter().rev());
             turned(&profile)
         }
@@ -168,22 +162,22 @@ fn household(random: &mut Random) -> Mesh {
             let (shoulder, neck) = (between(random, 0.45, 0.75), radius * between(random, 0.25, 0.6));
             let throat = shoulder + between(random, 0.05, 0.2);
             turned(&[
-                [0.0, 0.0],
-                [radius * 0.95, 0.0],
-                [radius, 0.03],
-                [radius, shoulder],
-                [neck, throat],
-                [neck, 0.97],
-                [0.0, 1.0],
+                (0.0, 0.0),
+                (radius * 0.95, 0.0),
+                (radius, 0.03),
+                (radius, shoulder),
+                (neck, throat),
+                (neck, 0.97),
+                (0.0, 1.0),
             ])
         }
         _ => {
             let bumps = [0; 3].map(|_| between(random, -0.25, 0.25));
-            let profile: Vec<[f64; 2]> = (0..=12)
+            let profile: Vec<(f64, f64)> = (0..=12)
                 .map(|i| {
                     let angle = PI * f64::from(i) / 12.0;
                     let bump: f64 = (2..).zip(bumps).map(|(k, b)| b * (f64::from(k) * angle).cos()).sum();
-                    [radius * angle.sin() * (1.0 + bump), 0.5 - 0.5 * angle.cos()]
+                    (radius * angle.sin() * (1.0 + bump), 0.5 - 0.5 * angle.cos())
                 })
                 .collect();
             turned(&profile)
@@ -193,15 +187,14 @@ fn household(random: &mut Random) -> Mesh {
 
 /// A profile of (radius, height) from the axis back to the axis, turned about z. Each band has normals of its own: edges of
 /// cans are sharp.
-fn turned(profile: &[[f64; 2]]) -> Mesh {
+fn turned(profile: &[(f64, f64)]) -> Mesh {
     let (mut vertices, mut normals, mut texcoords, mut faces) = (vec![], vec![], vec![], vec![]);
-    let lengths: Vec<f64> =
-        profile.windows(2).map(|w| (w[1][0] - w[0][0]).hypot(w[1][1] - w[0][1])).collect();
+    let lengths: Vec<f64> = profile.windows(2).map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1)).collect();
     let whole = lengths.iter().sum::<f64>().max(1e-9);
     let mut done = 0.0;
     for (band, length) in profile.windows(2).zip(lengths) {
         let first = vertices.len() as u32;
-        let [along, up] = [band[1][0] - band[0][0], band[1][1] - band[0][1]];
+        let (along, up) = (band[1].0 - band[0].0, band[1].1 - band[0].1);
         let ends = [done / whole, (done + length) / whole];
         done += length;
         for step in 0..=AROUND {
@@ -209,7 +202,7 @@ fn turned(profile: &[[f64; 2]]) -> Mesh {
             let (s, c) = (TAU * share).sin_cos();
             let normal = Vec3::new(up * c, up * s, -along);
             let normal = normal.try_normalize(1e-12).unwrap_or_else(Vec3::zeros);
-            for (end, [r, z]) in ends.iter().zip(band) {
+            for (end, (r, z)) in ends.iter().zip(band) {
                 vertices.push(Vec3::new(r * c, r * s, *z));
                 normals.push(normal);
                 texcoords.push([share as f32, *end as f32]);

@@ -1,10 +1,11 @@
 //! Simple closed shapes with known sizes, for tests and for trying out a gripper: boxes and turned (lathe) shapes.
 //! All stand on `z = 0` except the cuboid, which is centred.
 
-use std::f64::consts::TAU;
-
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, MeshError};
+
+use crate::profiles;
+use crate::shapes::solids::{band, rings};
 
 /// Sides of a turned shape.
 const SIDES: usize = 48;
@@ -30,29 +31,19 @@ pub fn cuboid(size: Vec3) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`] for numbers that are not finite or a profile without points.
 pub fn turned(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
-    let mut vertices = vec![];
-    for &(radius, height) in profile {
-        for k in 0..SIDES {
-            let angle = TAU * k as f64 / SIDES as f64;
-            vertices.push(Vec3::new(radius * angle.cos(), radius * angle.sin(), height));
-        }
-    }
     let mut faces = vec![];
-    for row in 0..profile.len().saturating_sub(1) {
-        for k in 0..SIDES {
-            let next = (k + 1) % SIDES;
-            let at = |r: usize, k: usize| (r * SIDES + k) as u32;
-            let (a, b, c, d) = (at(row, k), at(row, next), at(row + 1, next), at(row + 1, k));
+    for (row, pair) in profile.windows(2).enumerate() {
+        for [lower, upper] in band(row * SIDES, (row + 1) * SIDES, SIDES) {
             // Points on the axis coincide: the triangle there has no area.
-            if profile[row].0 > 0.0 {
-                faces.push([a, b, c]);
+            if pair[0].0 > 0.0 {
+                faces.push(lower);
             }
-            if profile[row + 1].0 > 0.0 {
-                faces.push([a, c, d]);
+            if pair[1].0 > 0.0 {
+                faces.push(upper);
             }
         }
     }
-    Mesh::new(vertices, faces)
+    Mesh::new(rings(profile, SIDES).collect(), faces)
 }
 
 /// A solid cylinder.
@@ -60,7 +51,7 @@ pub fn turned(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`].
 pub fn cylinder(radius: f64, height: f64) -> Result<Mesh, MeshError> {
-    turned(&[(0.0, 0.0), (radius, 0.0), (radius, height), (0.0, height)])
+    turned(&profiles::cylinder(radius, height))
 }
 
 /// A cup without a handle: a cylinder with a wall and a floor of thickness `wall`.
@@ -68,14 +59,7 @@ pub fn cylinder(radius: f64, height: f64) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`].
 pub fn cup(radius: f64, height: f64, wall: f64) -> Result<Mesh, MeshError> {
-    turned(&[
-        (0.0, 0.0),
-        (radius, 0.0),
-        (radius, height),
-        (radius - wall, height),
-        (radius - wall, wall),
-        (0.0, wall),
-    ])
+    turned(&profiles::cup(radius, radius, height, wall, wall))
 }
 
 /// A bowl whose wall rises as a quarter of an ellipse, with a flat foot of a third of its radius.

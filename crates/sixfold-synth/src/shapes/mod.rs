@@ -5,7 +5,7 @@
 //! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
 //! another (`solids.rs`). Real objects are thereby all held out. [`toy`] draws what belongs to no family.
 
-mod solids;
+pub(crate) mod solids;
 mod sweep;
 mod toy;
 
@@ -17,6 +17,7 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 
+use crate::profiles;
 use solids::Builder;
 
 pub use toy::{TOY_DIAMETER, TOY_LEAST_SIDE, toy};
@@ -293,11 +294,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
 /// A cup: foot narrower than the rim by `taper`.
 fn vessel(b: &mut Builder, r: f64, h: f64, taper: f64, wall: f64) {
     let floor = 1.5 * wall;
-    b.turned(
-        &[(0.0, 0.0), (taper * r, 0.0), (r, h), (r - wall, h), (taper * r - wall, floor), (0.0, floor)],
-        SIDES,
-        6,
-    );
+    b.turned(&profiles::cup(taper * r, r, h, wall, floor), SIDES, 6);
 }
 
 #[cfg(test)]

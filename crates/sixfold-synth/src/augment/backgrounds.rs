@@ -7,9 +7,9 @@ use image::imageops::FilterType;
 use rand::RngExt;
 use sixfold_geometry::{Image, Rect, RgbImage};
 
-use crate::error::AugmentError;
-use crate::patch::{AffineMap, Patch};
-use crate::texture::procedural_texture;
+use super::error::AugmentError;
+use super::patch::{AffineMap, Patch};
+use super::texture::procedural_texture;
 use sixfold_geometry::random::{Random, uniform};
 
 /// How a folder of photographs is read.

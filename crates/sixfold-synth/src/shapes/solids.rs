@@ -7,6 +7,26 @@ use std::f64::consts::TAU;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 
+/// A ring of `sides` vertices about z for each (radius, height) of a profile.
+pub(crate) fn rings(profile: &[(f64, f64)], sides: usize) -> impl Iterator<Item = Vec3> {
+    profile.iter().flat_map(move |&(radius, height)| {
+        (0..sides).map(move |k| {
+            let angle = TAU * k as f64 / sides as f64;
+            Vec3::new(radius * angle.cos(), radius * angle.sin(), height)
+        })
+    })
+}
+
+/// Faces between two rings of vertices, given by their first ones, that run to the right when seen from outside with the
+/// first ring below: of each side the face with an edge on the lower ring, then the one with an edge on the upper.
+pub(crate) fn band(below: usize, above: usize, sides: usize) -> impl Iterator<Item = [[u32; 3]; 2]> {
+    (0..sides).map(move |k| {
+        let next = (k + 1) % sides;
+        let [a, b, c, d] = [below + k, below + next, above + next, above + k].map(|i| i as u32);
+        [[a, b, c], [a, c, d]]
+    })
+}
+
 /// Vertices and faces in the making.
 #[derive(Debug, Default)]
 pub(super) struct Builder {
@@ -37,25 +57,16 @@ impl Builder {
         }
         fine.extend(profile.last());
         let first = self.vertices.len();
-        for &(radius, height) in &fine {
-            for k in 0..sides {
-                let angle = TAU * k as f64 / sides as f64;
-                self.vertices.push(Vec3::new(radius * angle.cos(), radius * angle.sin(), height));
-            }
-        }
+        self.vertices.extend(rings(&fine, sides));
         for row in 0..fine.len().saturating_sub(1) {
             self.band(first + row * sides, first + (row + 1) * sides, sides);
         }
     }
 
-    /// Faces between two rings of vertices that run to the right when seen from outside with the first one below.
+    /// [`band`], added to the faces.
     fn band(&mut self, below: usize, above: usize, sides: usize) {
-        for k in 0..sides {
-            let next = (k + 1) % sides;
-            let [a, b, c, d] = [below + k, below + next, above + next, above + k].map(|i| i as u32);
-            // Faces on an axis have no area, but they keep the count.
-            self.faces.extend([[a, b, c], [a, c, d]]);
-        }
+        // Faces on an axis have no area, but they keep the count.
+        self.faces.extend(band(below, above, sides).flatten());
     }
 
     /// A box with these side lengths, its middle at `pose`, every side cut into `cells` times `cells`.

@@ -7,7 +7,7 @@
 
 use rand::RngExt;
 
-use crate::coverage::Coverage;
+use super::coverage::Coverage;
 use sixfold_geometry::random::{Random, uniform};
 
 /// A shape about a centre, without its size.
