@@ -7,11 +7,10 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::store::{
-    Description, Experience, ExperienceStore as _, Match, SqliteStore, StoreError, Summary,
-};
 use sixfold_dgcm::transfer::Memory;
+use sixfold_experience::{
+    Description, Experience, ExperienceStore as _, FEATURE, Match, SqliteStore, StoreError, Summary,
+};
 use sixfold_grasp::{AntipodalQuality, Grasp};
 
 use crate::arrays::{self, about, bad, whole};

@@ -3,11 +3,12 @@
 
 use std::path::Path;
 
+use sixfold_io::fnv1a;
+
 use crate::error::StoreError;
 use crate::model::Descriptor;
 use crate::network::DESCRIPTOR;
 use crate::store::write_bytes;
-use sixfold_io::fnv1a;
 
 const MAGIC: &[u8; 8] = b"SIXFDSC\0";
 const VERSION: u32 = 1;

@@ -11,7 +11,6 @@ use sixfold_simulation::{
     AttemptOptions, ConvexParts, PartsOptions, SimulatedView, ViewPoint, attempt, simulate_view,
 };
 use sixfold_synth::primitives as shapes;
-use sixfold_synth::primitives as shapes;
 
 fn hand() -> Gripper {
     Gripper::built_in("jaws-140").unwrap()

@@ -7,11 +7,11 @@
 use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_geometry::random::stream;
 use sixfold_nn::layers::normal;
+use sixfold_synth::shapes::Family;
 
 use super::pool::{Pool, View};
-use sixfold_geometry::random::stream;
-use sixfold_synth::shapes::Family;
 
 /// How pairs are drawn and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

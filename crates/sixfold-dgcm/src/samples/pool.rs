@@ -12,8 +12,7 @@ use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
-use crate::crop::{Crop, CropOptions};
-use crate::vd_noc::Extent;
+use sixfold_experience::{Crop, CropOptions, Extent};
 use sixfold_synth::shapes::{Family, Rest, member};
 
 /// How views are made.

@@ -200,7 +200,7 @@ mod tests {
     use sixfold_synth::shapes::{Family, Member, member};
 
     use super::*;
-    use crate::crop::{Crop, CropOptions};
+    use sixfold_experience::{Crop, CropOptions};
 
     /// A made-up object on a table, 0.7 m from a camera that looks down by 40 degrees.
     struct Seen {

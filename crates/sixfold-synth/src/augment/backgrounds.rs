@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use image::imageops::FilterType;
 use rand::RngExt;
+use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Image, Rect, RgbImage};
 
 use super::error::AugmentError;
 use super::patch::{AffineMap, Patch};
 use super::texture::procedural_texture;
-use sixfold_geometry::random::{Random, uniform};
 
 /// How a folder of photographs is read.
 #[derive(Debug, Clone, Copy, PartialEq)]

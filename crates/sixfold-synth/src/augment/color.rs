@@ -2,10 +2,10 @@
 
 use rand::RngExt;
 use rand::seq::SliceRandom;
+use sixfold_geometry::random::{Random, uniform};
 
 use super::error::AugmentError;
 use super::patch::Patch;
-use sixfold_geometry::random::{Random, uniform};
 
 /// Ranges and chances of each change. Values are those of images in 0..1; a range of two equal neutral numbers turns
 /// its change off.

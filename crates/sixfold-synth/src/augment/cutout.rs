@@ -1,11 +1,11 @@
 //! Cut-out pictures of objects: pasted behind an object as clutter, or in front of it to hide a part.
 
 use rand::RngExt;
+use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Mask, RgbImage};
 
 use super::coverage::Coverage;
 use super::patch::Patch;
-use sixfold_geometry::random::{Random, uniform};
 
 /// A small picture with coverage, 8 bits each.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,9 +6,9 @@
 //! and no search is needed.
 
 use rand::RngExt;
+use sixfold_geometry::random::{Random, uniform};
 
 use super::coverage::Coverage;
-use sixfold_geometry::random::{Random, uniform};
 
 /// A shape about a centre, without its size.
 #[derive(Debug, Clone, PartialEq)]

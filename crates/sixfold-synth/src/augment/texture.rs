@@ -2,12 +2,12 @@
 //! shapes, coloured at random.
 
 use rand::RngExt;
+use sixfold_geometry::random::{Random, uniform};
 
 use super::coverage::Coverage;
 use super::noise::{add_noise, value_noise};
 use super::patch::Patch;
 use super::shapes::Shape;
-use sixfold_geometry::random::{Random, uniform};
 
 /// Noise in octaves, about 0..1, with a random slope of its spectrum.
 fn fractal(width: usize, height: usize, random: &mut Random) -> Vec<f32> {

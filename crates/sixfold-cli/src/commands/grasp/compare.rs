@@ -10,10 +10,10 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::{
     Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
 };
+use sixfold_experience::StorePlace;
 use sixfold_geometry::Pose;
 use sixfold_geometry::random::stream;
 use sixfold_grasp::{

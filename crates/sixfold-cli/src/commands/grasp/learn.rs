@@ -6,11 +6,9 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::outcome::Attempt;
-use sixfold_dgcm::store::{Experience, StorePlace};
 use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
+use sixfold_experience::{Attempt, Crop, Experience, StorePlace};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
-use sixfold_dgcm::store::StorePlace;
+use sixfold_experience::StorePlace;
 use sixfold_io::write_rgb;
 
 use self::handles::Handles;

@@ -13,10 +13,9 @@ use anyhow::{Context, Result, bail};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::{Experience, SqliteStore};
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_experience::{Crop, Experience, SqliteStore};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{

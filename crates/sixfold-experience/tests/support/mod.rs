@@ -8,11 +8,9 @@ use std::sync::OnceLock;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::crop::{Crop, CropOptions};
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::outcome::Attempt;
-use sixfold_dgcm::store::{
-    COPIES, Copy, Experience, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError,
+use sixfold_experience::{
+    Attempt, COPIES, Copy, Crop, CropOptions, Experience, ExperienceStore, FEATURE, FeatureIndex, Position,
+    SqliteStore, StoreError,
 };
 use sixfold_geometry::{Camera, Image, Mask, Plane, Pose, Vec3};
 use sixfold_grasp::{AntipodalQuality, GraspDescription, Gripper};

@@ -16,9 +16,8 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::store::{
-    COPIES, Copy, Experience, ExperienceStore, FeatureIndex, OutboxOptions, OutboxStore, Position,
+use sixfold_experience::{
+    COPIES, Copy, Experience, ExperienceStore, FEATURE, FeatureIndex, OutboxOptions, OutboxStore, Position,
     PostgresStore, StoreError, StorePlace,
 };
 use support::server::Server;

@@ -6,7 +6,7 @@ use sixfold_grasp::{Gripper, parse_gripper};
 use super::StoreError;
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience};
-use crate::vd_noc::Extent;
+use crate::Extent;
 
 /// Tests an experience that is to be stored; its images, and the key that is the same for the same experience.
 ///

@@ -6,11 +6,22 @@ use sixfold_geometry::Pose;
 use sixfold_grasp::{Grasp, Gripper};
 
 use super::StoreError;
-use crate::crop::Crop;
-use crate::model::DgcmModel;
+use crate::{Crop, CropOptions};
 
 /// Turns of the in-plane copies, radians: -90 to 90 degrees in steps of 45 (dissertation, section 6.3.1).
 pub const COPIES: [f64; 5] = [0.0, -2.0 * FRAC_PI_4, -FRAC_PI_4, FRAC_PI_4, 2.0 * FRAC_PI_4];
+
+/// What turns a crop into a feature: all that a store has to know of a network.
+pub trait FeatureExtractor {
+    /// A name that tells its features from those of another.
+    fn fingerprint(&self) -> String;
+
+    /// How objects are cut out for it.
+    fn crop_options(&self) -> &CropOptions;
+
+    /// [`crate::FEATURE`] numbers for a crop of its size.
+    fn feature(&self, crop: &Crop) -> Vec<f32>;
+}
 
 /// An in-plane copy: everything but its feature follows from the experience.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,7 +74,7 @@ impl Experience {
     /// An experience of a grasp that worked: region and features are computed.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
-        model: &DgcmModel,
+        model: &dyn FeatureExtractor,
         crop: Crop,
         grasp: &Grasp,
         gripper: &Gripper,
@@ -93,7 +104,7 @@ impl Experience {
     ///
     /// # Errors
     /// [`StoreError::Field`] for a crop of another size than the network's.
-    pub fn encoded(&self, model: &DgcmModel) -> Result<Experience, StoreError> {
+    pub fn encoded(&self, model: &dyn FeatureExtractor) -> Result<Experience, StoreError> {
         if self.crop.side != model.crop_options().side {
             return Err(StoreError::Field {
                 id: 0,
@@ -133,16 +144,13 @@ impl Experience {
 }
 
 /// The features of a crop and of its in-plane copies.
-fn copies(model: &DgcmModel, crop: &Crop) -> Vec<Copy> {
+fn copies(model: &dyn FeatureExtractor, crop: &Crop) -> Vec<Copy> {
     let trim = model.crop_options().trim;
     COPIES
         .iter()
         .map(|&angle| {
-            let feature = if angle == 0.0 {
-                model.encode(crop).feature
-            } else {
-                model.encode(&crop.turned(angle, trim)).feature
-            };
+            let feature =
+                if angle == 0.0 { model.feature(crop) } else { model.feature(&crop.turned(angle, trim)) };
             Copy { angle, feature }
         })
         .collect()

@@ -15,10 +15,9 @@ use std::time::Duration;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::outcome::Attempt;
-use sixfold_dgcm::store::{
-    Changes, Experience, ExperienceStore, FeatureIndex, Notice, OutboxOptions, OutboxStore, Position,
-    SqliteStore, StoreError, StorePlace, Stored, Summary,
+use sixfold_experience::{
+    Attempt, Changes, Experience, ExperienceStore, FeatureIndex, Notice, OutboxOptions, OutboxStore,
+    Position, SqliteStore, StoreError, StorePlace, Stored, Summary,
 };
 use support::{attempt, contract, experience, feature, heard, kills, named, objects, said};
 

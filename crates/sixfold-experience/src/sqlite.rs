@@ -13,7 +13,7 @@ use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
 use super::row::{self, Raw};
 use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
-use crate::outcome::Attempt;
+use crate::Attempt;
 
 /// Says that a SQLite file is one of ours: "6fEx".
 const APPLICATION: i64 = 0x3666_4578;
@@ -383,7 +383,7 @@ impl ExperienceStore for SqliteStore {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::outcome::Attempt;
+    use crate::Attempt;
     use sixfold_grasp::{AntipodalQuality, GraspDescription};
 
     #[test]

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::store::{COPIES, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError};
+use sixfold_experience::{COPIES, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError};
 use support::{experience, feature, kills, said};
 
 /// This test binary again, as a process of its own that does one thing.

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use rusqlite::{OptionalExtension, params};
 
-use crate::outcome::Attempt;
+use crate::Attempt;
 
 use super::{Changes, Experience, ExperienceStore, Position, SqliteStore, StoreError, Stored, Summary};
 

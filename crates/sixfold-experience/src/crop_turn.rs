@@ -4,7 +4,7 @@
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
-use crate::crop::Crop;
+use crate::Crop;
 
 /// The camera's turn: takes points of the old camera's frame to the turned one's.
 pub fn turn(angle: f64) -> Pose {
@@ -13,7 +13,7 @@ pub fn turn(angle: f64) -> Pose {
 
 impl Crop {
     /// The crop turned about its middle by `angle` radians (positive: from x to y), with points, normals and VD-NOC of the
-    /// turned camera. `trim` as in [`crate::crop::CropOptions`].
+    /// turned camera. `trim` as in [`crate::CropOptions`].
     pub fn turned(&self, angle: f64, trim: f64) -> Crop {
         let pose = turn(angle);
         let middle = 0.5 * (self.side as f64 - 1.0);
@@ -65,7 +65,7 @@ impl Crop {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::crop::CropOptions;
+    use crate::CropOptions;
     use sixfold_geometry::{Image, Mask};
 
     #[test]

@@ -9,7 +9,7 @@ use sixfold_geometry::{
 use sixfold_grasp::GraspView;
 use thiserror::Error;
 
-use crate::vd_noc::Extent;
+use crate::Extent;
 
 /// Why an object cannot be cut out of a depth image.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -216,7 +216,7 @@ impl Crop {
 }
 
 /// Pixel by pixel to plane by plane.
-pub(crate) fn planes(pixels: &[[f32; 3]]) -> Vec<f32> {
+fn planes(pixels: &[[f32; 3]]) -> Vec<f32> {
     (0..3).flat_map(|k| pixels.iter().map(move |p| p[k])).collect()
 }
 

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::{ExperienceStore, Position, StoreError};
-use crate::networks::FEATURE;
+use crate::FEATURE;
 
 /// Steps of the whole numbers from 0 to 1. 256 squared differences of twice this fit into 32 bits.
 const STEPS: f32 = 1024.0;
@@ -41,7 +41,7 @@ pub struct FeatureIndex {
 }
 
 impl FeatureIndex {
-    /// An empty index for the features of one network ([`crate::model::DgcmModel::fingerprint`]).
+    /// An empty index for the features of one network ([`crate::FeatureExtractor::fingerprint`]).
     pub fn new(network: &str) -> FeatureIndex {
         FeatureIndex {
             network: network.to_owned(),

@@ -22,8 +22,8 @@ use super::index::{Match, distance};
 use super::place::shown;
 use super::row::{self, Raw};
 use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
-use crate::networks::FEATURE;
-use crate::outcome::Attempt;
+use crate::Attempt;
+use crate::FEATURE;
 
 /// Says that a schema `sixfold` is ours.
 const APPLICATION: &str = "sixfold experiences";

@@ -1,12 +1,11 @@
-//! Milliseconds to find the ten nearest of many experiences: `cargo run --release -p sixfold-dgcm --example bench_retrieval
+//! Milliseconds to find the ten nearest of many experiences: `cargo run --release -p sixfold-experience --example bench_retrieval
 //! [COUNT]` (default 100000 features).
 
 use std::time::Instant;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::store::FeatureIndex;
+use sixfold_experience::{FEATURE, FeatureIndex};
 
 fn main() {
     let count: usize = std::env::args().nth(1).and_then(|n| n.parse().ok()).unwrap_or(100_000);

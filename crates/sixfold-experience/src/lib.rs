@@ -1,10 +1,19 @@
 //! The memory of what worked: every successful grasp with what the camera saw (dissertation, section 6.2.1).
 //!
+//! An experience holds what was seen ([`Crop`]), what the gripper did and a feature by which it is found again. Where features come
+//! from ([`FeatureExtractor`]) the store does not know.
+//!
 //! [`ExperienceStore`] is what a store can do. `SqliteStore` is one in a single file, `PostgresStore` (feature `postgres`) one on
 //! a server for several robots, `OutboxStore` a robot's own copy of that one, which goes on when the server is away.
 //! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
 //! memory, asks the store only for what has changed, and finds the nearest exactly.
 
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+mod attempt;
+mod crop;
+mod crop_turn;
 mod describe;
 #[cfg(any(feature = "sqlite", feature = "postgres"))]
 mod encode;
@@ -19,23 +28,29 @@ mod postgres;
 mod row;
 #[cfg(feature = "sqlite")]
 mod sqlite;
+mod vd_noc;
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::outcome::Attempt;
-
+#[cfg(feature = "postgres")]
+pub use self::postgres::PostgresStore;
+pub use attempt::Attempt;
+pub use crop::{Crop, CropError, CropOptions};
+pub use crop_turn::turn;
 pub use describe::Description;
-pub use experience::{COPIES, Copy, Experience, Stored, region};
+pub use experience::{COPIES, Copy, Experience, FeatureExtractor, Stored, region};
 pub use index::{FeatureIndex, Match};
 #[cfg(feature = "sqlite")]
 pub use outbox::{Listener, Notice, OutboxOptions, OutboxStore};
 pub use place::StorePlace;
-#[cfg(feature = "postgres")]
-pub use postgres::PostgresStore;
 #[cfg(feature = "sqlite")]
 pub use sqlite::SqliteStore;
+pub use vd_noc::Extent;
+
+/// Length of a feature.
+pub const FEATURE: usize = 256;
 
 /// Why a store cannot do what was asked.
 #[derive(Debug, Error)]

@@ -7,8 +7,8 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
 use super::StoreError;
-use crate::crop::Crop;
-use crate::outcome::Attempt;
+use crate::Attempt;
+use crate::Crop;
 
 /// Steps of the stored depth, metres: 6.5 m fit into 16 bits.
 const DEPTH_STEP: f64 = 1e-4;
@@ -56,7 +56,7 @@ fn png(image: DynamicImage) -> Option<Vec<u8>> {
 pub(super) fn crop(
     images: &Images,
     camera: &Camera,
-    extent: crate::vd_noc::Extent,
+    extent: crate::Extent,
     table: Option<Plane>,
 ) -> Result<Crop, (&'static str, String)> {
     let side = camera.width;
