@@ -13,7 +13,7 @@ use sixfold_geometry::Pose;
 
 use crate::arrays::{self, about, bad, id, positive, whole};
 use crate::camera::PyCamera;
-use crate::guard::{dataset_error, free, results_error};
+use crate::guard::{dataset_error, free, image_error, results_error};
 use crate::mesh::PyMesh;
 
 /// What serialises, as dicts, lists and numbers.
@@ -342,7 +342,7 @@ impl PyDataset {
 /// >>> rgb = read_rgb("data/demo/test/000002/rgb/000003.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> {
-    let image = free(py, || sixfold_bop::read_rgb(&path))?.map_err(dataset_error)?;
+    let image = free(py, || sixfold_io::read_rgb(&path))?.map_err(image_error)?;
     arrays::from_image_of(py, image)
 }
 
@@ -354,7 +354,7 @@ fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> 
 #[pyfunction]
 fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound<'_, PyArray2<f32>>> {
     let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
-    let image = free(py, || sixfold_bop::read_depth(&path, metres))?.map_err(dataset_error)?;
+    let image = free(py, || sixfold_io::read_depth(&path, metres))?.map_err(image_error)?;
     arrays::from_image(py, image)
 }
 
@@ -365,7 +365,7 @@ fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound
 /// >>> mask = read_mask("mask.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>>> {
-    let image = free(py, || sixfold_bop::read_mask(&path))?.map_err(dataset_error)?;
+    let image = free(py, || sixfold_io::read_mask(&path))?.map_err(image_error)?;
     arrays::from_image(py, image)
 }
 
@@ -377,7 +377,7 @@ fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>
 #[pyfunction]
 fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::rgb("rgb", rgb)?;
-    free(py, || sixfold_bop::write_rgb(&path, &image))?.map_err(dataset_error)
+    free(py, || sixfold_io::write_rgb(&path, &image))?.map_err(image_error)
 }
 
 /// Writes a depth image (H, W) in metres as 16 bit PNG in steps of mm_per_unit millimetres (BOP's depth_scale).
@@ -389,7 +389,7 @@ fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<
 fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_unit: f64) -> PyResult<()> {
     let image = arrays::depth("depth", depth)?;
     let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
-    free(py, || sixfold_bop::write_depth(&path, &image, metres))?.map_err(dataset_error)
+    free(py, || sixfold_io::write_depth(&path, &image, metres))?.map_err(image_error)
 }
 
 /// Writes a mask (H, W) bool as PNG.
@@ -400,7 +400,7 @@ fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_u
 #[pyfunction]
 fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::mask("mask", mask)?;
-    free(py, || sixfold_bop::write_mask(&path, &image))?.map_err(dataset_error)
+    free(py, || sixfold_io::write_mask(&path, &image))?.map_err(image_error)
 }
 
 /// Masks and visibility of posed objects, [(mesh, camera_from_object (4, 4)), ...], as BOP's ground-truth info: a list of

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::{PyTuple, PyType};
-use sixfold_bop::CameraFile;
 use sixfold_geometry::{BrownConrady, Camera, Vec2};
+use sixfold_io::CameraFile;
 
 use crate::arrays::{self, about, bad, whole};
 use crate::guard::{camera_file_error, free};

@@ -7,11 +7,10 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::networks::FEATURE;
-use sixfold_dgcm::store::{
-    Description, Experience, ExperienceStore as _, Match, SqliteStore, StoreError, Summary,
-};
 use sixfold_dgcm::transfer::Memory;
+use sixfold_experience::{
+    Description, Experience, ExperienceStore as _, FEATURE, Match, SqliteStore, StoreError, Summary,
+};
 use sixfold_grasp::{AntipodalQuality, Grasp};
 
 use crate::arrays::{self, about, bad, whole};
@@ -21,7 +20,7 @@ use crate::dgcm_net::{Look, network_of};
 use crate::experienced::PyExperience;
 use crate::grasp::PyGrasp;
 use crate::gripper::gripper_of;
-use crate::guard::{Stop, dataset_error, interruptible, os_error};
+use crate::guard::{Stop, image_error, interruptible, os_error};
 
 /// A store that cannot do what was asked.
 pub(crate) fn store_error(error: StoreError) -> PyErr {
@@ -273,7 +272,7 @@ impl ExperienceStore {
                 };
                 let picture = stored.experience.picture().map_err(about("folder"))?;
                 let file = folder.join(format!("{id:06}.png"));
-                sixfold_bop::write_rgb(&file, &picture).map_err(dataset_error)?;
+                sixfold_io::write_rgb(&file, &picture).map_err(image_error)?;
                 let file = file.with_extension("json");
                 let text = serde_json::to_string_pretty(&Description::new(&stored, true))
                     .map_err(about("folder"))?;

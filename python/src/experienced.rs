@@ -2,7 +2,7 @@
 
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
-use sixfold_dgcm::store::Stored;
+use sixfold_experience::Stored;
 use sixfold_geometry::Image;
 
 use crate::arrays::{self, about};

@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use sixfold_bop::{CameraFileError, DatasetError, EvalError, ResultsError};
+use sixfold_bop::{DatasetError, EvalError, ResultsError};
+use sixfold_io::{CameraFileError, ImageFileError};
 use sixfold_mesh::MeshFileError;
 
 /// How often Ctrl-C is looked for.
@@ -167,6 +168,16 @@ pub(crate) fn dataset_error(error: DatasetError) -> PyErr {
             Err(error) => PyValueError::new_err(error.to_string()),
         },
         other => PyValueError::new_err(other.to_string()),
+    }
+}
+
+/// An image file that cannot be read or written.
+pub(crate) fn image_error(error: ImageFileError) -> PyErr {
+    match &error {
+        ImageFileError::Read { source, .. } | ImageFileError::Write { source, .. } => {
+            os_error(source.kind(), error.to_string())
+        }
+        _ => PyValueError::new_err(error.to_string()),
     }
 }
 

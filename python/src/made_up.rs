@@ -5,8 +5,8 @@ use numpy::PyArray2;
 use pyo3::prelude::*;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sixfold_shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PileOptions};
+use sixfold_synth::shapes::{Family, member, toy};
 
 use crate::arrays::{self, about, bad};
 use crate::guard::{free, interruptible};

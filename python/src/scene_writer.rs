@@ -5,16 +5,15 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 
 use pyo3::prelude::*;
-use sixfold_bop::{GroundTruth, NewImage, SceneWriter, Target, TargetObject, ground_truth_visibility};
+use sixfold_bop::{
+    GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility,
+};
 use sixfold_mesh::{ModelsInfo, PlyFormat, Unit, write_ply};
 
 use crate::arrays::{self, bad, id, positive, whole};
 use crate::camera::PyCamera;
 use crate::guard::{dataset_error, free, mesh_file_error, os_error};
 use crate::mesh::PyMesh;
-
-/// Tolerance of the visibility test, metres: BOP's.
-const DELTA: f64 = 0.015;
 
 /// Writes a scene of a BOP dataset, `path/split/000001` and the like: images with add, the text files with finish, which the
 /// end of a with block calls. Folders are made as needed; text files of a scene that is there are replaced.
@@ -96,7 +95,7 @@ impl PySceneWriter {
                     .zip(&ground_truth)
                     .map(|(m, g)| (m.as_ref(), g.camera_from_object))
                     .collect();
-                for seen in ground_truth_visibility(&posed, &camera, depth.as_ref(), DELTA) {
+                for seen in ground_truth_visibility(&posed, &camera, depth.as_ref(), VISIBILITY_DELTA) {
                     info.push(seen.info);
                     masks.push(seen.mask);
                     masks_visible.push(seen.mask_visible);

@@ -8,9 +8,9 @@ use std::path::Path;
 
 use serde_json::{Map, Value, json};
 use sixfold_geometry::Rect;
+use sixfold_io::write_atomically;
 
 use crate::dataset_error::DatasetError;
-use crate::files::write_atomically;
 use crate::json::{At, describe, parse};
 use crate::rle::Rle;
 

@@ -6,14 +6,14 @@ use std::path::Path;
 
 use serde::Serialize;
 use serde_json::json;
+use sixfold_io::write_atomically;
 use sixfold_mesh::Mesh;
 
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
 use crate::dataset::{BopDataset, MaskKind, Models};
 use crate::dataset_error::DatasetError;
-use crate::files::write_atomically;
 use crate::rle::Rle;
-use crate::visibility::ground_truth_visibility;
+use crate::visibility::{VISIBILITY_DELTA, ground_truth_visibility};
 
 /// Objects less visible than this are marked as crowds: detections of them are neither right nor wrong. BOP leaves them
 /// out of its targets too.
@@ -64,7 +64,8 @@ impl VisibleTruth {
                 let placed: Vec<_> =
                     frame.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
                 let depth = scene.depth(im_id)?;
-                let rendered = ground_truth_visibility(&placed, &scene.camera(im_id)?, depth.as_ref(), 0.015);
+                let rendered =
+                    ground_truth_visibility(&placed, &scene.camera(im_id)?, depth.as_ref(), VISIBILITY_DELTA);
                 for ((mask, info), rendered) in masks.iter_mut().zip(&mut infos).zip(rendered) {
                     info.get_or_insert((rendered.info.bbox_visib, rendered.info.visib_fract));
                     mask.get_or_insert(rendered.mask_visible);

@@ -7,10 +7,10 @@ use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
+use sixfold_io::{ImageFile, ImageFileError};
 use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh};
 
 use crate::dataset_error::DatasetError;
-use crate::image_files::ImageFile;
 use crate::json::{At, parse};
 use crate::scene_files::{
     GroundTruth, GroundTruthInfo, ImageCamera, Target, TargetObject, parse_scene_camera, parse_scene_gt,
@@ -400,7 +400,7 @@ impl Scene {
             .rgb_path(im_id)
             .or_else(|| self.depth_path(im_id))
             .ok_or_else(|| DatasetError::UnknownSize { path: self.dir.clone(), im_id })?;
-        let size = ImageFile { path: &path, im_id, expected: None }.size()?;
+        let size = ImageFile::new(&path).size().map_err(|e| DatasetError::of_image(im_id, e))?;
         Ok((size, path.display().to_string()))
     }
 
@@ -408,11 +408,13 @@ impl Scene {
         &self,
         path: Option<PathBuf>,
         im_id: u32,
-        decode: impl FnOnce(&ImageFile<'_>) -> Result<T, DatasetError>,
+        decode: impl FnOnce(&ImageFile<'_>) -> Result<T, ImageFileError>,
     ) -> Result<Option<T>, DatasetError> {
         let Some(path) = path else { return Ok(None) };
-        let expected = Some(self.expected_size(im_id)?);
-        decode(&ImageFile { path: &path, im_id, expected }).map(Some)
+        let (expected, size_from) = self.expected_size(im_id)?;
+        decode(&ImageFile::of_size(&path, expected, size_from))
+            .map(Some)
+            .map_err(|e| DatasetError::of_image(im_id, e))
     }
 
     /// The colour image (grey images as colour); `None` where the scene has none.

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use sixfold_io::ImageFileError;
 use thiserror::Error;
 
 /// Where in a scene file something is: image, then number in that image's list.
@@ -150,4 +151,36 @@ pub enum DatasetError {
     /// A model or `models_info.json` is broken.
     #[error(transparent)]
     Model(Box<dyn std::error::Error + Send + Sync>),
+}
+
+impl DatasetError {
+    /// What is wrong with a file of image `im_id`.
+    pub(crate) fn of_image(im_id: u32, error: ImageFileError) -> Self {
+        match error {
+            ImageFileError::Read { path, source } => DatasetError::Read { path, source },
+            ImageFileError::Write { path, source } => DatasetError::Write { path, source },
+            ImageFileError::Content { path, reason } => DatasetError::Image { path, im_id, reason },
+            ImageFileError::Size { path, expected, found, size_from } => {
+                DatasetError::ImageSize { path, im_id, expected, found, size_from }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_images_name_file_and_image() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("000007.png");
+        std::fs::write(&path, b"not an image").unwrap();
+        let error = sixfold_io::read_rgb(&path).unwrap_err();
+        let message = DatasetError::of_image(7, error).to_string();
+        assert!(
+            message.contains("000007.png: im_id 7: not a readable image: neither PNG nor JPEG"),
+            "{message}"
+        );
+    }
 }

@@ -3,7 +3,6 @@
 //! Millimetres exist in the files only; everything here is in metres, radians and pixels. The short way from a result
 //! file to scores: [`BopDataset::open`], [`read_results`], [`BopDataset::targets`], [`evaluate`].
 
-mod camera_file;
 mod coco;
 mod coco_score;
 mod coco_truth;
@@ -11,8 +10,6 @@ mod dataset;
 mod dataset_error;
 mod errors;
 mod evaluate;
-mod files;
-mod image_files;
 mod json;
 mod plot;
 mod points;
@@ -20,11 +17,9 @@ mod results;
 mod rle;
 mod scene_files;
 mod score;
-mod single_images;
 mod visibility;
 mod write;
 
-pub use camera_file::{CameraFile, CameraFileError};
 pub use coco::{
     AdjustedDetection, Adjustment, Annotation, CocoGroundTruth, Detection, Detections, ReadDetections,
     parse_detections, read_detections, write_detections,
@@ -55,6 +50,5 @@ pub use scene_files::{
 pub use score::{
     area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
 };
-pub use single_images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
-pub use visibility::{ObjectVisibility, ground_truth_visibility};
+pub use visibility::{ObjectVisibility, VISIBILITY_DELTA, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

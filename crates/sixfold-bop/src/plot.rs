@@ -1,15 +1,13 @@
-//! Recall curves as a picture, drawn with nothing but pixels: no font file, no system library.
+//! Recall curves as a picture.
 
 use std::path::Path;
 
-use sixfold_geometry::{Image, RgbImage};
+use sixfold_geometry::RgbImage;
+use sixfold_io::{ImageFileError, write_rgb};
+use sixfold_plot::{COLORS, Canvas, FAINT, INK, PAPER, text_width};
 
-use crate::dataset_error::DatasetError;
 use crate::evaluate::{Evaluation, RecallCurves};
-use crate::image_files::{png_of_rgb, write_png};
 
-/// Drawn this many times larger and averaged down: smooth lines.
-const OVERSAMPLING: usize = 3;
 const PANEL_WIDTH: usize = 560;
 const PANEL_HEIGHT: usize = 400;
 const LEGEND_WIDTH: usize = 190;
@@ -17,221 +15,6 @@ const LEFT: usize = 64;
 const RIGHT: usize = 20;
 const TOP: usize = 44;
 const BOTTOM: usize = 56;
-
-const INK: [u8; 3] = [40, 44, 52];
-const FAINT: [u8; 3] = [226, 229, 234];
-const PAPER: [u8; 3] = [255, 255, 255];
-/// Colours that stay apart for colour-blind eyes (Tol's bright and muted schemes).
-const COLORS: [[u8; 3]; 12] = [
-    [68, 119, 170],
-    [238, 102, 119],
-    [34, 136, 51],
-    [204, 187, 68],
-    [102, 204, 238],
-    [170, 51, 119],
-    [221, 119, 51],
-    [51, 34, 136],
-    [68, 170, 153],
-    [153, 153, 51],
-    [136, 34, 85],
-    [150, 150, 150],
-];
-
-/// Glyphs of 5 x 7 pixels for the characters from space to `~`, a byte a column, lowest bit on top.
-const FONT: [[u8; 5]; 95] = [
-    [0, 0, 0, 0, 0],
-    [0, 0, 95, 0, 0],
-    [0, 7, 0, 7, 0],
-    [20, 127, 20, 127, 20],
-    [36, 42, 127, 42, 18],
-    [35, 19, 8, 100, 98],
-    [54, 73, 86, 32, 80],
-    [0, 8, 7, 3, 0],
-    [0, 28, 34, 65, 0],
-    [0, 65, 34, 28, 0],
-    [42, 28, 127, 28, 42],
-    [8, 8, 62, 8, 8],
-    [0, 128, 112, 48, 0],
-    [8, 8, 8, 8, 8],
-    [0, 0, 96, 96, 0],
-    [32, 16, 8, 4, 2],
-    [62, 81, 73, 69, 62],
-    [0, 66, 127, 64, 0],
-    [114, 73, 73, 73, 70],
-    [33, 65, 73, 77, 51],
-    [24, 20, 18, 127, 16],
-    [39, 69, 69, 69, 57],
-    [60, 74, 73, 73, 49],
-    [65, 33, 17, 9, 7],
-    [54, 73, 73, 73, 54],
-    [70, 73, 73, 41, 30],
-    [0, 0, 20, 0, 0],
-    [0, 64, 52, 0, 0],
-    [0, 8, 20, 34, 65],
-    [20, 20, 20, 20, 20],
-    [0, 65, 34, 20, 8],
-    [2, 1, 89, 9, 6],
-    [62, 65, 93, 89, 78],
-    [124, 18, 17, 18, 124],
-    [127, 73, 73, 73, 54],
-    [62, 65, 65, 65, 34],
-    [127, 65, 65, 65, 62],
-    [127, 73, 73, 73, 65],
-    [127, 9, 9, 9, 1],
-    [62, 65, 65, 81, 115],
-    [127, 8, 8, 8, 127],
-    [0, 65, 127, 65, 0],
-    [32, 64, 65, 63, 1],
-    [127, 8, 20, 34, 65],
-    [127, 64, 64, 64, 64],
-    [127, 2, 28, 2, 127],
-    [127, 4, 8, 16, 127],
-    [62, 65, 65, 65, 62],
-    [127, 9, 9, 9, 6],
-    [62, 65, 81, 33, 94],
-    [127, 9, 25, 41, 70],
-    [38, 73, 73, 73, 50],
-    [3, 1, 127, 1, 3],
-    [63, 64, 64, 64, 63],
-    [31, 32, 64, 32, 31],
-    [63, 64, 56, 64, 63],
-    [99, 20, 8, 20, 99],
-    [3, 4, 120, 4, 3],
-    [97, 89, 73, 77, 67],
-    [0, 127, 65, 65, 65],
-    [2, 4, 8, 16, 32],
-    [0, 65, 65, 65, 127],
-    [4, 2, 1, 2, 4],
-    [64, 64, 64, 64, 64],
-    [0, 3, 7, 8, 0],
-    [32, 84, 84, 120, 64],
-    [127, 40, 68, 68, 56],
-    [56, 68, 68, 68, 40],
-    [56, 68, 68, 40, 127],
-    [56, 84, 84, 84, 24],
-    [0, 8, 126, 9, 2],
-    [24, 164, 164, 156, 120],
-    [127, 8, 4, 4, 120],
-    [0, 68, 125, 64, 0],
-    [32, 64, 64, 61, 0],
-    [127, 16, 40, 68, 0],
-    [0, 65, 127, 64, 0],
-    [124, 4, 120, 4, 120],
-    [124, 8, 4, 4, 120],
-    [56, 68, 68, 68, 56],
-    [252, 24, 36, 36, 24],
-    [24, 36, 36, 24, 252],
-    [124, 8, 4, 4, 8],
-    [72, 84, 84, 84, 36],
-    [4, 4, 63, 68, 36],
-    [60, 64, 64, 32, 124],
-    [28, 32, 64, 32, 28],
-    [60, 64, 48, 64, 60],
-    [68, 40, 16, 40, 68],
-    [76, 144, 144, 144, 124],
-    [68, 100, 84, 76, 68],
-    [0, 8, 54, 65, 0],
-    [0, 0, 119, 0, 0],
-    [0, 65, 54, 8, 0],
-    [2, 1, 2, 4, 2],
-];
-
-/// A canvas in picture coordinates; drawing happens at the oversampled size.
-struct Canvas {
-    width: usize,
-    height: usize,
-    large: RgbImage,
-}
-
-impl Canvas {
-    fn new(width: usize, height: usize) -> Self {
-        let large = Image::filled(width * OVERSAMPLING, height * OVERSAMPLING, PAPER);
-        Canvas { width, height, large }
-    }
-
-    fn set(&mut self, x: i64, y: i64, color: [u8; 3]) {
-        if x >= 0 && y >= 0 && (x as usize) < self.large.width() && (y as usize) < self.large.height() {
-            self.large[(x as usize, y as usize)] = color;
-        }
-    }
-
-    fn rectangle(&mut self, x: f64, y: f64, width: f64, height: f64, color: [u8; 3]) {
-        let s = OVERSAMPLING as f64;
-        let to = |v: f64| (v * s).round() as i64;
-        for py in to(y)..to(y + height) {
-            for px in to(x)..to(x + width) {
-                self.set(px, py, color);
-            }
-        }
-    }
-
-    /// A line with round ends.
-    fn line(&mut self, from: (f64, f64), to: (f64, f64), thickness: f64, color: [u8; 3]) {
-        let s = OVERSAMPLING as f64;
-        let (ax, ay, bx, by) = (from.0 * s, from.1 * s, to.0 * s, to.1 * s);
-        let radius = 0.5 * thickness * s;
-        let (dx, dy) = (bx - ax, by - ay);
-        let length_squared = (dx * dx + dy * dy).max(1e-12);
-        let low = |a: f64, b: f64| (a.min(b) - radius).floor() as i64;
-        let high = |a: f64, b: f64| (a.max(b) + radius).ceil() as i64;
-        for y in low(ay, by)..=high(ay, by) {
-            for x in low(ax, bx)..=high(ax, bx) {
-                let (px, py) = (x as f64 + 0.5 - ax, y as f64 + 0.5 - ay);
-                let along = ((px * dx + py * dy) / length_squared).clamp(0.0, 1.0);
-                let (ox, oy) = (px - along * dx, py - along * dy);
-                if ox * ox + oy * oy <= radius * radius {
-                    self.set(x, y, color);
-                }
-            }
-        }
-    }
-
-    /// Text with its top left corner at `(x, y)`; a glyph's pixel is `size` picture pixels.
-    fn text(&mut self, x: f64, y: f64, size: f64, text: &str, color: [u8; 3]) {
-        for (i, c) in text.chars().enumerate() {
-            self.glyph(c, color, size, |column, row| (x + size * (6.0 * i as f64 + column), y + size * row));
-        }
-    }
-
-    /// Text that runs upwards, its middle at `(x, y)`.
-    fn text_upwards(&mut self, x: f64, y: f64, size: f64, text: &str, color: [u8; 3]) {
-        let bottom = y + 0.5 * text_width(text, size);
-        for (i, c) in text.chars().enumerate() {
-            self.glyph(c, color, size, |column, row| {
-                (x + size * row, bottom - size * (6.0 * i as f64 + column + 1.0))
-            });
-        }
-    }
-
-    fn glyph(&mut self, c: char, color: [u8; 3], size: f64, place: impl Fn(f64, f64) -> (f64, f64)) {
-        let Some(columns) = (c as usize).checked_sub(32).and_then(|i| FONT.get(i)) else { return };
-        for (column, bits) in columns.iter().enumerate() {
-            for row in (0..8).filter(|row| bits >> row & 1 == 1) {
-                let (px, py) = place(column as f64, f64::from(row));
-                self.rectangle(px, py, size, size, color);
-            }
-        }
-    }
-
-    fn finish(self) -> RgbImage {
-        Image::from_fn(self.width, self.height, |x, y| {
-            let mut sum = [0usize; 3];
-            for dy in 0..OVERSAMPLING {
-                for dx in 0..OVERSAMPLING {
-                    let pixel = self.large[(x * OVERSAMPLING + dx, y * OVERSAMPLING + dy)];
-                    for (total, value) in sum.iter_mut().zip(pixel) {
-                        *total += usize::from(value);
-                    }
-                }
-            }
-            sum.map(|v| (v / (OVERSAMPLING * OVERSAMPLING)) as u8)
-        })
-    }
-}
-
-fn text_width(text: &str, size: f64) -> f64 {
-    size * (6.0 * text.chars().count() as f64 - 1.0)
-}
 
 fn panel(
     canvas: &mut Canvas,
@@ -335,12 +118,9 @@ pub fn draw_recall_curves(evaluation: &Evaluation) -> RgbImage {
 /// Writes [`draw_recall_curves`] as a PNG file.
 ///
 /// # Errors
-/// [`DatasetError::Write`].
-pub fn write_recall_curves(path: &Path, evaluation: &Evaluation) -> Result<(), DatasetError> {
-    match png_of_rgb(&draw_recall_curves(evaluation)) {
-        Some(png) => write_png(path, png),
-        None => Ok(()),
-    }
+/// [`ImageFileError::Write`].
+pub fn write_recall_curves(path: &Path, evaluation: &Evaluation) -> Result<(), ImageFileError> {
+    write_rgb(path, &draw_recall_curves(evaluation))
 }
 
 #[cfg(test)]

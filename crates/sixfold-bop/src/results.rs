@@ -6,10 +6,10 @@ use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Mat3, Pose, Vec3};
+use sixfold_io::write_atomically;
 use thiserror::Error;
 
 use crate::errors::Placement;
-use crate::files::write_atomically;
 use crate::write::{rotation_rows, translation_mm};
 
 const HEADER: &str = "scene_id,im_id,obj_id,score,R,t,time";

@@ -10,6 +10,11 @@ use sixfold_render::{Frame, RenderOptions, SceneObject};
 
 use crate::scene_files::GroundTruthInfo;
 
+/// Tolerance of the visibility test in metres: a surface counts as visible up to this far behind the measured depth. 15 mm,
+/// the delta of BOP's VSD (Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018) and of its `mask_visib`
+/// (`scripts/calc_gt_masks.py` of the BOP toolkit).
+pub const VISIBILITY_DELTA: f64 = 0.015;
+
 /// How far outside the image a silhouette is followed, in image sizes to each side.
 const MARGIN: usize = 1;
 
@@ -27,7 +32,7 @@ pub struct ObjectVisibility {
 /// Renders every object and says what of it is visible.
 ///
 /// `test_depth` is the sensor's depth image in metres, of the camera's size; `delta` the tolerance of the visibility
-/// test in metres (BOP: 15 mm). A depth image of another size is as good as none, so check it before.
+/// test in metres ([`VISIBILITY_DELTA`] in BOP). A depth image of another size is as good as none, so check it before.
 pub fn ground_truth_visibility(
     objects: &[(&Mesh, Pose)],
     camera: &Camera,
@@ -133,7 +138,7 @@ mod tests {
     #[test]
     fn a_free_square_is_fully_visible() {
         let mesh = square();
-        let found = &ground_truth_visibility(&[(&mesh, at(0.0, 1.0))], &camera(), None, 0.015)[0];
+        let found = &ground_truth_visibility(&[(&mesh, at(0.0, 1.0))], &camera(), None, VISIBILITY_DELTA)[0];
         assert_eq!((found.info.px_count_all, found.info.px_count_visib), (Some(400), Some(400)));
         assert_eq!(found.info.visib_fract, 1.0);
         let expected = Rect { x: 40.0, y: 30.0, width: 19.0, height: 19.0 };
@@ -144,7 +149,7 @@ mod tests {
     #[test]
     fn half_outside_the_image_is_half_visible() {
         let mesh = square();
-        let found = &ground_truth_visibility(&[(&mesh, at(0.5, 1.0))], &camera(), None, 0.015)[0];
+        let found = &ground_truth_visibility(&[(&mesh, at(0.5, 1.0))], &camera(), None, VISIBILITY_DELTA)[0];
         assert_eq!(found.info.px_count_all, Some(400));
         assert_eq!(found.info.visib_fract, 0.5);
         assert_eq!(found.info.bbox_obj.unwrap(), Rect { x: 90.0, y: 30.0, width: 19.0, height: 19.0 });
@@ -158,7 +163,7 @@ mod tests {
             Mesh::new(square().vertices().iter().map(|v| v * 0.5).collect(), square().faces().to_vec());
         // The small square at half the distance covers the right half: shifted by 0.05 m at 0.5 m.
         let objects = [(&mesh, at(0.0, 1.0)), (&near.unwrap(), at(0.05, 0.5))];
-        let found = ground_truth_visibility(&objects, &camera(), None, 0.015);
+        let found = ground_truth_visibility(&objects, &camera(), None, VISIBILITY_DELTA);
         assert_eq!(found[0].info.visib_fract, 0.5);
         assert_eq!(found[1].info.visib_fract, 1.0);
 
@@ -172,7 +177,7 @@ mod tests {
                 0.99f32
             }
         });
-        let found = &ground_truth_visibility(&objects[..1], &camera(), Some(&depth), 0.015)[0];
+        let found = &ground_truth_visibility(&objects[..1], &camera(), Some(&depth), VISIBILITY_DELTA)[0];
         assert_eq!(found.info.px_count_visib, Some(300));
         assert_eq!(found.info.px_count_valid, Some(380));
         assert_eq!(found.info.bbox_visib.unwrap(), Rect { x: 40.0, y: 35.0, width: 19.0, height: 14.0 });
@@ -181,7 +186,7 @@ mod tests {
     #[test]
     fn what_is_behind_the_camera_has_no_box() {
         let mesh = square();
-        let found = &ground_truth_visibility(&[(&mesh, at(0.0, -1.0))], &camera(), None, 0.015)[0];
+        let found = &ground_truth_visibility(&[(&mesh, at(0.0, -1.0))], &camera(), None, VISIBILITY_DELTA)[0];
         assert_eq!((found.info.bbox_obj, found.info.visib_fract), (None, 0.0));
     }
 }

@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value, json};
 use sixfold_geometry::{Camera, DepthImage, Mask, Mat3, Pose, Rect, RgbImage};
+use sixfold_io::{write_atomically, write_depth, write_mask, write_rgb};
 
 use crate::dataset_error::DatasetError;
-use crate::files::write_atomically;
-use crate::image_files::{png_of_depth, png_of_mask, png_of_rgb, write_png};
 use crate::scene_files::{GroundTruth, GroundTruthInfo, Target};
 
 /// One image to be written; what is `None` or empty is left out.
@@ -83,6 +82,7 @@ impl SceneWriter {
         let im_id = image.im_id;
         let name = format!("{im_id:06}.png");
         let at = crate::json::At::image(&self.dir, im_id);
+        let of_image = |error| DatasetError::of_image(im_id, error);
         let size = (image.camera.width, image.camera.height);
         let same_size = |field: &str, found: (usize, usize)| {
             if found == size {
@@ -101,9 +101,7 @@ impl SceneWriter {
         same_length("masks_visible", image.masks_visible.map(<[_]>::len))?;
         if let Some(rgb) = image.rgb {
             same_size("rgb", rgb.size())?;
-            if let Some(png) = png_of_rgb(rgb) {
-                write_png(&self.dir.join("rgb").join(&name), png)?;
-            }
+            write_rgb(&self.dir.join("rgb").join(&name), rgb).map_err(of_image)?;
         }
         if let Some(depth) = image.depth {
             same_size("depth", depth.size())?;
@@ -114,16 +112,13 @@ impl SceneWriter {
                     "metres per unit, above 0",
                 ));
             }
-            if let Some(png) = png_of_depth(depth, image.depth_scale) {
-                write_png(&self.dir.join("depth").join(&name), png)?;
-            }
+            write_depth(&self.dir.join("depth").join(&name), depth, image.depth_scale).map_err(of_image)?;
         }
         for (folder, masks) in [("mask", image.masks), ("mask_visib", image.masks_visible)] {
             for (index, mask) in masks.into_iter().flatten().enumerate() {
                 same_size(folder, mask.size())?;
-                if let Some(png) = png_of_mask(mask) {
-                    write_png(&self.dir.join(folder).join(format!("{im_id:06}_{index:06}.png")), png)?;
-                }
+                let path = self.dir.join(folder).join(format!("{im_id:06}_{index:06}.png"));
+                write_mask(&path, mask).map_err(of_image)?;
             }
         }
         let c = image.camera;

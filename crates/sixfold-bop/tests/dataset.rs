@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use sixfold_bop::{
     BopDataset, Estimate, EvalOptions, GroundTruth, GroundTruthInfo, MaskKind, Models, NewImage, SceneWriter,
-    Target, TargetObject, evaluate, evaluate_detection, ground_truth_visibility, write_camera, write_targets,
+    Target, TargetObject, VISIBILITY_DELTA, evaluate, evaluate_detection, ground_truth_visibility,
+    write_camera, write_targets,
 };
 use sixfold_geometry::nalgebra::Vector6;
 use sixfold_geometry::{Camera, Image, Mask, Pose, Vec3};
@@ -75,7 +76,7 @@ fn write_dataset(root: &Path) -> Vec<Target> {
         frame.render(&objects, &RenderOptions::default());
         let depth = frame.depth().map(|z| if *z > 0.0 { *z } else { 1.0 });
         let pairs: Vec<(&Mesh, Pose)> = truth.iter().map(|gt| (&mesh, gt.camera_from_object)).collect();
-        let visibility = ground_truth_visibility(&pairs, &camera, Some(&depth), 0.015);
+        let visibility = ground_truth_visibility(&pairs, &camera, Some(&depth), VISIBILITY_DELTA);
         let infos: Vec<GroundTruthInfo> = visibility.iter().map(|v| v.info).collect();
         let masks: Vec<Mask> = visibility.iter().map(|v| v.mask.clone()).collect();
         let visible: Vec<Mask> = visibility.iter().map(|v| v.mask_visible.clone()).collect();

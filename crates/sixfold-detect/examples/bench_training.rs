@@ -6,13 +6,13 @@ use std::error::Error;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use sixfold_augment::Backgrounds;
 use sixfold_detect::network::{DetectorConfig, Encoder};
 use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
 use sixfold_detect::training::{TrainingOptions, TrainingPace, train};
 use sixfold_geometry::Vec3;
 use sixfold_mesh::Mesh;
 use sixfold_nn::lite0::imagenet_encoder;
+use sixfold_synth::augment::Backgrounds;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let steps = std::env::args().nth(1).map_or(Ok(60), |text| text.parse())?;

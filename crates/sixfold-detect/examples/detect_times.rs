@@ -9,9 +9,9 @@ use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
 
-use sixfold_bop::read_rgb;
 use sixfold_detect::detect::NetworkImage;
 use sixfold_detect::model::DetectorModel;
+use sixfold_io::read_rgb;
 
 /// Milliseconds of every call after the first.
 fn times<T>(rounds: usize, mut call: impl FnMut() -> T) -> Vec<f64> {

@@ -5,12 +5,13 @@
 use std::error::Error;
 use std::path::Path;
 
-use sixfold_augment::{Backgrounds, PhotographOptions};
-use sixfold_bop::{BopDataset, Models, write_rgb};
+use sixfold_bop::{BopDataset, Models};
 use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
+use sixfold_io::write_rgb;
 use sixfold_pix2pose::samples::read_real_crops;
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();

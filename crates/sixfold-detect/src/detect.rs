@@ -1,9 +1,10 @@
 //! From an image to boxes: resizing and padding, decoding, non-maximum suppression, masks.
 
-use crate::loss::{distance, middle, sigmoid};
+use crate::loss::{distance, middle};
 use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
-use sixfold_augment::{AffineMap, Patch};
+use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
+use sixfold_synth::augment::{AffineMap, Patch};
 
 /// Which detections are given.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -8,6 +8,5 @@ pub mod model;
 pub mod network;
 pub mod recipe;
 pub mod samples;
-mod solids;
 pub mod targets;
 pub mod training;

@@ -7,6 +7,7 @@
 
 use crate::network::DetectorConfig;
 use crate::targets::Targets;
+use sixfold_geometry::stats::sigmoid;
 
 /// Weights of the terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,10 +58,6 @@ pub struct LossValue {
 
 /// Logarithms of distances are cut to this on both sides.
 const LONGEST: f32 = 6.0;
-
-pub(crate) fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + (-x).exp())
-}
 
 /// Cross entropy of a logit and a target in 0..1, without overflow.
 fn entropy(logit: f32, target: f32) -> f32 {

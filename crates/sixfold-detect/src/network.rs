@@ -7,9 +7,8 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_geometry::random::stream;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig, Padding};
 use sixfold_nn::lite0::{Lite0, Lite0Config};
@@ -118,8 +117,7 @@ impl DetectorConfig {
             Encoder::ResNet50(_) => &[256, 512, 1024, 2048],
         };
         assert_eq!(matches!(encoder, Encoder::Lite0(_)), self.encoder == EncoderKind::Lite0);
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(1);
+        let mut rng = stream(seed, 1);
         let mut conv = |inputs: usize, outputs: usize, kernel: usize, activation: Activation, gain: f32| {
             ConvConfig::new([inputs, outputs], kernel, activation).init(gain, &mut rng, device)
         };

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use sixfold_augment::AugmentError;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
@@ -16,6 +15,7 @@ use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::{ModelCard, WeightsError};
 use sixfold_pix2pose::material::{Material, plain_backgrounds};
 use sixfold_pix2pose::samples::{SampleError, read_real_crops};
+use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};

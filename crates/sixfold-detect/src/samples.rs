@@ -8,16 +8,17 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::solids::{random_solid, random_turn};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sixfold_augment::{
-    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream,
-    uniform,
-};
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
-use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch, randomly_colored};
+use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch};
+use sixfold_synth::augment::{
+    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Shape, procedural_texture,
+};
+use sixfold_synth::distractors::{random_solid, random_turn};
+use sixfold_synth::randomly_colored;
 
 use crate::targets::{Annotation, IGNORED, Instance};
 

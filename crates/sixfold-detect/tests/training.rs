@@ -5,7 +5,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use sixfold_augment::Backgrounds;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use sixfold_detect::network::{DetectorConfig, Encoder};
@@ -15,6 +14,7 @@ use sixfold_geometry::{Image, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::weights::ModelCard;
+use sixfold_synth::augment::Backgrounds;
 
 /// A pyramid or a flat box of one colour.
 fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {

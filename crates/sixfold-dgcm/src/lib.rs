@@ -10,17 +10,11 @@
 // `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
-pub mod crop;
-mod crop_turn;
 pub mod loss;
 pub mod model;
 pub mod networks;
 pub mod outcome;
 pub mod recipe;
 pub mod samples;
-pub mod store;
 pub mod training;
 pub mod transfer;
-pub mod vd_noc;
-
-pub use crop_turn::turn;

@@ -4,12 +4,13 @@ use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_experience::{Crop, CropOptions, FeatureExtractor};
+use sixfold_io::fnv1a;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
 };
 
-use crate::crop::{Crop, CropOptions};
 use crate::networks::{Encoded, FEATURE, Network};
 
 /// Why a model could not be read.
@@ -134,11 +135,7 @@ impl DgcmModel {
 
     /// A name that tells this network's features from those of another: its architecture and a hash of its card.
     pub fn fingerprint(&self) -> String {
-        // FNV-1a, which is the same everywhere.
-        let text = serde_json::to_string(&self.card).unwrap_or_default();
-        let hash = text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-        });
+        let hash = fnv1a(serde_json::to_string(&self.card).unwrap_or_default().as_bytes());
         format!("{}-{hash:016x}", self.card.architecture)
     }
 
@@ -182,6 +179,20 @@ impl DgcmModel {
 
 fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
+}
+
+impl FeatureExtractor for DgcmModel {
+    fn fingerprint(&self) -> String {
+        DgcmModel::fingerprint(self)
+    }
+
+    fn crop_options(&self) -> &CropOptions {
+        DgcmModel::crop_options(self)
+    }
+
+    fn feature(&self, crop: &Crop) -> Vec<f32> {
+        self.encode(crop).feature
+    }
 }
 
 #[cfg(test)]

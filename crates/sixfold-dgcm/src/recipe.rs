@@ -6,13 +6,13 @@ use std::sync::Mutex;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
+use sixfold_experience::CropOptions;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 use thiserror::Error;
 
-use crate::crop::CropOptions;
 use crate::model::{DgcmModel, ModelError};
 use crate::networks::{CompactConfig, Network, PaperConfig};
 use crate::samples::{Pool, PoolOptions};

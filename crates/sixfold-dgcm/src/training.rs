@@ -14,11 +14,11 @@ use sixfold_nn::schedule::LearningRate;
 use sixfold_nn::training::{Course, Trainee, run};
 pub use sixfold_nn::training::{Ending, TrainingError};
 use sixfold_nn::training_log::TrainingRecord;
+use sixfold_synth::shapes::Family;
 
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
 use crate::networks::Network;
 use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
-use sixfold_shapes::Family;
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,15 +1,13 @@
 //! From an experience on the handle of one mug to the handle of another, with the network that ships.
-#![cfg(feature = "sqlite")]
 
 use std::path::Path;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::outcome::OutcomeModel;
-use sixfold_dgcm::store::{Experience, ExperienceStore, SqliteStore};
 use sixfold_dgcm::transfer::{Hypothesis, Memory, ProposeOptions, propose, rank_on_part};
+use sixfold_experience::{Crop, Experience, ExperienceStore, SqliteStore};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_grasp::{
@@ -18,7 +16,7 @@ use sixfold_grasp::{
 };
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
-use sixfold_shapes::{Family, Member, member};
+use sixfold_synth::shapes::{Family, Member, member};
 
 /// A made-up mug on a table, 0.7 m from a camera that looks down by 40 degrees.
 struct Seen {

@@ -1,8 +1,7 @@
 //! The geometry of the transfer, without a network: coordinates that are right by construction.
 
-use sixfold_dgcm::crop::{Crop, CropOptions};
-use sixfold_dgcm::store::region;
 use sixfold_dgcm::transfer::{AlignOptions, Hypothesis, transfer};
+use sixfold_experience::{Crop, CropOptions, region};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, IndexedCloud, Mask, Mat3, PointCloud, Pose, Vec3};
 use sixfold_grasp::{Gripper, gripper_pose};

@@ -18,7 +18,9 @@ mod normals;
 mod plane;
 mod pnp;
 mod pose;
+pub mod random;
 mod solver;
+pub mod stats;
 mod undistort;
 
 pub use camera::{BrownConrady, Camera, CameraError};

@@ -8,9 +8,10 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use rand::{RngExt, SeedableRng};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{KdTree, Pose, Vec3};
 use thiserror::Error;
 
@@ -152,8 +153,7 @@ fn search(
         let found: Vec<Vec<Grasp>> = samples
             .into_par_iter()
             .map(|sample| {
-                let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-                random.set_stream(sample as u64);
+                let mut random = stream(options.seed, sample as u64);
                 planner.sample(&mut random)
             })
             .collect();

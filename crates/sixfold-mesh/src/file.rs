@@ -1,11 +1,11 @@
 //! The door for mesh files: format by ending, unit to metres, and the check for a wrong unit.
 
 use std::fs;
-use std::io;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use sixfold_geometry::RgbImage;
+use sixfold_io::write_atomically_with;
 
 use crate::{Mesh, MeshFileError, Unit};
 
@@ -162,18 +162,10 @@ pub(crate) fn load_texture(
     decode_texture(&bytes).map_err(error)
 }
 
-/// Writes a file aside and renames it, so that nobody sees a part of it.
+/// Writes a file that nobody sees a part of, into a folder that is there already.
 pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), MeshFileError> {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
-    let aside = path.with_file_name(format!(".{name}.{}-{number}.part", std::process::id()));
-    let written = fs::write(&aside, bytes).and_then(|()| fs::rename(&aside, path));
-    written.map_err(|source| {
-        // The first error is the one to tell.
-        let _ = fs::remove_file(&aside);
-        MeshFileError::Io { file: path.display().to_string(), source }
-    })
+    write_atomically_with(path, |file| file.write_all(bytes))
+        .map_err(|source| MeshFileError::Io { file: path.display().to_string(), source })
 }
 
 #[cfg(test)]

@@ -3,10 +3,12 @@
 
 use std::path::Path;
 
+use sixfold_io::fnv1a;
+
 use crate::error::StoreError;
 use crate::model::Descriptor;
 use crate::network::DESCRIPTOR;
-use crate::store::{checksum, write_bytes};
+use crate::store::write_bytes;
 
 const MAGIC: &[u8; 8] = b"SIXFDSC\0";
 const VERSION: u32 = 1;
@@ -20,7 +22,7 @@ pub(crate) fn write(path: &Path, made_from: [u64; 2], descriptors: &[Descriptor]
     made_from.iter().for_each(|m| out.extend_from_slice(&m.to_le_bytes()));
     out.extend_from_slice(&(descriptors.len() as u32).to_le_bytes());
     descriptors.iter().flatten().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
-    let sum = checksum(&out);
+    let sum = fnv1a(&out);
     out.extend_from_slice(&sum.to_le_bytes());
     write_bytes(path, &out)
 }
@@ -38,7 +40,7 @@ pub(crate) fn read(path: &Path, made_from: [u64; 2]) -> Result<Vec<Descriptor>, 
         return Err(StoreError::Version { path: path.to_path_buf(), found, expected });
     }
     let (body, sum) = bytes.split_at(bytes.len() - 8);
-    if checksum(body).to_le_bytes() != sum {
+    if fnv1a(body).to_le_bytes() != sum {
         return Err(damaged("the checksum does not match: damaged or cut off"));
     }
     let long = |at: usize| u64::from(word(at)) | u64::from(word(at + 4)) << 32;

@@ -5,6 +5,7 @@ use std::path::Path;
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
+use sixfold_io::Fnv1a;
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
@@ -72,20 +73,16 @@ impl ObjectTemplates {
     }
 }
 
-/// FNV-1a (Fowler, Noll, Vo) over what templates depend on.
+/// FNV-1a over what templates depend on.
 fn fingerprint(mesh: &Mesh, options: &TemplateOptions) -> u64 {
-    let mut hash = 0xcbf2_9ce4_8422_2325u64;
-    let mut add = |bytes: &[u8]| {
-        for &b in bytes {
-            hash = (hash ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3);
-        }
-    };
+    let mut hash = Fnv1a::default();
+    let mut add = |bytes: &[u8]| hash.write(bytes);
     add(options.coverage.name().as_bytes());
     add(&options.margin.to_le_bytes());
     add(&options.distance.to_le_bytes());
     mesh.vertices().iter().flat_map(|v| v.iter()).for_each(|c| add(&c.to_le_bytes()));
     mesh.faces().iter().flatten().for_each(|i| add(&i.to_le_bytes()));
-    hash
+    hash.value()
 }
 
 /// One view; `None` when nothing of the mesh is seen from there (a sheet seen edge-on).

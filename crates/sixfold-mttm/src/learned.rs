@@ -6,6 +6,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec3};
+use sixfold_io::fnv1a;
 
 use crate::descriptor_file;
 use crate::error::StoreError;
@@ -14,7 +15,6 @@ use crate::model::{Descriptor, Encoded, MttmModel, PairSays};
 use crate::network::DESCRIPTOR;
 use crate::patch::{Patch, REACH, TemplateSurface};
 use crate::regions::shared_diameter;
-use crate::store::checksum;
 use crate::template::ObjectTemplates;
 
 /// The network, and every template at every turn as it describes it.
@@ -42,7 +42,7 @@ impl Learned {
         object: &ObjectTemplates,
         entries: &[Entry],
     ) -> (Learned, Option<StoreError>) {
-        let made_from = [model.fingerprint(), checksum(&object.to_bytes())];
+        let made_from = [model.fingerprint(), fnv1a(&object.to_bytes())];
         let mut note = None;
         match descriptor_file::read(path, made_from) {
             Ok(descriptors) if descriptors.len() == entries.len() => {

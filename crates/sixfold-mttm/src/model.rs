@@ -7,6 +7,7 @@ use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_io::fnv1a;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -153,10 +154,7 @@ impl MttmModel {
 
     /// A number that tells this network's descriptors from those of another: FNV-1a over its card.
     pub fn fingerprint(&self) -> u64 {
-        let text = serde_json::to_string(&self.card).unwrap_or_default();
-        text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-        })
+        fnv1a(serde_json::to_string(&self.card).unwrap_or_default().as_bytes())
     }
 
     /// Maps of patches: what everything else is asked with.

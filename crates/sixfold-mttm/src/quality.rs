@@ -3,6 +3,7 @@
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_geometry::stats::upper_median;
 
 use crate::loss::squared_distance;
 use crate::network::{MAP, Network, masked};
@@ -113,8 +114,7 @@ pub fn quality(network: &Network, pool: &Pool) -> Quality {
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+    upper_median(&mut values).unwrap_or(f64::NAN)
 }
 
 fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {

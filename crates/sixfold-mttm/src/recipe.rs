@@ -7,18 +7,18 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use burn::tensor::Device;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::RngExt;
 use rayon::prelude::*;
-use sixfold_bop::{DatasetError, write_rgb};
+use sixfold_geometry::random::stream;
+use sixfold_io::{ImageFileError, write_rgb};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_nn::checkpoint::Checkpoint;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PileOptions, SimulationError, drop_objects};
+use sixfold_synth::shapes::{Family, member, toy};
 use thiserror::Error;
 
 use crate::model::{ModelError, MttmModel};
@@ -116,7 +116,7 @@ pub enum RecipeError {
     Simulation(#[from] SimulationError),
     /// The picture of the first samples.
     #[error(transparent)]
-    Picture(Box<DatasetError>),
+    Picture(#[from] ImageFileError),
     /// The model file.
     #[error(transparent)]
     Model(#[from] ModelError),
@@ -160,8 +160,7 @@ impl Recipe {
         };
         hear(News::Note(&format!("scenes: {} regions with an object", pool.with_object().len())));
         let first = Batch::of_step(&pool, &options.batch, options.seed, 0);
-        write_rgb(&out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))
-            .map_err(|error| RecipeError::Picture(Box::new(error)))?;
+        write_rgb(&out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))?;
         let mut last = TrainingRecord::default();
         let shown = |record: &TrainingRecord| {
             hear(News::Steps(record, options.steps));
@@ -289,8 +288,7 @@ fn make_pool(
     let objects: Vec<(Mesh, ConvexParts)> = (0..objects)
         .into_par_iter()
         .map(|number| -> Result<_, RecipeError> {
-            let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-            random.set_stream(number as u64);
+            let mut random = stream(options.seed, number as u64);
             let mesh = match number % 2 {
                 0 => member(Family::ALL[number / 2 % Family::ALL.len()], &mut random)?.mesh,
                 _ => toy(&mut random)?,
@@ -326,8 +324,7 @@ fn make_pool(
 
 /// Some of the objects, fallen.
 fn arrange(hulls: &[ConvexParts], pile: &PileOptions, seed: u64, scene: u64) -> Arrangement {
-    let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5ce7e);
-    random.set_stream(scene);
+    let mut random = stream(seed ^ 0x5ce7e, scene);
     let count = random.random_range(OBJECTS.0..=OBJECTS.1);
     let mut chosen: Vec<usize> = vec![];
     while chosen.len() < count {

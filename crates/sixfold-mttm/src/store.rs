@@ -5,11 +5,12 @@
 //! half a file, and the old one stays until the new one is whole.
 
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::Path;
 
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
+use sixfold_io::{fnv1a, write_atomically_with};
 
 use crate::error::StoreError;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
@@ -21,30 +22,15 @@ const NUMBERS_PER_TEMPLATE: usize = 8;
 const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
 const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 
-/// FNV-1a (Fowler, Noll, Vo).
-pub(crate) fn checksum(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
-}
-
 /// Puts a whole file in its place.
 pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
-    let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
-    let written = (|| -> io::Result<()> {
-        let mut file = File::create(&temporary)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        drop(file);
-        std::fs::rename(&temporary, path)?;
-        // The new name must be on the disk as well. Not every system lets a folder be opened.
-        if let Some(Ok(folder)) = path.parent().map(File::open) {
-            let _ = folder.sync_all();
-        }
-        Ok(())
-    })();
-    if written.is_err() {
-        let _ = std::fs::remove_file(&temporary);
+    write_atomically_with(path, |file| file.write_all(bytes))
+        .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+    // The new name must be on the disk as well. Not every system lets a folder be opened.
+    if let Some(Ok(folder)) = path.parent().map(File::open) {
+        let _ = folder.sync_all();
     }
-    written.map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
+    Ok(())
 }
 
 impl ObjectTemplates {
@@ -75,7 +61,7 @@ impl ObjectTemplates {
             }
             t.depth.iter().for_each(|z| out.extend_from_slice(&z.to_le_bytes()));
         }
-        let sum = checksum(&out);
+        let sum = fnv1a(&out);
         out.extend_from_slice(&sum.to_le_bytes());
         out
     }
@@ -116,7 +102,7 @@ impl ObjectTemplates {
             return Err(damaged("cut off"));
         }
         let (body, sum) = bytes.split_at(bytes.len() - 8);
-        if checksum(body).to_le_bytes() != sum {
+        if fnv1a(body).to_le_bytes() != sum {
             return Err(damaged("the checksum does not match: damaged or cut off"));
         }
         reader = Reader(&body[12..]);
@@ -236,7 +222,7 @@ mod tests {
         let at = HEAD_BYTES - 4;
         bytes[at..at + 4].copy_from_slice(&u32::MAX.to_le_bytes());
         let end = bytes.len() - 8;
-        let sum = checksum(&bytes[..end]);
+        let sum = fnv1a(&bytes[..end]);
         bytes[end..].copy_from_slice(&sum.to_le_bytes());
         assert!(matches!(
             ObjectTemplates::parse(&bytes, Path::new("t")).unwrap_err(),

@@ -313,7 +313,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::{Pose, Vec3};
     use sixfold_mesh::Mesh;
-    use sixfold_shapes::{Family, member};
+    use sixfold_synth::shapes::{Family, member};
 
     /// Household shapes side by side on a table.
     fn pool() -> Pool {

@@ -7,9 +7,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sixfold_bop::{BopDataset, Models, read_depth, read_mask};
+use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
 use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
+use sixfold_io::{read_depth, read_mask};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{

@@ -18,8 +18,9 @@ use burn::store::ModuleRecord;
 use burn::tensor::Bytes;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use sixfold_io::write_atomically_with;
 
-use crate::files::{explain, write_atomically};
+use crate::files::explain;
 
 const MAGIC: &[u8; 8] = b"sixfckp1";
 const ENDING: &str = ".checkpoint";
@@ -136,7 +137,7 @@ impl CheckpointWriter {
             .map_err(|source| CheckpointError::Write { file: folder.to_owned(), source })?;
         let path = folder.join(format!("step-{:09}{ENDING}", self.step));
         let mut hash = Checksum::default();
-        write_atomically(&path, |file| {
+        write_atomically_with(&path, |file| {
             let mut put = |bytes: &[u8]| {
                 hash.update(bytes);
                 file.write_all(bytes)

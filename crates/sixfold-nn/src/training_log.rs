@@ -6,9 +6,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
+use sixfold_io::{write_atomically_with, write_rgb};
 use sixfold_plot::{COLORS, Canvas, FAINT, INK, Ticks, text_width, ticks, ticks_logarithmic};
 
-use crate::files::{explain, write_atomically};
+use crate::files::explain;
 
 /// What is known after a step.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -101,7 +102,7 @@ impl TrainingLog {
             let kept: Vec<_> = records.iter().filter(|r| r.step <= resumed_step).collect();
             last_step = kept.last().map(|r| r.step);
             if torn || kept.len() < records.len() {
-                write_atomically(path, |file| {
+                write_atomically_with(path, |file| {
                     kept.iter().try_for_each(|record| file.write_all(line(record)?.as_bytes()))
                 })
                 .map_err(write_error)?;
@@ -201,18 +202,14 @@ pub fn draw_curves(log: &[TrainingRecord], png: &Path) -> Result<(), TrainingLog
     panels.push(("samples per second", over_steps(|r| r.samples_per_second)));
     let columns = 2.min(panels.len() as u32);
     let rows = (panels.len() as u32).div_ceil(columns);
-    let mut canvas = Canvas::new(columns * PANEL_WIDTH, rows * PANEL_HEIGHT);
+    let mut canvas = Canvas::new((columns * PANEL_WIDTH) as usize, (rows * PANEL_HEIGHT) as usize);
     for (i, (name, points)) in panels.iter().enumerate() {
         let (column, row) = (i as u32 % columns, i as u32 / columns);
         let corner = (f64::from(column * PANEL_WIDTH), f64::from(row * PANEL_HEIGHT));
         panel(&mut canvas, corner, name, points, COLORS[i % COLORS.len()]);
     }
-    let mut bytes = io::Cursor::new(Vec::new());
-    let encoded = canvas.finish().write_to(&mut bytes, image::ImageFormat::Png);
-    let written = encoded
-        .map_err(io::Error::other)
-        .and_then(|()| write_atomically(png, |f| f.write_all(bytes.get_ref())));
-    written.map_err(|source| TrainingLogError::Write { file: png.to_owned(), source })
+    write_rgb(png, &canvas.finish())
+        .map_err(|error| TrainingLogError::Write { file: png.to_owned(), source: error.into() })
 }
 
 fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f64)], color: [u8; 3]) {

@@ -15,8 +15,9 @@ use burn::tensor::{Bool, Int, Tensor, TensorData};
 use half::{bf16, f16};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
+use sixfold_io::write_atomically_with;
 
-use crate::files::{explain, write_atomically};
+use crate::files::explain;
 
 /// Version of the weight file's layout that this version of Sixfold writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
@@ -214,7 +215,7 @@ pub fn save_weights<M: Module>(module: &M, card: &ModelCard, path: &Path) -> Res
     }
     let metadata = std::iter::once((CARD_KEY.to_owned(), card)).collect();
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| write_error(invalid(&e)))?;
-    write_atomically(path, |file| file.write_all(&bytes)).map_err(write_error)
+    write_atomically_with(path, |file| file.write_all(&bytes)).map_err(write_error)
 }
 
 /// Fills `module` with the tensors of a file that [`save_weights`] wrote and gives it back with the file's card.
@@ -312,7 +313,7 @@ pub fn read_card(path: &Path) -> Result<ModelCard, WeightsError> {
 /// # Errors
 /// [`WeightsError::Write`].
 pub fn write_card_markdown(card: &ModelCard, path: &Path) -> Result<(), WeightsError> {
-    write_atomically(path, |file| file.write_all(card_markdown(card).as_bytes()))
+    write_atomically_with(path, |file| file.write_all(card_markdown(card).as_bytes()))
         .map_err(|source| WeightsError::Write { file: path.to_owned(), source })
 }
 

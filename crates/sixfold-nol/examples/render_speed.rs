@@ -4,10 +4,10 @@
 use std::path::Path;
 use std::time::Instant;
 
-use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_nol::model::NolModel;
 use sixfold_nol::quality::{QualityOptions, quality};
 use sixfold_nol::samples::{SampleOptions, make_sample};
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);

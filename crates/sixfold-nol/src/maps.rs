@@ -1,6 +1,6 @@
 //! Square images of any number of channels that are looked up between pixels, with their gradients.
 
-use sixfold_augment::Patch;
+use sixfold_synth::augment::Patch;
 
 /// Channels over a square crop, interleaved: what one lookup needs lies together.
 #[derive(Debug, Clone, PartialEq)]

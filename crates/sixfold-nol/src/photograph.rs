@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use sixfold_augment::Window;
 use sixfold_geometry::{Camera, CameraError, Mask, Pose, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
+use sixfold_synth::augment::Window;
 
 /// What is wrong with photographs or options.
 #[derive(Debug, thiserror::Error)]

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{Device, Tensor};
-use sixfold_augment::Backgrounds;
+use sixfold_synth::augment::Backgrounds;
 
 use crate::network::{COLOURS, Network};
 use crate::samples::{Batch, SampleOptions, make_sample};

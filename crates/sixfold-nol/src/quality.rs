@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
-use sixfold_augment::Backgrounds;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::weights::WeightsError;
+use sixfold_synth::augment::Backgrounds;
 
 use crate::loss::{Perceptual, image_loss, psnr, squared_error};
 use crate::model::NolModel;

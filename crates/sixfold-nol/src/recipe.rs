@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use sixfold_augment::{AugmentError, Backgrounds, PhotographOptions};
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::{ModelCard, WeightsError};
+use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 use thiserror::Error;
 
 use crate::loss::Perceptual;

@@ -5,10 +5,10 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_augment::Patch;
 use sixfold_geometry::Mask;
 use sixfold_nn::lite0::{Lite0, imagenet_encoder};
 use sixfold_nn::weights::WeightsError;
+use sixfold_synth::augment::Patch;
 
 use crate::loss::psnr;
 

@@ -1,9 +1,9 @@
 //! A photograph cut to the object, with what is known of its geometry at the present pose.
 
-use sixfold_augment::{Coverage, Patch};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_synth::augment::{Coverage, Patch};
 
 use crate::photograph::{NolError, Photograph, object_window};
 use crate::projection::{Projection, TargetSurface};

@@ -2,9 +2,9 @@
 //! account of what none of them shows.
 
 use rayon::prelude::*;
-use sixfold_augment::Patch;
 use sixfold_geometry::{Camera, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
+use sixfold_synth::augment::Patch;
 
 use crate::features::SourceFeatures;
 use crate::maps::Maps;
@@ -180,7 +180,7 @@ impl<'a> ViewMaker<'a> {
     /// The sources that together show most of what the view shows.
     fn choose(&self, camera: &Camera, pose: &Pose) -> Vec<usize> {
         let black = Patch::filled(camera.width, camera.height, [0.0; 3]);
-        let whole = sixfold_augment::Coverage::filled(camera.width, camera.height, 1.0);
+        let whole = sixfold_synth::augment::Coverage::filled(camera.width, camera.height, 1.0);
         let view = SourceView::of_crop(black, whole, *camera, *pose, self.mesh);
         let only: Vec<bool> = self
             .points

@@ -9,13 +9,13 @@ use burn::module::Module;
 use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_augment::Backgrounds;
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use sixfold_nn::recurrent::gather;
 use sixfold_nn::schedule::LearningRate;
 use sixfold_nn::training::{Course, Trainee, run};
 pub use sixfold_nn::training::{Ending, TrainingError};
 use sixfold_nn::training_log::TrainingRecord;
+use sixfold_synth::augment::Backgrounds;
 
 use crate::loss::{Perceptual, WEIGHTS, image_loss, smooth_loss, squared_error};
 use crate::network::{Blend, COLOURS, Network};

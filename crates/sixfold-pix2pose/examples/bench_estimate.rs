@@ -1,5 +1,5 @@
 //! Time per box of each part of an estimate: DATASET TARGETS.json WEIGHTS.
-use sixfold_bop::{BopDataset, Models, ground_truth_visibility};
+use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             .iter()
             .filter_map(|g| Some((known(g.obj_id)?, g.camera_from_object)))
             .collect();
-        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         for (truth, visible) in frame.ground_truth.iter().zip(visible) {
             let asked = target.object.is_some_and(|o| o.obj_id == truth.obj_id);
             let (true, Some(region)) = (asked, visible.info.bbox_visib) else {

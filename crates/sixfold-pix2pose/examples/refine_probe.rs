@@ -1,7 +1,7 @@
 //! How well alignment with the image mends disturbed ground-truth poses: DATASET FRAMES.json [image weight]...
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_bop::{BopDataset, Models, ground_truth_visibility};
+use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::{Pose, Rect, Vec3};
 use sixfold_pix2pose::estimate::{Found, Hypothesis, View};
 use sixfold_pix2pose::model::Prediction;
@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let image = scene.rgb(target.im_id)?.unwrap();
         let placed: Vec<_> =
             frame.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
-        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         for (g, v) in frame.ground_truth.iter().zip(visible) {
             if v.info.visib_fract < 0.3 {
                 continue;

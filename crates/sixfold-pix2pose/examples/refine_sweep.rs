@@ -2,7 +2,9 @@
 //!
 //! Prints the recall of ADD(-S) below a tenth of the diameter, and the median error along the view axis.
 use rayon::prelude::*;
-use sixfold_bop::{BopDataset, ModelPoints, Models, Placement, add, adi, ground_truth_visibility};
+use sixfold_bop::{
+    BopDataset, ModelPoints, Models, Placement, VISIBILITY_DELTA, add, adi, ground_truth_visibility,
+};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
 use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
@@ -48,7 +50,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let Some(image) = scene.rgb(*im_id)?.map(Arc::new) else { continue };
         let known: Vec<_> = frame.ground_truth.iter().filter(|g| meshes.contains_key(&g.obj_id)).collect();
         let placed: Vec<_> = known.iter().map(|g| (&meshes[&g.obj_id].0, g.camera_from_object)).collect();
-        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         for (truth, visible) in known.iter().zip(visible) {
             let (true, Some(region)) = (ids.contains(&truth.obj_id), visible.info.bbox_visib) else {
                 continue;

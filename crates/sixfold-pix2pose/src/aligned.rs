@@ -10,6 +10,7 @@ use crate::model::Pix2PoseModel;
 use crate::object::Correction;
 use crate::refine::{RefineOptions, refine};
 use crate::samples::RealCrop;
+use sixfold_geometry::stats::upper_median;
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
@@ -205,11 +206,7 @@ fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32
 
 /// The middle value, 0 of none.
 fn median(values: &mut [f64]) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    upper_median(values).unwrap_or(0.0)
 }
 
 #[cfg(test)]

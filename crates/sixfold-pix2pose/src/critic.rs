@@ -2,8 +2,8 @@
 
 use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::RngExt;
+use sixfold_geometry::random::stream;
 use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 
 use crate::networks::{Discriminator, DiscriminatorConfig};
@@ -35,8 +35,7 @@ impl Critic {
         device: &Device,
     ) -> f64 {
         // Soft labels, now and then turned round for a whole batch, as in the author's code.
-        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
-        random.set_stream(step + 1);
+        let mut random = stream(self.seed, step + 1);
         let mut sum = 0.0;
         for (images, true_label) in [(generated, false), (rendered, true)] {
             let label = if true_label != (random.random::<f32>() < 0.2) {

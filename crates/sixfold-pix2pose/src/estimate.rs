@@ -8,8 +8,8 @@ use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
 use crate::samples::second_stage::GREY;
 use rayon::prelude::*;
-use sixfold_augment::{Patch, Window};
 use sixfold_geometry::{Camera, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac};
+use sixfold_synth::augment::{Patch, Window};
 
 /// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
 #[derive(Debug, Clone, PartialEq)]

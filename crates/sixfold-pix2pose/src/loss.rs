@@ -5,6 +5,7 @@
 
 use crate::object::SymmetryMap;
 use rayon::prelude::*;
+use sixfold_geometry::stats::sigmoid;
 
 /// What a network's channels mean, and how its pixels are weighed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,10 +71,6 @@ pub struct LossValue {
     pub visibility: f64,
     /// In the shape of the output, multiplied by the scale that was asked for.
     pub gradient: Vec<f32>,
-}
-
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + (-x).exp())
 }
 
 /// Loss and gradient of one object's images. `raw`, the network's output, is `batch x channels x pixels`; the gradient belongs to

@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sixfold_augment::{AugmentError, Backgrounds, PhotographOptions};
 use sixfold_bop::{BopDataset, DatasetError, Models};
 use sixfold_geometry::{Rect, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::BoundingBoxScale;
+use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 use thiserror::Error;
 
 use crate::samples::{RealCrop, SampleError, TrainingObject, read_real_crops};

@@ -2,7 +2,6 @@
 
 use burn::module::Module;
 use burn::tensor::Device;
-use sixfold_augment::Backgrounds;
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::weights::{ModelCard, save_weights};
@@ -12,6 +11,7 @@ use sixfold_pix2pose::object::SymmetryMap;
 use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
 use sixfold_pix2pose::training::{TrainingError, TrainingOptions, TrainingOutcome, train};
 use sixfold_render::BoundingBoxScale;
+use sixfold_synth::augment::Backgrounds;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 

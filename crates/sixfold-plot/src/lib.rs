@@ -6,13 +6,13 @@
 mod font;
 mod ticks;
 
-use image::{Rgb, RgbImage};
+use sixfold_geometry::{Image, RgbImage};
 
 use font::FONT;
 pub use ticks::{Ticks, ticks, ticks_logarithmic};
 
 /// Drawn this many times larger and averaged down: smooth lines.
-const OVERSAMPLING: u32 = 3;
+const OVERSAMPLING: usize = 3;
 
 /// Colour of text and axes.
 pub const INK: [u8; 3] = [40, 44, 52];
@@ -38,31 +38,29 @@ pub const COLORS: [[u8; 3]; 12] = [
 
 /// A picture under construction.
 pub struct Canvas {
-    width: u32,
-    height: u32,
+    width: usize,
+    height: usize,
     large: RgbImage,
 }
 
 impl Canvas {
     /// An empty picture of `width` x `height` pixels.
-    pub fn new(width: u32, height: u32) -> Self {
-        let large = RgbImage::from_pixel(width * OVERSAMPLING, height * OVERSAMPLING, Rgb(PAPER));
+    pub fn new(width: usize, height: usize) -> Self {
+        let large = Image::filled(width * OVERSAMPLING, height * OVERSAMPLING, PAPER);
         Canvas { width, height, large }
     }
 
     fn set(&mut self, x: i64, y: i64, color: [u8; 3]) {
-        if let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y))
-            && let Some(pixel) = self.large.get_pixel_mut_checked(x, y)
-        {
-            *pixel = Rgb(color);
+        if x >= 0 && y >= 0 && (x as usize) < self.large.width() && (y as usize) < self.large.height() {
+            self.large[(x as usize, y as usize)] = color;
         }
     }
 
     /// A filled rectangle with its top left corner at `(x, y)`.
     pub fn rectangle(&mut self, x: f64, y: f64, width: f64, height: f64, color: [u8; 3]) {
-        let s = f64::from(OVERSAMPLING);
+        let s = OVERSAMPLING as f64;
         let to = |v: f64| (v * s).round() as i64;
-        let (right, bottom) = (i64::from(self.large.width()), i64::from(self.large.height()));
+        let (right, bottom) = (self.large.width() as i64, self.large.height() as i64);
         for py in to(y).max(0)..to(y + height).min(bottom) {
             for px in to(x).max(0)..to(x + width).min(right) {
                 self.set(px, py, color);
@@ -72,7 +70,7 @@ impl Canvas {
 
     /// A line with round ends. A line to or from a point that is not finite is left out.
     pub fn line(&mut self, from: (f64, f64), to: (f64, f64), thickness: f64, color: [u8; 3]) {
-        let s = f64::from(OVERSAMPLING);
+        let s = OVERSAMPLING as f64;
         let (ax, ay, bx, by) = (from.0 * s, from.1 * s, to.0 * s, to.1 * s);
         if ![ax, ay, bx, by].iter().all(|v| v.is_finite()) {
             return;
@@ -81,7 +79,7 @@ impl Canvas {
         let (dx, dy) = (bx - ax, by - ay);
         let length_squared = (dx * dx + dy * dy).max(1e-12);
         let low = |a: f64, b: f64| ((a.min(b) - radius).floor() as i64).max(0);
-        let high = |a: f64, b: f64, end: u32| ((a.max(b) + radius).ceil() as i64).min(i64::from(end) - 1);
+        let high = |a: f64, b: f64, end: usize| ((a.max(b) + radius).ceil() as i64).min(end as i64 - 1);
         for y in low(ay, by)..=high(ay, by, self.large.height()) {
             for x in low(ax, bx)..=high(ax, bx, self.large.width()) {
                 let (px, py) = (x as f64 + 0.5 - ax, y as f64 + 0.5 - ay);
@@ -124,17 +122,17 @@ impl Canvas {
 
     /// The picture.
     pub fn finish(self) -> RgbImage {
-        RgbImage::from_fn(self.width, self.height, |x, y| {
-            let mut sum = [0u32; 3];
+        Image::from_fn(self.width, self.height, |x, y| {
+            let mut sum = [0usize; 3];
             for dy in 0..OVERSAMPLING {
                 for dx in 0..OVERSAMPLING {
-                    let pixel = self.large.get_pixel(x * OVERSAMPLING + dx, y * OVERSAMPLING + dy);
-                    for (total, value) in sum.iter_mut().zip(pixel.0) {
-                        *total += u32::from(value);
+                    let pixel = self.large[(x * OVERSAMPLING + dx, y * OVERSAMPLING + dy)];
+                    for (total, value) in sum.iter_mut().zip(pixel) {
+                        *total += usize::from(value);
                     }
                 }
             }
-            Rgb(sum.map(|v| (v / (OVERSAMPLING * OVERSAMPLING)) as u8))
+            sum.map(|v| (v / (OVERSAMPLING * OVERSAMPLING)) as u8)
         })
     }
 }
@@ -165,10 +163,10 @@ mod tests {
         let mut canvas = Canvas::new(40, 20);
         canvas.line((5.0, 10.0), (35.0, 10.0), 3.0, INK);
         let picture = canvas.finish();
-        assert_eq!(picture.get_pixel(20, 9).0, INK);
-        assert_eq!(picture.get_pixel(20, 10).0, INK);
-        assert_eq!(picture.get_pixel(20, 4).0, PAPER);
-        assert_eq!(picture.get_pixel(1, 10).0, PAPER);
+        assert_eq!(picture[(20, 9)], INK);
+        assert_eq!(picture[(20, 10)], INK);
+        assert_eq!(picture[(20, 4)], PAPER);
+        assert_eq!(picture[(1, 10)], PAPER);
     }
 
     #[test]
@@ -178,6 +176,6 @@ mod tests {
         canvas.line((f64::NAN, 5.0), (5.0, 5.0), 2.0, INK);
         canvas.rectangle(-20.0, -20.0, 5.0, 5.0, INK);
         canvas.text(100.0, 100.0, 2.0, "out \u{e4}", INK);
-        assert!(canvas.finish().pixels().all(|p| p.0 == PAPER));
+        assert!(canvas.finish().as_slice().iter().all(|p| *p == PAPER));
     }
 }

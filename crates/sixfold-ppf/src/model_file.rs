@@ -8,6 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{PointCloud, Pose, Vec3};
+use sixfold_io::{Fnv1a, fnv1a, write_atomically};
 use sixfold_mesh::Mesh;
 use thiserror::Error;
 
@@ -76,38 +77,22 @@ impl ObjectModel {
     }
 }
 
-/// FNV-1a (Fowler, Noll, Vo) over what the description depends on.
+/// FNV-1a over what the description depends on.
 fn fingerprint(mesh: &Mesh, options: &ModelOptions) -> u64 {
-    let mut hash = Fnv::default();
-    hash.bytes(&options.sampling_step.to_le_bytes());
-    hash.bytes(&(options.angle_steps as u64).to_le_bytes());
+    let mut hash = Fnv1a::default();
+    hash.write(&options.sampling_step.to_le_bytes());
+    hash.write(&(options.angle_steps as u64).to_le_bytes());
     for v in mesh.vertices() {
         for c in v.iter() {
-            hash.bytes(&c.to_le_bytes());
+            hash.write(&c.to_le_bytes());
         }
     }
     for f in mesh.faces() {
         for i in f {
-            hash.bytes(&i.to_le_bytes());
+            hash.write(&i.to_le_bytes());
         }
     }
-    hash.0
-}
-
-struct Fnv(u64);
-
-impl Default for Fnv {
-    fn default() -> Self {
-        Fnv(0xcbf2_9ce4_8422_2325)
-    }
-}
-
-impl Fnv {
-    fn bytes(&mut self, bytes: &[u8]) {
-        for &b in bytes {
-            self.0 = (self.0 ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3);
-        }
-    }
+    hash.value()
 }
 
 fn write(path: &Path, key: u64, model: &ObjectModel) -> Result<(), ModelFileError> {
@@ -130,16 +115,9 @@ fn write(path: &Path, key: u64, model: &ObjectModel) -> Result<(), ModelFileErro
     for v in &model.visible_from {
         out.extend_from_slice(&v.to_le_bytes());
     }
-    let mut sum = Fnv::default();
-    sum.bytes(&out);
-    out.extend_from_slice(&sum.0.to_le_bytes());
-    let io = |source| ModelFileError::Io { path: path.to_path_buf(), source };
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder).map_err(io)?;
-    }
-    // Under a name of its own first: a reader, or a crash, never sees half a file.
-    let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
-    std::fs::write(&temporary, &out).and_then(|()| std::fs::rename(&temporary, path)).map_err(io)
+    let sum = fnv1a(&out);
+    out.extend_from_slice(&sum.to_le_bytes());
+    write_atomically(path, &out).map_err(|source| ModelFileError::Io { path: path.to_path_buf(), source })
 }
 
 fn read(path: &Path, key: u64, options: &ModelOptions) -> Result<Description, ModelFileError> {
@@ -150,9 +128,7 @@ fn read(path: &Path, key: u64, options: &ModelOptions) -> Result<Description, Mo
         return Err(damaged("no description of an object"));
     }
     let (body, sum) = bytes.split_at(bytes.len() - 8);
-    let mut expected = Fnv::default();
-    expected.bytes(body);
-    if expected.0.to_le_bytes() != sum {
+    if fnv1a(body).to_le_bytes() != sum {
         return Err(damaged("the checksum does not match: the file is damaged or cut off"));
     }
     let mut reader = Reader { bytes: &body[8..] };

@@ -5,10 +5,11 @@
 
 use std::path::{Path, PathBuf};
 
-use sixfold_bop::{BopDataset, Models, read_depth};
+use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
 use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_ppf::{PpfEstimate, PpfOptions, ModelOptions, ObjectModel, estimate};
+use sixfold_io::read_depth;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 
 fn data() -> Option<PathBuf> {

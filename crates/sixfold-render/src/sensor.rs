@@ -7,9 +7,9 @@
 
 use std::sync::LazyLock;
 
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::{Rng, RngExt};
 use rayon::prelude::*;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{DepthImage, Image, NormalImage};
 
 use crate::shadow::shadow_row;
@@ -145,8 +145,7 @@ pub fn simulate_depth(
     let rows: Vec<Vec<f32>> = (0..height)
         .into_par_iter()
         .map(|y| {
-            let mut random = ChaCha8Rng::seed_from_u64(seed);
-            random.set_stream(y as u64);
+            let mut random = stream(seed, y as u64);
             let mut row: Vec<f32> = (0..width)
                 .map(|x| seen.measure(x, y, waves.as_ref().map(|w| w.at(x, y)), &mut random))
                 .collect();
@@ -287,8 +286,7 @@ impl Waves {
 
     fn new(width: usize, height: usize, step: usize, seed: u64) -> Waves {
         let (columns, rows) = (width / step + 2, height / step + 2);
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(Waves::STREAM);
+        let mut random = stream(seed, Waves::STREAM);
         let knots = (0..columns * rows).map(|_| gaussian_pair(&mut random).0 as f32).collect();
         Waves { step, columns, knots }
     }

@@ -1,9 +1,9 @@
 //! One whole attempt: an object comes to rest, a depth camera looks, the planner proposes, the hand tries.
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::RngExt;
 use serde::Serialize;
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, Grasp, GraspView, Gripper, ViewOptions, antipodal_grasps,
@@ -113,8 +113,7 @@ pub struct Scene {
 
 /// The scene of attempt `number`: pose, view point and noise are drawn from `seed` and `number` alone.
 pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u64, number: u64) -> Scene {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    random.set_stream(number);
+    let mut random = stream(seed, number);
     let yaw = random.random_range(-std::f64::consts::PI..std::f64::consts::PI);
     let upright = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, yaw].into());
     let any: [f64; 4] = std::array::from_fn(|_| random.random_range(-1.0..1.0));

@@ -10,8 +10,8 @@
 //! ```
 //! use sixfold_geometry::{Pose, Vec3};
 //! use sixfold_grasp::{Gripper, gripper_pose};
-//! use sixfold_simulation::{ConvexParts, Outcome, TrialOptions, shapes, try_grasp};
-//! let cube = ConvexParts::of_convex(&shapes::cuboid(Vec3::repeat(0.05)).unwrap())?;
+//! use sixfold_simulation::{ConvexParts, Outcome, TrialOptions, try_grasp};
+//! let cube = ConvexParts::of_convex(&sixfold_synth::primitives::cuboid(Vec3::repeat(0.05)).unwrap())?;
 //! let world_from_object = Pose::from_translation(Vec3::new(0.0, 0.0, 0.025));
 //! let gripper = Gripper::built_in("jaws-85").unwrap();
 //! let grasp = gripper_pose(&Vec3::new(0.0, 0.0, 0.01), &-Vec3::z(), &Vec3::x()).unwrap();
@@ -28,7 +28,6 @@ mod error;
 mod parts;
 mod pile;
 mod settle;
-pub mod shapes;
 mod statistics;
 mod trial;
 mod view;

@@ -182,7 +182,7 @@ pub(crate) fn vec3(v: &Vector) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shapes;
+    use sixfold_synth::primitives as shapes;
 
     #[test]
     fn a_bowl_stays_hollow_and_a_cube_is_one_part() {

@@ -2,10 +2,10 @@
 
 use std::f64::consts::TAU;
 
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::{Rng, RngExt};
 use rapier3d::prelude::RigidBodyHandle;
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 
 use crate::error::check_ranges;
@@ -111,8 +111,7 @@ pub fn drop_objects(
     if options.check().is_err() {
         return poses;
     }
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    random.set_stream(number);
+    let mut random = stream(seed, number);
     let mut objects: Vec<Dropped> = vec![];
     for (number, parts) in parts.iter().enumerate() {
         let upright = random.random::<f64>() < options.upright;
@@ -217,9 +216,9 @@ fn any_turn(random: &mut impl Rng) -> UnitQuaternion<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shapes;
     use crate::world::to_engine;
     use rapier3d::parry::query::contact;
+    use sixfold_synth::primitives as shapes;
 
     fn objects() -> Vec<ConvexParts> {
         let mut list = vec![];

@@ -50,7 +50,7 @@ pub fn settle_in_middle(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Po
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shapes;
+    use sixfold_synth::primitives as shapes;
 
     #[test]
     fn a_tilted_box_comes_to_lie_on_a_side() {

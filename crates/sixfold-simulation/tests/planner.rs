@@ -8,8 +8,9 @@ use sixfold_grasp::{
 use sixfold_mesh::Mesh;
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{
-    AttemptOptions, ConvexParts, PartsOptions, SimulatedView, ViewPoint, attempt, shapes, simulate_view,
+    AttemptOptions, ConvexParts, PartsOptions, SimulatedView, ViewPoint, attempt, simulate_view,
 };
+use sixfold_synth::primitives as shapes;
 
 fn hand() -> Gripper {
     Gripper::built_in("jaws-140").unwrap()

@@ -2,7 +2,8 @@
 
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{Gripper, gripper_pose};
-use sixfold_simulation::{ConvexParts, Outcome, PartsOptions, TrialOptions, shapes, try_grasp};
+use sixfold_simulation::{ConvexParts, Outcome, PartsOptions, TrialOptions, try_grasp};
+use sixfold_synth::primitives as shapes;
 
 fn hand() -> Gripper {
     Gripper::built_in("jaws-85").unwrap()

@@ -2,10 +2,10 @@
 //! pixels on either side, which are theirs, an edge of the image speaks for a border (ours): `w g^2 / (g^2 + EDGE^2)` is added to
 //! its log likelihood, where `g` is the change of colour across it and `w` the weight of [`Outline::with_edges`].
 
-use sixfold_augment::Patch;
 use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_synth::augment::Patch;
 
 /// Fewer lines do not hold a pose.
 pub const LEAST_LINES: usize = 12;

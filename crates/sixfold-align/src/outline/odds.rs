@@ -1,6 +1,6 @@
 //! Where colour says that a pixel shows the object: histograms of what lies inside and around it in this one image.
 
-use sixfold_augment::Patch;
+use sixfold_synth::augment::Patch;
 
 /// Bins of the colour histograms along each channel.
 const BINS: usize = 16;

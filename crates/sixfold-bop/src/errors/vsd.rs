@@ -15,7 +15,7 @@ pub struct VsdOptions {
 
 impl Default for VsdOptions {
     fn default() -> Self {
-        VsdOptions { delta: 0.015, taus: crate::score::fractions_05_to_50() }
+        VsdOptions { delta: crate::visibility::VISIBILITY_DELTA, taus: crate::score::fractions_05_to_50() }
     }
 }
 

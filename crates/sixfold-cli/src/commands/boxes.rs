@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow};
 use sixfold_bop::{
-    Adjustment, BopDataset, Detection, ReadDetections, Rle, Scene, Target, TargetObject,
+    Adjustment, BopDataset, Detection, ReadDetections, Rle, Scene, Target, TargetObject, VISIBILITY_DELTA,
     ground_truth_visibility, read_detections,
 };
 use sixfold_geometry::{Camera, Mask, Rect};
@@ -173,7 +173,7 @@ fn ground_truth_boxes<'m>(
         .collect();
     let meshes: Vec<_> = objects.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
     let depth = scene.depth(im_id)?;
-    let visible = ground_truth_visibility(&meshes, &scene.camera(im_id)?, depth.as_ref(), 0.015);
+    let visible = ground_truth_visibility(&meshes, &scene.camera(im_id)?, depth.as_ref(), VISIBILITY_DELTA);
     Ok(objects
         .iter()
         .zip(visible)

@@ -6,10 +6,11 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Detection, Rle, read_rgb, write_detections, write_rgb};
+use sixfold_bop::{BopDataset, Detection, Rle, write_detections};
 use sixfold_detect::detect::{DetectOptions, Detected};
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
+use sixfold_io::{read_rgb, write_rgb};
 
 use super::frames::excepted;
 use crate::Outcome;

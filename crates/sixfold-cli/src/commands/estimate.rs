@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_geometry::{Camera, DepthImage, Mask, Rect, RgbImage, undistort_depth, undistort_rgb};
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
 
 use crate::Outcome;

@@ -6,8 +6,9 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::{Deserialize, Serialize};
-use sixfold_bop::{BopDataset, Models, ResultsAppender, Target, write_rgb};
+use sixfold_bop::{BopDataset, Models, ResultsAppender, Target};
 use sixfold_geometry::Pose;
+use sixfold_io::write_rgb;
 use sixfold_match::{ObjectModel, Scene, estimate};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_pix2pose::depth::DepthScene;

@@ -5,10 +5,10 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2, Vec3, undistort_depth, undistort_rgb};
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::depth::DepthScene;
 use sixfold_pix2pose::object::ObjectEntry;

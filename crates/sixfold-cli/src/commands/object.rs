@@ -2,8 +2,8 @@
 
 use anyhow::{Result, anyhow};
 use serde::Serialize;
-use sixfold_bop::write_rgb;
 use sixfold_geometry::Vec3;
+use sixfold_io::write_rgb;
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo, ModelsInfo, read_mesh};
 
 use crate::Outcome;

@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result, bail};
 use serde_json::json;
-use sixfold_bop::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
+use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_mesh::Mesh;
 use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
 

@@ -6,10 +6,11 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde_json::json;
 use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_rgb,
-    write_targets,
+    BopDataset, Models, NewImage, SceneWriter, Target, VISIBILITY_DELTA, ground_truth_visibility,
+    write_camera, write_targets,
 };
 use sixfold_geometry::Pose;
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
 
@@ -72,7 +73,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
                 let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
                 write_rgb(&path, &overlay::side_by_side(&ideal, &depth))?;
             }
-            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
+            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), VISIBILITY_DELTA);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
             let rgb = if a.rgb { scene.rgb(im_id)? } else { None };
             writer.add(&NewImage {

@@ -111,7 +111,7 @@ fn colour_image_in_place_of_depth() {
 #[test]
 fn depth_of_zeros() {
     let empty = sixfold_geometry::DepthImage::filled(WIDTH, HEIGHT, 0.0);
-    let write = |dir: &Path| sixfold_bop::write_depth(&dir.join("depth.png"), &empty, 1e-3).unwrap();
+    let write = |dir: &Path| sixfold_io::write_depth(&dir.join("depth.png"), &empty, 1e-3).unwrap();
     estimate_fails(write, "", &["depth.png", "no valid pixel"]);
 }
 
@@ -173,13 +173,13 @@ fn intrinsics_of_another_resolution() {
     );
     let small = sixfold_geometry::RgbImage::filled(160, 120, [1; 3]);
     estimate_fails(
-        |dir| sixfold_bop::write_rgb(&dir.join("rgb.png"), &small).unwrap(),
+        |dir| sixfold_io::write_rgb(&dir.join("rgb.png"), &small).unwrap(),
         "",
         &["rgb.png", "160x120", "320x240"],
     );
     let mask = sixfold_geometry::Mask::filled(160, 120, true);
     estimate_fails(
-        |dir| sixfold_bop::write_mask(&dir.join("mask.png"), &mask).unwrap(),
+        |dir| sixfold_io::write_mask(&dir.join("mask.png"), &mask).unwrap(),
         "--mask mask.png",
         &["mask.png", "160x120", "320x240"],
     );
@@ -197,7 +197,7 @@ fn boxes_and_masks_that_leave_nothing() {
     assert!(run.stderr.contains("--box"), "{}", run.stderr);
     let mask = sixfold_geometry::Mask::filled(WIDTH, HEIGHT, false);
     estimate_fails(
-        |dir| sixfold_bop::write_mask(&dir.join("mask.png"), &mask).unwrap(),
+        |dir| sixfold_io::write_mask(&dir.join("mask.png"), &mask).unwrap(),
         "--mask mask.png",
         &["mask.png", "empty"],
     );

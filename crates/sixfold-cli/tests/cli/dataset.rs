@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use serde_json::Value;
-use sixfold_bop::{Detection, Rle, ground_truth_visibility, read_results, write_detections};
+use sixfold_bop::{
+    Detection, Rle, VISIBILITY_DELTA, ground_truth_visibility, read_results, write_detections,
+};
 use sixfold_geometry::{Mask, Rect};
 
 use crate::support::*;
@@ -122,7 +124,7 @@ fn masks_of_detections_say_more_than_their_boxes() {
     let tiny = Tiny::new(true);
     let (meshes, posed) = ([part(), other_part()], [1, 2].map(|id| tiny.truth_of(4, id)));
     let posed: Vec<_> = meshes.iter().zip(posed).collect();
-    let masks = ground_truth_visibility(&posed, &camera(), None, 0.015);
+    let masks = ground_truth_visibility(&posed, &camera(), None, VISIBILITY_DELTA);
     // The box is the whole image; only the mask says where in it.
     let found = |mask: Option<&Mask>| {
         let detection = Detection {

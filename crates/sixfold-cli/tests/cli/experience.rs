@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::Path;
 
-use sixfold_bop::write_mask;
+use sixfold_io::write_mask;
 use sixfold_render::render_depth;
 
 use crate::support::*;

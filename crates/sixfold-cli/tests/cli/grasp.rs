@@ -2,8 +2,8 @@
 
 use std::fs;
 
-use sixfold_bop::write_mask;
 use sixfold_geometry::Mask;
+use sixfold_io::write_mask;
 use sixfold_render::render_depth;
 
 use crate::support::*;

@@ -80,7 +80,7 @@ fn a_table_prints_where_no_json_is_asked_for() {
 #[test]
 fn nothing_found_is_exit_status_1() {
     let case = OneImage::new();
-    sixfold_bop::write_depth(&case.path().join("depth.png"), &depth_of(&[]), DEPTH_SCALE).unwrap();
+    sixfold_io::write_depth(&case.path().join("depth.png"), &depth_of(&[]), DEPTH_SCALE).unwrap();
     let run = sixfold(case.path(), &format!("{} --json", OneImage::ARGUMENTS)).expect(1);
     let json = run.json();
     assert_eq!(json["poses"].as_array().unwrap().len(), 0, "{json}");
@@ -99,7 +99,7 @@ fn two_instances_and_boxes() {
     let part = part();
     let poses = [on_table(-0.09, 0.0, 0.4), on_table(0.09, 0.02, 2.5)];
     let depth = depth_of(&[(&part, poses[0]), (&part, poses[1])]);
-    sixfold_bop::write_depth(&case.path().join("depth.png"), &depth, DEPTH_SCALE).unwrap();
+    sixfold_io::write_depth(&case.path().join("depth.png"), &depth, DEPTH_SCALE).unwrap();
     let found = |more: &str| -> Vec<_> {
         let run = sixfold(case.path(), &format!("{} --json {more}", OneImage::ARGUMENTS)).expect(0);
         let json = run.json();
@@ -116,7 +116,7 @@ fn two_instances_and_boxes() {
     assert_eq!(left.len(), 1);
     assert_near(&left[0], &poses[0]);
     let mask = sixfold_geometry::Mask::from_fn(WIDTH, HEIGHT, |x, _| x >= WIDTH / 2);
-    sixfold_bop::write_mask(&case.path().join("mask.png"), &mask).unwrap();
+    sixfold_io::write_mask(&case.path().join("mask.png"), &mask).unwrap();
     let right = found("--mask mask.png");
     assert_eq!(right.len(), 1);
     assert_near(&right[0], &poses[1]);

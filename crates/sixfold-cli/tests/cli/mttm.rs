@@ -1,7 +1,7 @@
 //! `sixfold estimate --method mttm`, `sixfold object add --templates` and `--depth`, `sixfold reproduce mttm`.
 
-use sixfold_bop::{write_depth, write_mask};
 use sixfold_geometry::{Mask, Pose};
+use sixfold_io::{write_depth, write_mask};
 
 use crate::support::*;
 

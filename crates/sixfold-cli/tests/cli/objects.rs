@@ -86,8 +86,8 @@ fn render_writes_what_is_seen() {
     }
     // The mask covers exactly where the library sees the object, and its depth is the same.
     let expected = sixfold_render::render_depth(&part(), &case.truth, &camera());
-    let found = sixfold_bop::read_depth(&dir.join("seen/depth.png"), 1e-4).unwrap();
-    let mask = sixfold_bop::read_mask(&dir.join("seen/mask.png")).unwrap();
+    let found = sixfold_io::read_depth(&dir.join("seen/depth.png"), 1e-4).unwrap();
+    let mask = sixfold_io::read_mask(&dir.join("seen/mask.png")).unwrap();
     let mut pixels = 0;
     for (i, z) in expected.as_slice().iter().enumerate() {
         let seen = *z > 0.0;

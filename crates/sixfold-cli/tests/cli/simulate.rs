@@ -1,6 +1,7 @@
 //! `sixfold simulate-depth`.
 
-use sixfold_bop::{BopDataset, read_depth};
+use sixfold_bop::BopDataset;
+use sixfold_io::read_depth;
 
 use crate::support::*;
 

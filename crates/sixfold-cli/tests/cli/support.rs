@@ -176,10 +176,10 @@ impl OneImage {
         let part = part();
         write_ply(dir.path().join("part.ply"), &part, Unit::Millimetre, PlyFormat::BinaryLittleEndian)
             .unwrap();
-        sixfold_bop::write_depth(&dir.path().join("depth.png"), &depth_of(&[(&part, truth)]), DEPTH_SCALE)
+        sixfold_io::write_depth(&dir.path().join("depth.png"), &depth_of(&[(&part, truth)]), DEPTH_SCALE)
             .unwrap();
         let grey = sixfold_geometry::RgbImage::filled(WIDTH, HEIGHT, [90; 3]);
-        sixfold_bop::write_rgb(&dir.path().join("rgb.png"), &grey).unwrap();
+        sixfold_io::write_rgb(&dir.path().join("rgb.png"), &grey).unwrap();
         write_camera(dir.path(), &camera(), DEPTH_SCALE).unwrap();
         OneImage { dir, truth }
     }

@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
-use sixfold_bop::{BopDataset, read_mask, read_rgb, write_mask};
+use sixfold_bop::BopDataset;
 use sixfold_geometry::Mask;
+use sixfold_io::{read_mask, read_rgb, write_mask};
 
 use crate::support::*;
 

@@ -10,7 +10,7 @@ pub use compact::{Compact, CompactConfig};
 pub use paper::{Paper, PaperConfig};
 
 /// Length of features and codes.
-pub const FEATURE: usize = 256;
+pub const FEATURE: usize = sixfold_experience::FEATURE;
 
 /// What an encoder says of a batch.
 #[derive(Debug, Clone)]

@@ -10,8 +10,7 @@ use burn::module::Module;
 use burn::nn::Linear;
 use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::random::stream;
 use sixfold_nn::conv_transpose::{ConvTranspose, ConvTransposeConfig};
 use sixfold_nn::dense::dense;
 use sixfold_nn::kernels::Activation;
@@ -55,8 +54,7 @@ impl PaperConfig {
     }
 
     fn init_with(&self, backbone: ResNet50, seed: u64, device: &Device) -> Paper {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(1);
+        let mut rng = stream(seed, 1);
         let rng = &mut rng;
         let mut down = |layers: &[(usize, usize)], mut inputs: usize| -> Vec<Conv> {
             layers

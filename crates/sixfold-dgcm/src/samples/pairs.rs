@@ -4,13 +4,14 @@
 //! every pixel of the first where the same place of the object has its VD-NOC in the second. Negative: views of different
 //! families, or of one that share less.
 
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_geometry::random::stream;
 use sixfold_nn::layers::normal;
+use sixfold_synth::shapes::Family;
 
 use super::pool::{Pool, View};
-use sixfold_shapes::Family;
 
 /// How pairs are drawn and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -55,8 +56,7 @@ pub struct Pair {
 impl Pool {
     /// The pair with this number, the same for the same seed.
     pub fn pair(&self, positive: bool, options: &PairOptions, seed: u64, number: u64) -> Pair {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(number);
+        let mut random = stream(seed, number);
         let (first, second) = self.draw(positive, options, &mut random);
         let side = self.options().crop.side;
         let pixels = side * side;

@@ -3,18 +3,17 @@
 
 use std::sync::Arc;
 
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::{Rng, RngExt};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
-use crate::crop::{Crop, CropOptions};
-use crate::vd_noc::Extent;
-use sixfold_shapes::{Family, Rest, member};
+use sixfold_experience::{Crop, CropOptions, Extent};
+use sixfold_synth::shapes::{Family, Rest, member};
 
 /// How views are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -159,8 +158,7 @@ impl Pool {
 }
 
 fn views_of_member(options: &PoolOptions, number: u64) -> Vec<View> {
-    let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-    random.set_stream(number);
+    let mut random = stream(options.seed, number);
     let family = Family::ALL[(number % Family::ALL.len() as u64) as usize];
     let rests = family.rests();
     let rest = rests[random.random_range(0..rests.len())];

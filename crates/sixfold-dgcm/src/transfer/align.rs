@@ -8,8 +8,7 @@
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, Vec3, icp, kabsch};
 
-use crate::crop::Crop;
-use crate::vd_noc::Extent;
+use sixfold_experience::{Crop, Extent};
 
 /// How an experience is aligned.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -216,10 +216,8 @@ fn joined(mut candidates: Vec<Ranked>, clusters: &ClusterOptions) -> (Vec<Ranked
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::crop::{Crop, CropOptions};
-    use crate::outcome::Attempt;
-    use crate::store::Match;
     use crate::transfer::Hypothesis;
+    use sixfold_experience::{Attempt, Crop, CropOptions, Match};
     use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
     use sixfold_grasp::{
         AntipodalOptions, AntipodalQuality, GraspDescription, GraspView, Gripper, gripper_pose,

@@ -4,7 +4,7 @@
 use sixfold_geometry::nalgebra::Rotation3;
 use sixfold_geometry::{Pose, Vec3};
 
-use crate::crop::Crop;
+use sixfold_experience::Crop;
 
 /// Side of a cell, metres.
 const CELL: f64 = 0.005;

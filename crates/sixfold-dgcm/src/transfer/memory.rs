@@ -3,9 +3,10 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use sixfold_experience::{Attempt, ExperienceStore, FeatureIndex, Match, StoreError, Stored, Summary};
+
 use crate::model::DgcmModel;
-use crate::outcome::{Attempt, OutcomeModel};
-use crate::store::{ExperienceStore, FeatureIndex, Match, StoreError, Stored, Summary};
+use crate::outcome::OutcomeModel;
 
 /// Experiences of one store for one network.
 pub struct Memory {

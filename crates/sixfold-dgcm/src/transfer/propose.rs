@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
+use sixfold_experience::{Crop, CropError, Match, StoreError, Summary, turn};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
 use sixfold_grasp::{Grasp, GraspFitter, Gripper, middle_between_pads};
@@ -10,10 +11,7 @@ use thiserror::Error;
 
 use super::Memory;
 use super::align::{AlignOptions, Hypothesis, Transferred, noc, pixels_near, transfer};
-use crate::crop::{Crop, CropError};
-use crate::crop_turn::turn;
 use crate::model::DgcmModel;
-use crate::store::{Match, StoreError, Summary};
 
 /// Why nothing can be proposed.
 #[derive(Debug, Error)]
@@ -330,7 +328,7 @@ fn stand_off(fitter: &GraspFitter<'_>, gripper: &Gripper, source: &Source<'_>, p
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::crop::CropOptions;
+    use sixfold_experience::CropOptions;
     use sixfold_geometry::{Camera, Image, Mask};
     use sixfold_grasp::{AntipodalQuality, gripper_pose};
 

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use rayon::prelude::*;
+use sixfold_experience::{Match, StoreError, Stored};
 use sixfold_geometry::Vec3;
 use sixfold_grasp::{Grasp, GraspFitter, middle_between_pads};
 
@@ -11,7 +12,6 @@ use super::align::{Hypothesis, Transferred};
 use super::fit::Shape;
 use super::propose::{FEWEST_HELD, Proposal, Proposals, Source, between_pads, place};
 use super::upright::upright;
-use crate::store::{Match, StoreError, Stored};
 
 /// Experiences that are compared.
 const EXPERIENCES: usize = 10;

@@ -197,10 +197,10 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::{Camera, Mask, Mat3, Plane};
     use sixfold_render::{Frame, RenderOptions, SceneObject};
-    use sixfold_shapes::{Family, Member, member};
+    use sixfold_synth::shapes::{Family, Member, member};
 
     use super::*;
-    use crate::crop::{Crop, CropOptions};
+    use sixfold_experience::{Crop, CropOptions};
 
     /// A made-up object on a table, 0.7 m from a camera that looks down by 40 degrees.
     struct Seen {

@@ -11,8 +11,7 @@ use burn::module::Module;
 use burn::nn::Linear;
 use burn::tensor::activation::elu;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::random::stream;
 use sixfold_nn::dense::dense;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
@@ -48,8 +47,7 @@ impl PaperConfig {
     }
 
     fn init_with(&self, backbone: ResNet50, seed: u64, device: &Device) -> Paper {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(1);
+        let mut rng = stream(seed, 1);
         let rng = &mut rng;
         let mut conv = |channels: [usize; 2], kernel: usize, activation: Activation, gain: f32| {
             ConvConfig::new(channels, kernel, activation).init(gain, rng, device)

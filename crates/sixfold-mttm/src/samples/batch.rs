@@ -1,8 +1,8 @@
 //! A step's numbers: regions, shifted, mirrored, turned and hidden in part, with their templates.
 
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
+use sixfold_geometry::random::stream;
 
 use super::anchor::{Anchor, SeenPatch};
 use super::pool::Pool;
@@ -75,8 +75,7 @@ pub struct Batch {
 impl Batch {
     /// The numbers of a step: a function of pool, options, seed and step.
     pub fn of_step(pool: &Pool, options: &BatchOptions, seed: u64, step: u64) -> Batch {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(step);
+        let mut random = stream(seed, step);
         let mut batch = Batch::default();
         let side = pool.options().anchors.side;
         for _ in 0..options.anchors {

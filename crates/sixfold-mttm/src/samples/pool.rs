@@ -2,11 +2,12 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rand::{RngExt, SeedableRng};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Vec3};
 use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_mesh::Mesh;
@@ -84,8 +85,7 @@ impl Pool {
                 }
                 let anchors: Vec<Anchor> = (0..options.views as u64)
                     .flat_map(|view| {
-                        let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-                        random.set_stream(number as u64 * 1000 + view);
+                        let mut random = stream(options.seed, number as u64 * 1000 + view);
                         see(meshes, arrangement, options, &mut random)
                     })
                     .collect();

@@ -8,8 +8,7 @@ use std::path::Path;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::random::stream;
 use sixfold_nn::batch_norm::{BatchNorm, BatchNormConfig};
 use sixfold_nn::conv_norm::{BareConv, BareConvConfig};
 use sixfold_nn::densenet::{DenseNet121, DenseNet121Config};
@@ -48,8 +47,7 @@ impl PaperConfig {
     }
 
     fn init_with(&self, encoder: DenseNet121, seed: u64, device: &Device) -> Paper {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(1);
+        let mut rng = stream(seed, 1);
         let rng = &mut rng;
         let reduce = MAPS
             .iter()

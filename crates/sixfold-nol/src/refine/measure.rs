@@ -1,9 +1,9 @@
 //! What one photograph says about the pose of its object: colours against those of the others, the outline, the given pose.
 
-use sixfold_augment::Coverage;
 use sixfold_geometry::{NormalEquations, Pose, Vec3};
 use sixfold_align::outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
 use sixfold_render::Frame;
+use sixfold_synth::augment::Coverage;
 
 use super::appearance::Light;
 use super::arrangement::Wanted;

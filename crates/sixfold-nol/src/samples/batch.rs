@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sixfold_augment::{Backgrounds, Patch, stream};
+use sixfold_geometry::random::stream;
 use sixfold_nn::kernels::{Place, Places, neighbours};
+use sixfold_synth::augment::{Backgrounds, Patch};
 
 use super::view::{Sample, SampleOptions, make_sample};
 use crate::network::COLOURS;

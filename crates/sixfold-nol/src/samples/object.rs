@@ -1,12 +1,13 @@
 //! A made-up object with a random surface, and what a camera sees of it under a lamp.
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Coverage, Patch, Random, procedural_texture};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::random::Random;
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
-use sixfold_shapes::{Family, member};
+use sixfold_synth::augment::{Backgrounds, Coverage, Patch, procedural_texture};
+use sixfold_synth::shapes::{Family, member};
 
 /// Pixels along a texture's side.
 const TEXTURE: usize = 160;

@@ -3,12 +3,12 @@
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sixfold_augment::{
-    Backgrounds, ColorAugmentation, Coverage, Patch, Random, Shape, Window, occluder_of_fraction, stream,
-    uniform,
-};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
+use sixfold_synth::augment::{
+    Backgrounds, ColorAugmentation, Coverage, Patch, Shape, Window, occluder_of_fraction,
+};
 
 use super::object::{Lamp, PaintedObject, between, random_direction};
 use crate::photograph::object_window;

@@ -7,8 +7,8 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::random::stream;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig, Padding};
 use sixfold_nn::lite0::{Lite0, Lite0Config};
@@ -54,8 +54,7 @@ impl CompactConfig {
     pub fn init(&self, encoder: Lite0, seed: u64, device: &Device) -> Compact {
         let decoders = (0..self.objects)
             .map(|object| {
-                let mut rng = ChaCha8Rng::seed_from_u64(seed);
-                rng.set_stream(object as u64 + 1);
+                let mut rng = stream(seed, object as u64 + 1);
                 Decoder::init(&mut rng, device)
             })
             .collect();

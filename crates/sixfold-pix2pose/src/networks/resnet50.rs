@@ -4,8 +4,7 @@ use std::path::Path;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::random::stream;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::resnet::{ResNet50, ResNet50Config};
 
@@ -36,8 +35,7 @@ impl ResNet50GeneratorConfig {
     }
 
     fn with_encoder(&self, encoder: ResNet50, device: &Device) -> ResNet50Generator {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
-        rng.set_stream(1);
+        let mut rng = stream(self.seed, 1);
         let last = ConvStage::init([512, 512], 2, &mut rng, device);
         ResNet50Generator { encoder, last, decoder: Decoder::init(SKIPS, &mut rng, device) }
     }

@@ -1,10 +1,10 @@
 //! Why no model could be trained.
 
-use sixfold_augment::AugmentError;
 use sixfold_mesh::MeshError;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::NotReady;
 use sixfold_nn::weights::WeightsError;
+use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
 use crate::estimate::EstimateError;

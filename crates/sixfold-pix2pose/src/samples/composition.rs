@@ -1,8 +1,9 @@
 //! From an object's picture to an input image: background, clutter behind, occluders in front.
 
 use rand::RngExt;
-use sixfold_augment::{
-    Backgrounds, Coverage, Cutout, Patch, Random, Shape, occluder_of_fraction, procedural_texture, uniform,
+use sixfold_geometry::random::{Random, uniform};
+use sixfold_synth::augment::{
+    Backgrounds, Coverage, Cutout, Patch, Shape, occluder_of_fraction, procedural_texture,
 };
 
 use super::options::SampleOptions;

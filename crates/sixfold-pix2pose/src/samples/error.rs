@@ -1,7 +1,7 @@
 //! What can be wrong with training data.
 
-use sixfold_augment::AugmentError;
 use sixfold_bop::DatasetError;
+use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
 /// Why no samples can be made.

@@ -21,5 +21,5 @@ pub use error::SampleError;
 pub use options::SampleOptions;
 pub use poses::PoseRange;
 pub use real::{RealCrop, read_real_crops};
-pub use rendering::{color_patch, randomly_colored};
+pub use rendering::color_patch;
 pub use source::{Sample, SampleSource, TrainingObject};

@@ -3,8 +3,9 @@
 use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
 
 use rand::RngExt;
-use sixfold_augment::{ColorAugmentation, Random};
 use sixfold_geometry::Camera;
+use sixfold_geometry::random::Random;
+use sixfold_synth::augment::ColorAugmentation;
 
 use super::error::SampleError;
 

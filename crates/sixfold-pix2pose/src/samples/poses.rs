@@ -1,8 +1,8 @@
 //! Poses of rendered objects: near those of photographs, or from anywhere on a part of the view sphere.
 
 use rand::RngExt;
-use sixfold_augment::{Random, uniform};
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
+use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec2, Vec3};
 
 use super::options::SampleOptions;
@@ -81,7 +81,7 @@ fn looking_from(direction: &Vec3, azimuth: f64) -> UnitQuaternion<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sixfold_augment::stream;
+    use sixfold_geometry::random::stream;
 
     #[test]
     fn the_camera_looks_from_above_and_upright() {

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use sixfold_augment::{AffineMap, Coverage, Cutout};
-use sixfold_bop::{BopDataset, MaskKind, Models, ground_truth_visibility};
+use sixfold_bop::{BopDataset, MaskKind, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
+use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 
 use super::error::SampleError;
 
@@ -207,7 +207,7 @@ pub fn read_real_crops(
             }
             let placed: Vec<(&Mesh, Pose)> =
                 frame.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
-            let rendered = ground_truth_visibility(&placed, &camera, None, 0.015);
+            let rendered = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
             for ((mask, fraction), rendered) in masks.iter_mut().zip(&mut fractions).zip(rendered) {
                 if mask.is_none() {
                     *mask = Some(rendered.mask_visible);

@@ -3,7 +3,8 @@
 //! rectangles are missing or added, holes appear.
 
 use rand::RngExt;
-use sixfold_augment::{Coverage, Patch, Random, uniform};
+use sixfold_geometry::random::{Random, uniform};
+use sixfold_synth::augment::{Coverage, Patch};
 
 /// Value of what is masked out, in images of 0..1.
 pub(crate) const GREY: f32 = 0.5;

@@ -3,17 +3,19 @@
 use std::collections::BTreeMap;
 
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, Coverage, Cutout, Patch, Random, Window, stream, uniform};
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, simplify};
 use sixfold_render::BoundingBoxScale;
+use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
+use sixfold_synth::randomly_colored;
 
 use super::composition::{Composition, Scenery, gain};
 use super::error::SampleError;
 use super::options::SampleOptions;
 use super::poses::PoseRange;
 use super::real::RealCrop;
-use super::rendering::{color_patch, colors, random_lights, random_material, randomly_colored, targets};
+use super::rendering::{color_patch, colors, random_lights, random_material, targets};
 use super::second_stage;
 use super::symmetry::canonical;
 use super::window::{Extent, turned, turned_pixel, window_around};

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use sixfold_augment::{Backgrounds, ColorAugmentation};
 use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo};
 use sixfold_render::{BoundingBoxScale, Light, Material};
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
 
 use super::rendering::{colors, targets};
 use super::*;
@@ -345,7 +345,7 @@ fn same_numbers_same_bytes_on_any_thread() {
 #[test]
 fn both_stages_in_blocks_or_mixed() {
     let second_stages = |options: SampleOptions| -> Vec<bool> {
-        let mut random = sixfold_augment::stream(1, 1);
+        let mut random = sixfold_geometry::random::stream(1, 1);
         (0..200).map(|n| options.is_second_stage(n, &mut random)).collect()
     };
     let blocks = second_stages(SampleOptions { second_stage_block: Some(50), ..SampleOptions::default() });
@@ -369,7 +369,7 @@ fn a_freely_turning_object_has_one_target() {
         // The same photograph and mask, the pose turned about the axis.
         let crop = photograph(7, poses()[0]);
         let silhouette =
-            crop.visible(&sixfold_augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
+            crop.visible(&sixfold_synth::augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
         let mask = Mask::from_fn(320, 240, |x, y| silhouette.data[y * 320 + x] > 0.5);
         let crop = RealCrop::new(7, crop.image().clone(), camera(), pose, &mask).unwrap();
         SampleSource::new(vec![turning.clone()], vec![crop], grey_background(), options.clone()).unwrap()

@@ -5,9 +5,10 @@
 //! rendered at `R_z P` with the window's camera, and nothing but colour is ever interpolated.
 
 use rand::RngExt;
-use sixfold_augment::{Coverage, Random, Window, uniform};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
+use sixfold_synth::augment::{Coverage, Window};
 
 use super::options::SampleOptions;
 

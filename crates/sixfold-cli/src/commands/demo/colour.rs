@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Target, write_rgb};
+use sixfold_bop::{BopDataset, Target};
+use sixfold_io::write_rgb;
 
 use super::super::boxes::Boxes;
 use super::super::material::was_trained_on;

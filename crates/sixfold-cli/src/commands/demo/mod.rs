@@ -10,7 +10,8 @@ use std::time::Instant;
 
 use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves, write_rgb};
+use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
+use sixfold_io::write_rgb;
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
 
 use self::colour::Colour;

@@ -8,19 +8,18 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_bop::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::{
     Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
 };
+use sixfold_experience::StorePlace;
 use sixfold_geometry::Pose;
+use sixfold_geometry::random::stream;
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps,
 };
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;
@@ -92,8 +91,7 @@ impl Hardness {
     /// Where the hand goes when it is sent somewhere; the same deviation for the same seed.
     pub fn reached(&self, world_from_gripper: &Pose, seed: u64) -> Pose {
         let Some((position, orientation)) = self.error else { return *world_from_gripper };
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(u64::from(u32::MAX));
+        let mut random = stream(seed, u64::from(u32::MAX));
         let mut draw = |deviation: f64| deviation * f64::from(normal(&mut random));
         let shift = [draw(position), draw(position), draw(position)];
         let turn = [draw(orientation), draw(orientation), draw(orientation)];

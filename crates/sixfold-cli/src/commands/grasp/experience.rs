@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::StorePlace;
 use sixfold_dgcm::transfer::Memory;
+use sixfold_experience::StorePlace;
 
 /// Which network encodes objects.
 #[derive(Debug, Args)]

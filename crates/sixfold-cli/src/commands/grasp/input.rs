@@ -1,9 +1,9 @@
 //! A depth image from files, prepared for grasping.
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_grasp::{GraspView, ViewOptions, find_objects};
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 
 use super::arguments::InputArguments;
 

@@ -5,25 +5,22 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::outcome::Attempt;
-use sixfold_dgcm::store::{Experience, StorePlace};
 use sixfold_dgcm::transfer::{Kind, Memory, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
+use sixfold_experience::{Attempt, Crop, Experience, StorePlace};
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, antipodal_grasps,
     middle_between_pads,
 };
 use sixfold_mesh::Mesh;
-use sixfold_shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{
     AttemptOptions, ConvexParts, Ending, PartsOptions, Scene, SimulatedView, scene, try_grasp,
     wilson_interval,
 };
+use sixfold_synth::shapes::{Family, Member, Rest, member};
 
 use super::arguments::PhysicsArguments;
 use super::compare::{Hardness, hardness};
@@ -138,8 +135,7 @@ pub(super) fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<P
     };
     for family in families {
         for number in 0..members {
-            let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x6465_6d6f);
-            random.set_stream(number * 64 + family as u64);
+            let mut random = stream(seed ^ 0x6465_6d6f, number * 64 + family as u64);
             let made = member(family, &mut random)?;
             let rest = family.rests()[number as usize % family.rests().len()];
             pupils.push(Pupil {

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::Serialize;
-use sixfold_bop::write_rgb;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
+use sixfold_io::write_rgb;
 use sixfold_simulation::{
     Attempt, AttemptOptions, ConvexParts, Ending, PartsOptions, TrialOptions, TrialReport, attempt,
     wilson_interval,

@@ -4,12 +4,12 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::write_rgb;
 use sixfold_geometry::Pose;
 use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
     antipodal_grasps, cluster_grasps, draw_grasps,
 };
+use sixfold_io::write_rgb;
 
 use super::arguments::ProposeArguments;
 use super::input::{self, Input};

@@ -5,12 +5,11 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use serde::{Deserialize, Serialize};
-use sixfold_bop::write_rgb;
-use sixfold_dgcm::crop::Crop;
-use sixfold_dgcm::store::{Description, Experience, ExperienceStore, StorePlace, Stored};
+use sixfold_experience::{Crop, Description, Experience, ExperienceStore, StorePlace, Stored};
 use sixfold_geometry::Pose;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_grasp::{AntipodalQuality, Grasp};
+use sixfold_io::write_rgb;
 
 use super::arguments::InputArguments;
 use super::experience::{NetworkArguments, model, now};

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
-use sixfold_bop::{write_mask, write_rgb};
+use sixfold_io::{write_mask, write_rgb};
 use sixfold_match::{Scene, VerificationScore};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::mask::to_image;

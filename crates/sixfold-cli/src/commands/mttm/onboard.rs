@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_bop::{CameraFile, read_depth, read_mask};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
+use sixfold_io::{CameraFile, read_depth, read_mask};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 

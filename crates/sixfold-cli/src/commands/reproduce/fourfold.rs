@@ -5,14 +5,16 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use rand::RngExt;
-use sixfold_augment::{Backgrounds, stream, uniform};
 use sixfold_bop::{
-    GroundTruth, NewImage, SceneWriter, Target, TargetObject, ground_truth_visibility, write_targets,
+    GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility,
+    write_targets,
 };
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
+use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
 use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_synth::augment::Backgrounds;
 
 use crate::progress::{Progress, check_interrupt};
 
@@ -69,7 +71,7 @@ pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
             pixel.map(&mut noisy)
         });
         let truth = [GroundTruth::new(OBJECT, pose)];
-        let visible = ground_truth_visibility(&[(&mesh, pose)], &camera, None, 0.015);
+        let visible = ground_truth_visibility(&[(&mesh, pose)], &camera, None, VISIBILITY_DELTA);
         let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
         writer.add(&NewImage {
             rgb: Some(&image),

@@ -17,6 +17,7 @@ use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Models, Target, read_results};
 use sixfold_geometry::Rect;
+use sixfold_io::fnv1a;
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::estimate::Quirks;
 
@@ -126,7 +127,7 @@ fn run_pix2pose(a: &ReproducePix2PoseArguments, whole: &ReproduceArguments) -> R
         weights: a.weights.display().to_string(),
         weights_hash: format!(
             "{:016x}",
-            fnv(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
+            fnv1a(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
         ),
         trained_on: trained_on.iter().map(|(scene, image)| format!("{scene}/{image}")).collect(),
         published: a.published.as_ref().map(|f| f.display().to_string()),
@@ -305,13 +306,6 @@ fn same_inputs(folder: &Path, inputs: &impl Serialize) -> Result<()> {
     write_atomically(&path, serde_json::to_string_pretty(&now)?.as_bytes())
 }
 
-/// 64-bit FNV-1a: tells files apart, nothing more.
-fn fnv(bytes: &[u8]) -> u64 {
-    bytes
-        .iter()
-        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
-}
-
 impl Bench {
     /// All targets of a dataset, in their ground-truth boxes.
     fn of_dataset(root: &Path, seed: u64) -> Result<Bench> {
@@ -344,7 +338,7 @@ impl Bench {
             for s in skipped {
                 eprintln!("skipped {s}");
             }
-            let hash = fnv(&std::fs::read(file).with_context(|| file.display().to_string())?);
+            let hash = fnv1a(&std::fs::read(file).with_context(|| file.display().to_string())?);
             let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
             detections.push(Detections {
                 name,
@@ -353,16 +347,5 @@ impl Bench {
             });
         }
         Ok(Bench { dataset, targets, meshes, truth, detections, seed: a.seed })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_hash_is_fnv_1a() {
-        assert_eq!(fnv(b""), 0xcbf2_9ce4_8422_2325);
-        assert_eq!(fnv(b"foobar"), 0x8594_4171_f739_67e8);
     }
 }

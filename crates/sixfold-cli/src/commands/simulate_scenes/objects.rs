@@ -3,14 +3,15 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use rand::{RngExt, SeedableRng};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, read_mesh, write_ply};
-use sixfold_shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PartsOptions};
+use sixfold_synth::shapes::{Family, member, toy};
 
 use super::arguments::SimulateScenesArguments;
 use crate::objects::find;
@@ -51,11 +52,11 @@ pub(super) fn collect(a: &SimulateScenesArguments) -> Result<Vec<Thing>> {
     for family in a.chosen_families()? {
         for number in 0..a.members {
             let stream = (family as u64) << 32 | number as u64;
-            add(&mut described, of_family(family, number, &mut stream_of(a.seed, stream))?);
+            add(&mut described, of_family(family, number, &mut stream(a.seed, stream))?);
         }
     }
     for number in 0..a.toys {
-        let mesh = toy(&mut stream_of(a.seed, 1 << 40 | number as u64))?;
+        let mesh = toy(&mut stream(a.seed, 1 << 40 | number as u64))?;
         let info = ModelInfo::of_mesh(&mesh);
         add(&mut described, Described { name: format!("toy-{number}"), mesh, info });
     }
@@ -75,13 +76,6 @@ pub(super) fn collect(a: &SimulateScenesArguments) -> Result<Vec<Thing>> {
     }
     progress.finish();
     Ok(things)
-}
-
-/// A stream of random numbers that belongs to one object.
-fn stream_of(seed: u64, stream: u64) -> ChaCha8Rng {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    random.set_stream(stream);
-    random
 }
 
 fn of_dataset(dataset: &Path, wanted: &[u32]) -> Result<Vec<(u32, Described)>> {
@@ -140,7 +134,7 @@ fn coloured(mesh: Mesh, id: u32) -> Result<Mesh> {
     if mesh.colors().is_some() || mesh.texture().is_some() {
         return Ok(mesh);
     }
-    let mut random = stream_of(u64::from(id), 2 << 40);
+    let mut random = stream(u64::from(id), 2 << 40);
     // Hues a golden section apart: neighbours in number differ most.
     let hue = f64::from(id) * 0.618_033_988_749_895;
     let (pale, bright) = (0.15 + 0.5 * random.random::<f64>(), 110.0 + 120.0 * random.random::<f64>());

@@ -3,8 +3,9 @@
 use std::path::Path;
 
 use anyhow::Result;
-use sixfold_bop::{BopDataset, write_rgb};
+use sixfold_bop::BopDataset;
 use sixfold_geometry::RgbImage;
+use sixfold_io::write_rgb;
 
 use crate::overlay;
 

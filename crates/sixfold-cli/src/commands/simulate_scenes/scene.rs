@@ -4,10 +4,13 @@ use std::f64::consts::TAU;
 
 use anyhow::Result;
 use rand::seq::SliceRandom;
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
-use sixfold_bop::{GroundTruth, NewImage, ObjectVisibility, SceneWriter, ground_truth_visibility};
+use sixfold_bop::{
+    GroundTruth, NewImage, ObjectVisibility, SceneWriter, VISIBILITY_DELTA, ground_truth_visibility,
+};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade, simulate_depth};
@@ -47,8 +50,7 @@ pub(super) fn write(
     things: &[Thing],
     scene_id: u32,
 ) -> Result<Made> {
-    let mut random = ChaCha8Rng::seed_from_u64(a.seed);
-    random.set_stream(3 << 40 | u64::from(scene_id));
+    let mut random = stream(a.seed, 3 << 40 | u64::from(scene_id));
     let (things, made) = settle(a, things, scene_id, &mut random);
     let scene = Scene { things, table: table(&mut random)?, lights: Lights::random(&mut random) };
     let mut writer = SceneWriter::new(&a.out, &a.split, scene_id);
@@ -196,7 +198,7 @@ impl Scene<'_> {
 /// Which pixels show which object is known exactly here, so it need not be guessed from the noisy depth as in real
 /// datasets; only how many pixels were measured comes from that.
 fn visibility(posed: &[(&Mesh, Pose)], camera: &Camera, depth: &DepthImage) -> Vec<ObjectVisibility> {
-    let mut visible = ground_truth_visibility(posed, camera, None, 0.015);
+    let mut visible = ground_truth_visibility(posed, camera, None, VISIBILITY_DELTA);
     for object in &mut visible {
         let pixels = object.mask.as_slice().iter().zip(depth.as_slice());
         object.info.px_count_valid = Some(pixels.filter(|(inside, z)| **inside && **z > 0.0).count() as u64);

@@ -8,11 +8,10 @@ use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use sixfold_bop::{
-    BopDataset, CameraFile, Detection, MaskKind, Models, Rle, ground_truth_visibility, read_mask, read_rgb,
-};
+use sixfold_bop::{BopDataset, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
+use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 use sixfold_nol::Photograph;
 
@@ -82,7 +81,7 @@ impl Input {
             let placed: Vec<(u32, &Mesh, Pose)> =
                 objects.iter().filter_map(|(id, pose)| Some((*id, mesh_of(*id)?, *pose))).collect();
             let scene: Vec<(&Mesh, Pose)> = placed.iter().map(|(_, mesh, pose)| (*mesh, *pose)).collect();
-            let visible = ground_truth_visibility(&scene, camera, None, 0.015);
+            let visible = ground_truth_visibility(&scene, camera, None, VISIBILITY_DELTA);
             for ((id, _, _), visible) in placed.iter().zip(visible) {
                 if !self.kept.contains(&(*image, *id)) {
                     masks.insert((*image, *id), visible.mask_visible);
@@ -210,7 +209,7 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
         let mesh_of = |id: u32| subjects.get(&id).map(|s| &s.mesh).or_else(|| others.get(&id));
         let placed: Vec<(&Mesh, Pose)> =
             truth.iter().zip(&poses).filter_map(|(g, pose)| Some((mesh_of(g.obj_id)?, *pose))).collect();
-        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         let seen = detected.of(&image)?;
         for (index, ((g, pose), visible)) in truth.iter().zip(&poses).zip(visible).enumerate() {
             if visible.info.visib_fract < a.least_visible {
@@ -313,7 +312,7 @@ fn from_file(a: &SynthesizeArguments, path: &Path) -> Result<Subject> {
             Some(mask) => Some(read_mask(&folder.join(mask))?),
             None if detected.0.is_none() => None,
             None => {
-                let silhouette = ground_truth_visibility(&[(&mesh, pose)], &camera, None, 0.015);
+                let silhouette = ground_truth_visibility(&[(&mesh, pose)], &camera, None, VISIBILITY_DELTA);
                 let silhouette = silhouette.into_iter().next().map(|v| v.mask_visible);
                 let seen = detected.of(&image)?;
                 silhouette.and_then(|s| DetectedMasks::choose(&seen, id, &s))

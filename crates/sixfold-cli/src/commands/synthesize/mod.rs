@@ -12,15 +12,16 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use serde_json::{Value, json};
-use sixfold_augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::write_camera;
 use sixfold_geometry::Camera;
+use sixfold_geometry::stats::upper_median;
 use sixfold_mesh::{PlyFormat, Unit, write_ply};
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::select::{choose_by_surface, shown_points};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_nol::{NolError, SourceView};
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use self::arguments::{SynthesizeArguments, WeightingKind};
 use self::input::{Input, Subject};
@@ -182,8 +183,7 @@ fn table(a: &SynthesizeArguments, summary: &Summary) {
 
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+    upper_median(&mut values).unwrap_or(0.0)
 }
 
 fn views_per_object(a: &SynthesizeArguments) -> usize {

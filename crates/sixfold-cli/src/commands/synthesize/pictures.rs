@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::Result;
-use sixfold_bop::write_rgb;
 use sixfold_geometry::{Camera, Pose, RgbImage};
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{Frame, RenderOptions, SceneObject};

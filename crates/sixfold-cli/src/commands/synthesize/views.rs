@@ -4,14 +4,15 @@ use std::f64::consts::{FRAC_PI_4, TAU};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use sixfold_augment::{Backgrounds, Coverage, Patch, stream, uniform};
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;
 use sixfold_nol::{Photograph, SourceView, object_window};
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
+use sixfold_synth::augment::{Backgrounds, Coverage, Patch};
 
 use super::arguments::SynthesizeArguments;
 use super::input::Subject;

@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
-use sixfold_dgcm::store::StorePlace;
+use sixfold_experience::StorePlace;
+use sixfold_io::write_rgb;
 
 use self::handles::Handles;
 use self::offline::{Answer, COUNTS, Instance, Offline, Question, Size};
@@ -230,12 +231,6 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     Ok(Outcome::Found)
 }
 
-fn write_png(path: &Path, picture: &image::RgbImage) -> Result<()> {
-    let mut bytes = std::io::Cursor::new(vec![]);
-    picture.write_to(&mut bytes, image::ImageFormat::Png)?;
-    write_atomically(path, bytes.get_ref())
-}
-
 /// The command line's defaults.
 fn physics() -> PhysicsArguments {
     PhysicsArguments { gripper: "jaws-140".to_owned(), mass: 0.2, friction: None, force: None }
@@ -358,7 +353,7 @@ impl Whole {
             }
             let tag = ["5cm", "1cm"][k];
             let title = format!("grasps within {name}");
-            write_png(&folder.join(format!("experience-{tag}.png")), &pictures::curves(&title, &lines))?;
+            write_rgb(&folder.join(format!("experience-{tag}.png")), &pictures::curves(&title, &lines))?;
             let names: Vec<String> = instances.iter().map(short).collect();
             let shares: Vec<Vec<Option<f64>>> = instances
                 .iter()
@@ -370,12 +365,12 @@ impl Whole {
                 })
                 .collect();
             let picture = pictures::matrix(&title, &names, &shares);
-            write_png(&folder.join(format!("between-objects-{tag}.png")), &picture)?;
+            write_rgb(&folder.join(format!("between-objects-{tag}.png")), &picture)?;
         }
         let first: Vec<(&str, &Curve)> =
             self.incremental.iter().filter_map(|o| Some((o.setting(), o.curves.first()?))).collect();
         let picture = pictures::incremental(&first, NEAR);
-        write_png(&folder.join("incremental.png"), &picture)?;
+        write_rgb(&folder.join("incremental.png"), &picture)?;
         Ok(())
     }
 

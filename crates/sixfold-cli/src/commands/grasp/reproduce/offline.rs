@@ -10,14 +10,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
+use rand::RngExt;
 use rand::seq::SliceRandom;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::crop::Crop;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::{Experience, SqliteStore};
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_experience::{Crop, Experience, SqliteStore};
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, gripper_pose,
@@ -242,8 +241,7 @@ impl Offline<'_> {
             for count in COUNTS {
                 for round in 0..self.size.rounds {
                     for all in [false, true] {
-                        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
-                        random.set_stream(round * 64 + count as u64);
+                        let mut random = stream(self.seed, round * 64 + count as u64);
                         let mut only = BTreeSet::new();
                         for (other, ids) in self.instances.iter().zip(known) {
                             let mut ids = ids.clone();
@@ -299,8 +297,7 @@ impl Offline<'_> {
             for view in 0..self.size.stretched {
                 check_interrupt("what was answered is kept; run the same command again to go on")?;
                 progress.step(instance.name.clone());
-                let mut random = ChaCha8Rng::seed_from_u64(self.seed ^ 0x73_7472);
-                random.set_stream(view);
+                let mut random = stream(self.seed ^ 0x73_7472, view);
                 // As many times smaller as larger; in hundredths, to be a key.
                 let factors: [i64; 3] = std::array::from_fn(|_| {
                     (100.0 * 2f64.powf(random.random_range(-1.0..1.0))).round() as i64

@@ -1,5 +1,6 @@
 //! Figures 6.7 and 6.10 to 6.12 as pictures.
 
+use sixfold_geometry::RgbImage;
 use sixfold_plot::{COLORS, Canvas, FAINT, INK, text_width};
 
 use super::offline::COUNTS;
@@ -14,7 +15,7 @@ pub(super) struct Line {
 }
 
 /// Shares against the number of experiences per object.
-pub(super) fn curves(title: &str, lines: &[Line]) -> image::RgbImage {
+pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
     let (left, top, width, height) = (70.0, 40.0, 420.0, 300.0);
     let mut canvas = Canvas::new(680, 400);
     canvas.text(left, 12.0, 2.0, title, INK);
@@ -61,12 +62,12 @@ pub(super) fn curves(title: &str, lines: &[Line]) -> image::RgbImage {
 }
 
 /// Shares from every object (rows) to every other (columns).
-pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>]) -> image::RgbImage {
+pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>]) -> RgbImage {
     let cell = 46.0;
     let widest = names.iter().map(|n| text_width(n, 1.5)).fold(0.0, f64::max);
     let (left, top) = (widest + 24.0, widest + 44.0);
     let side = cell * names.len() as f64;
-    let mut canvas = Canvas::new((left + side + 20.0) as u32, (top + side + 30.0) as u32);
+    let mut canvas = Canvas::new((left + side + 20.0) as usize, (top + side + 30.0) as usize);
     canvas.text(12.0, 12.0, 2.0, title, INK);
     for (i, row) in shares.iter().enumerate() {
         let y = top + cell * i as f64;
@@ -89,9 +90,9 @@ pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>])
 }
 
 /// Success and nearest feature distance over the attempts: one strip per object and setting.
-pub(super) fn incremental(curves: &[(&str, &Curve)], near: f64) -> image::RgbImage {
+pub(super) fn incremental(curves: &[(&str, &Curve)], near: f64) -> RgbImage {
     let (left, width, height, gap) = (80.0, 480.0, 110.0, 66.0);
-    let mut canvas = Canvas::new(620, (40.0 + (height + gap) * curves.len() as f64) as u32);
+    let mut canvas = Canvas::new(620, (40.0 + (height + gap) * curves.len() as f64) as usize);
     for (i, (setting, curve)) in curves.iter().enumerate() {
         let top = 34.0 + (height + gap) * i as f64;
         canvas.text(left, top - 22.0, 2.0, &format!("{}, {setting} setting", curve.object), INK);

@@ -8,10 +8,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Result;
-use sixfold_augment::{Backgrounds, ColorAugmentation, Coverage, Patch, Random, stream, uniform};
-use sixfold_bop::write_rgb;
+use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{RgbImage, Vec3};
+use sixfold_io::write_rgb;
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation, Coverage, Patch};
 
 use super::material::{Material, PosedFrame};
 

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
-use sixfold_bop::{BopDataset, Models, ground_truth_visibility};
+use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_nol::Photograph;
@@ -115,7 +115,7 @@ fn things(root: &Path, quick: bool) -> Result<(Vec<u32>, Vec<Thing>)> {
         }
         let placed: Vec<(&Mesh, Pose)> =
             things.iter().zip(truth).map(|(t, g)| (&t.mesh, g.camera_from_object)).collect();
-        let visible = ground_truth_visibility(&placed, &camera, None, 0.015);
+        let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         for ((thing, g), visible) in things.iter_mut().zip(truth).zip(visible) {
             if visible.info.visib_fract >= LEAST_VISIBLE {
                 let name = format!("{im_id} of object {}", thing.object);

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sixfold_bop::{BopDataset, Models, ground_truth_visibility};
+use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
@@ -185,7 +185,7 @@ impl Material {
     fn visible(&self, frame: &PosedFrame, poses: &[Pose]) -> Vec<(f64, sixfold_geometry::Mask)> {
         let placed: Vec<(&Mesh, Pose)> =
             frame.truth.iter().zip(poses).map(|((id, _), pose)| (&self.meshes[id], *pose)).collect();
-        ground_truth_visibility(&placed, &frame.camera, None, 0.015)
+        ground_truth_visibility(&placed, &frame.camera, None, VISIBILITY_DELTA)
             .into_iter()
             .map(|v| (v.info.visib_fract, v.mask_visible))
             .collect()

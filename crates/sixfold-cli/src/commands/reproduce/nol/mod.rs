@@ -15,6 +15,7 @@ use std::collections::BTreeMap;
 
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
+use sixfold_io::fnv1a;
 use sixfold_mesh::Mesh;
 use sixfold_nol::Photograph;
 use sixfold_nol::model::NolModel;
@@ -27,7 +28,7 @@ use self::poses::{PosesRow, PosesSummary};
 use self::speed::Speed;
 use self::views::{Networks, Target, ViewRow, ViewsSummary, Way};
 use super::row::kept_or_made;
-use super::{fnv, same_inputs};
+use super::same_inputs;
 use crate::Outcome;
 use crate::arguments::JsonArguments;
 use crate::output::{report, write_atomically};
@@ -102,7 +103,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         }
         networks.push((name.clone(), NolModel::load(file)?));
         let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
-        hashes.push((name, format!("{:016x}", fnv(&bytes))));
+        hashes.push((name, format!("{:016x}", fnv1a(&bytes))));
     }
     let material = Material::read(a)?;
     let inputs = Inputs {

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
-use sixfold_augment::Patch;
-use sixfold_bop::{read_rgb, write_rgb};
 use sixfold_geometry::RgbImage;
+use sixfold_io::{read_rgb, write_rgb};
 use sixfold_plot::Canvas;
+use sixfold_synth::augment::Patch;
 
 use super::views::ViewRow;
 
@@ -60,7 +60,7 @@ impl Strips {
         }
         columns.sort_by_key(|(set, _)| sets.iter().position(|s| s == set));
         let width = side * (columns.len() + 1);
-        let mut head = Canvas::new(width as u32, HEAD as u32);
+        let mut head = Canvas::new(width, HEAD);
         let ink = [30; 3];
         head.text(4.0, 6.0, 1.0, "photograph", ink);
         for (k, (set, method)) in columns.iter().enumerate() {
@@ -71,7 +71,7 @@ impl Strips {
         let head = head.finish();
         let picture = RgbImage::from_fn(width, HEAD + side * strips.len(), |x, y| {
             let Some(y) = y.checked_sub(HEAD) else {
-                return head.get_pixel(x as u32, y as u32).0;
+                return head[(x, y)];
             };
             let (row, strip) = &strips[y / side];
             let from = match (x / side).checked_sub(1) {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{Pose, Vec3, stats};
 use sixfold_mesh::Mesh;
 use sixfold_nol::Photograph;
 use sixfold_nol::model::NolModel;
@@ -233,12 +233,7 @@ fn summary(title: &str, rows: &[&PosesRow], error: impl Fn(&RefinedSource) -> Po
 
 /// The middle value, or the mean of the two.
 fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    match values.len() {
-        0 => f64::NAN,
-        n if n % 2 == 1 => values[n / 2],
-        n => 0.5 * (values[n / 2 - 1] + values[n / 2]),
-    }
+    stats::median(&mut values).unwrap_or(f64::NAN)
 }
 
 #[cfg(test)]

@@ -4,7 +4,6 @@ use anyhow::Result;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_augment::Patch;
 use sixfold_geometry::{Mask, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_nn::layers::normal;
@@ -14,6 +13,7 @@ use sixfold_nol::similarity::{Judge, Similarity, in_light_of, in_place_of, witho
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
+use sixfold_synth::augment::Patch;
 
 /// Photographs behind a view (dissertation: 6).
 pub(super) const PER_VIEW: usize = 6;

@@ -1,0 +1,340 @@
+//! The memory of what worked: every successful grasp with what the camera saw (dissertation, section 6.2.1).
+//!
+//! An experience holds what was seen ([`Crop`]), what the gripper did and a feature by which it is found again. Where features come
+//! from ([`FeatureExtractor`]) the store does not know.
+//!
+//! [`ExperienceStore`] is what a store can do. `SqliteStore` is one in a single file, `PostgresStore` (feature `postgres`) one on
+//! a server for several robots, `OutboxStore` a robot's own copy of that one, which goes on when the server is away.
+//! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
+//! memory, asks the store only for what has changed, and finds the nearest exactly.
+
+// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
+mod attempt;
+mod crop;
+mod crop_turn;
+mod describe;
+#[cfg(any(feature = "sqlite", feature = "postgres"))]
+mod encode;
+mod experience;
+mod index;
+#[cfg(feature = "sqlite")]
+mod outbox;
+mod place;
+#[cfg(feature = "postgres")]
+mod postgres;
+#[cfg(any(feature = "sqlite", feature = "postgres"))]
+mod row;
+#[cfg(feature = "sqlite")]
+mod sqlite;
+mod vd_noc;
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+#[cfg(feature = "postgres")]
+pub use self::postgres::PostgresStore;
+pub use attempt::Attempt;
+pub use crop::{Crop, CropError, CropOptions};
+pub use crop_turn::turn;
+pub use describe::Description;
+pub use experience::{COPIES, Copy, Experience, FeatureExtractor, Stored, region};
+pub use index::{FeatureIndex, Match};
+#[cfg(feature = "sqlite")]
+pub use outbox::{Listener, Notice, OutboxOptions, OutboxStore};
+pub use place::StorePlace;
+#[cfg(feature = "sqlite")]
+pub use sqlite::SqliteStore;
+pub use vd_noc::Extent;
+
+/// Length of a feature.
+pub const FEATURE: usize = 256;
+
+/// Why a store cannot do what was asked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    /// The file cannot be opened.
+    #[error("{}: the experience store cannot be opened: {reason}", file.display())]
+    Open {
+        /// The file.
+        file: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The file holds something else.
+    #[error(
+        "{}: found {found}, expected an experience store; give one that `sixfold grasp learn` or `sixfold grasp store add` wrote", file.display()
+    )]
+    NotAStore {
+        /// The file.
+        file: PathBuf,
+        /// What it is.
+        found: String,
+    },
+    /// The store was written by another version.
+    #[error(
+        "{}: the experience store has version {found}, expected {expected}: use the version of Sixfold that wrote it, and export and add its experiences", file.display()
+    )]
+    Version {
+        /// The file.
+        file: PathBuf,
+        /// Its version.
+        found: i64,
+        /// The version this program knows.
+        expected: i64,
+    },
+    /// The file is damaged.
+    #[error(
+        "{}: the experience store is damaged ({reason}); what can still be read can be saved with `sixfold grasp store export`", file.display()
+    )]
+    Broken {
+        /// The file.
+        file: PathBuf,
+        /// What SQLite says.
+        reason: String,
+    },
+    /// There is no room.
+    #[error(
+        "{}: the disk is full: the last experience was not stored, all earlier ones are safe; make room and go on", file.display()
+    )]
+    Full {
+        /// The file.
+        file: PathBuf,
+    },
+    /// Another process keeps writing.
+    #[error("{}: another process has been writing for 20 s; try again when it is done", file.display())]
+    Busy {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The store may not be written.
+    #[error("{}: the experience store may only be read; check the permissions of file and folder, or, of a server, that it is no standby", file.display())]
+    ReadOnly {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The server does not answer. Nothing was asked of it, so nothing was stored.
+    #[error(
+        "{server}: the server of the experience store cannot be reached ({reason}); check that it runs, its name and port, and the network"
+    )]
+    Unreachable {
+        /// The server, without the password.
+        server: String,
+        /// Why.
+        reason: String,
+    },
+    /// The connection broke off before the server had confirmed.
+    #[error(
+        "{server}: the connection to the experience store was lost ({reason}); whether what was being stored has arrived is not known: do the same again, nothing is stored twice"
+    )]
+    Lost {
+        /// The server, without the password.
+        server: String,
+        /// Why.
+        reason: String,
+    },
+    /// The server lets nobody in with this address, or not do this.
+    #[error(
+        "{server}: the server refuses ({reason}); check user, database and password (PGPASSWORD, or in the address) and what the user may do there"
+    )]
+    Refused {
+        /// The server, without the password.
+        server: String,
+        /// What the server says.
+        reason: String,
+    },
+    /// The server's database lacks pgvector.
+    #[error(
+        "{server}: the database has no extension `vector` ({reason}); install pgvector on the server (Debian: postgresql-VERSION-pgvector) and let an administrator say CREATE EXTENSION vector in this database"
+    )]
+    Extension {
+        /// The server, without the password.
+        server: String,
+        /// What is missing.
+        reason: String,
+    },
+    /// The address of a server cannot be understood.
+    #[error(
+        "{server}: {reason}; expected postgres://user@host:port/database, a password in PGPASSWORD or behind the user's name"
+    )]
+    Address {
+        /// The address, without what may be a password.
+        server: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The program was built without this kind of store.
+    #[error(
+        "{place}: this program was built without the feature `{feature}`; build it with: cargo install --path crates/sixfold-cli --features {feature}"
+    )]
+    Feature {
+        /// The file, or the server without the password.
+        place: String,
+        /// The feature that it needs.
+        feature: &'static str,
+    },
+    /// A field of an experience cannot be used.
+    #[error("experience {id}: field {field}: expected {expected}, found {found}")]
+    Field {
+        /// Number of the experience, 0 for a new one.
+        id: i64,
+        /// The field.
+        field: &'static str,
+        /// What it may hold.
+        expected: &'static str,
+        /// What it holds.
+        found: String,
+    },
+    /// Anything else.
+    #[error("{}: {reason}", file.display())]
+    Other {
+        /// The file.
+        file: PathBuf,
+        /// What SQLite says.
+        reason: String,
+    },
+}
+
+impl StoreError {
+    /// Whether the same may well succeed later, with nothing changed here: the server or the network is away, or the server is
+    /// busy, full or a standby.
+    pub fn is_passing(&self) -> bool {
+        matches!(
+            self,
+            StoreError::Unreachable { .. }
+                | StoreError::Lost { .. }
+                | StoreError::Busy { .. }
+                | StoreError::Full { .. }
+                | StoreError::ReadOnly { .. }
+        )
+    }
+}
+
+/// How far a reader has followed a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Position {
+    /// The last feature read.
+    pub feature: i64,
+    /// The last removal read.
+    pub removal: i64,
+}
+
+/// A feature of a stored experience or of one of its in-plane copies.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StoredFeature {
+    /// Number of the experience.
+    pub experience: i64,
+    /// The copy's turn about the optical axis, radians; 0 for the experience itself.
+    pub angle: f64,
+    /// The network that made it: features of different networks cannot be compared.
+    pub network: String,
+    /// 256 numbers.
+    pub feature: Vec<f32>,
+}
+
+/// What happened in a store since a position.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Changes {
+    /// New features, in the order in which they were stored.
+    pub features: Vec<StoredFeature>,
+    /// Experiences that were forgotten.
+    pub forgotten: Vec<i64>,
+    /// Where the store is now.
+    pub position: Position,
+}
+
+/// A line of a list of experiences.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Summary {
+    /// Number of the experience.
+    pub id: i64,
+    /// Seconds since 1970.
+    pub time: i64,
+    /// What was grasped.
+    pub object: String,
+    /// The part that was grasped, where it is known.
+    pub part: Option<String>,
+    /// The gripper's name.
+    pub gripper: String,
+    /// Distance of the contacts, metres.
+    pub width: f64,
+    /// The network that made its features.
+    pub network: String,
+    /// Where it comes from.
+    pub provenance: String,
+}
+
+/// What a store of experiences does. Numbers of experiences are never used twice.
+pub trait ExperienceStore {
+    /// Stores an experience with its in-plane copies and returns its number. When it returns, the experience survives
+    /// whatever happens to the process or to the power. An experience that is there already keeps its number, and the
+    /// second value is false.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is stored then.
+    fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError>;
+
+    /// An experience by its number; `None` when there is none.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn get(&self, id: i64) -> Result<Option<Stored>, StoreError>;
+
+    /// All experiences, in the order of their numbers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn list(&self) -> Result<Vec<Summary>, StoreError>;
+
+    /// Forgets an experience; false when there was none.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn forget(&mut self, id: i64) -> Result<bool, StoreError>;
+
+    /// What was stored and forgotten since a position ([`Position::default`]: everything).
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn changes(&self, since: Position) -> Result<Changes, StoreError>;
+
+    /// Keeps a grasp that was tried, whatever came of it; false when it is there already.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is stored then.
+    fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError>;
+
+    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError>;
+
+    /// A name that no other store has, where the store has one: a server's, so that its robots notice when another one answers.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn identity(&self) -> Result<Option<String>, StoreError> {
+        Ok(None)
+    }
+
+    /// Takes over all experiences and attempts of another store that are not here yet; how many experiences were new.
+    ///
+    /// # Errors
+    /// [`StoreError`]; what was taken over until then is kept.
+    fn merge(&mut self, other: &dyn ExperienceStore) -> Result<usize, StoreError> {
+        let mut added = 0;
+        for summary in other.list()? {
+            if let Some(stored) = other.get(summary.id)? {
+                added += usize::from(self.add(&stored.experience)?.1);
+            }
+        }
+        for (_, attempt) in other.attempts(0)? {
+            self.add_attempt(&attempt)?;
+        }
+        Ok(added)
+    }
+}

@@ -1,0 +1,473 @@
+//! A robot's own copy of a fleet's store, which goes on when the server is away.
+//!
+//! The copy is an ordinary store file. Everything is read from it, and whatever is added is in it, on the disk, before anything
+//! else happens; its numbers never change. At every contact three things follow, each of which may be cut off anywhere and done
+//! again: experiences of which the file does not say under which number the server has them are delivered, in order; what was
+//! forgotten here is forgotten there; and what others have stored and forgotten is taken over. The server's unique key makes
+//! a delivery that is repeated harmless.
+
+use std::cell::{Cell, RefCell};
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use rusqlite::{OptionalExtension, params};
+
+use crate::Attempt;
+
+use super::{Changes, Experience, ExperienceStore, Position, SqliteStore, StoreError, Stored, Summary};
+
+/// `delivered`: the server's number of an experience, or why the server will not have it. `followed`: which server, and how far;
+/// `followed_attempts`: the last attempt of the copy that the server has, and the last one of the server that the copy has.
+const TABLES: &str = "
+    CREATE TABLE IF NOT EXISTS delivered (experience INTEGER PRIMARY KEY, number INTEGER, reason TEXT);
+    CREATE INDEX IF NOT EXISTS delivered_number ON delivered(number);
+    CREATE TABLE IF NOT EXISTS followed (
+        one INTEGER PRIMARY KEY CHECK (one = 1), identity TEXT, feature INTEGER NOT NULL, removal INTEGER NOT NULL);
+    INSERT OR IGNORE INTO followed (one, identity, feature, removal) VALUES (1, NULL, 0, 0);
+    CREATE TABLE IF NOT EXISTS followed_attempts (
+        one INTEGER PRIMARY KEY CHECK (one = 1), sent INTEGER NOT NULL, taken INTEGER NOT NULL);
+    INSERT OR IGNORE INTO followed_attempts (one, sent, taken) VALUES (1, 0, 0);
+";
+
+/// What a user should know.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Notice {
+    /// The server is away.
+    Away {
+        /// Why.
+        reason: String,
+        /// Experiences that wait.
+        waiting: usize,
+        /// Where.
+        file: PathBuf,
+    },
+    /// The store is closed, and experiences wait.
+    Waiting {
+        /// Experiences that wait.
+        waiting: usize,
+        /// Where.
+        file: PathBuf,
+    },
+    /// What had waited is delivered.
+    Delivered {
+        /// Experiences.
+        delivered: usize,
+        /// Experiences that still wait.
+        waiting: usize,
+    },
+    /// Many experiences are taken over from the server, which takes a while.
+    TakingOver {
+        /// Experiences.
+        experiences: usize,
+    },
+    /// The server will never take an experience.
+    Refused {
+        /// Its number in the file.
+        id: i64,
+        /// Why.
+        reason: String,
+        /// The file, in which it stays.
+        file: PathBuf,
+    },
+    /// An experience of the server is left out.
+    Unreadable {
+        /// Its number on the server.
+        number: i64,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl fmt::Display for Notice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Notice::Away { reason, waiting, file } => write!(
+                f,
+                "{reason}. Going on without: experiences are kept in {} and delivered later ({waiting} wait)",
+                file.display()
+            ),
+            Notice::Waiting { waiting, file } => write!(
+                f,
+                "{waiting} experiences wait in {0} for the server; the same command delivers them at its next start, `sixfold grasp store merge ADDRESS {0}` at once",
+                file.display()
+            ),
+            Notice::Delivered { delivered, waiting: 0 } => {
+                write!(f, "{delivered} experiences that waited were delivered to the server")
+            }
+            Notice::Delivered { delivered, waiting } => {
+                write!(
+                    f,
+                    "{delivered} experiences that waited were delivered to the server, {waiting} still wait"
+                )
+            }
+            Notice::TakingOver { experiences } => {
+                write!(f, "taking over {experiences} experiences from the server")
+            }
+            Notice::Refused { id, reason, file } => write!(
+                f,
+                "the server will not have experience {id} ({reason}); it stays in {} and is not offered again",
+                file.display()
+            ),
+            Notice::Unreadable { number, reason } => {
+                write!(f, "experience {number} of the server is left out: {reason}")
+            }
+        }
+    }
+}
+
+/// How an [`OutboxStore`] goes about its server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OutboxOptions {
+    /// How long a server that was away is left alone, at least.
+    pub retry: Duration,
+}
+
+impl Default for OutboxOptions {
+    fn default() -> Self {
+        OutboxOptions { retry: Duration::from_secs(10) }
+    }
+}
+
+/// Called with every [`Notice`].
+pub type Listener = Box<dyn Fn(&Notice) + Send>;
+
+/// A copy of a remote store in a file, and the outbox for what was added to it.
+pub struct OutboxStore {
+    copy: RefCell<SqliteStore>,
+    remote: RefCell<Box<dyn ExperienceStore + Send>>,
+    listener: Listener,
+    retry: Duration,
+    /// The remote store is away, and left alone until then.
+    away: Cell<Option<Instant>>,
+    /// Whether the remote store is known to be the one that the copy is of.
+    known: Cell<bool>,
+}
+
+/// Whose fault it is.
+enum Trouble {
+    /// The copy's: the caller has to know.
+    Here(StoreError),
+    /// The remote store's: it has to wait.
+    There(StoreError),
+}
+
+impl OutboxStore {
+    /// Opens the copy, or makes one, and contacts the remote store. Experiences that are in the file already, from an earlier
+    /// run or from a store without a server, are delivered.
+    ///
+    /// # Errors
+    /// [`StoreError`] for a file that is no store or belongs to another server, and for a server that answers but will not do;
+    /// not for one that is away ([`StoreError::is_passing`]): `listener` hears of that.
+    pub fn create(
+        file: &Path,
+        remote: Box<dyn ExperienceStore + Send>,
+        options: &OutboxOptions,
+        listener: Listener,
+    ) -> Result<OutboxStore, StoreError> {
+        let copy = SqliteStore::create(file)?;
+        copy.run(TABLES)?;
+        let store = OutboxStore {
+            copy: RefCell::new(copy),
+            remote: RefCell::new(remote),
+            listener,
+            retry: options.retry,
+            away: Cell::new(None),
+            known: Cell::new(false),
+        };
+        let began = Instant::now();
+        match store.contact(None) {
+            Ok(()) => {}
+            Err(Trouble::There(error)) if error.is_passing() => store.leave_alone(&error, began)?,
+            Err(Trouble::Here(error) | Trouble::There(error)) => return Err(error),
+        }
+        Ok(store)
+    }
+
+    /// Experiences that were not delivered yet.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn waiting(&self) -> Result<usize, StoreError> {
+        self.undelivered().map(|w| w.len())
+    }
+
+    /// Contacts the remote store now if it is time to; the local copy is as it should be whatever comes of it.
+    fn synchronise(&self, fresh: Option<i64>) -> Result<(), StoreError> {
+        if self.away.get().is_some_and(|until| Instant::now() < until) {
+            return Ok(());
+        }
+        let began = Instant::now();
+        match self.contact(fresh) {
+            Ok(()) => {
+                self.away.set(None);
+                Ok(())
+            }
+            Err(Trouble::Here(error)) => Err(error),
+            Err(Trouble::There(error)) => self.leave_alone(&error, began),
+        }
+    }
+
+    fn leave_alone(&self, error: &StoreError, began: Instant) -> Result<(), StoreError> {
+        // Trying takes a tenth of the time at most, however long a try hangs.
+        let pause = self.retry.max(10 * began.elapsed());
+        if self.away.replace(Some(Instant::now() + pause)).is_none() {
+            let waiting = self.waiting()?;
+            (self.listener)(&Notice::Away { reason: error.to_string(), waiting, file: self.file() });
+        }
+        Ok(())
+    }
+
+    fn file(&self) -> PathBuf {
+        self.copy.borrow().file.clone()
+    }
+
+    /// Everything that there is to do with the remote store. `fresh` has not waited.
+    fn contact(&self, fresh: Option<i64>) -> Result<(), Trouble> {
+        self.recognise()?;
+        self.deliver(fresh)?;
+        self.deliver_removals()?;
+        self.take_over()?;
+        self.exchange_attempts()
+    }
+
+    /// Delivers attempts and takes over those of others. One that goes back and forth keeps its key, so nobody has it twice.
+    fn exchange_attempts(&self) -> Result<(), Trouble> {
+        let (sent, taken) = self
+            .numbers("SELECT sent, taken FROM followed_attempts")
+            .map_err(Trouble::Here)?
+            .first()
+            .copied()
+            .unwrap_or_default();
+        let mine = self.copy.borrow().attempts(sent).map_err(Trouble::Here)?;
+        for (id, attempt) in mine {
+            let answer = self.remote.borrow_mut().add_attempt(&attempt);
+            answer.map_err(Trouble::There)?;
+            self.follow_attempts("sent", id)?;
+        }
+        let theirs = self.remote.borrow().attempts(taken).map_err(Trouble::There)?;
+        for (number, attempt) in theirs {
+            self.copy.borrow_mut().add_attempt(&attempt).map_err(Trouble::Here)?;
+            self.follow_attempts("taken", number)?;
+        }
+        Ok(())
+    }
+
+    fn follow_attempts(&self, which: &str, number: i64) -> Result<(), Trouble> {
+        let copy = self.copy.borrow();
+        let done = copy.connection.execute(&format!("UPDATE followed_attempts SET {which} = ?1"), [number]);
+        copy.checked(done).map(|_| ()).map_err(Trouble::Here)
+    }
+
+    /// Makes sure that the remote store is the one of which the file is a copy.
+    fn recognise(&self) -> Result<(), Trouble> {
+        if self.known.get() {
+            return Ok(());
+        }
+        let identity = self.remote.borrow().identity().map_err(Trouble::There)?;
+        let copy = self.copy.borrow();
+        let found: Option<String> = copy
+            .checked(copy.connection.query_row("SELECT identity FROM followed", [], |r| r.get(0)))
+            .map_err(Trouble::Here)?;
+        if found.is_some() && found != identity {
+            return Err(Trouble::There(StoreError::Other {
+                file: copy.file.clone(),
+                reason: "this file goes with another store than the one that answers at the address; give the other address, or another file with --outbox (`sixfold grasp store merge` takes experiences over)".to_owned(),
+            }));
+        }
+        copy.checked(copy.connection.execute("UPDATE followed SET identity = ?1", [identity]))
+            .map_err(Trouble::Here)?;
+        self.known.set(true);
+        Ok(())
+    }
+
+    /// Experiences of which the file does not say that the server has them, in the order in which they were added.
+    fn undelivered(&self) -> Result<Vec<i64>, StoreError> {
+        self.numbers(
+            "SELECT e.id FROM experience e LEFT JOIN delivered d ON d.experience = e.id
+             WHERE d.experience IS NULL ORDER BY e.id",
+        )
+        .map(|rows| rows.into_iter().map(|r| r.0).collect())
+    }
+
+    /// One or two numbers a row.
+    fn numbers(&self, question: &str) -> Result<Vec<(i64, i64)>, StoreError> {
+        let copy = self.copy.borrow();
+        copy.checked((|| {
+            let mut query = copy.connection.prepare(question)?;
+            let second = query.column_count() - 1;
+            query.query_map([], |row| Ok((row.get(0)?, row.get(second)?)))?.collect()
+        })())
+    }
+
+    fn deliver(&self, fresh: Option<i64>) -> Result<(), Trouble> {
+        let waiting = self.undelivered().map_err(Trouble::Here)?;
+        let mut done = 0;
+        let mut trouble = Ok(());
+        for id in waiting {
+            let stored = self.copy.borrow().get(id).map_err(Trouble::Here)?;
+            // Another process forgot it.
+            let Some(stored) = stored else { continue };
+            let answer = self.remote.borrow_mut().add(&stored.experience);
+            match answer {
+                Ok((number, _)) => {
+                    self.note(id, Some(number), None)?;
+                    done += usize::from(Some(id) != fresh);
+                }
+                Err(error @ StoreError::Field { .. }) => {
+                    let reason = error.to_string();
+                    self.note(id, None, Some(&reason))?;
+                    (self.listener)(&Notice::Refused { id, reason, file: self.file() });
+                }
+                Err(error) => {
+                    trouble = Err(Trouble::There(error));
+                    break;
+                }
+            }
+        }
+        if done > 0 {
+            let waiting = self.waiting().map_err(Trouble::Here)?;
+            (self.listener)(&Notice::Delivered { delivered: done, waiting });
+        }
+        trouble
+    }
+
+    /// Writes down what became of an experience.
+    fn note(&self, id: i64, number: Option<i64>, reason: Option<&str>) -> Result<(), Trouble> {
+        let copy = self.copy.borrow();
+        let done = copy.connection.execute(
+            "INSERT OR REPLACE INTO delivered (experience, number, reason) VALUES (?1, ?2, ?3)",
+            params![id, number, reason],
+        );
+        copy.checked(done).map(|_| ()).map_err(Trouble::Here)
+    }
+
+    fn strike(&self, id: i64) -> Result<(), Trouble> {
+        let copy = self.copy.borrow();
+        let done = copy.connection.execute("DELETE FROM delivered WHERE experience = ?1", [id]);
+        copy.checked(done).map(|_| ()).map_err(Trouble::Here)
+    }
+
+    fn deliver_removals(&self) -> Result<(), Trouble> {
+        // Numbers in the file are never used twice: what is noted and not there was forgotten.
+        let removed = self
+            .numbers(
+                "SELECT d.experience, coalesce(d.number, 0) FROM delivered d
+                 LEFT JOIN experience e ON e.id = d.experience WHERE e.id IS NULL ORDER BY d.experience",
+            )
+            .map_err(Trouble::Here)?;
+        for (id, number) in removed {
+            if number > 0 {
+                self.remote.borrow_mut().forget(number).map_err(Trouble::There)?;
+            }
+            self.strike(id)?;
+        }
+        Ok(())
+    }
+
+    fn take_over(&self) -> Result<(), Trouble> {
+        let since = {
+            let copy = self.copy.borrow();
+            let read = copy.connection.query_row("SELECT feature, removal FROM followed", [], |row| {
+                Ok(Position { feature: row.get(0)?, removal: row.get(1)? })
+            });
+            copy.checked(read).map_err(Trouble::Here)?
+        };
+        let changes = self.remote.borrow().changes(since).map_err(Trouble::There)?;
+        if changes.position == since {
+            return Ok(());
+        }
+        let mut new: Vec<i64> = changes.features.iter().map(|f| f.experience).collect();
+        new.dedup();
+        let mut unknown = vec![];
+        for number in new {
+            if self.local(number)?.is_none() {
+                unknown.push(number);
+            }
+        }
+        if unknown.len() >= 100 {
+            (self.listener)(&Notice::TakingOver { experiences: unknown.len() });
+        }
+        for number in unknown {
+            let answer = self.remote.borrow().get(number);
+            match answer {
+                Ok(Some(stored)) => {
+                    let added = self.copy.borrow_mut().add(&stored.experience);
+                    self.note(added.map_err(Trouble::Here)?.0, Some(number), None)?;
+                }
+                Ok(None) => {}
+                Err(error @ StoreError::Field { .. }) => {
+                    (self.listener)(&Notice::Unreadable { number, reason: error.to_string() });
+                }
+                Err(error) => return Err(Trouble::There(error)),
+            }
+        }
+        for number in changes.forgotten {
+            if let Some(id) = self.local(number)? {
+                self.copy.borrow_mut().forget(id).map_err(Trouble::Here)?;
+                self.strike(id)?;
+            }
+        }
+        let copy = self.copy.borrow();
+        let done = copy.connection.execute(
+            "UPDATE followed SET feature = ?1, removal = ?2",
+            params![changes.position.feature, changes.position.removal],
+        );
+        copy.checked(done).map(|_| ()).map_err(Trouble::Here)
+    }
+
+    /// The number here of an experience of the server.
+    fn local(&self, number: i64) -> Result<Option<i64>, Trouble> {
+        let copy = self.copy.borrow();
+        let found = copy
+            .connection
+            .query_row("SELECT experience FROM delivered WHERE number = ?1", [number], |row| row.get(0))
+            .optional();
+        copy.checked(found).map_err(Trouble::Here)
+    }
+}
+
+impl Drop for OutboxStore {
+    fn drop(&mut self) {
+        if let Ok(waiting @ 1..) = self.waiting() {
+            (self.listener)(&Notice::Waiting { waiting, file: self.file() });
+        }
+    }
+}
+
+impl ExperienceStore for OutboxStore {
+    fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
+        let (id, new) = self.copy.borrow_mut().add(experience)?;
+        self.synchronise(new.then_some(id))?;
+        Ok((id, new))
+    }
+
+    fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
+        self.copy.borrow().get(id)
+    }
+
+    fn list(&self) -> Result<Vec<Summary>, StoreError> {
+        self.copy.borrow().list()
+    }
+
+    fn forget(&mut self, id: i64) -> Result<bool, StoreError> {
+        let forgotten = self.copy.borrow_mut().forget(id)?;
+        self.synchronise(None)?;
+        Ok(forgotten)
+    }
+
+    /// Delivered at the next contact.
+    fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
+        self.copy.borrow_mut().add_attempt(attempt)
+    }
+
+    fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+        self.copy.borrow().attempts(after)
+    }
+
+    fn changes(&self, since: Position) -> Result<Changes, StoreError> {
+        self.synchronise(None)?;
+        self.copy.borrow().changes(since)
+    }
+}

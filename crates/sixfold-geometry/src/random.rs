@@ -1,0 +1,19 @@
+//! Random numbers: one ChaCha stream per sample, so that a sample is a function of seed and number alone.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// The generator of the whole house.
+pub type Random = ChaCha8Rng;
+
+/// The generator of sample `number` under `seed`: the same numbers on any thread and machine.
+pub fn stream(seed: u64, number: u64) -> Random {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(number);
+    random
+}
+
+/// Uniform between the two ends of `range`; its first end where they are equal or not in order.
+pub fn uniform(random: &mut Random, range: [f32; 2]) -> f32 {
+    range[0] + (range[1] - range[0]).max(0.0) * random.random::<f32>()
+}

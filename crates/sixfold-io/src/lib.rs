@@ -1,0 +1,17 @@
+//! Files outside any dataset: colour, depth and mask images, camera files, writes that are seen whole or not at all.
+//!
+//! Images are decoded without trusting their headers; depth comes out in metres. What knows datasets stands above.
+
+mod camera_file;
+mod error;
+mod files;
+mod hash;
+mod image_files;
+mod images;
+
+pub use camera_file::{CameraFile, CameraFileError};
+pub use error::ImageFileError;
+pub use files::{write_atomically, write_atomically_with};
+pub use hash::{Fnv1a, fnv1a};
+pub use image_files::ImageFile;
+pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};

@@ -1,0 +1,30 @@
+//! Image augmentation, occluders, procedural backgrounds and textures for training networks on few images.
+//!
+//! Works on small patches of colour ([`Patch`], planar `f32` in 0..1) and of one channel ([`Coverage`]): a network's
+//! input, not a photograph. Everything random takes the caller's generator
+//! ([`stream`](sixfold_geometry::random::stream) makes one per sample), so that a
+//! sample is a function of seed and number alone, whatever thread draws it.
+//!
+//! Colour augmentation after K. Park, dissertation, table 3.2; occluders after table 3.3.
+
+mod backgrounds;
+mod blur;
+mod color;
+mod coverage;
+mod cutout;
+mod error;
+mod noise;
+mod patch;
+mod shapes;
+mod texture;
+mod window;
+
+pub use backgrounds::{Backgrounds, PhotographOptions};
+pub use color::ColorAugmentation;
+pub use coverage::Coverage;
+pub use cutout::Cutout;
+pub use error::AugmentError;
+pub use patch::{AffineMap, Patch};
+pub use shapes::{Shape, occluder_of_fraction};
+pub use texture::procedural_texture;
+pub use window::Window;

@@ -1,0 +1,37 @@
+//! Colours for shapes that have none.
+
+use rand::RngExt;
+use sixfold_geometry::Vec3;
+use sixfold_geometry::random::{Random, uniform};
+use sixfold_mesh::Mesh;
+
+/// The mesh in random colours that change slowly over its surface, for shapes without colours.
+pub fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
+    let (low, high) = mesh.bounding_box();
+    let size = (high - low).norm().max(1e-9);
+    let base: [f32; 3] = std::array::from_fn(|_| uniform(random, [0.1, 0.9]));
+    let waves: Vec<(Vec3, f64, [f32; 3])> = (0..random.random_range(1..5u32))
+        .map(|_| {
+            let k = Vec3::from_fn(|_, _| f64::from(uniform(random, [-25.0, 25.0]))) / size;
+            let phase = f64::from(uniform(random, [0.0, std::f32::consts::TAU]));
+            (k, phase, std::array::from_fn(|_| uniform(random, [-0.25, 0.25])))
+        })
+        .collect();
+    let colors = mesh
+        .vertices()
+        .iter()
+        .map(|v| {
+            let mut color = base;
+            for (k, phase, amount) in &waves {
+                let wave = (k.dot(v) + phase).sin() as f32;
+                (0..3).for_each(|c| color[c] += amount[c] * wave);
+            }
+            color.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8)
+        })
+        .collect();
+    // One colour per vertex always fits. The texture would win over it, so only the shape is kept.
+    Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())
+        .and_then(|shape| shape.with_normals(mesh.vertex_normals()))
+        .and_then(|shape| shape.with_colors(colors))
+        .unwrap_or_else(|_| mesh.clone())
+}
