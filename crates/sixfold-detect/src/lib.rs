@@ -3,6 +3,7 @@
 //! The short way: [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
 
 pub mod detect;
+pub mod detector;
 pub mod loss;
 pub mod model;
 pub mod network;

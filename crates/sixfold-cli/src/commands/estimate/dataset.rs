@@ -1,0 +1,132 @@
+//! `sixfold estimate --dataset`: all targets of a BOP dataset into a result CSV, image by image, resumable.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use anyhow::{Context, Result, anyhow, bail};
+use sixfold_bop::{BopDataset, Target};
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_io::write_rgb;
+use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunError};
+use sixfold_shell::Outcome;
+use sixfold_shell::frames::excepted;
+use sixfold_shell::output::report;
+use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::progress::{Progress, interrupted};
+
+use super::arguments::{CommonArguments, EstimateArguments};
+
+/// Detections this sure are passed on: a pose's own confidence sorts them further.
+const MIN_DETECTION: f32 = 0.1;
+
+pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
+    let common = &a.common;
+    let out = common.out.as_deref().ok_or_else(|| anyhow!("--out FILE.csv is missing"))?;
+    if out.extension().is_none_or(|e| e != "csv") {
+        bail!("--out: found {}, expected a file that ends in .csv", out.display());
+    }
+    let dataset = BopDataset::open(root, &common.split)?;
+    let mut targets = dataset.targets(common.targets.as_deref())?;
+    let left_out = excepted(&dataset, common.except.as_deref())?;
+    targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
+    let targets = dataset.object_targets(&targets)?;
+    let (regions, mut skipped) = regions(common, &dataset, &targets)?;
+    let estimator = a.method.build(a.of_method(), common)?;
+    let images: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
+    let (cache, options) = (common.cache.cache(), a.run_options());
+    let run = DatasetRun {
+        estimator: estimator.as_ref(),
+        dataset: &dataset,
+        targets: &targets,
+        regions: &regions,
+        min_confidence: common.min_score,
+        cache: &cache,
+        options: &options,
+    };
+    let mut progress = Progress::new("images", images.len());
+    // An overlay that cannot be written costs no poses.
+    let mut undrawn = vec![];
+    let summary = run.run(out, interrupted(), &mut |event| {
+        match event {
+            DatasetEvent::Image { image, earlier: true } => progress.step(format!("{image} was done")),
+            DatasetEvent::Image { image, earlier: false } => progress.step(image),
+            DatasetEvent::Note(note) => eprintln!("note: {note}"),
+            DatasetEvent::Result(result) => {
+                if let Some(folder) = &common.overlays
+                    && let Err(error) = draw(folder, result)
+                {
+                    let image = format!("{}/{}", result.scene_id, result.im_id);
+                    undrawn.push(format!("overlay of image {image}: {}", sixfold_shell::describe(&error)));
+                }
+            }
+        }
+        Ok::<(), RunError>(())
+    });
+    progress.finish();
+    let mut summary = summary?;
+    skipped.append(&mut summary.skipped);
+    skipped.append(&mut undrawn);
+    summary.skipped = skipped;
+    for s in &summary.skipped {
+        eprintln!("skipped {s}");
+    }
+    report(&common.json, &summary, || {
+        println!(
+            "{} poses for {} targets in {} images: {}",
+            summary.poses, summary.targets, summary.images, summary.results
+        );
+        if let Some(mean) = summary.seconds_per_image {
+            println!("{mean:.2} s per image");
+        }
+    })?;
+    Ok(match (summary.skipped.is_empty(), summary.poses) {
+        (false, _) => Outcome::Incomplete,
+        (true, 0) => Outcome::NothingFound,
+        (true, _) => Outcome::Found,
+    })
+}
+
+/// Where the options say that the targets are, and what was left out of a file of detections.
+fn regions(a: &CommonArguments, dataset: &BopDataset, targets: &[Target]) -> Result<(RegionSource, Vec<String>)> {
+    let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+    Ok(match (a.boxes.as_deref(), &a.detector) {
+        (Some("gt"), _) => (RegionSource::GroundTruth, vec![]),
+        (None | Some("detect"), Some(weights)) => {
+            let detector = TrainedDetector::load(weights)?.with_threshold(MIN_DETECTION);
+            let of_detector = RegionSource::of_detector(Box::new(detector), ids);
+            (of_detector.with_context(|| weights.display().to_string())?, vec![])
+        }
+        (Some("detect"), None) => {
+            bail!("--boxes detect needs --detector FILE.safetensors, which `sixfold train detector` writes")
+        }
+        (None, None) => (RegionSource::Anywhere, vec![]),
+        (Some(file), _) => {
+            let (source, changed, left_out) = RegionSource::read(dataset, Path::new(file))?;
+            changed.iter().for_each(|note| eprintln!("note: {note}"));
+            (source, left_out)
+        }
+    })
+}
+
+/// Draws the poses of an image over it.
+fn draw(folder: &Path, result: &ImageResult<'_>) -> Result<()> {
+    let (scene, im_id) = (result.scene, result.im_id);
+    let camera = scene.camera(im_id)?;
+    let background = match (scene.rgb(im_id)?, scene.depth(im_id)?) {
+        (Some(rgb), _) => rgb,
+        (None, Some(depth)) => overlay::depth_picture(&depth),
+        (None, None) => return Ok(()),
+    };
+    let drawn: Vec<Drawn<'_>> = result
+        .found
+        .iter()
+        .map(|p| Drawn {
+            mesh: p.mesh,
+            camera_from_object: p.estimate.camera_from_object,
+            color: overlay::color(p.obj_id as usize),
+        })
+        .collect();
+    let path = folder.join(format!("{:06}_{im_id:06}.png", result.scene_id));
+    write_rgb(&path, &overlay::draw(&background, &camera, &drawn))?;
+    Ok(())
+}

@@ -1,0 +1,116 @@
+//! Where in one image to look: `--box`, `--mask` or what `--detector` finds, in the pinhole image.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, anyhow, bail};
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_estimator::{ObjectDetector, Region};
+use sixfold_geometry::{Camera, Mask, Rect, RgbImage, Vec2};
+use sixfold_io::read_mask;
+
+use super::arguments::CommonArguments;
+
+/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
+const MIN_SCORE: f32 = 0.4;
+
+/// Where to look.
+pub(super) enum Where {
+    /// In the whole image.
+    Anywhere,
+    /// In a region.
+    In(Region),
+    /// Nowhere: the detector does not see the object.
+    Nowhere,
+}
+
+/// What the options say. `lens` is the camera with its distortion, `image` the colour image without.
+pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>) -> Result<Where> {
+    let boxed = given_box(a, lens)?.map(|b| undistorted(&b, lens));
+    if let Some(weights) = &a.detector {
+        if boxed.is_some() || a.mask.is_some() {
+            bail!("--detector: give it, or --box or --mask, but not both");
+        }
+        let image = image.ok_or_else(|| anyhow!("--detector needs a colour image: give --rgb FILE"))?;
+        return detected(weights, image, a.object_id);
+    }
+    let mask = a.mask.as_deref().map(|path| given_mask(path, lens, boxed.as_ref())).transpose()?;
+    Ok(match (mask, boxed) {
+        (Some(region), _) => Where::In(region),
+        (None, Some(bbox)) => Where::In(Region::of_box(bbox)),
+        (None, None) => Where::Anywhere,
+    })
+}
+
+/// `--box`, which has a size and shows something of the image.
+fn given_box(a: &CommonArguments, camera: &Camera) -> Result<Option<Rect>> {
+    let Some(r) = &a.region else { return Ok(None) };
+    let [x, y, width, height] = r[..] else {
+        bail!("--box: found {} numbers, expected x, y, width, height", r.len())
+    };
+    if !(width > 0.0 && height > 0.0 && r.iter().all(|v| v.is_finite())) {
+        bail!("--box: found {r:?}, expected x, y, width, height with a size above 0");
+    }
+    let region = Rect { x, y, width, height };
+    let image = Rect { x: 0.0, y: 0.0, width: camera.width as f64, height: camera.height as f64 };
+    if region.intersect(&image).is_none() {
+        bail!("--box: {r:?} lies outside the {}x{} image", camera.width, camera.height);
+    }
+    Ok(Some(region))
+}
+
+/// The pixels of `--mask`, of those of `--box` where that is given too.
+fn given_mask(path: &Path, lens: &Camera, boxed: Option<&Rect>) -> Result<Region> {
+    let mask = read_mask(path)?;
+    lens.check_image(mask.width(), mask.height()).with_context(|| path.display().to_string())?;
+    let empty = || {
+        let and_box = if boxed.is_some() { " and --box" } else { "" };
+        anyhow!(
+            "{}{and_box}: the mask is empty: no pixel is left in which the object could be; it has to be above zero on the object",
+            path.display()
+        )
+    };
+    let mask = match boxed {
+        None => mask,
+        Some(bbox) => {
+            let inside = Region::of_box(*bbox).pixels(lens);
+            Mask::from_fn(mask.width(), mask.height(), |x, y| mask[(x, y)] && inside[(x, y)])
+        }
+    };
+    let region = Region::of_mask(mask).ok_or_else(empty)?;
+    if lens.distortion.is_none() {
+        return Ok(region);
+    }
+    // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
+    Ok(Region::of_box(undistorted(&region.bbox, lens)))
+}
+
+/// Where a detector sees the object best, if at all.
+fn detected(weights: &Path, image: &RgbImage, id: Option<u32>) -> Result<Where> {
+    let id = id.ok_or_else(|| anyhow!("--detector needs --object-id N: which of its objects is it?"))?;
+    let detector = TrainedDetector::load(weights)?;
+    let threshold = detector.options().threshold.min(MIN_SCORE);
+    let detector = detector.with_threshold(threshold);
+    detector.check_object(id).with_context(|| weights.display().to_string())?;
+    let found = detector.detect(image)?.into_iter().filter(|d| d.object_id == id);
+    let best = found.max_by(|a, b| a.region.score.total_cmp(&b.region.score));
+    Ok(best.map_or(Where::Nowhere, |d| Where::In(d.region)))
+}
+
+/// The box that holds what a box of the raw image shows, in the pinhole image.
+fn undistorted(region: &Rect, lens: &Camera) -> Rect {
+    if lens.distortion.is_none() {
+        return *region;
+    }
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for (u, v) in (0..=4).flat_map(|u| (0..=4).map(move |v| (u, v))) {
+        let along = |i: i32, start: f64, size: f64| start + 0.25 * f64::from(i) * size;
+        let at = Vec2::new(along(u, region.x, region.width), along(v, region.y, region.height));
+        if let Some(at) = lens.undistort_point(&at) {
+            (low, high) = (low.inf(&at), high.sup(&at));
+        }
+    }
+    if low.x > high.x {
+        return *region;
+    }
+    Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y }
+}

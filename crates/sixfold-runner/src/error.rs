@@ -1,0 +1,113 @@
+//! Why a run cannot go on.
+
+use std::path::PathBuf;
+
+use sixfold_bop::{DatasetError, ResultsError};
+use sixfold_estimator::{CacheError, EstimatorError};
+use sixfold_geometry::CameraError;
+use thiserror::Error;
+
+/// Why a run cannot go on.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The dataset cannot be read.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// The result file cannot be read or written.
+    #[error(transparent)]
+    Results(#[from] ResultsError),
+    /// The method failed.
+    #[error(transparent)]
+    Estimator(#[from] EstimatorError),
+    /// The cache cannot be used.
+    #[error(transparent)]
+    Cache(#[from] CacheError),
+    /// The mask of a detection has another size than the image.
+    #[error("segmentation of object {object_id} in image {scene_id}/{image_id}")]
+    Segmentation {
+        /// The object.
+        object_id: u32,
+        /// The scene.
+        scene_id: u32,
+        /// The image.
+        image_id: u32,
+        /// Why.
+        source: CameraError,
+    },
+    /// An image lacks what the run needs.
+    #[error("has no {what}, which {user} needs")]
+    Lacks {
+        /// What it lacks.
+        what: &'static str,
+        /// Who needs it.
+        user: &'static str,
+    },
+    /// The method cannot do without regions.
+    #[error(
+        "--method {method} needs boxes: give --detector FILE.safetensors, --boxes gt or a file of COCO detections"
+    )]
+    NoRegions {
+        /// The method.
+        method: &'static str,
+    },
+    /// The result file is there, and nothing says what it was made with.
+    #[error(
+        "{} exists, but {} does not say what it was made with: remove it or choose another --out",
+        results.display(), record.display()
+    )]
+    NoRecord {
+        /// The result file.
+        results: PathBuf,
+        /// The record beside it.
+        record: PathBuf,
+    },
+    /// The result file was made with other options.
+    #[error(
+        "{} was made with other options ({option}: {before}, now {now}; see {}): remove both or choose another --out",
+        results.display(), record.display()
+    )]
+    OtherOptions {
+        /// The result file.
+        results: PathBuf,
+        /// The record beside it.
+        record: PathBuf,
+        /// The option that differs.
+        option: String,
+        /// What it was.
+        before: String,
+        /// What it is.
+        now: String,
+    },
+    /// A file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The caller asked to stop.
+    #[error("interrupted; run the same command again to resume")]
+    Interrupted,
+    /// The caller's own work on a result failed.
+    #[error(transparent)]
+    Caller(Box<dyn std::error::Error + Send + Sync>),
+}
+
+/// The whole chain of causes in one line, without repeating a cause that its parent already prints.
+pub fn describe(error: &(dyn std::error::Error + 'static)) -> String {
+    let mut text = String::new();
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        let part = error.to_string();
+        if !text.contains(&part) {
+            if !text.is_empty() {
+                text.push_str(": ");
+            }
+            text.push_str(&part);
+        }
+        cause = error.source();
+    }
+    text
+}

@@ -1,0 +1,106 @@
+//! A method on one image.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+use sixfold_align::VerificationScore;
+use sixfold_estimator::{EstimatorError, Object, PoseEstimate, PoseEstimator, PreparedObject, Query};
+
+/// A method and the image that it is asked about.
+pub struct ImageRun<'a> {
+    /// The method.
+    pub estimator: &'a dyn PoseEstimator,
+    /// The image, and where to look in it.
+    pub query: Query<'a>,
+}
+
+/// An object that was searched, with what was found of it.
+pub struct FoundObject {
+    /// The object as the method knows it.
+    pub object: Box<dyn PreparedObject>,
+    /// Its poses, best first.
+    pub estimates: Vec<PoseEstimate>,
+    /// Seconds for preparing and searching it.
+    pub seconds: f64,
+}
+
+impl ImageRun<'_> {
+    /// Searches one object. What the image says of all objects is computed for the first alone.
+    ///
+    /// # Errors
+    /// [`EstimatorError`].
+    pub fn find(&self, object: &Object) -> Result<FoundObject, EstimatorError> {
+        let start = Instant::now();
+        let object = self.estimator.prepare(object)?;
+        let estimates = self.estimator.estimate(object.as_ref(), &self.query)?;
+        Ok(FoundObject { object, estimates, seconds: start.elapsed().as_secs_f64() })
+    }
+
+    /// Objects that were searched as programs and people read them.
+    pub fn report(&self, found: &[FoundObject]) -> ImageReport {
+        let poses = found.iter().flat_map(|f| f.estimates.iter().map(|e| FoundPose::new(f, e))).collect();
+        let missing = found.iter().filter(|f| f.estimates.is_empty());
+        let not_found = missing.map(|f| f.object.name().to_owned()).collect();
+        ImageReport { poses, not_found, overlay: None, diagnostics: BTreeMap::new() }
+    }
+}
+
+/// A pose as JSON.
+#[derive(Debug, Serialize)]
+pub struct FoundPose {
+    /// The object's name.
+    pub object: String,
+    /// The pose by rows, metres.
+    pub camera_from_object: [[f64; 4]; 4],
+    /// 0 to 1.
+    pub confidence: f64,
+    /// What verification by rendering says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verification: Option<VerificationScore>,
+    /// The method's own keys, and `seconds`.
+    #[serde(flatten)]
+    pub details: Map<String, Value>,
+    /// Seconds for preparing and searching the object.
+    #[serde(skip)]
+    pub elapsed: f64,
+}
+
+impl FoundPose {
+    fn new(found: &FoundObject, estimate: &PoseEstimate) -> FoundPose {
+        let m = estimate.camera_from_object.to_matrix();
+        let mut details = estimate.details.clone();
+        if !details.contains_key("seconds") {
+            details.insert("seconds".to_owned(), found.seconds.into());
+        }
+        FoundPose {
+            object: found.object.name().to_owned(),
+            camera_from_object: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])),
+            confidence: estimate.confidence,
+            verification: estimate.verification,
+            details,
+            elapsed: found.seconds,
+        }
+    }
+
+    /// The fraction of the object that is seen, where verification says it.
+    pub fn visibility(&self) -> Option<f64> {
+        self.verification.map(|v| v.visible_share())
+    }
+}
+
+/// What one image holds, as JSON.
+#[derive(Debug, Serialize)]
+pub struct ImageReport {
+    /// All poses, object by object.
+    pub poses: Vec<FoundPose>,
+    /// Names of the objects that were not found.
+    pub not_found: Vec<String>,
+    /// The overlay, where one was rendered.
+    pub overlay: Option<PathBuf>,
+    /// Images of the method's own, by name.
+    #[serde(flatten)]
+    pub diagnostics: BTreeMap<String, PathBuf>,
+}

@@ -1,0 +1,16 @@
+//! Any [`PoseEstimator`](sixfold_estimator::PoseEstimator) on one image ([`ImageRun`]) or on all targets of a BOP dataset
+//! ([`DatasetRun`]), where regions come from the ground truth, a file of detections or a detector ([`RegionSource`]).
+
+mod dataset;
+mod error;
+mod image;
+mod record;
+mod regions;
+mod table;
+
+pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject};
+pub use error::{RunError, describe};
+pub use image::{FoundObject, FoundPose, ImageReport, ImageRun};
+pub use record::RunOptions;
+pub use regions::RegionSource;
+pub use table::pose_table;

@@ -1,0 +1,30 @@
+//! Poses as a table for people, the same for every method.
+
+use std::fmt::Write;
+
+use crate::image::ImageReport;
+
+/// The poses of one image and what was not found, a line each.
+pub fn pose_table(report: &ImageReport) -> String {
+    let mut text = format!(
+        "{:<24} {:>10} {:>8} {:>26} {:>8}\n",
+        "object", "confidence", "visible", "translation (m)", "seconds"
+    );
+    for pose in &report.poses {
+        let t: Vec<String> = pose.camera_from_object[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
+        let visible = pose.visibility().map_or_else(|| "-".into(), |v| format!("{:.0}%", 100.0 * v));
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "{:<24} {:>10.3} {visible:>8} {:>26} {:>8.2}",
+            pose.object,
+            pose.confidence,
+            t.join(" "),
+            pose.elapsed
+        );
+    }
+    for name in &report.not_found {
+        let _ = writeln!(text, "{name:<24} not found");
+    }
+    text
+}
