@@ -1,4 +1,4 @@
-//! `made_up_mesh`, `drop_objects`: objects of no mesh file (`sixfold-shapes`), and scenes of objects that fell on a table
+//! `made_up_mesh`, `drop_objects`: objects of no mesh file (`sixfold-synth`), and scenes of objects that fell on a table
 //! (`sixfold-simulation`).
 
 use numpy::PyArray2;

@@ -10,7 +10,7 @@
 
 use sixfold_experience::Attempt;
 use sixfold_geometry::nalgebra::{SMatrix, SVector};
-use sixfold_grasp::{AntipodalQuality, GraspDescription};
+use sixfold_grasp::GraspDescription;
 
 /// How many numbers describe a grasp to the model, the constant included.
 const NUMBERS: usize = 17;
@@ -150,6 +150,7 @@ mod tests {
     use super::*;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
+    use sixfold_grasp::AntipodalQuality;
 
     fn description(alignment: f64, lever: f64) -> GraspDescription {
         let quality = AntipodalQuality { alignment, support: 0.8, centring: 0.7, observed: 0.5 };

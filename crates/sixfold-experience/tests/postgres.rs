@@ -1,6 +1,6 @@
 //! The store on a PostgreSQL server, against a real one from a wheel; where there is none the tests say so and pass.
 //!
-//! `cargo test --workspace --release --features sixfold-dgcm/postgres --test postgres -- --nocapture` runs them;
+//! `cargo test --workspace --release --features sixfold-experience/postgres --test postgres -- --nocapture` runs them;
 //! `SIXFOLD_KILLS=100` in the environment kills server and robot a hundred times.
 #![cfg(all(feature = "postgres", feature = "sqlite", unix))]
 

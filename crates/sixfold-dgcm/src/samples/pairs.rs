@@ -157,6 +157,7 @@ fn block(
 mod tests {
     use super::*;
     use crate::samples::PoolOptions;
+    use rand::SeedableRng;
 
     fn pool() -> Pool {
         Pool::new(&PoolOptions { views: 96, ..PoolOptions::default() }, |_| ())

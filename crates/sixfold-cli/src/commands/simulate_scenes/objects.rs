@@ -51,8 +51,8 @@ pub(super) fn collect(a: &SimulateScenesArguments) -> Result<Vec<Thing>> {
     }
     for family in a.chosen_families()? {
         for number in 0..a.members {
-            let stream = (family as u64) << 32 | number as u64;
-            add(&mut described, of_family(family, number, &mut stream(a.seed, stream))?);
+            let number_of_all = (family as u64) << 32 | number as u64;
+            add(&mut described, of_family(family, number, &mut stream(a.seed, number_of_all))?);
         }
     }
     for number in 0..a.toys {
