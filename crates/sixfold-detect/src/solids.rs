@@ -7,9 +7,9 @@ use std::f64::consts::{PI, TAU};
 
 use rand::RngExt;
 use sixfold_augment::{Backgrounds, Random, procedural_texture};
+use sixfold_data::randomly_colored;
 use sixfold_geometry::{Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_pix2pose::samples::randomly_colored;
 
 /// Corners around a turned solid.
 const AROUND: u32 = 24;

@@ -7,7 +7,6 @@ mod critic;
 pub mod depth;
 pub mod estimate;
 pub mod loss;
-pub mod material;
 pub mod model;
 pub mod networks;
 pub mod object;

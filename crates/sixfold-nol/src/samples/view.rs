@@ -11,9 +11,9 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec3};
 
 use super::object::{Lamp, PaintedObject, between, random_direction};
-use crate::photograph::object_window;
 use crate::projection::TargetSurface;
 use crate::source::{MARGIN, SourceView};
+use crate::window::object_window;
 
 /// The target's side in units of the object's box.
 const TARGET_MARGIN: f64 = 1.1;
