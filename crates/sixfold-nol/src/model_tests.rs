@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use sixfold_data::PosedImage;
-use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
