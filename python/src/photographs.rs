@@ -106,7 +106,10 @@ impl RefinedPoses {
     #[getter]
     fn photographs(&self) -> PyResult<Vec<PyPhotograph>> {
         let kept = self.photographs.iter().zip(&self.refinement.sources).filter(|(_, s)| s.dropped.is_none());
-        kept.map(|(p, s)| p.with_pose(s.camera_from_object).map(PyPhotograph).map_err(nol_error)).collect()
+        kept.map(|(p, s)| {
+            p.with_pose(s.camera_from_object).map(PyPhotograph).map_err(|e| nol_error(e.into()))
+        })
+        .collect()
     }
 
     fn __len__(&self) -> usize {
