@@ -5,7 +5,8 @@ use std::sync::Arc;
 use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_nol::{NolError, Photograph};
+use sixfold_data::PosedImage;
+use sixfold_nol::NolError;
 
 use crate::arrays::{self, about, bad};
 use crate::camera::PyCamera;
@@ -37,7 +38,7 @@ pub(crate) fn nol_error(error: NolError) -> PyErr {
 /// >>> Photograph(np.zeros((480, 640, 3), np.uint8), Camera(500, 500, 320, 240, 640, 480), pose, name="first")
 /// <Photograph: first>
 #[pyclass(name = "Photograph", module = "sixfold", frozen)]
-pub(crate) struct PyPhotograph(pub(crate) Photograph);
+pub(crate) struct PyPhotograph(pub(crate) PosedImage);
 
 #[pymethods]
 impl PyPhotograph {
@@ -54,11 +55,13 @@ impl PyPhotograph {
         let camera = camera.of_image("rgb", image.size())?;
         let pose = arrays::pose("camera_from_object", camera_from_object)?;
         let mask = mask.map(|mask| arrays::mask("mask", mask)).transpose()?;
-        let photograph = Photograph::new(name, Arc::new(image), camera, pose, mask);
-        photograph.map(PyPhotograph).map_err(|error| match &error {
-            NolError::Size { what: "mask", .. } => about("mask")(error),
-            _ => about("camera_from_object")(error),
-        })
+        // A photograph by a user is of one object, whatever its id in a dataset.
+        let photograph =
+            PosedImage::new(name, 1, Arc::new(image), camera, pose).map_err(about("camera_from_object"))?;
+        Ok(PyPhotograph(match mask {
+            Some(mask) => photograph.with_mask(&mask).map_err(about("mask"))?,
+            None => photograph,
+        }))
     }
 
     /// What stands for it in messages.
@@ -88,7 +91,7 @@ impl PyPhotograph {
     /// Where the object is visible, (H, W) bool, or None.
     #[getter]
     fn mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<bool>>>> {
-        self.0.mask().map(|mask| arrays::from_image(py, mask.clone())).transpose()
+        self.0.mask().map(|mask| arrays::from_image(py, mask.to_mask())).transpose()
     }
 
     /// The same photograph with another pose (4, 4).

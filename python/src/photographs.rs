@@ -6,13 +6,14 @@ use std::sync::atomic::Ordering;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use sixfold_data::PosedImage;
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
+use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::{ModelError, NolModel};
 use sixfold_nol::refine::{RefineOptions, Refinement, SceneKind, SceneSource, refine_scene};
 use sixfold_nol::synthesis::{NewView, ViewMaker, Weighting};
-use sixfold_nol::{Photograph, SourceView};
 
 use crate::arrays::{self, bad, whole};
 use crate::camera::PyCamera;
@@ -34,7 +35,7 @@ fn model_error(error: ModelError) -> PyErr {
 #[pyclass(name = "RefinedPoses", module = "sixfold", frozen)]
 pub(crate) struct RefinedPoses {
     refinement: Refinement,
-    photographs: Vec<Photograph>,
+    photographs: Vec<PosedImage>,
 }
 
 impl RefinedPoses {
@@ -105,7 +106,10 @@ impl RefinedPoses {
     #[getter]
     fn photographs(&self) -> PyResult<Vec<PyPhotograph>> {
         let kept = self.photographs.iter().zip(&self.refinement.sources).filter(|(_, s)| s.dropped.is_none());
-        kept.map(|(p, s)| p.with_pose(s.camera_from_object).map(PyPhotograph).map_err(nol_error)).collect()
+        kept.map(|(p, s)| {
+            p.with_pose(s.camera_from_object).map(PyPhotograph).map_err(|e| nol_error(e.into()))
+        })
+        .collect()
     }
 
     fn __len__(&self) -> usize {
@@ -224,7 +228,7 @@ fn with_surface(mesh: &Mesh) -> PyResult<()> {
     Ok(())
 }
 
-fn given(photographs: &[PyRef<'_, PyPhotograph>]) -> PyResult<Vec<Photograph>> {
+fn given(photographs: &[PyRef<'_, PyPhotograph>]) -> PyResult<Vec<PosedImage>> {
     if photographs.is_empty() {
         return Err(bad("photographs", "at least one Photograph", "none"));
     }

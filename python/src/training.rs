@@ -8,12 +8,11 @@ use std::sync::atomic::AtomicBool;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use sixfold_data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
 use sixfold_mesh::ModelInfo;
 use sixfold_nn::recipe::{Listener, News, Trained};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_pix2pose::material::{Frames, Material, MaterialError};
-use sixfold_pix2pose::samples::SampleError;
 
 use crate::arrays::{self, bad, whole};
 use crate::bop::PyDataset;
@@ -161,7 +160,7 @@ pub(crate) fn steps_of(steps: Option<i64>) -> PyResult<Option<u64>> {
 
 /// A BOP dataset by its folder, an opened one, or meshes by their ids.
 pub(crate) enum Source {
-    Dataset { root: PathBuf, split: String, ids: Vec<u32>, frames: Frames },
+    Dataset { root: PathBuf, split: String, ids: Vec<u32>, frames: FrameSelection },
     Meshes(Vec<(u32, sixfold_mesh::Mesh, ModelInfo)>),
 }
 
@@ -194,28 +193,27 @@ impl Source {
         };
         let frames = match frames {
             Some(_) if renders_only => return Err(bad("frames", "None with renders_only", "some")),
-            Some(list) => Frames::Listed(arrays::pairs("frames", list)?),
-            None if renders_only => Frames::RendersOnly,
-            None => Frames::All,
+            Some(list) => {
+                let pairs = arrays::pairs("frames", list)?;
+                FrameSelection::Listed(pairs.into_iter().map(FrameId::from).collect())
+            }
+            None if renders_only => FrameSelection::RendersOnly,
+            None => FrameSelection::All,
         };
         let ids = ids.map_or(Ok(vec![]), |ids| arrays::ids("ids", ids))?;
         let split = split.or(own).unwrap_or_else(|| "test".to_owned());
         Ok(Source::Dataset { root, split, ids, frames })
     }
 
-    pub(crate) fn read(self, py: Python<'_>, least_visible: f64) -> PyResult<Material> {
+    pub(crate) fn read(self, py: Python<'_>, least_visible: f64) -> PyResult<TrainingSet> {
         let read = interruptible(py, move |_| match self {
             Source::Dataset { root, split, ids, frames } => {
-                Material::of_dataset(&root, &split, &ids, &frames, least_visible)
+                TrainingSet::of_dataset(&root, &split, &ids, &frames, least_visible)
             }
-            Source::Meshes(meshes) => Ok(Material::of_meshes(meshes, "meshes")),
+            Source::Meshes(meshes) => Ok(TrainingSet::of_meshes(meshes, "meshes")),
         })?;
         read.map_err(|error| match error {
-            MaterialError::Dataset(error) => dataset_error(*error),
-            MaterialError::Samples(error) => match *error {
-                SampleError::Dataset(error) => dataset_error(error),
-                other => file_or_value(&other),
-            },
+            TrainingSetError::Dataset(error) => dataset_error(*error),
             other => file_or_value(&other),
         })
     }

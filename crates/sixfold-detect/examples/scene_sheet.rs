@@ -5,13 +5,14 @@
 use std::error::Error;
 use std::path::Path;
 
-use sixfold_bop::{BopDataset, Models};
+use sixfold_bop::{BopDataset, Models, write_rgb};
 use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
 use sixfold_io::write_rgb;
 use sixfold_pix2pose::samples::read_real_crops;
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
+use sixfold_data::{FrameId, TrainingObject, read_posed_images};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -19,18 +20,16 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: scene_sheet DATASET FRAMES.json BACKGROUNDS OUT.png".into());
     };
     let dataset = BopDataset::open(Path::new(dataset), "test")?;
-    let frames: Vec<serde_json::Value> = serde_json::from_slice(&std::fs::read(frames)?)?;
-    let id = |v: &serde_json::Value, field: &str| v[field].as_u64().unwrap_or(0) as u32;
-    let frames: Vec<(u32, u32)> = frames.iter().map(|f| (id(f, "scene_id"), id(f, "im_id"))).collect();
+    let frames: Vec<FrameId> = serde_json::from_slice(&std::fs::read(frames)?)?;
     let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let ids: Vec<u32> = infos.0.keys().copied().collect();
-    let real = read_real_crops(&dataset, &frames, &ids, 0.0)?;
-    let cut = read_real_crops(&dataset, &frames, &ids, 0.6)?;
+    let real = read_posed_images(&dataset, &frames, &ids, 0.0)?;
+    let cut = read_posed_images(&dataset, &frames, &ids, 0.6)?;
     let objects = ids
         .iter()
         .map(|id| {
             let mesh = dataset.model(*id, Models::Rendering)?;
-            Ok(SceneObject { id: *id, mesh, diameter: infos.0[id].diameter })
+            Ok(TrainingObject::new(*id, mesh, infos.0[id].clone()))
         })
         .collect::<Result<Vec<_>, Box<dyn Error>>>()?;
     let backgrounds = Backgrounds::from_folder(backgrounds, &PhotographOptions::default())?;

@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
+use sixfold_synth::augment::AugmentError;
+use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::{ModelCard, WeightsError};
+use sixfold_nn::weights::{ModelCard, WeightsError, training_frames};
 use sixfold_pix2pose::material::{Material, plain_backgrounds};
 use sixfold_pix2pose::samples::{SampleError, read_real_crops};
 use sixfold_synth::augment::AugmentError;
@@ -20,7 +22,7 @@ use thiserror::Error;
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use crate::network::{Detector, DetectorConfig, Encoder};
-use crate::samples::{SceneError, SceneObject, SceneOptions, SceneSource};
+use crate::samples::{SceneError, SceneOptions, SceneSource};
 use crate::training::{Ending, TrainingError, TrainingOptions, TrainingPace, last_checkpoint, train};
 
 /// Which network learns.
@@ -122,9 +124,6 @@ pub enum RecipeError {
     /// Backgrounds.
     #[error(transparent)]
     Backgrounds(#[from] AugmentError),
-    /// Photographs.
-    #[error(transparent)]
-    Samples(Box<SampleError>),
     /// Training images.
     #[error(transparent)]
     Scenes(#[from] SceneError),
@@ -140,12 +139,6 @@ pub enum RecipeError {
     /// The training itself.
     #[error(transparent)]
     Training(#[from] TrainingError),
-}
-
-impl From<SampleError> for RecipeError {
-    fn from(error: SampleError) -> Self {
-        RecipeError::Samples(Box::new(error))
-    }
 }
 
 /// Less complete instances are not cut out to be pasted elsewhere.
@@ -173,7 +166,7 @@ impl Recipe {
     /// [`RecipeError`].
     pub fn train(
         &self,
-        material: Material,
+        material: TrainingSet,
         out: &Path,
         stop: &AtomicBool,
         hear: &mut Listener<'_>,
@@ -189,23 +182,16 @@ impl Recipe {
             random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
             ..SceneOptions::default()
         };
-        let photographs = material.real.len();
+        let photographs = material.images.len();
         hear(News::Note(&format!(
             "making {} objects and {photographs} photographed instances ready",
             ids.len()
         )));
-        let cut = match &material.frames {
-            Some((dataset, frames)) => read_real_crops(dataset, frames, &ids, CUT_VISIBLE)?,
-            None => vec![],
-        };
-        let objects = material
-            .objects
-            .into_iter()
-            .map(|o| SceneObject { id: o.id, mesh: o.mesh, diameter: o.info.diameter })
-            .collect();
+        let complete = |image: &&PosedImage| image.visible_fraction().is_some_and(|f| f >= CUT_VISIBLE);
+        let cut: Vec<PosedImage> = material.images.iter().filter(complete).cloned().collect();
         let (backgrounds, share) = plain_backgrounds(self.backgrounds.as_deref())?;
         let backgrounds = backgrounds.with_procedural_share(share);
-        let source = SceneSource::new(objects, &material.real, &cut, backgrounds, scene_options)?;
+        let source = SceneSource::new(material.objects, &material.images, &cut, backgrounds, scene_options)?;
         let mut last = TrainingRecord::default();
         let shown = |record: &TrainingRecord| {
             hear(News::Steps(record, self.steps));
@@ -227,7 +213,7 @@ impl Recipe {
     ///
     /// # Errors
     /// [`RecipeError`].
-    pub fn export(&self, material: &Material, out: &Path) -> Result<Trained, RecipeError> {
+    pub fn export(&self, material: &TrainingSet, out: &Path) -> Result<Trained, RecipeError> {
         let p = self.prepare(material, out)?;
         let Some((network, step)) = last_checkpoint(&p.folder, p.network)? else {
             return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
@@ -255,7 +241,7 @@ impl Recipe {
         Ok(())
     }
 
-    fn prepare(&self, material: &Material, out: &Path) -> Result<Prepared, RecipeError> {
+    fn prepare(&self, material: &TrainingSet, out: &Path) -> Result<Prepared, RecipeError> {
         self.check()?;
         let ids: Vec<u32> = material.objects.iter().map(|o| o.id).collect();
         let device = Device::flex().autodiff();
@@ -286,6 +272,7 @@ impl Recipe {
         };
         let mut card = ModelCard::new("", &format!("Detector, {} network", self.network.name()));
         card.data.clone_from(&material.description);
+        card.training_frames = training_frames(self.init.as_deref(), &material.frames)?;
         card.seed = self.seed;
         card.command.clone_from(&self.command);
         card.extra = serde_json::json!({

@@ -14,11 +14,10 @@ use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch};
-use sixfold_synth::augment::{
-    AffineMap, AugmentError, Backgrounds, Coverage, Cutout, Patch, Shape, procedural_texture,
-};
+use sixfold_synth::augment::{AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream, uniform};
 use sixfold_synth::distractors::{random_solid, random_turn};
 use sixfold_synth::randomly_colored;
+use sixfold_data::{DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject, color_patch, default_distances, distances, image_color_augmentation, is_textured, randomly_colored};
 
 use crate::targets::{Annotation, IGNORED, Instance};
 
@@ -27,11 +26,10 @@ const LEAST_PIXELS: usize = 64;
 /// Photographs whose colours are kept of each object, and how many colours of each.
 const PALETTE_PICTURES: usize = 6;
 const PALETTE_COLORS: usize = 40;
-/// Meshes with more faces are simplified.
+/// Meshes with more faces are simplified, but for those with a texture.
 const FACES: usize = 5000;
-/// The camera of renders where there are no photographs.
-const DEFAULT_CAMERA: Camera =
-    Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+/// Directions in which a mesh's farthest vertices decide about its box.
+const EXTREMES: usize = 200;
 
 /// Shares and ranges. The defaults are for few real images of objects on a table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -108,36 +106,25 @@ pub enum SceneError {
         /// The object.
         id: u32,
     },
+    /// An image does not show enough of its object.
+    #[error(transparent)]
+    Image(#[from] PosedImageError),
     /// Colours or backgrounds.
     #[error(transparent)]
     Augment(#[from] AugmentError),
 }
 
-/// An object to be learnt.
-#[derive(Debug, Clone)]
-pub struct SceneObject {
-    /// Its id in the dataset.
-    pub id: u32,
-    /// Its surface in metres.
-    pub mesh: Mesh,
-    /// Its diameter in metres.
-    pub diameter: f64,
-}
-
 /// An object made ready.
 struct Prepared {
-    mesh: Mesh,
-    colored: bool,
-    extremes: Vec<Vec3>,
-    centre: Vec3,
+    drawn: PreparedMesh,
     poses: Vec<Pose>,
     distance: [f64; 2],
     /// Visible parts in photographs, with the length of the longer side there.
     cutouts: Vec<(Cutout, f32)>,
 }
 
-/// A photograph with the objects visible in it.
-struct Photograph {
+/// An image with a label for each of the objects visible in it.
+struct LabelledImage {
     image: Arc<RgbImage>,
     /// For every pixel 0 or the object's number in the photograph, from 1.
     labels: Vec<u8>,
@@ -157,11 +144,15 @@ pub struct SceneSample {
 /// Draws training images; shared between threads by reference.
 pub struct SceneSource {
     objects: Vec<Prepared>,
-    photographs: Vec<Photograph>,
+    photographs: Vec<LabelledImage>,
     backgrounds: Backgrounds,
     camera: Camera,
     options: SceneOptions,
-    poses: SampleOptions,
+    poses: PoseVariation,
+    /// Colours of the finished image.
+    color: ColorAugmentation,
+    /// Colours of a rendered object before it is pasted.
+    render_color: ColorAugmentation,
     /// Colours of the objects.
     palette: Vec<[u8; 3]>,
 }
@@ -221,13 +212,16 @@ impl SceneSource {
     /// # Errors
     /// [`SceneError`].
     pub fn new(
-        objects: Vec<SceneObject>,
-        real: &[RealCrop],
-        cut: &[RealCrop],
+        objects: Vec<TrainingObject>,
+        real: &[PosedImage],
+        cut: &[PosedImage],
         backgrounds: Backgrounds,
         options: SceneOptions,
     ) -> Result<Self, SceneError> {
         options.check()?;
+        for image in real.iter().chain(cut) {
+            image.check_visible()?;
+        }
         if objects.is_empty() {
             return Err(SceneError::NoObjects);
         }
@@ -238,14 +232,24 @@ impl SceneSource {
             .into_iter()
             .map(|object| Prepared::new(object, real, cut, &options))
             .collect::<Result<Vec<_>, _>>()?;
-        let poses = SampleOptions {
-            near_real_share: options.near_real_share,
+        let poses = PoseVariation {
+            near_fraction: options.near_real_share,
             rotation: options.rotation,
-            view_turn: options.rotation,
-            ..SampleOptions::default()
+            view_rotation: options.rotation,
+            ..PoseVariation::default()
         };
         let palette = prepared.iter().flat_map(Prepared::palette).collect();
-        Ok(SceneSource { objects: prepared, photographs, backgrounds, camera, options, poses, palette })
+        Ok(SceneSource {
+            objects: prepared,
+            photographs,
+            backgrounds,
+            camera,
+            options,
+            poses,
+            color: image_color_augmentation(),
+            render_color: ColorAugmentation::renders(),
+            palette,
+        })
     }
 
     /// The options.
@@ -289,7 +293,7 @@ impl SceneSource {
             }
             canvas
         };
-        self.poses.color.apply(&mut canvas.image, random);
+        self.color.apply(&mut canvas.image, random);
         let annotation = self.annotation(&mut canvas);
         SceneSample { rgb: canvas.image.data, annotation }
     }
@@ -363,7 +367,7 @@ impl SceneSource {
         }
         let class = random.random_range(0..self.objects.len());
         let object = &self.objects[class];
-        let can_render = object.colored || self.options.random_color_chance > 0.0;
+        let can_render = object.drawn.colored || self.options.random_color_chance > 0.0;
         let render =
             object.cutouts.is_empty() || (can_render && random.random::<f32>() < self.options.render_share);
         let drawn = if render { self.render(object, random) } else { self.cut(object, random) };
@@ -396,19 +400,13 @@ impl SceneSource {
     fn render(&self, object: &Prepared, random: &mut Random) -> Option<(Patch, Coverage)> {
         let range = PoseRange {
             camera: &self.camera,
-            centre: object.centre,
+            centre: object.drawn.centre,
             distance: object.distance,
             real: &object.poses,
         };
         let pose = range.draw(&self.poses, random);
         let scale = f64::from(self.scale(random));
-        let pixels: Option<Vec<Vec2>> =
-            object.extremes.iter().map(|v| self.camera.project(&pose.transform_point(v))).collect();
-        let (low, high) = pixels?
-            .iter()
-            .fold((Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY)), |(low, high), p| {
-                (low.inf(p), high.sup(p))
-            });
+        let (low, high) = object.drawn.pixel_box(&self.camera, &pose)?;
         let side = (high - low).max() * scale + 4.0;
         if !(8.0..=1.5 * self.options.size as f64).contains(&side) {
             return None;
@@ -424,13 +422,14 @@ impl SceneSource {
             height: size,
             distortion: None,
         };
-        let random_colors = !object.colored || random.random::<f32>() < self.options.random_color_chance;
+        let random_colors =
+            !object.drawn.colored || random.random::<f32>() < self.options.random_color_chance;
         let (mut patch, cover) = if random_colors {
-            color_patch(&randomly_colored(&object.mesh, random), &camera, &pose, random)
+            color_patch(&randomly_colored(&object.drawn.mesh, random), &camera, &pose, random)
         } else {
-            color_patch(&object.mesh, &camera, &pose, random)
+            color_patch(&object.drawn.mesh, &camera, &pose, random)
         };
-        self.poses.render_color.apply(&mut patch, random);
+        self.render_color.apply(&mut patch, random);
         Some((patch, cover))
     }
 
@@ -487,7 +486,7 @@ impl SceneSource {
             distortion: None,
         };
         let (mut patch, cover) = color_patch(&mesh, &camera, &pose, random);
-        self.poses.render_color.apply(&mut patch, random);
+        self.render_color.apply(&mut patch, random);
         (patch, cover)
     }
 
@@ -532,15 +531,15 @@ fn draw(cutout: &Cutout, longest: f32, turn: f32) -> (Patch, Coverage) {
 }
 
 /// The photographs with their labels.
-fn photographs(real: &[RealCrop], class_of: &BTreeMap<u32, usize>) -> Vec<Photograph> {
-    let mut photographs: Vec<Photograph> = vec![];
+fn photographs(real: &[PosedImage], class_of: &BTreeMap<u32, usize>) -> Vec<LabelledImage> {
+    let mut photographs: Vec<LabelledImage> = vec![];
     for crop in real {
         let Some(class) = class_of.get(&crop.object_id()) else { continue };
         let (width, height) = crop.image().size();
         let index =
             photographs.iter().position(|p| Arc::ptr_eq(&p.image, crop.image())).unwrap_or_else(|| {
                 let image = crop.image().clone();
-                photographs.push(Photograph { image, labels: vec![0; width * height], instances: vec![] });
+                photographs.push(LabelledImage { image, labels: vec![0; width * height], instances: vec![] });
                 photographs.len() - 1
             });
         let photograph = &mut photographs[index];
@@ -567,47 +566,36 @@ fn photographs(real: &[RealCrop], class_of: &BTreeMap<u32, usize>) -> Vec<Photog
 
 impl Prepared {
     fn new(
-        object: SceneObject,
-        real: &[RealCrop],
-        cut: &[RealCrop],
+        object: TrainingObject,
+        real: &[PosedImage],
+        cut: &[PosedImage],
         options: &SceneOptions,
     ) -> Result<Self, SceneError> {
-        let SceneObject { id, mesh, diameter } = object;
-        let colored = (mesh.texture().is_some() && mesh.texcoords().is_some()) || mesh.colors().is_some();
-        let colored = colored && !mesh.faces().is_empty();
+        let TrainingObject { id, mesh, info, .. } = object;
+        let faces = if is_textured(&mesh) { usize::MAX } else { FACES };
+        let drawn = PreparedMesh::new(&mesh, faces, EXTREMES);
         let mine = || real.iter().filter(|c| c.object_id() == id);
         let cutouts: Vec<(Cutout, f32)> = cut
             .iter()
             .filter(|c| c.object_id() == id)
-            .filter_map(RealCrop::cutout)
+            .filter_map(PosedImage::cutout)
             .map(|c| {
                 let longest = c.size().0.max(c.size().1) as f32;
                 (c, longest)
             })
             .collect();
-        if cutouts.is_empty() && !(colored || options.random_color_chance > 0.0 && !mesh.faces().is_empty()) {
+        if cutouts.is_empty()
+            && !(drawn.colored || options.random_color_chance > 0.0 && !mesh.faces().is_empty())
+        {
             return Err(SceneError::NoPictures { id });
         }
         let poses: Vec<Pose> = mine().map(|c| *c.camera_from_object()).collect();
-        // Without photographs of its own: those of the others, else 4 to 12 diameters.
-        let far = |crops: &mut dyn Iterator<Item = &RealCrop>| {
-            let (low, high) = crops
-                .map(|c| c.camera_from_object().translation().norm())
-                .fold((f64::INFINITY, 0.0f64), |(low, high), d| (low.min(d), high.max(d)));
-            (low <= high).then_some([0.9 * low, 1.1 * high])
-        };
-        let distance = far(&mut mine())
-            .or_else(|| far(&mut real.iter()))
-            .unwrap_or([4.0 * diameter, 12.0 * diameter])
-            .map(|d| d.max(diameter));
-        let (low, high) = mesh.bounding_box();
-        let extremes = mesh.extremes(200);
-        let textured = mesh.texture().is_some() && mesh.texcoords().is_some();
-        let mesh = if mesh.faces().len() > FACES && !textured { simplify(&mesh, FACES) } else { mesh };
-        // Normals looked up per sample would be computed anew every time.
-        let normals = mesh.vertex_normals();
-        let mesh = mesh.clone().with_normals(normals).unwrap_or(mesh);
-        Ok(Prepared { mesh, colored, extremes, centre: (low + high) * 0.5, poses, distance, cutouts })
+        // Without images of its own: those of the others.
+        let distance = distances(mine())
+            .or_else(|| distances(real))
+            .unwrap_or(default_distances(info.diameter))
+            .map(|d| d.max(info.diameter));
+        Ok(Prepared { drawn, poses, distance, cutouts })
     }
 
     /// A few of its colours: as photographed, else those of its mesh.
@@ -621,7 +609,7 @@ impl Prepared {
                 std::array::from_fn(|c| (255.0 * patch.data[c * pixels + i]).round().clamp(0.0, 255.0) as u8)
             }));
         }
-        if let (true, Some(of_mesh)) = (colors.is_empty(), self.mesh.colors()) {
+        if let (true, Some(of_mesh)) = (colors.is_empty(), self.drawn.mesh.colors()) {
             colors.extend(of_mesh.iter().step_by((of_mesh.len() / PALETTE_COLORS).max(1)));
         }
         colors

@@ -5,19 +5,21 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
+use sixfold_synth::augment::Backgrounds;
+use sixfold_data::TrainingObject;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_detect::samples::{SceneOptions, SceneSource};
 use sixfold_detect::training::{Ending, TrainingError, TrainingOptions, TrainingPace, train};
 use sixfold_geometry::{Image, RgbImage, Vec3};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::weights::ModelCard;
 use sixfold_synth::augment::Backgrounds;
 
 /// A pyramid or a flat box of one colour.
-fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {
+fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {
     let (vertices, faces): (Vec<[f64; 3]>, Vec<[u32; 3]>) = if pyramid {
         let corners = [[-0.05, -0.05, 0.0], [0.05, -0.05, 0.0], [0.05, 0.05, 0.0], [-0.05, 0.05, 0.0]];
         let tip = [[0.0, 0.0, 0.09]];
@@ -34,7 +36,9 @@ fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {
     };
     let colors = vec![color; vertices.len()];
     let mesh = Mesh::new(vertices.into_iter().map(Vec3::from).collect(), faces).unwrap();
-    SceneObject { id, mesh: mesh.with_colors(colors).unwrap(), diameter: 0.14 }
+    let mesh = mesh.with_colors(colors).unwrap();
+    let info = ModelInfo { diameter: 0.14, ..ModelInfo::of_mesh(&mesh) };
+    TrainingObject::new(id, mesh, info)
 }
 
 fn source(size: usize) -> SceneSource {
@@ -168,9 +172,9 @@ fn samples_are_a_function_of_their_number() {
     }
     assert!(a.sample(4, 0) != a.sample(5, 0));
     // Without a mesh to render and a photograph there is nothing to see.
-    let bare = SceneObject { mesh: object(3, true, [0; 3]).mesh, ..object(3, true, [0; 3]) };
+    let bare = object(3, true, [0; 3]);
     let plain = Mesh::new(bare.mesh.vertices().to_vec(), bare.mesh.faces().to_vec()).unwrap();
-    let grey = SceneObject { mesh: plain, ..bare };
+    let grey = TrainingObject { mesh: plain, ..bare };
     let options = SceneOptions { size: 64, ..SceneOptions::default() };
     let error =
         SceneSource::new(vec![grey], &[], &[], Backgrounds::procedural(), options.clone()).unwrap_err();

@@ -10,6 +10,7 @@
 mod camera;
 mod cloud;
 mod depth_check;
+mod frame_id;
 mod icp;
 mod image;
 mod kabsch;
@@ -26,6 +27,7 @@ mod undistort;
 pub use camera::{BrownConrady, Camera, CameraError};
 pub use cloud::{PointCloud, sphere_directions};
 pub use depth_check::{DepthImageError, usable_depth};
+pub use frame_id::FrameId;
 pub use icp::{
     CorrespondenceSource, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, icp,
 };

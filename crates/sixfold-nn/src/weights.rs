@@ -16,6 +16,7 @@ use half::{bf16, f16};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use sixfold_io::write_atomically_with;
+use sixfold_geometry::FrameId;
 
 use crate::files::explain;
 
@@ -36,8 +37,12 @@ pub struct ModelCard {
     pub format_version: u32,
     /// One line for people.
     pub title: String,
-    /// What it was trained on.
+    /// What it was trained on, for people.
     pub data: String,
+    /// The frames of a dataset that it was trained on, in order, those of trainings that it goes on from included; empty for
+    /// a training without any, `None` where nobody said. Scores on these frames are worth nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub training_frames: Option<Vec<FrameId>>,
     /// Training steps done.
     pub steps: u64,
     /// Seed of the training.
@@ -62,6 +67,29 @@ impl ModelCard {
             ..ModelCard::default()
         }
     }
+
+    /// Whether the weights have seen a frame in their training; `None` where the card does not say.
+    pub fn was_trained_on(&self, frame: FrameId) -> Option<bool> {
+        self.training_frames.as_ref().map(|frames| frames.contains(&frame))
+    }
+}
+
+/// What a card says of the frames of a training: these, and those of the weights that it goes on from. `None` where the card
+/// of those does not say.
+///
+/// # Errors
+/// [`WeightsError`] for a file that is no weight file.
+pub fn training_frames(
+    init: Option<&Path>,
+    frames: &[FrameId],
+) -> Result<Option<Vec<FrameId>>, WeightsError> {
+    let before = init.map(read_card).transpose()?.map_or(Some(vec![]), |card| card.training_frames);
+    Ok(before.map(|mut all| {
+        all.extend_from_slice(frames);
+        all.sort_unstable();
+        all.dedup();
+        all
+    }))
 }
 
 /// Why weights could not be saved or loaded.
@@ -321,9 +349,11 @@ fn card_markdown(card: &ModelCard) -> String {
     let mut text = String::new();
     let title = if card.title.is_empty() { &card.architecture } else { &card.title };
     let _ = writeln!(text, "# {title}\n");
+    let frames = card.training_frames.iter().flatten().map(FrameId::to_string).collect::<Vec<_>>();
     let rows = [
         ("Architecture", card.architecture.clone()),
         ("Trained on", card.data.clone()),
+        ("Training frames", frames.join(" ")),
         ("Steps", card.steps.to_string()),
         ("Seed", card.seed.to_string()),
         ("Format version", card.format_version.to_string()),
@@ -568,6 +598,7 @@ mod tests {
         card.steps = 7;
         card.scores.insert("AR".to_owned(), 0.5);
         card.objects.push("drill".into());
+        card.training_frames = Some(vec![FrameId::new(2, 36), FrameId::new(2, 79)]);
         card.extra = serde_json::json!({"crop": 128});
         card
     }
@@ -595,6 +626,26 @@ mod tests {
         let again = dir.path().join("again.safetensors");
         save_weights(&loaded, &card(), &again).unwrap();
         assert_eq!(fs::read(&path).unwrap(), fs::read(&again).unwrap());
+    }
+
+    #[test]
+    fn a_training_that_goes_on_has_seen_the_frames_of_the_one_before() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("net.safetensors");
+        let device = Device::default();
+        save_weights(&net(4, &device), &card(), &path).unwrap();
+        let [old, new, other] = [36, 40, 41].map(|im_id| FrameId::new(2, im_id));
+        let frames = training_frames(Some(&path), &[new, old]).unwrap();
+        let card = ModelCard { training_frames: frames, ..card() };
+        assert_eq!(card.training_frames.as_ref().map(Vec::len), Some(3));
+        assert_eq!([old, new, other].map(|f| card.was_trained_on(f)), [Some(true), Some(true), Some(false)]);
+        assert_eq!(training_frames(None, &[]).unwrap(), Some(vec![]));
+        // A card that does not say leaves it open, and is written as before.
+        let silent = ModelCard::new("test-net", "");
+        assert_eq!(silent.was_trained_on(old), None);
+        assert!(!serde_json::to_string(&silent).unwrap().contains("training_frames"));
+        save_weights(&net(4, &device), &silent, &path).unwrap();
+        assert_eq!(training_frames(Some(&path), &[new]).unwrap(), None);
     }
 
     #[test]
@@ -694,6 +745,7 @@ mod tests {
         for part in [
             "# A network | for tests",
             "- Architecture: test-net",
+            "- Training frames: 2/36 2/79",
             "| AR | 0.5000 |",
             "- drill",
             "\"crop\": 128",

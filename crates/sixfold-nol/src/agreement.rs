@@ -93,8 +93,9 @@ pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f6
 mod tests {
     use std::sync::Arc;
 
+    use sixfold_data::PosedImage;
+
     use super::*;
-    use crate::photograph::Photograph;
     use crate::refine::tests::photographs;
 
     #[test]
@@ -109,8 +110,7 @@ mod tests {
                 image[(x, y)] = [250, 250, 20];
             }
         }
-        let first =
-            Photograph::new("0".to_owned(), Arc::new(image), *list[0].camera(), truth[0], None).unwrap();
+        let first = PosedImage::new("0", 1, Arc::new(image), *list[0].camera(), truth[0]).unwrap();
         let mut views: Vec<SourceView> = std::iter::once(&first)
             .chain(&list[1..])
             .map(|p| SourceView::new(p, &mesh, side).unwrap())

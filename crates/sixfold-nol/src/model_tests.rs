@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
@@ -9,7 +10,6 @@ use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
 
 use super::*;
 use crate::network::{CompactConfig, IntegratorKind};
-use crate::photograph::Photograph;
 
 /// A box of 8 cm with a smooth pattern of colours.
 fn printed_box() -> Mesh {
@@ -53,14 +53,18 @@ fn pose(angle: f64) -> Pose {
 }
 
 /// What a camera without noise sees in even light.
-fn photograph(mesh: &Mesh, angle: f64, mask: Option<Mask>) -> Photograph {
+fn photograph(mesh: &Mesh, angle: f64, mask: Option<Mask>) -> PosedImage {
     let (camera, pose) = (camera(), pose(angle));
     let mut frame = Frame::new(&camera);
     let objects = [SceneObject { mesh, camera_from_object: pose }];
     frame.render(&objects, &RenderOptions::default());
     let lights = [Light::Ambient { color: [1.0; 3] }];
     let image = shade(&frame, &objects, &lights, &Material::default(), None);
-    Photograph::new("drawn", Arc::new(image), camera, pose, mask).unwrap()
+    let posed = PosedImage::new("drawn", 1, Arc::new(image), camera, pose).unwrap();
+    match mask {
+        Some(mask) => posed.with_mask(&mask).unwrap(),
+        None => posed,
+    }
 }
 
 fn model(integrator: IntegratorKind) -> NolModel {

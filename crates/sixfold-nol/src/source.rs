@@ -1,12 +1,15 @@
 //! A photograph cut to the object, with what is known of its geometry at the present pose.
 
+use sixfold_synth::augment::{Coverage, Patch};
+use sixfold_data::{PosedImage, PosedImageError};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 use sixfold_synth::augment::{Coverage, Patch};
 
-use crate::photograph::{NolError, Photograph, object_window};
+use crate::error::NolError;
 use crate::projection::{Projection, TargetSurface};
+use crate::window::object_window;
 
 /// Colour where the crop reaches out of the image.
 const OUTSIDE: f32 = 0.5;
@@ -36,32 +39,20 @@ impl SourceView {
     /// Cuts the object out at the photograph's pose, `side` pixels wide.
     ///
     /// # Errors
-    /// [`NolError::OutsideImage`] where the mesh reaches behind the camera.
-    pub fn new(photograph: &Photograph, mesh: &Mesh, side: usize) -> Result<Self, NolError> {
+    /// [`PosedImageError::OutsideImage`] where the mesh reaches behind the camera.
+    pub fn new(photograph: &PosedImage, mesh: &Mesh, side: usize) -> Result<Self, NolError> {
         let (camera, pose) = (photograph.camera(), photograph.camera_from_object());
         let Some(window) = object_window(camera, mesh, pose, MARGIN) else {
             let t = pose.translation();
-            return Err(NolError::OutsideImage {
-                name: photograph.name().to_owned(),
-                translation: [t.x, t.y, t.z],
-            });
+            let name = photograph.name().to_owned();
+            return Err(PosedImageError::OutsideImage { name, translation: [t.x, t.y, t.z] }.into());
         };
         let map = window.map(camera, side, 0.0);
         let (patch, mut visible) = Patch::warp(photograph.image(), &map, side, side, [OUTSIDE; 3]);
         if let Some(mask) = photograph.mask() {
-            let (width, height) = mask.size();
-            let at = |x: isize, y: isize| {
-                let inside = x >= 0 && y >= 0 && (x as usize) < width && (y as usize) < height;
-                f32::from(u8::from(inside && mask[(x as usize, y as usize)]))
-            };
             for (i, value) in visible.data.iter_mut().enumerate() {
                 let [u, v] = map.apply((i % side) as f32, (i / side) as f32);
-                let (x, y) = (u.floor(), v.floor());
-                let (fx, fy) = (u - x, v - y);
-                let (x, y) = (x as isize, y as isize);
-                let top = at(x, y) * (1.0 - fx) + at(x + 1, y) * fx;
-                let bottom = at(x, y + 1) * (1.0 - fx) + at(x + 1, y + 1) * fx;
-                *value *= top * (1.0 - fy) + bottom * fy;
+                *value *= mask.sample(u, v);
             }
         }
         Ok(Self::of_crop(patch, visible, window.camera(camera, side), *pose, mesh))
@@ -187,7 +178,7 @@ mod tests {
         let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
         let pose = Pose::new(turn, Vec3::new(0.0, 0.0, 0.5));
         let image = Arc::new(RgbImage::filled(320, 240, [90; 3]));
-        let photograph = Photograph::new("plates".to_owned(), image, camera, pose, None).unwrap();
+        let photograph = PosedImage::new("plates", 1, image, camera, pose).unwrap();
         let view = SourceView::new(&photograph, &mesh, 96).unwrap();
         let up = Vec3::z();
         let (pixel, cosine) = view.see(&Vec3::new(0.0, 0.0, 0.03), &up).expect("the plate in front");

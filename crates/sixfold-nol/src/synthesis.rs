@@ -6,10 +6,10 @@ use sixfold_geometry::{Camera, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::Patch;
 
+use crate::error::NolError;
 use crate::features::SourceFeatures;
 use crate::maps::Maps;
 use crate::model::NolModel;
-use crate::photograph::NolError;
 use crate::projection::TargetSurface;
 use crate::select::{choose_by_surface, shown_points, unseen_share};
 use crate::source::SourceView;

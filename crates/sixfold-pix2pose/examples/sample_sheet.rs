@@ -11,7 +11,9 @@ use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
 
-use sixfold_bop::{BopDataset, Models};
+use sixfold_bop::{BopDataset, Models, write_rgb};
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation, PhotographOptions};
+use sixfold_data::{FrameId, TrainingObject, read_posed_images};
 use sixfold_geometry::RgbImage;
 use sixfold_io::write_rgb;
 use sixfold_mesh::ModelInfo;
@@ -31,15 +33,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (scene_id, images) = frames.split_once(':').ok_or("frames look like 2:3,17,36 or 2:/6")?;
     let scene_id: u32 = scene_id.parse()?;
     let scene = dataset.scene(scene_id)?;
-    let frames: Vec<(u32, u32)> = match images.strip_prefix('/') {
+    let frames: Vec<FrameId> = match images.strip_prefix('/') {
         Some(step) => {
             // Only frames whose picture is there count.
             let there = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
-            there.step_by(step.parse::<usize>()?.max(1)).map(|id| (scene_id, id)).collect()
+            there.step_by(step.parse::<usize>()?.max(1)).map(|im_id| FrameId { scene_id, im_id }).collect()
         }
         None => images
             .split(',')
-            .map(|id| Ok((scene_id, id.parse()?)))
+            .map(|id| Ok(FrameId::new(scene_id, id.parse()?)))
             .collect::<Result<_, std::num::ParseIntError>>()?,
     };
     let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
@@ -48,15 +50,13 @@ fn main() -> Result<(), Box<dyn Error>> {
         None => infos.0.keys().copied().collect(),
     };
     let started = Instant::now();
-    let real = read_real_crops(&dataset, &frames, &ids, 0.3)?;
+    let real = read_posed_images(&dataset, &frames, &ids, 0.3)?;
     println!("{} frames, {} crops, {:.1} s", frames.len(), real.len(), started.elapsed().as_secs_f64());
     let mut objects = Vec::new();
     for &id in &ids {
         let mesh = dataset.model(id, Models::Rendering)?;
-        let (low, high) = mesh.bounding_box();
-        let scale = BoundingBoxScale::of_corners(&low, &high);
         let info = infos.0.get(&id).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-        objects.push(TrainingObject { id, mesh, info, scale });
+        objects.push(TrainingObject::new(id, mesh, info));
     }
     let backgrounds = match rest.first().filter(|folder| *folder != "-") {
         Some(folder) => {

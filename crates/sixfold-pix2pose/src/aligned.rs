@@ -11,6 +11,7 @@ use crate::object::Correction;
 use crate::refine::{RefineOptions, refine};
 use crate::samples::RealCrop;
 use sixfold_geometry::stats::upper_median;
+use sixfold_data::PosedImage;
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
@@ -136,7 +137,7 @@ const SYMMETRY_STEP: f64 = 0.1;
 /// As [`estimate`], for objects that the model does not know.
 pub fn measure_corrections(
     model: &Pix2PoseModel,
-    photographs: &[RealCrop],
+    photographs: &[PosedImage],
     objects: &BTreeMap<u32, (Mesh, ModelInfo)>,
     mut progress: impl FnMut(),
 ) -> Result<BTreeMap<u32, Correction>, EstimateError> {
@@ -148,7 +149,7 @@ pub fn measure_corrections(
         let id = photograph.object_id();
         let Some((mesh, info)) = objects.get(&id) else { continue };
         let camera = photograph.camera();
-        let region = photograph.visible_box();
+        let Some(region) = photograph.visible_box() else { continue };
         let Some(aligned) = estimate_aligned(model, photograph.image(), camera, id, &region, mesh, &options)?
         else {
             continue;

@@ -8,7 +8,6 @@ pub mod depth;
 pub mod estimate;
 pub mod estimator;
 pub mod loss;
-pub mod material;
 pub mod model;
 pub mod networks;
 pub mod object;

@@ -2,13 +2,15 @@
 
 use burn::module::Module;
 use burn::tensor::Device;
+use sixfold_synth::augment::Backgrounds;
+use sixfold_data::TrainingObject;
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::weights::{ModelCard, save_weights};
 use sixfold_pix2pose::model::Network;
 use sixfold_pix2pose::networks::CompactConfig;
 use sixfold_pix2pose::object::SymmetryMap;
-use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
+use sixfold_pix2pose::samples::{SampleOptions, SampleSource};
 use sixfold_pix2pose::training::{TrainingError, TrainingOptions, TrainingOutcome, train};
 use sixfold_render::BoundingBoxScale;
 use sixfold_synth::augment::Backgrounds;

@@ -1,13 +1,14 @@
 //! What trainings have in common: what they learn from, what they tell on their way, and what they say in the end.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
+use sixfold_data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
 use sixfold_nn::recipe::{News, Trained};
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_pix2pose::material::{Frames, Material, MaterialError};
 
 use crate::arguments::MaterialArguments;
 use crate::objects;
@@ -33,14 +34,14 @@ impl Summary {
 }
 
 /// What `a` names: all its objects, and the photographed instances of which at least the share `least_visible` is seen.
-pub(super) fn material(a: &MaterialArguments, least_visible: f64) -> Result<Material> {
+pub(super) fn material(a: &MaterialArguments, least_visible: f64) -> Result<TrainingSet> {
     if let Some(root) = &a.dataset {
         let frames = match &a.frames {
-            Some(file) => Frames::File(file.clone()),
-            None if a.renders_only => Frames::RendersOnly,
-            None => Frames::All,
+            Some(file) => FrameSelection::File(file.clone()),
+            None if a.renders_only => FrameSelection::RendersOnly,
+            None => FrameSelection::All,
         };
-        return Material::of_dataset(root, &a.split, &a.ids, &frames, least_visible).map_err(in_words);
+        return TrainingSet::of_dataset(root, &a.split, &a.ids, &frames, least_visible).map_err(in_words);
     }
     if a.objects.is_empty() {
         bail!("what is to be learnt? Give --dataset DIR, or --object NAME_OR_MESH for training on renders");
@@ -50,17 +51,17 @@ pub(super) fn material(a: &MaterialArguments, least_visible: f64) -> Result<Mate
         let object = objects::find(name, a.unit, &a.store)?;
         meshes.push((index as u32 + 1, object.mesh, object.info));
     }
-    Ok(Material::of_meshes(meshes, &a.objects.join(", ")))
+    Ok(TrainingSet::of_meshes(meshes, &a.objects.join(", ")))
 }
 
 /// With the options that help.
-fn in_words(error: MaterialError) -> anyhow::Error {
+fn in_words(error: TrainingSetError) -> anyhow::Error {
     match &error {
-        MaterialError::NoObjects { .. } => anyhow!("{error} with --ids"),
-        MaterialError::NoImages { .. } => {
+        TrainingSetError::NoObjects { .. } => anyhow!("{error} with --ids"),
+        TrainingSetError::NoImages { .. } => {
             anyhow!("{error}; give another --split, or train with --renders-only")
         }
-        MaterialError::NothingVisible { .. } => {
+        TrainingSetError::NothingVisible { .. } => {
             anyhow!("{error} with --frames, or train with --renders-only")
         }
         _ => error.into(),
@@ -126,8 +127,16 @@ pub(super) fn command_line() -> String {
     std::iter::once("sixfold".to_string()).chain(words).collect::<Vec<_>>().join(" ")
 }
 
-/// Whether a model's card names a frame (`scene/image`) among those of its training.
-pub(crate) fn was_trained_on(card: &ModelCard, scene_id: u32, im_id: u32) -> bool {
-    let name = format!("{scene_id}/{im_id}");
-    card.data.split(|c: char| !(c.is_ascii_digit() || c == '/')).any(|word| word == name)
+/// Whether the model in `file` was trained on a frame: scores there are worth nothing.
+///
+/// # Errors
+/// For a card that does not say: no frame can be tested on then.
+pub(crate) fn was_trained_on(card: &ModelCard, file: &Path, frame: FrameId) -> Result<bool> {
+    card.was_trained_on(frame).with_context(|| {
+        format!(
+            "{}: its card has no training_frames, so whether it was trained on frame {frame} is not known; train it anew, or \
+             write its last checkpoint again with --export",
+            file.display()
+        )
+    })
 }

@@ -118,7 +118,7 @@ pub(super) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary> {
     };
     let material = material(&a.material, LEAST_VISIBLE)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
-    let photographs = material.real.len();
+    let photographs = material.images.len();
     let mut shown = Shown::new(|record| {
         format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
     });

@@ -46,7 +46,7 @@ pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary> {
     };
     let material = material(&a.material, LEAST_VISIBLE)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
-    let photographs = material.real.len();
+    let photographs = material.images.len();
     let mut shown = Shown::new(|record| {
         format!(
             "scores {:.3}, boxes {:.3}, masks {:.3}, {:.1} images/s",

@@ -338,6 +338,14 @@ fn the_table_is_made_row_by_row() {
     std::fs::write(tiny.path().join("wrong.json"), "[{\"scene_id\": 7, \"im_id\": 0}]").unwrap();
     let wrong = command.replace("frames.json", "wrong.json").replace("--out table", "--out other");
     fails(tiny.path(), &wrong, &["7/11", "wrong.json"]);
+    // A card that does not say which frames those are is no leave to test.
+    let mut bytes = std::fs::read(tiny.path().join(WEIGHTS)).unwrap();
+    let name = b"training_frames";
+    let at = bytes.windows(name.len()).position(|w| w == name).unwrap();
+    bytes[at..at + name.len()].copy_from_slice(b"another_setting");
+    std::fs::write(tiny.path().join("silent.safetensors"), bytes).unwrap();
+    let silent = command.replace(WEIGHTS, "silent.safetensors").replace("--out table", "--out other");
+    fails(tiny.path(), &silent, &["silent.safetensors", "no training_frames", "--export"]);
     let all = serde_json::json!([0, 4, 11].map(|im| serde_json::json!({"scene_id": 7, "im_id": im})));
     std::fs::write(tiny.path().join("all.json"), all.to_string()).unwrap();
     fails(

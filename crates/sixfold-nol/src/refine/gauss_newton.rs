@@ -6,6 +6,7 @@
 //! still share the poses of the cameras ([`super::alignment`]).
 
 use rayon::prelude::*;
+use sixfold_data::PosedImage;
 use sixfold_mesh::Mesh;
 use sixfold_align::outline::outline_mesh;
 use sixfold_render::Frame;
@@ -14,8 +15,8 @@ use super::alignment::{Object, Scene, shown};
 use super::appearance::Light;
 use super::measure::Working;
 use super::options::{RefineOptions, Refinement, SourceReport};
+use crate::error::NolError;
 use crate::maps::Maps;
-use crate::photograph::{NolError, Photograph};
 use crate::source::SourceView;
 use crate::surface::outwards;
 
@@ -27,7 +28,7 @@ pub struct SceneSource<'a> {
     /// Number of the image: sources of one image share its camera.
     pub image: usize,
     /// The photograph with the object's pose.
-    pub photograph: &'a Photograph,
+    pub photograph: &'a PosedImage,
 }
 
 /// Makes the poses of photographs of one object better; see [`refine_scene`].
@@ -35,7 +36,7 @@ pub struct SceneSource<'a> {
 /// # Errors
 /// [`NolError`] for options out of range.
 pub fn refine_poses(
-    photographs: &[Photograph],
+    photographs: &[PosedImage],
     mesh: &Mesh,
     options: &RefineOptions,
     progress: impl FnMut(f64) -> bool,

@@ -2,7 +2,7 @@
 
 use sixfold_geometry::Pose;
 
-use crate::photograph::NolError;
+use crate::error::NolError;
 
 /// How poses are made better.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,14 +2,15 @@
 //! itself and the others, then [`printed_rule`] against it.
 
 use rayon::prelude::*;
+use sixfold_data::PosedImage;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use super::printed::{PrintedOptions, printed_rule};
+use crate::error::NolError;
 use crate::features::SourceFeatures;
 use crate::maps::Maps;
 use crate::model::NolModel;
-use crate::photograph::{NolError, Photograph};
 use crate::projection::TargetSurface;
 use crate::select::{choose_by_surface, shown_points};
 use crate::source::SourceView;
@@ -25,7 +26,7 @@ const POINTS: usize = 3000;
 /// # Errors
 /// [`NolError`] for a photograph that cannot be cut out.
 pub fn printed_poses(
-    photographs: &[Photograph],
+    photographs: &[PosedImage],
     mesh: &Mesh,
     model: Option<&NolModel>,
     side: usize,

@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
 use super::*;
-use crate::photograph::Photograph;
 
 pub(crate) fn block() -> Mesh {
     let corner = |i: usize| {
@@ -33,7 +33,7 @@ fn paint(p: &[f32; 3]) -> [u8; 3] {
 }
 
 /// Photographs with exact poses, and the same with disturbed ones.
-pub(crate) fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Vec<Pose>, Vec<Photograph>) {
+pub(crate) fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Vec<Pose>, Vec<PosedImage>) {
     let mesh = block();
     let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -58,7 +58,7 @@ pub(crate) fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Ve
         let turn = UnitQuaternion::from_euler_angles(draw(reach[1]), draw(reach[1]), draw(reach[1]));
         let rough = Pose::new(turn * truth.rotation(), truth.translation() + shift);
         poses.push(truth);
-        list.push(Photograph::new(format!("{}", list.len()), Arc::new(image), camera, rough, None).unwrap());
+        list.push(PosedImage::new(format!("{}", list.len()), 1, Arc::new(image), camera, rough).unwrap());
     }
     (mesh, poses, list)
 }
@@ -105,7 +105,7 @@ fn a_photograph_with_a_wrong_pose_is_dropped() {
 
 /// Ten photographs of two blocks, the second standing `between` from the first in a photograph: the mesh, true poses of the
 /// first and then of the second, and both kinds of photographs with disturbed poses.
-fn two_blocks(between: impl Fn(usize) -> Pose) -> (Mesh, Vec<Pose>, Vec<Photograph>, Vec<Photograph>) {
+fn two_blocks(between: impl Fn(usize) -> Pose) -> (Mesh, Vec<Pose>, Vec<PosedImage>, Vec<PosedImage>) {
     let (mesh, mut truth, first) = photographs(10, [0.008, 0.04], 9);
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let mut draw = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
@@ -124,8 +124,8 @@ fn two_blocks(between: impl Fn(usize) -> Pose) -> (Mesh, Vec<Pose>, Vec<Photogra
 }
 
 /// The sources of two objects, each in every image.
-fn sources<'a>(first: &'a [Photograph], second: &'a [Photograph]) -> Vec<SceneSource<'a>> {
-    let of = |object: usize, list: &'a [Photograph]| {
+fn sources<'a>(first: &'a [PosedImage], second: &'a [PosedImage]) -> Vec<SceneSource<'a>> {
+    let of = |object: usize, list: &'a [PosedImage]| {
         list.iter().enumerate().map(move |(image, photograph)| SceneSource { object, image, photograph })
     };
     of(0, first).chain(of(1, second)).collect()

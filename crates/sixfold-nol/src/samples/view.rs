@@ -11,9 +11,9 @@ use sixfold_synth::augment::{
 };
 
 use super::object::{Lamp, PaintedObject, between, random_direction};
-use crate::photograph::object_window;
 use crate::projection::TargetSurface;
 use crate::source::{MARGIN, SourceView};
+use crate::window::object_window;
 
 /// The target's side in units of the object's box.
 const TARGET_MARGIN: f64 = 1.1;

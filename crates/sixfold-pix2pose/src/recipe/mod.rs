@@ -8,23 +8,23 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
+use sixfold_data::{PosedImage, TrainingObject, TrainingSet, backgrounds_with_images};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
 use sixfold_nn::training::Ending;
 use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::{ModelCard, WeightsError};
+use sixfold_nn::weights::{ModelCard, WeightsError, training_frames};
 use sixfold_align::outline::outline_mesh;
 
 pub use self::error::RecipeError;
 use crate::adversarial::{AdversarialOptions, train_adversarial};
 use crate::aligned::measure_corrections;
-use crate::material::{Material, backgrounds};
 use crate::model::{ImageSizes, Network, Pix2PoseModel};
 use crate::networks::{Compact, CompactConfig, PaperGeneratorConfig, ResNet50GeneratorConfig};
 use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
 use crate::preset::Preset;
-use crate::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
+use crate::samples::{SampleOptions, SampleSource};
 use crate::training::{TrainingOptions, last_checkpoint, train};
 
 /// Which network learns.
@@ -135,7 +135,7 @@ const ADVERSARIAL: f32 = 0.01;
 /// Everything that stands before the first step.
 struct Prepared {
     objects: Vec<TrainingObject>,
-    real: Vec<RealCrop>,
+    real: Vec<PosedImage>,
     entries: Vec<ObjectEntry>,
     network: Compact,
     card: ModelCard,
@@ -152,7 +152,7 @@ impl Recipe {
     /// [`RecipeError`].
     pub fn train(
         &self,
-        material: Material,
+        material: TrainingSet,
         out: &Path,
         stop: &AtomicBool,
         hear: &mut Listener<'_>,
@@ -164,7 +164,7 @@ impl Recipe {
             self.prepare(material, out, hear)?;
         let outlines = outlines(&objects, &real);
         let photographs = real.clone();
-        let backgrounds = backgrounds(self.backgrounds.as_deref(), &real, &objects)?;
+        let backgrounds = backgrounds_with_images(self.backgrounds.as_deref(), &real, &objects)?;
         let pools: Vec<Vec<SymmetryMap>> =
             objects.iter().map(|o| SymmetryMap::pool(&o.info, &o.scale)).collect();
         let sample_options = SampleOptions {
@@ -229,7 +229,7 @@ impl Recipe {
     /// [`RecipeError`].
     pub fn export(
         &self,
-        material: Material,
+        material: TrainingSet,
         out: &Path,
         hear: &mut Listener<'_>,
     ) -> Result<Trained, RecipeError> {
@@ -250,7 +250,7 @@ impl Recipe {
     /// since it was trained.
     fn measure_anew(
         &self,
-        material: Material,
+        material: TrainingSet,
         out: &Path,
         hear: &mut Listener<'_>,
     ) -> Result<Trained, RecipeError> {
@@ -264,6 +264,8 @@ impl Recipe {
         let model = Pix2PoseModel::load(file)?;
         let (steps, mut card) = (model.card().steps, model.card().clone());
         let p = self.prepare(material, out, hear)?;
+        // The corrections are learnt from these frames too.
+        card.training_frames = p.card.training_frames.clone();
         card.extra["corrections"] = serde_json::json!({ "command": self.command, "data": p.card.data });
         let model = model.with_card(card);
         std::fs::create_dir_all(out)
@@ -328,11 +330,11 @@ impl Recipe {
 
     fn prepare(
         &self,
-        material: Material,
+        material: TrainingSet,
         out: &Path,
         hear: &mut Listener<'_>,
     ) -> Result<Prepared, RecipeError> {
-        let Material { mut objects, real, mut description, .. } = material;
+        let TrainingSet { mut objects, images: real, frames, mut description } = material;
         self.check(objects.len())?;
         if let Some(preset) = self.preset {
             for object in &mut objects {
@@ -372,6 +374,7 @@ impl Recipe {
         };
         let mut card = ModelCard::new("", "Pix2Pose, compact network");
         card.data = description;
+        card.training_frames = training_frames(self.init.as_deref(), &frames)?;
         card.seed = self.seed;
         card.command.clone_from(&self.command);
         card.extra = serde_json::json!({
@@ -391,7 +394,7 @@ fn wrong(field: &'static str, found: impl ToString, expected: &'static str) -> R
 }
 
 /// What the alignment is measured with, where there are photographs to measure it on.
-fn outlines(objects: &[TrainingObject], photographs: &[RealCrop]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
+fn outlines(objects: &[TrainingObject], photographs: &[PosedImage]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
     if photographs.is_empty() {
         return BTreeMap::new();
     }
@@ -402,7 +405,7 @@ fn outlines(objects: &[TrainingObject], photographs: &[RealCrop]) -> BTreeMap<u3
 fn save_corrected(
     mut model: Pix2PoseModel,
     path: &Path,
-    photographs: &[RealCrop],
+    photographs: &[PosedImage],
     outlines: &BTreeMap<u32, (Mesh, ModelInfo)>,
     hear: &mut Listener<'_>,
 ) -> Result<(), RecipeError> {

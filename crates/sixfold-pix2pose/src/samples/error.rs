@@ -2,6 +2,7 @@
 
 use sixfold_bop::DatasetError;
 use sixfold_synth::augment::AugmentError;
+use sixfold_data::PosedImageError;
 use thiserror::Error;
 
 /// Why no samples can be made.
@@ -21,9 +22,9 @@ pub enum SampleError {
     /// Options of the augmentation, or backgrounds.
     #[error(transparent)]
     Augment(#[from] AugmentError),
-    /// The dataset cannot be read.
+    /// An image does not show enough of its object.
     #[error(transparent)]
-    Dataset(#[from] DatasetError),
+    Image(#[from] PosedImageError),
     /// There is nothing to learn.
     #[error("no training object was given; give at least one mesh with its description")]
     NoObjects,
@@ -56,48 +57,7 @@ pub enum SampleError {
         /// The object.
         id: u32,
     },
-    /// A photograph does not fit its camera or mask.
-    #[error(
-        "object {id}: the {what} has {width}x{height} pixels, the camera is for {camera_width}x{camera_height}"
-    )]
-    Size {
-        /// The object.
-        id: u32,
-        /// "photograph" or "visible mask".
-        what: &'static str,
-        /// Its width.
-        width: usize,
-        /// Its height.
-        height: usize,
-        /// The camera's width.
-        camera_width: usize,
-        /// The camera's height.
-        camera_height: usize,
-    },
-    /// Nothing of the object is seen in a photograph.
-    #[error(
-        "object {id}: its visible mask holds {pixels} pixels, expected at least {least}; leave this photograph out or \
-         check its pose"
-    )]
-    NotVisible {
-        /// The object.
-        id: u32,
-        /// Visible pixels.
-        pixels: usize,
-        /// How many there should be.
-        least: usize,
-    },
-    /// The pose puts the object behind the camera or outside the image.
-    #[error(
-        "object {id}: its pose puts it at {translation:?} metres, outside the photograph; check pose, unit and camera"
-    )]
-    OutsideImage {
-        /// The object.
-        id: u32,
-        /// Translation of the pose.
-        translation: [f64; 3],
-    },
-    /// A photograph shows an object that is not trained.
+    /// An image shows an object that is not trained.
     #[error(
         "a photograph shows object {id}, which is not among the training objects ({known}); give its mesh as well"
     )]
@@ -106,21 +66,5 @@ pub enum SampleError {
         id: u32,
         /// Those that are known.
         known: String,
-    },
-    /// A frame of the dataset has no colour image.
-    #[error("scene {scene_id}, image {im_id}: there is no colour image; leave this frame out")]
-    NoColorImage {
-        /// The scene.
-        scene_id: u32,
-        /// The image.
-        im_id: u32,
-    },
-    /// The camera is not usable.
-    #[error("object {id}: {source}")]
-    Camera {
-        /// The object.
-        id: u32,
-        /// What is wrong.
-        source: sixfold_geometry::CameraError,
     },
 }

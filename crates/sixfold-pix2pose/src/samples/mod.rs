@@ -1,4 +1,4 @@
-//! Training samples for Pix2Pose: crops of few posed photographs and renders, augmented, with the coordinates, the
+//! Training samples for Pix2Pose: crops of few posed images and renders, augmented, with the coordinates, the
 //! silhouette and the visible part of the object (dissertation, section 3.4.1, tables 3.2 and 3.3).
 //!
 //! [`SampleSource`] draws sample after sample. Each is a function of seed, object and number alone, so that any number
@@ -7,12 +7,10 @@
 mod composition;
 mod error;
 mod options;
-mod poses;
-mod real;
-mod rendering;
 pub(crate) mod second_stage;
 mod source;
 mod symmetry;
+mod targets;
 #[cfg(test)]
 mod tests;
 pub(crate) mod window;
@@ -23,3 +21,4 @@ pub use poses::PoseRange;
 pub use real::{RealCrop, read_real_crops};
 pub use rendering::color_patch;
 pub use source::{Sample, SampleSource, TrainingObject};
+pub use source::{Sample, SampleSource};

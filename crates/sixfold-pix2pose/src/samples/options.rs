@@ -1,8 +1,8 @@
 //! What samples look like.
 
-use std::f32::consts::{FRAC_PI_2, FRAC_PI_4};
-
 use rand::RngExt;
+use sixfold_synth::augment::{ColorAugmentation, Random};
+use sixfold_data::{PoseVariation, image_color_augmentation};
 use sixfold_geometry::Camera;
 use sixfold_geometry::random::Random;
 use sixfold_synth::augment::ColorAugmentation;
@@ -81,6 +81,7 @@ pub struct SampleOptions {
 
 impl Default for SampleOptions {
     fn default() -> Self {
+        let poses = PoseVariation::default();
         SampleOptions {
             size: 128,
             target_size: None,
@@ -91,7 +92,7 @@ impl Default for SampleOptions {
             visible_box_chance: 0.5,
             cut_chance: 0.3,
             cut: [0.1, 0.55],
-            rotation: FRAC_PI_4,
+            rotation: poses.rotation,
             keep_background_chance: 0.5,
             occlusion_chance: 0.7,
             occlusion: [0.04, 0.5],
@@ -101,16 +102,12 @@ impl Default for SampleOptions {
             border_blur: [0.4, 1.5],
             second_stage_share: 0.5,
             second_stage_block: None,
-            color: ColorAugmentation {
-                strong_contrast_chance: 0.4,
-                strong_contrast: [0.5, 1.8],
-                ..ColorAugmentation::real_images()
-            },
+            color: image_color_augmentation(),
             render_color: ColorAugmentation::renders(),
-            near_real_share: 0.5,
-            pose_noise: 25f64.to_radians(),
-            elevation: [0.0, FRAC_PI_2],
-            view_turn: std::f32::consts::PI,
+            near_real_share: poses.near_fraction,
+            pose_noise: poses.noise,
+            elevation: poses.elevation,
+            view_turn: poses.view_rotation,
             distance: None,
             camera: None,
             random_color_chance: 0.0,
@@ -125,6 +122,17 @@ impl SampleOptions {
     /// The side of coordinates and masks, pixels.
     pub fn target(&self) -> usize {
         self.target_size.unwrap_or(self.size)
+    }
+
+    /// How poses of renders vary.
+    pub(super) fn poses(&self) -> PoseVariation {
+        PoseVariation {
+            near_fraction: self.near_real_share,
+            noise: self.pose_noise,
+            rotation: self.rotation,
+            elevation: self.elevation,
+            view_rotation: self.view_turn,
+        }
     }
 
     /// Whether sample `number` imitates the second stage.

@@ -6,6 +6,8 @@ use rand::RngExt;
 use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, simplify};
+use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Random, Window, stream, uniform};
+use sixfold_data::{DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors, default_distances, distances, is_textured, random_lights, random_material, randomly_colored};
 use sixfold_render::BoundingBoxScale;
 use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
 use sixfold_synth::randomly_colored;
@@ -18,14 +20,14 @@ use super::real::RealCrop;
 use super::rendering::{color_patch, colors, random_lights, random_material, targets};
 use super::second_stage;
 use super::symmetry::canonical;
+use super::targets::targets;
 use super::window::{Extent, turned, turned_pixel, window_around};
 
 /// Renders of each object that serve as clutter and occluders, and their side in pixels.
 const CUTOUTS_PER_OBJECT: u64 = 16;
 const CUTOUT_SIDE: usize = 96;
-/// The camera of renders where nobody gives one.
-const DEFAULT_CAMERA: Camera =
-    Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+/// Directions in which a mesh's farthest vertices decide about its box.
+const EXTREMES: usize = 300;
 
 /// One training sample. All arrays are row-major, channel first; S is the input's side, T the targets'
 /// ([`SampleOptions::target`]). Target pixel `(x, y)` stands for the centre of its block of input pixels.
@@ -43,34 +45,16 @@ pub struct Sample {
     pub object_index: usize,
 }
 
-/// An object to be learnt.
-#[derive(Debug, Clone)]
-pub struct TrainingObject {
-    /// Its id in the dataset.
-    pub id: u32,
-    /// Its surface, with colours or texture if it is to be rendered in its own colours.
-    pub mesh: Mesh,
-    /// Diameter and symmetries.
-    pub info: ModelInfo,
-    /// How coordinates are normalised.
-    pub scale: BoundingBoxScale,
-}
-
 /// A training object made ready.
 struct Prepared {
     id: u32,
     info: ModelInfo,
     scale: BoundingBoxScale,
     /// What targets are drawn from.
-    mesh: Mesh,
+    drawn: PreparedMesh,
     /// The textured mesh, where there is one: the simplified mesh has lost its texture.
     textured: Option<Mesh>,
-    /// Whether the mesh has colours or texture of its own.
-    colored: bool,
-    /// Vertices that decide about the object's box from any side.
-    extremes: Vec<Vec3>,
-    centre: Vec3,
-    real: Vec<RealCrop>,
+    real: Vec<PosedImage>,
     real_poses: Vec<Pose>,
     distance: [f64; 2],
     camera: Camera,
@@ -93,7 +77,7 @@ impl SampleSource {
     /// object that can neither be cut from a photograph nor rendered.
     pub fn new(
         objects: Vec<TrainingObject>,
-        real: Vec<RealCrop>,
+        real: Vec<PosedImage>,
         backgrounds: Backgrounds,
         options: SampleOptions,
     ) -> Result<Self, SampleError> {
@@ -101,8 +85,9 @@ impl SampleSource {
         if objects.is_empty() {
             return Err(SampleError::NoObjects);
         }
-        let mut real_of: BTreeMap<u32, Vec<RealCrop>> = BTreeMap::new();
+        let mut real_of: BTreeMap<u32, Vec<PosedImage>> = BTreeMap::new();
         for crop in real {
+            crop.check_visible()?;
             if !objects.iter().any(|o| o.id == crop.object_id()) {
                 let known: Vec<String> = objects.iter().map(|o| o.id.to_string()).collect();
                 return Err(SampleError::UnknownObject { id: crop.object_id(), known: known.join(", ") });
@@ -110,27 +95,20 @@ impl SampleSource {
             real_of.entry(crop.object_id()).or_default().push(crop);
         }
         // Distances and camera of an object without photographs: those of the others.
-        let any_real: Vec<&RealCrop> = real_of.values().flatten().collect();
-        let common_camera = options.camera.or_else(|| any_real.first().map(|c| *c.camera()));
+        let mut any_real = real_of.values().flatten();
+        let common_distance = distances(any_real.clone());
+        let common_camera = options.camera.or_else(|| any_real.next().map(|c| *c.camera()));
         let camera = common_camera.unwrap_or(DEFAULT_CAMERA).without_distortion();
-        let range_of = |crops: &[&RealCrop]| -> Option<[f64; 2]> {
-            let distances = crops.iter().map(|c| c.camera_from_object().translation().norm());
-            let (low, high) =
-                distances.fold((f64::INFINITY, 0.0f64), |(low, high), d| (low.min(d), high.max(d)));
-            (low <= high).then_some([0.9 * low, 1.1 * high])
-        };
-        let common_distance = range_of(&any_real);
-        drop(any_real);
         let mut prepared = Vec::with_capacity(objects.len());
         for object in objects {
             let real = real_of.remove(&object.id).unwrap_or_default();
-            let own = range_of(&real.iter().collect::<Vec<_>>());
+            let own = distances(&real);
             let diameter = object.info.diameter;
             let distance = options
                 .distance
                 .or(own)
                 .or(common_distance)
-                .unwrap_or([4.0 * diameter, 12.0 * diameter])
+                .unwrap_or(default_distances(diameter))
                 .map(|d| d.max(diameter));
             prepared.push(Prepared::new(object, real, distance, camera, &options)?);
         }
@@ -166,7 +144,7 @@ impl SampleSource {
         let options = &self.options;
         // Objects draw different samples under the same number.
         let mut random = stream(seed ^ (object_index as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15), number);
-        let can_render = object.colored || options.random_color_chance > 0.0;
+        let can_render = object.drawn.colored || options.random_color_chance > 0.0;
         let rendered =
             can_render && (object.real.is_empty() || random.random::<f32>() < options.render_share);
         let scenery =
@@ -216,7 +194,7 @@ impl SampleSource {
             Patch::warp(crop.image(), &map, options.size, options.size, [second_stage::GREY; 3]);
         let visible = crop.visible(&map, options.size);
         let (coordinates, mask) = targets(
-            &object.mesh,
+            &object.drawn.mesh,
             &object.scale,
             &window.camera(camera, options.target()),
             &canonical(&pose, &object.info, options.view_limits),
@@ -237,23 +215,23 @@ impl SampleSource {
         random: &mut Random,
     ) -> (Composition, Vec<f32>, Coverage, Option<Coverage>) {
         let options = &self.options;
-        let pose = object.pose_range().draw(options, random);
+        let pose = object.pose_range().draw(&options.poses(), random);
         let extent = object
             .extent(&object.camera, &pose)
             .unwrap_or(Extent::at(Vec2::new(object.camera.cx, object.camera.cy)));
         let (window, hidden) = self.window(extent, random);
         let (coordinates, mask) = targets(
-            &object.mesh,
+            &object.drawn.mesh,
             &object.scale,
             &window.camera(&object.camera, options.target()),
             &canonical(&pose, &object.info, options.view_limits),
         );
         let camera = window.camera(&object.camera, options.size);
-        let random_colors = !object.colored || random.random::<f32>() < options.random_color_chance;
+        let random_colors = !object.drawn.colored || random.random::<f32>() < options.random_color_chance;
         let (mut patch, silhouette) = if random_colors {
-            color_patch(&randomly_colored(&object.mesh, random), &camera, &pose, random)
+            color_patch(&randomly_colored(&object.drawn.mesh, random), &camera, &pose, random)
         } else {
-            color_patch(object.textured.as_ref().unwrap_or(&object.mesh), &camera, &pose, random)
+            color_patch(object.textured.as_ref().unwrap_or(&object.drawn.mesh), &camera, &pose, random)
         };
         options.render_color.apply(&mut patch, random);
         let mut composition = scenery.paste(&patch, silhouette, random);
@@ -283,17 +261,17 @@ impl SampleSource {
             return cutouts;
         }
         for (index, object) in self.objects.iter().enumerate() {
-            cutouts.extend(object.real.iter().filter_map(RealCrop::cutout).map(|c| (index, c)));
-            if !object.colored {
+            cutouts.extend(object.real.iter().filter_map(PosedImage::cutout).map(|c| (index, c)));
+            if !object.drawn.colored {
                 continue;
             }
             for number in 0..CUTOUTS_PER_OBJECT {
                 let mut random = stream(self.options.seed, index as u64 * CUTOUTS_PER_OBJECT + number);
-                let pose = object.pose_range().draw(&self.options, &mut random);
+                let pose = object.pose_range().draw(&self.options.poses(), &mut random);
                 let Some(extent) = object.extent(&object.camera, &pose) else { continue };
                 let window = Window { centre: extent.centre(), side: extent.longest() * 1.02 };
                 let camera = window.camera(&object.camera, CUTOUT_SIDE);
-                let mesh = object.textured.as_ref().unwrap_or(&object.mesh);
+                let mesh = object.textured.as_ref().unwrap_or(&object.drawn.mesh);
                 let lights = random_lights(&mut random);
                 let (image, silhouette) =
                     colors(mesh, &camera, &pose, &lights, &random_material(&mut random));
@@ -310,7 +288,7 @@ impl SampleSource {
 impl Prepared {
     fn new(
         object: TrainingObject,
-        real: Vec<RealCrop>,
+        real: Vec<PosedImage>,
         distance: [f64; 2],
         camera: Camera,
         options: &SampleOptions,
@@ -328,24 +306,14 @@ impl Prepared {
         {
             return Err(SampleError::Extent { id, field: "scale", found: format!("{scale:?}") });
         }
-        let has_texture = mesh.texture().is_some() && mesh.texcoords().is_some();
-        let colored = has_texture || mesh.colors().is_some();
-        if !colored && real.is_empty() && options.random_color_chance <= 0.0 {
+        let drawn = PreparedMesh::new(&mesh, options.faces, EXTREMES);
+        if !drawn.colored && real.is_empty() && options.random_color_chance <= 0.0 {
             return Err(SampleError::NoPictures { id });
         }
-        let (low, high) = mesh.bounding_box();
-        let small =
-            if mesh.faces().len() > options.faces { simplify(&mesh, options.faces) } else { mesh.clone() };
-        // Normals looked up per sample would be computed anew every time.
-        let normals = small.vertex_normals();
-        let small = small.clone().with_normals(normals).unwrap_or(small);
         Ok(Prepared {
             id,
-            extremes: mesh.extremes(300),
-            centre: (low + high) * 0.5,
-            mesh: small,
-            textured: has_texture.then_some(mesh),
-            colored,
+            drawn,
+            textured: is_textured(&mesh).then_some(mesh),
             real_poses: real.iter().map(|c| *c.camera_from_object()).collect(),
             real,
             info,
@@ -358,7 +326,7 @@ impl Prepared {
     fn pose_range(&self) -> PoseRange<'_> {
         PoseRange {
             camera: &self.camera,
-            centre: self.centre,
+            centre: self.drawn.centre,
             distance: self.distance,
             real: &self.real_poses,
         }
@@ -366,9 +334,8 @@ impl Prepared {
 
     /// The box of the whole object in the image; `None` when a part of it is behind the camera.
     fn extent(&self, camera: &Camera, pose: &Pose) -> Option<Extent> {
-        let pixels: Option<Vec<Vec2>> =
-            self.extremes.iter().map(|v| camera.project(&pose.transform_point(v))).collect();
-        Extent::of(pixels?)
+        let (low, high) = self.drawn.pixel_box(camera, pose)?;
+        Extent::of([low, high])
     }
 }
 

@@ -2,12 +2,14 @@
 
 use std::sync::Arc;
 
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
+use sixfold_data::{PosedImage, PosedImageError, TrainingObject, colors};
 use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo};
 use sixfold_render::{BoundingBoxScale, Light, Material};
 use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
 
-use super::rendering::{colors, targets};
+use super::targets::targets;
 use super::*;
 
 const GREY: [u8; 3] = [128; 3];
@@ -53,13 +55,22 @@ fn colored_box() -> Mesh {
 }
 
 fn object(id: u32, mesh: Mesh) -> TrainingObject {
-    let (low, high) = mesh.bounding_box();
-    let scale = BoundingBoxScale::of_corners(&low, &high);
-    TrainingObject { id, info: ModelInfo::of_mesh(&mesh), mesh, scale }
+    let info = ModelInfo::of_mesh(&mesh);
+    TrainingObject::new(id, mesh, info)
+}
+
+fn posed(
+    id: u32,
+    image: &Arc<RgbImage>,
+    camera: Camera,
+    pose: Pose,
+    mask: &Mask,
+) -> Result<PosedImage, PosedImageError> {
+    PosedImage::new("photograph", id, image.clone(), camera, pose)?.with_mask(mask)
 }
 
 /// A "photograph" of the box on grey: its colours are its coordinates, as nothing but even white light shines.
-fn photograph(id: u32, pose: Pose) -> RealCrop {
+fn photograph(id: u32, pose: Pose) -> PosedImage {
     let lights = [Light::Ambient { color: [1.0; 3] }];
     let (mut image, silhouette) = colors(&colored_box(), &camera(), &pose, &lights, &Material::default());
     let mask = Mask::from_fn(320, 240, |x, y| silhouette.data[y * 320 + x] > 0.5);
@@ -68,7 +79,7 @@ fn photograph(id: u32, pose: Pose) -> RealCrop {
             *pixel = GREY;
         }
     }
-    RealCrop::new(id, Arc::new(image), camera(), pose, &mask).unwrap()
+    posed(id, &Arc::new(image), camera(), pose, &mask).unwrap()
 }
 
 fn poses() -> Vec<Pose> {
@@ -371,7 +382,7 @@ fn a_freely_turning_object_has_one_target() {
         let silhouette =
             crop.visible(&sixfold_synth::augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
         let mask = Mask::from_fn(320, 240, |x, y| silhouette.data[y * 320 + x] > 0.5);
-        let crop = RealCrop::new(7, crop.image().clone(), camera(), pose, &mask).unwrap();
+        let crop = posed(7, crop.image(), camera(), pose, &mask).unwrap();
         SampleSource::new(vec![turning.clone()], vec![crop], grey_background(), options.clone()).unwrap()
     };
     let expected = make(pose).sample(0, 1, 1);
@@ -387,7 +398,7 @@ fn a_freely_turning_object_has_one_target() {
     }
 }
 
-fn error_of(objects: Vec<TrainingObject>, real: Vec<RealCrop>, options: SampleOptions) -> String {
+fn error_of(objects: Vec<TrainingObject>, real: Vec<PosedImage>, options: SampleOptions) -> String {
     SampleSource::new(objects, real, Backgrounds::procedural(), options).unwrap_err().to_string()
 }
 
@@ -439,18 +450,19 @@ fn photographs_that_do_not_fit_are_refused() {
     let full = Mask::filled(320, 240, true);
     let pose = poses()[0];
     let message = |image: &Arc<RgbImage>, camera: Camera, pose: Pose, mask: &Mask| {
-        RealCrop::new(5, image.clone(), camera, pose, mask).unwrap_err().to_string()
+        posed(5, image, camera, pose, mask).unwrap_err().to_string()
     };
-    let empty = Mask::filled(320, 240, false);
-    assert!(message(&image, camera(), pose, &empty).contains("0 pixels, expected at least 64"));
+    let empty = posed(7, &image, camera(), pose, &Mask::filled(320, 240, false)).unwrap();
+    let text = error_of(vec![object(7, colored_box())], vec![empty], SampleOptions::default());
+    assert!(text.contains("0 pixels of the object, expected at least 64"), "{text}");
     let small = Arc::new(RgbImage::filled(32, 24, GREY));
     let text = message(&small, camera(), pose, &full);
-    assert!(text.contains("photograph has 32x24") && text.contains("320x240"), "{text}");
-    assert!(message(&image, camera(), pose, &Mask::filled(3, 3, true)).contains("visible mask"));
+    assert!(text.contains("image is 32x24") && text.contains("320x240"), "{text}");
+    assert!(message(&image, camera(), pose, &Mask::filled(3, 3, true)).contains("the mask is 3x3"));
     let behind = Pose::from_translation(Vec3::new(0.0, 0.0, -0.6));
-    assert!(message(&image, camera(), behind, &full).contains("outside the photograph"));
+    assert!(message(&image, camera(), behind, &full).contains("outside the image"));
     let aside = Pose::from_translation(Vec3::new(9.0, 0.0, 0.6));
-    assert!(message(&image, camera(), aside, &full).contains("[9.0, 0.0, 0.6]"));
+    assert!(message(&image, camera(), aside, &full).contains("[9.000, 0.000, 0.600]"));
     let broken = Camera { fx: 0.0, ..camera() };
     assert!(message(&image, broken, pose, &full).contains("fx"));
 }

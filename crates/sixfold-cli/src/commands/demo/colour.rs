@@ -7,8 +7,9 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Target};
+use sixfold_bop::{BopDataset, Target, write_rgb};
 use sixfold_io::write_rgb;
+use sixfold_data::FrameId;
 
 use super::super::boxes::Boxes;
 use super::super::material::was_trained_on;
@@ -114,7 +115,7 @@ fn with_model(
             let Some(image) = scene.rgb(im_id)? else { continue };
             let detector = boxes.detector_card().zip(colour.detector.as_deref());
             for (card, file) in [(pix2pose.model().card(), weights)].into_iter().chain(detector) {
-                if was_trained_on(card, scene_id, im_id) {
+                if was_trained_on(card, file, FrameId { scene_id, im_id })? {
                     bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", file.display());
                 }
             }

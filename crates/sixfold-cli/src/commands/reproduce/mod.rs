@@ -16,6 +16,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Models, Target, read_results};
+use sixfold_data::FrameId;
 use sixfold_geometry::Rect;
 use sixfold_io::fnv1a;
 use sixfold_mesh::Mesh;
@@ -260,15 +261,18 @@ fn test_targets(
         targets.retain(known);
     }
     // The model's card says what it was trained on: scores on those frames would be worth nothing.
-    let card = &pix2pose.model().card().data;
-    if let Some(t) = targets.iter().find(|t| was_trained_on(pix2pose.model().card(), t.scene_id, t.im_id)) {
-        bail!(
-            "{}: the model was trained on frame {}/{}, which {} does not list; give the frames of its training (its card says: {card})",
-            a.weights.display(),
-            t.scene_id,
-            t.im_id,
-            a.frames.display()
-        );
+    let card = pix2pose.model().card();
+    for t in &targets {
+        let frame = FrameId::new(t.scene_id, t.im_id);
+        if was_trained_on(card, &a.weights, frame)? {
+            let all: Vec<String> = card.training_frames.iter().flatten().map(FrameId::to_string).collect();
+            bail!(
+                "{}: the model was trained on frame {frame}, which {} does not list; give the frames of its training (its card says: {})",
+                a.weights.display(),
+                a.frames.display(),
+                all.join(" ")
+            );
+        }
     }
     if a.quick {
         let frames: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();

@@ -8,12 +8,12 @@ use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use sixfold_bop::{BopDataset, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility};
+use sixfold_bop::{BopDataset, CameraFile, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility, read_mask, read_rgb};
+use sixfold_data::{FrameId, PosedImage};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
 use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
-use sixfold_nol::Photograph;
 
 use super::arguments::SynthesizeArguments;
 use crate::commands::detect::Detector;
@@ -92,9 +92,7 @@ impl Input {
             for source in &mut subject.photographs {
                 if let Some(mask) = masks.remove(&(source.image, subject.id)) {
                     let p = &source.photograph;
-                    let (image, camera) = (p.image().clone(), *p.camera());
-                    source.photograph =
-                        Photograph::new(p.name(), image, camera, *p.camera_from_object(), Some(mask))?;
+                    source.photograph = p.clone().with_mask(&mask)?;
                 }
             }
         }
@@ -115,7 +113,7 @@ pub(super) struct Source {
     pub image: usize,
     /// Scene and image of a dataset.
     pub frame: Option<(u32, u32)>,
-    pub photograph: Photograph,
+    pub photograph: PosedImage,
     /// The pose as it was given, before any disturbance.
     pub given: Pose,
 }
@@ -226,8 +224,9 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
             }
             let mask: Mask = own.unwrap_or(visible.mask_visible);
             let Some(subject) = subjects.get_mut(&g.obj_id) else { continue };
-            let name = format!("{scene_id}/{im_id} of object {}", g.obj_id);
-            let photograph = Photograph::new(name, image.clone(), camera, *pose, Some(mask))?;
+            let id = FrameId::new(*scene_id, *im_id);
+            let photograph =
+                PosedImage::of_frame(id, g.obj_id, image.clone(), camera, *pose)?.with_mask(&mask)?;
             subject.photographs.push(Source {
                 image: number,
                 frame: Some((*scene_id, *im_id)),
@@ -318,7 +317,11 @@ fn from_file(a: &SynthesizeArguments, path: &Path) -> Result<Subject> {
                 silhouette.and_then(|s| DetectedMasks::choose(&seen, id, &s))
             }
         };
-        let photograph = Photograph::new(&entry.image, Arc::new(image), camera, pose, mask)?;
+        let photograph = PosedImage::new(&entry.image, id, Arc::new(image), camera, pose)?;
+        let photograph = match &mask {
+            Some(mask) => photograph.with_mask(mask)?,
+            None => photograph,
+        };
         photographs.push(Source { image: number, frame: None, photograph, given });
     }
     let info = ModelInfo::of_mesh(&mesh);

@@ -3,10 +3,12 @@
 use std::path::Path;
 
 use anyhow::Result;
+use sixfold_bop::write_rgb;
+use sixfold_data::PosedImage;
 use sixfold_geometry::{Camera, Pose, RgbImage};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
-use sixfold_nol::{Photograph, SourceView};
+use sixfold_nol::SourceView;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
 use crate::overlay;
@@ -34,7 +36,7 @@ fn outline(image: &mut RgbImage, mesh: &Mesh, camera: &Camera, pose: &Pose, colo
 }
 
 /// One row per object, one column per photograph: above the outline at the given pose, below at the refined one.
-pub(super) fn refinement(path: &Path, rows: &[(&Mesh, Vec<(Photograph, Pose)>)]) -> Result<()> {
+pub(super) fn refinement(path: &Path, rows: &[(&Mesh, Vec<(PosedImage, Pose)>)]) -> Result<()> {
     let columns = rows.iter().map(|(_, list)| list.len()).max().unwrap_or(0);
     if columns == 0 {
         return Ok(());

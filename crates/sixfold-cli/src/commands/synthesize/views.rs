@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;
-use sixfold_nol::{Photograph, SourceView, object_window};
+use sixfold_nol::{SourceView, object_window};
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
 use sixfold_synth::augment::{Backgrounds, Coverage, Patch};
 
@@ -162,7 +163,7 @@ fn add_photograph(
     writer: &mut SceneWriter,
     subject: &Subject,
     im_id: u32,
-    photograph: &Photograph,
+    photograph: &PosedImage,
 ) -> Result<bool> {
     let pose = *photograph.camera_from_object();
     let view = SourceView::new(photograph, &subject.mesh, a.size)?;

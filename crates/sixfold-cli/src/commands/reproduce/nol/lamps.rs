@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
+use sixfold_data::PosedImage;
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
-use sixfold_nol::Photograph;
 use sixfold_nol::similarity::Judge;
 
 use super::picture::Strips;
@@ -33,7 +33,7 @@ struct Thing {
     /// The same, textured, if there is one.
     textured: Option<Mesh>,
     /// Under every lamp.
-    photographs: Vec<Photograph>,
+    photographs: Vec<PosedImage>,
 }
 
 pub(super) fn rows(
@@ -119,9 +119,8 @@ fn things(root: &Path, quick: bool) -> Result<(Vec<u32>, Vec<Thing>)> {
         for ((thing, g), visible) in things.iter_mut().zip(truth).zip(visible) {
             if visible.info.visib_fract >= LEAST_VISIBLE {
                 let name = format!("{im_id} of object {}", thing.object);
-                let mask = Some(visible.mask_visible);
-                let photograph = Photograph::new(name, image.clone(), camera, g.camera_from_object, mask)?;
-                thing.photographs.push(photograph);
+                let posed = PosedImage::new(name, thing.object, image.clone(), camera, g.camera_from_object)?;
+                thing.photographs.push(posed.with_mask(&visible.mask_visible)?);
             }
         }
     }

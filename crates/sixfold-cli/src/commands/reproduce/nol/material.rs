@@ -7,10 +7,10 @@ use anyhow::{Context, Result, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_nol::Photograph;
 
 use super::arguments::ReproduceNolArguments;
 
@@ -43,7 +43,7 @@ pub(super) struct Source {
     /// Which of the frame's objects it is.
     pub index: usize,
     pub object: u32,
-    pub photograph: Photograph,
+    pub photograph: PosedImage,
     pub truth: Pose,
 }
 
@@ -135,8 +135,9 @@ impl Material {
                     continue;
                 }
                 let (image, pose) = (frame.image.clone(), poses[index]);
-                let name = format!("{}/{} of object {object}", frame.id.0, frame.id.1);
-                let photograph = Photograph::new(name, image, frame.camera, pose, Some(mask))?;
+                let id = frame.id.into();
+                let photograph =
+                    PosedImage::of_frame(id, *object, image, frame.camera, pose)?.with_mask(&mask)?;
                 all.push(Source { frame: number, index, object: *object, photograph, truth: *truth });
             }
         }
@@ -155,14 +156,16 @@ impl Material {
                 let frame = &self.sources[s.frame];
                 let (image, pose) = (frame.image.clone(), poses[s.frame][s.index]);
                 let mask = visible[s.frame][s.index].1.clone();
-                let photograph = Photograph::new(s.photograph.name(), image, frame.camera, pose, Some(mask))?;
+                let id = frame.id.into();
+                let photograph =
+                    PosedImage::of_frame(id, s.object, image, frame.camera, pose)?.with_mask(&mask)?;
                 Ok(Source { photograph, ..*s })
             })
             .collect()
     }
 
     /// Targets of one object: true pose, visible mask.
-    pub fn targets_of(&self, object: u32) -> Result<Vec<((u32, u32), Photograph)>> {
+    pub fn targets_of(&self, object: u32) -> Result<Vec<((u32, u32), PosedImage)>> {
         let mut all = vec![];
         for frame in &self.targets {
             let poses: Vec<Pose> = frame.truth.iter().map(|(_, pose)| *pose).collect();
@@ -171,10 +174,9 @@ impl Material {
             }
             for ((id, pose), (share, mask)) in frame.truth.iter().zip(self.visible(frame, &poses)) {
                 if *id == object && share >= LEAST_VISIBLE_TARGET {
-                    let name = format!("{}/{} of object {object}", frame.id.0, frame.id.1);
-                    let photograph =
-                        Photograph::new(name, frame.image.clone(), frame.camera, *pose, Some(mask))?;
-                    all.push((frame.id, photograph));
+                    let (id, image) = (frame.id.into(), frame.image.clone());
+                    let photograph = PosedImage::of_frame(id, object, image, frame.camera, *pose)?;
+                    all.push((frame.id, photograph.with_mask(&mask)?));
                 }
             }
         }

@@ -5,10 +5,10 @@ use std::time::Instant;
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3, stats};
 use sixfold_mesh::Mesh;
-use sixfold_nol::Photograph;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::refine::{PrintedOptions, RefineOptions, SceneSource, printed_poses, refine_scene};
 
@@ -108,7 +108,7 @@ pub(super) fn refine(
             let model = model.filter(|_| way == "printed");
             let mut poses = vec![];
             for (object, mesh) in &material.meshes {
-                let of: Vec<Photograph> =
+                let of: Vec<PosedImage> =
                     sources.iter().filter(|s| s.object == *object).map(|s| s.photograph.clone()).collect();
                 let options = PrintedOptions::default();
                 let side = RefineOptions::default().side;

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
-use sixfold_nol::Photograph;
+use sixfold_data::PosedImage;
 use sixfold_nol::refine::{RefineOptions, refine_poses};
 
 use super::material::{Material, Source};
@@ -46,7 +46,7 @@ pub(super) fn measure(material: &Material, sources: &[Source], networks: &Networ
     let most = material.meshes.keys().map(count).max().unwrap_or(0);
     let object = material.meshes.keys().copied().find(|o| count(o) == most).unwrap_or(0);
     let mesh = &material.meshes[&object];
-    let photographs: Vec<Photograph> =
+    let photographs: Vec<PosedImage> =
         sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect();
     let start = Instant::now();
     refine_poses(&photographs, mesh, &RefineOptions::default(), |_| true)?;

@@ -4,14 +4,16 @@ use anyhow::Result;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_synth::augment::Patch;
+use sixfold_data::PosedImage;
 use sixfold_geometry::{Mask, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_nn::layers::normal;
+use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::similarity::{Judge, Similarity, in_light_of, in_place_of, without_border};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
-use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
 use sixfold_synth::augment::Patch;
 
@@ -68,7 +70,7 @@ pub(super) struct ViewRow {
 pub(super) fn ways<'a>(
     set: &'static str,
     mesh: &'a Mesh,
-    sources: &[Photograph],
+    sources: &[PosedImage],
     networks: &'a Networks,
     side: usize,
     judged: bool,
@@ -97,7 +99,7 @@ pub(super) struct Target<'a> {
     pub key: &'a str,
     pub frame: (u32, u32),
     pub object: u32,
-    pub photograph: &'a Photograph,
+    pub photograph: &'a PosedImage,
     /// The mesh as it is, for what the model itself looks like; with colours if it has any.
     pub mesh: &'a Mesh,
     pub side: usize,

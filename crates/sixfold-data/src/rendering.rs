@@ -1,42 +1,14 @@
-//! Drawing an object: its coordinates and silhouette as targets, and its colours under random light.
+//! Drawing an object: its colours under random light.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
 use sixfold_synth::augment::{Coverage, Patch};
 
-/// Coordinates (3 planes, normalised, 0 outside) and silhouette (0 or 1) of the whole object.
-pub(super) fn targets(
-    mesh: &Mesh,
-    scale: &BoundingBoxScale,
-    camera: &Camera,
-    camera_from_object: &Pose,
-) -> (Vec<f32>, Coverage) {
-    let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
-    let mut frame = Frame::new(camera);
-    frame.render(&objects, &RenderOptions::default());
-    let points = frame.object_coordinates(&objects);
-    let pixels = camera.width * camera.height;
-    let mut coordinates = vec![0.0; 3 * pixels];
-    let mut silhouette = Coverage::filled(camera.width, camera.height, 0.0);
-    let centre = scale.centre.map(|c| c as f32);
-    let inverse = scale.half_size.map(|h| (1.0 / h) as f32);
-    for (i, p) in points.as_slice().iter().enumerate() {
-        if p[0].is_nan() {
-            continue;
-        }
-        silhouette.data[i] = 1.0;
-        for c in 0..3 {
-            coordinates[c * pixels + i] = ((p[c] - centre[c]) * inverse[c]).clamp(-1.0, 1.0);
-        }
-    }
-    (coordinates, silhouette)
-}
-
 /// The object's colours and silhouette.
-pub(super) fn colors(
+pub fn colors(
     mesh: &Mesh,
     camera: &Camera,
     camera_from_object: &Pose,
@@ -65,7 +37,7 @@ pub fn color_patch(
 }
 
 /// Light from everywhere and one to three lamps on the camera's side.
-pub(super) fn random_lights(random: &mut Random) -> Vec<Light> {
+pub fn random_lights(random: &mut Random) -> Vec<Light> {
     let tint = |strength: f32, random: &mut Random| -> [f32; 3] {
         std::array::from_fn(|_| strength * uniform(random, [0.9, 1.1]))
     };
@@ -85,7 +57,8 @@ pub(super) fn random_lights(random: &mut Random) -> Vec<Light> {
     lights
 }
 
-pub(super) fn random_material(random: &mut Random) -> Material {
+/// A surface that is matt more often than shiny, its own colour random where the mesh has none.
+pub fn random_material(random: &mut Random) -> Material {
     let shiny = random.random::<f32>() < 0.4;
     Material {
         specular: if shiny { uniform(random, [0.05, 0.5]) } else { 0.0 },

@@ -1,11 +1,54 @@
-//! Poses of rendered objects: near those of photographs, or from anywhere on a part of the view sphere.
+//! Poses of rendered objects: near those of posed images, or from anywhere on a part of the view sphere.
 
 use rand::RngExt;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec2, Vec3};
 
-use super::options::SampleOptions;
+use crate::posed_image::PosedImage;
+
+/// The camera of renders where nobody gives one.
+pub const DEFAULT_CAMERA: Camera =
+    Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+
+/// How poses of renders vary. The defaults are for objects on a table, seen from above.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseVariation {
+    /// Fraction of poses near one of a posed image, 0..1; the others look from anywhere within `elevation`.
+    pub near_fraction: f32,
+    /// Largest rotation about each axis away from a posed image's pose, radians.
+    pub noise: f64,
+    /// Largest rotation in the image plane to either side near a posed image, radians.
+    pub rotation: f32,
+    /// Elevation of the camera over the object's xy plane, radians: `[0, pi/2]` is the upper hemisphere.
+    pub elevation: [f32; 2],
+    /// Largest rotation about the view axis from upright for poses that are not near a posed image's, radians.
+    pub view_rotation: f32,
+}
+
+impl Default for PoseVariation {
+    fn default() -> Self {
+        PoseVariation {
+            near_fraction: 0.5,
+            noise: 25f64.to_radians(),
+            rotation: std::f32::consts::FRAC_PI_4,
+            elevation: [0.0, std::f32::consts::FRAC_PI_2],
+            view_rotation: std::f32::consts::PI,
+        }
+    }
+}
+
+/// Distances at which images show their objects, a tenth nearer to a tenth farther, metres; `None` without images.
+pub fn distances<'a>(images: impl IntoIterator<Item = &'a PosedImage>) -> Option<[f64; 2]> {
+    let norms = images.into_iter().map(|image| image.camera_from_object().translation().norm());
+    let (low, high) = norms.fold((f64::INFINITY, 0.0f64), |(low, high), d| (low.min(d), high.max(d)));
+    (low <= high).then_some([0.9 * low, 1.1 * high])
+}
+
+/// Distances where no image tells them: 4 to 12 diameters.
+pub fn default_distances(diameter: f64) -> [f64; 2] {
+    [4.0 * diameter, 12.0 * diameter]
+}
 
 /// What poses are drawn from.
 pub struct PoseRange<'a> {
@@ -15,24 +58,24 @@ pub struct PoseRange<'a> {
     pub centre: Vec3,
     /// Distances of that centre from the camera, metres.
     pub distance: [f64; 2],
-    /// Poses of photographs, possibly none.
+    /// Poses of posed images, possibly none.
     pub real: &'a [Pose],
 }
 
 impl PoseRange<'_> {
-    /// A pose: near one of the photographs or from anywhere, as the options say.
-    pub fn draw(&self, options: &SampleOptions, random: &mut Random) -> Pose {
-        let near = !self.real.is_empty() && random.random::<f32>() < options.near_real_share;
+    /// A pose: near one of the posed images or from anywhere, as the variation says.
+    pub fn draw(&self, variation: &PoseVariation, random: &mut Random) -> Pose {
+        let near = !self.real.is_empty() && random.random::<f32>() < variation.near_fraction;
         let facing = if near {
             let pose = &self.real[random.random_range(0..self.real.len())];
-            let noise = Vec3::from_fn(|_, _| options.pose_noise * (2.0 * random.random::<f64>() - 1.0));
-            let turn = f64::from(uniform(random, [-options.rotation, options.rotation]));
+            let noise = Vec3::from_fn(|_, _| variation.noise * (2.0 * random.random::<f64>() - 1.0));
+            let turn = f64::from(uniform(random, [-variation.rotation, variation.rotation]));
             // As it looks when the camera points at it.
             let ray = pose.transform_point(&self.centre);
             let view = towards(&ray).inverse() * pose.rotation();
             turn_in_plane(turn) * UnitQuaternion::from_scaled_axis(noise) * view
         } else {
-            self.anywhere(options, random)
+            anywhere(variation, random)
         };
         // Anywhere in the image but its rim, seen along that ray.
         let pixel = Vec2::new(
@@ -45,17 +88,17 @@ impl PoseRange<'_> {
         let rotation = towards(&ray) * facing;
         Pose::new(rotation, ray * distance - rotation * self.centre)
     }
+}
 
-    fn anywhere(&self, options: &SampleOptions, random: &mut Random) -> UnitQuaternion<f64> {
-        // Uniform on the sphere: the sine of the elevation is uniform.
-        let sines = options.elevation.map(f32::sin);
-        let z = f64::from(uniform(random, sines)).clamp(-1.0, 1.0);
-        let azimuth = std::f64::consts::TAU * random.random::<f64>();
-        let r = (1.0 - z * z).max(0.0).sqrt();
-        let direction = Vec3::new(r * azimuth.cos(), r * azimuth.sin(), z);
-        let turn = f64::from(uniform(random, [-options.view_turn, options.view_turn]));
-        turn_in_plane(turn) * looking_from(&direction, azimuth)
-    }
+fn anywhere(variation: &PoseVariation, random: &mut Random) -> UnitQuaternion<f64> {
+    // Uniform on the sphere: the sine of the elevation is uniform.
+    let sines = variation.elevation.map(f32::sin);
+    let z = f64::from(uniform(random, sines)).clamp(-1.0, 1.0);
+    let azimuth = std::f64::consts::TAU * random.random::<f64>();
+    let r = (1.0 - z * z).max(0.0).sqrt();
+    let direction = Vec3::new(r * azimuth.cos(), r * azimuth.sin(), z);
+    let turn = f64::from(uniform(random, [-variation.view_rotation, variation.view_rotation]));
+    turn_in_plane(turn) * looking_from(&direction, azimuth)
 }
 
 fn turn_in_plane(angle: f64) -> UnitQuaternion<f64> {
@@ -88,7 +131,7 @@ mod tests {
         let camera = Camera::new(600.0, 600.0, 320.0, 240.0, 640, 480).unwrap();
         let centre = Vec3::new(0.01, 0.02, 0.03);
         let range = PoseRange { camera: &camera, centre, distance: [0.5, 0.9], real: &[] };
-        let options = SampleOptions { view_turn: 0.0, elevation: [0.3, 1.2], ..SampleOptions::default() };
+        let options = PoseVariation { view_rotation: 0.0, elevation: [0.3, 1.2], ..PoseVariation::default() };
         for number in 0..200 {
             let pose = range.draw(&options, &mut stream(4, number));
             let seen = pose.transform_point(&centre);
@@ -109,12 +152,8 @@ mod tests {
         let camera = Camera::new(600.0, 600.0, 320.0, 240.0, 640, 480).unwrap();
         let real = [Pose::exp(&[0.1, 0.1, 0.8, 2.0, 0.1, 0.3].into())];
         let range = PoseRange { camera: &camera, centre: Vec3::zeros(), distance: [0.5, 0.9], real: &real };
-        let options = SampleOptions {
-            near_real_share: 1.0,
-            rotation: 0.0,
-            pose_noise: 0.2,
-            ..SampleOptions::default()
-        };
+        let options =
+            PoseVariation { near_fraction: 1.0, rotation: 0.0, noise: 0.2, ..PoseVariation::default() };
         let view = |p: &Pose| p.inverse().translation().normalize();
         for number in 0..100 {
             let pose = range.draw(&options, &mut stream(4, number));

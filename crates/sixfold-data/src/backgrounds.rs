@@ -1,0 +1,59 @@
+//! What training images show behind their objects.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
+use sixfold_geometry::{Rect, Vec3};
+
+use crate::posed_image::PosedImage;
+use crate::training_set::TrainingObject;
+
+/// Photographs of a folder if there is one, else procedural textures; and the share of textures that goes well with them.
+///
+/// # Errors
+/// [`AugmentError`] for a folder without photographs.
+pub fn plain_backgrounds(folder: Option<&Path>) -> Result<(Backgrounds, f32), AugmentError> {
+    Ok(match folder {
+        Some(folder) => (Backgrounds::from_folder(folder, &PhotographOptions::default())?, 0.1),
+        None => (Backgrounds::procedural(), 0.6),
+    })
+}
+
+/// As [`plain_backgrounds`], and always the training images themselves away from their objects.
+///
+/// # Errors
+/// [`AugmentError`].
+pub fn backgrounds_with_images(
+    folder: Option<&Path>,
+    images: &[PosedImage],
+    objects: &[TrainingObject],
+) -> Result<Backgrounds, AugmentError> {
+    let (mut backgrounds, share) = plain_backgrounds(folder)?;
+    let mut frames: Vec<(&Arc<_>, Vec<Rect>)> = vec![];
+    for posed in images {
+        let Some(object) = objects.iter().find(|o| o.id == posed.object_id()) else { continue };
+        let (low, high) = object.mesh.bounding_box();
+        let corners = (0..8).filter_map(|i| {
+            let pick = |axis: usize| if i >> axis & 1 == 0 { low[axis] } else { high[axis] };
+            let corner = Vec3::new(pick(0), pick(1), pick(2));
+            posed.camera().project(&posed.camera_from_object().transform_point(&corner))
+        });
+        let (x, y): (Vec<f64>, Vec<f64>) = corners.map(|c| (c.x, c.y)).unzip();
+        let least = |v: &[f64]| v.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = |v: &[f64]| v.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        if x.is_empty() {
+            continue;
+        }
+        let rect =
+            Rect { x: least(&x), y: least(&y), width: most(&x) - least(&x), height: most(&y) - least(&y) };
+        match frames.iter_mut().find(|(image, _)| Arc::ptr_eq(image, posed.image())) {
+            Some((_, rects)) => rects.push(rect),
+            None => frames.push((posed.image(), vec![rect])),
+        }
+    }
+    for (image, rects) in frames {
+        backgrounds = backgrounds.with_image(image.clone(), rects)?;
+    }
+    Ok(backgrounds.with_procedural_share(share))
+}

@@ -1,0 +1,122 @@
+//! What can be wrong with posed images and training sets.
+
+use std::path::PathBuf;
+
+use sixfold_synth::augment::AugmentError;
+use sixfold_bop::DatasetError;
+use sixfold_geometry::{CameraError, FrameId};
+use thiserror::Error;
+
+/// What is wrong with one posed image.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum PosedImageError {
+    /// The camera cannot be used.
+    #[error("photograph {name}: {source}")]
+    Camera {
+        /// The image.
+        name: String,
+        /// What is wrong.
+        source: CameraError,
+    },
+    /// Image, mask and camera are not of one size.
+    #[error(
+        "photograph {name}: the {what} is {width}x{height}, the camera says {camera_width}x{camera_height}; give the camera of this image"
+    )]
+    Size {
+        /// The image.
+        name: String,
+        /// "image" or "mask".
+        what: &'static str,
+        /// Its columns.
+        width: usize,
+        /// Its rows.
+        height: usize,
+        /// The camera's columns.
+        camera_width: usize,
+        /// The camera's rows.
+        camera_height: usize,
+    },
+    /// The pose puts the object behind the camera or outside the image.
+    #[error(
+        "photograph {name}: its pose puts the object outside the image (translation {translation:.3?} m); poses are object to camera, in metres here and in millimetres in BOP files"
+    )]
+    OutsideImage {
+        /// The image.
+        name: String,
+        /// Translation of the pose, metres.
+        translation: [f64; 3],
+    },
+    /// Too little of the object is seen to learn from.
+    #[error(
+        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {least}; leave this image out or check its pose"
+    )]
+    NotVisible {
+        /// The image.
+        name: String,
+        /// Visible pixels.
+        pixels: usize,
+        /// How many there should be.
+        least: usize,
+    },
+    /// Nothing says where the object is visible.
+    #[error("photograph {name}: no mask says where the object is visible; give its mask")]
+    NoMask {
+        /// The image.
+        name: String,
+    },
+}
+
+/// Why there is nothing to learn from.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum TrainingSetError {
+    /// The dataset cannot be read.
+    #[error(transparent)]
+    Dataset(Box<DatasetError>),
+    /// An image of the dataset cannot be used.
+    #[error(transparent)]
+    Image(#[from] PosedImageError),
+    /// A frame of the dataset has no colour image.
+    #[error("scene {}, image {}: there is no colour image; leave this frame out", frame.scene_id, frame.im_id)]
+    NoColorImage {
+        /// The frame.
+        frame: FrameId,
+    },
+    /// The backgrounds cannot be read.
+    #[error(transparent)]
+    Backgrounds(#[from] AugmentError),
+    /// The dataset does not say which objects it has.
+    #[error("{}: no objects: its models have no models_info.json; name their ids", root.display())]
+    NoObjects {
+        /// The dataset.
+        root: PathBuf,
+    },
+    /// There is no colour image.
+    #[error("{}: split {split} has no colour images to learn from", root.display())]
+    NoImages {
+        /// The dataset.
+        root: PathBuf,
+        /// Its split.
+        split: String,
+    },
+    /// No frame shows enough of an object.
+    #[error(
+        "{}: none of the {frames} frames shows an object at least {percent:.0} % visible; choose other frames",
+        root.display()
+    )]
+    NothingVisible {
+        /// The dataset.
+        root: PathBuf,
+        /// How many there are.
+        frames: usize,
+        /// How much should be seen.
+        percent: f64,
+    },
+}
+
+impl From<DatasetError> for TrainingSetError {
+    fn from(error: DatasetError) -> Self {
+        TrainingSetError::Dataset(Box::new(error))
+    }
+}

@@ -1,0 +1,27 @@
+//! What methods learn from: posed images, training sets read from BOP datasets or made of meshes, and the drawing of
+//! training objects at random poses under random light. Nothing here knows a network.
+//!
+//! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] draws poses, [`color_patch`] pictures.
+
+mod backgrounds;
+mod colors;
+mod error;
+mod posed_image;
+mod poses;
+mod prepared_mesh;
+mod reading;
+mod rendering;
+mod training_set;
+mod visible_mask;
+
+pub use backgrounds::{backgrounds_with_images, plain_backgrounds};
+pub use colors::image_color_augmentation;
+pub use error::{PosedImageError, TrainingSetError};
+pub use posed_image::{LEAST_PIXELS, PosedImage};
+pub use poses::{DEFAULT_CAMERA, PoseRange, PoseVariation, default_distances, distances};
+pub use prepared_mesh::{PreparedMesh, is_textured};
+pub use reading::read_posed_images;
+pub use rendering::{color_patch, colors, random_lights, random_material, randomly_colored};
+pub use sixfold_geometry::FrameId;
+pub use training_set::{FrameSelection, TrainingObject, TrainingSet};
+pub use visible_mask::VisibleMask;

@@ -1,0 +1,19 @@
+//! The part of an image that an object fills.
+
+use sixfold_synth::augment::Window;
+use sixfold_geometry::{Camera, Pose, Vec2};
+use sixfold_mesh::Mesh;
+
+/// A square about the mesh at a pose, `room` times as wide as the longer side of its box in the image; `None` where a vertex
+/// lies behind the camera.
+pub fn object_window(camera: &Camera, mesh: &Mesh, pose: &Pose, room: f64) -> Option<Window> {
+    let mut low = Vec2::repeat(f64::INFINITY);
+    let mut high = Vec2::repeat(f64::NEG_INFINITY);
+    for v in mesh.vertices() {
+        let p = camera.project(&pose.transform_point(v))?;
+        low = low.inf(&p);
+        high = high.sup(&p);
+    }
+    // Far away, something of a few pixels still has a crop.
+    Some(Window { centre: (low + high) * 0.5, side: (high - low).amax().max(4.0) * room })
+}
