@@ -10,8 +10,8 @@ use sixfold_render::DepthSensor;
 use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::mttm::arguments::{DepthViewArguments, Matcher, ReproduceMttmArguments, TemplateViews};
 use crate::commands::reproduce::nol::arguments::{AFTER_HELP as NOL_HELP, ReproduceNolArguments};
-pub(crate) use crate::commands::train::TrainPix2PoseArguments;
 use crate::commands::train::TrainDetectorArguments;
+pub(crate) use crate::commands::train::TrainPix2PoseArguments;
 
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]

@@ -167,9 +167,9 @@ impl DetectorRecipe {
             }
             DetectorKind::Retinanet => {
                 let encoder = match &self.encoder {
-                    Some(file) => ResNet50Config::features(4)
-                        .from_pytorch(file, device)
-                        .map_err(TrainError::method)?,
+                    Some(file) => {
+                        ResNet50Config::features(4).from_pytorch(file, device).map_err(TrainError::method)?
+                    }
                     None => ResNet50Config::features(4).init(self.seed, device),
                 };
                 (DetectorConfig::retinanet(ids.len()), Encoder::ResNet50(encoder))
@@ -237,10 +237,7 @@ impl Recipe for DetectorRecipe {
     ) -> Result<Option<SceneSource>, TrainError> {
         let ids: Vec<u32> = classes.iter().map(|c| c.id).collect();
         let photographs = material.real.len();
-        session.note(&format!(
-            "making {} objects and {photographs} photographed instances ready",
-            ids.len()
-        ));
+        session.note(&format!("making {} objects and {photographs} photographed instances ready", ids.len()));
         let cut = match &material.frames {
             Some((dataset, frames)) => {
                 read_real_crops(dataset, frames, &ids, CUT_VISIBLE).map_err(TrainError::method)?

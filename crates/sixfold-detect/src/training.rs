@@ -197,7 +197,7 @@ impl Training for DetectorTraining {
                     })
                 })
                 .collect();
-        let join = |worker: std::thread::ScopedJoinHandle<'_, _>| match worker.join() {
+            let join = |worker: std::thread::ScopedJoinHandle<'_, _>| match worker.join() {
                 Ok(parts) => parts,
                 Err(panic) => std::panic::resume_unwind(panic),
             };

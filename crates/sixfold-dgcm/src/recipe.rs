@@ -146,11 +146,7 @@ impl Recipe for DgcmRecipe {
         self.options().check()
     }
 
-    fn prepare(
-        &self,
-        _: (),
-        _: &mut Session<'_>,
-    ) -> Result<Prepared<DgcmTraining, PoolOptions>, TrainError> {
+    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<DgcmTraining, PoolOptions>, TrainError> {
         let device = Device::flex().autodiff();
         let network = match (self.network, &self.encoder) {
             (DgcmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
@@ -176,11 +172,7 @@ impl Recipe for DgcmRecipe {
         Ok(Prepared { training: DgcmTraining::new(network, options, device), card, context: pool })
     }
 
-    fn samples(
-        &self,
-        pool: &mut PoolOptions,
-        session: &mut Session<'_>,
-    ) -> Result<Option<Pool>, TrainError> {
+    fn samples(&self, pool: &mut PoolOptions, session: &mut Session<'_>) -> Result<Option<Pool>, TrainError> {
         session.note(&format!("making {} views", self.views));
         let events = Mutex::new(&mut *session.events);
         let pool = Pool::new(pool, |done| {

@@ -161,11 +161,7 @@ impl Recipe for MttmRecipe {
         self.options().check()
     }
 
-    fn prepare(
-        &self,
-        _: (),
-        _: &mut Session<'_>,
-    ) -> Result<Prepared<MttmTraining, PoolOptions>, TrainError> {
+    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<MttmTraining, PoolOptions>, TrainError> {
         let device = Device::flex().autodiff();
         let network = match (self.network, &self.encoder) {
             (MttmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),

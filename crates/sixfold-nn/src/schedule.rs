@@ -52,7 +52,12 @@ impl LearningRate {
             LearningRate::Constant { rate } => positive("rate", *rate),
             LearningRate::StepDecay { rate, factor, at } => {
                 positive("rate", *rate)?;
-                OptionError::unless(*factor > 0.0 && *factor <= 1.0, "factor", factor, "above 0 and at most 1")?;
+                OptionError::unless(
+                    *factor > 0.0 && *factor <= 1.0,
+                    "factor",
+                    factor,
+                    "above 0 and at most 1",
+                )?;
                 let rising = at.windows(2).all(|w| w[0] < w[1]);
                 OptionError::unless(rising, "at", format!("{at:?}"), "steps in rising order")
             }

@@ -101,40 +101,19 @@ pub fn fit<T: Training>(
     mut progress: impl FnMut(&TrainingRecord),
 ) -> Result<Outcome<()>, TrainError> {
     let plan = training.plan(samples)?;
-    let Plan { steps, ref schedule, samples_per_step, pace, ref settings } = plan;
-    pace.check()?;
-    schedule.check()?;
+    plan.pace.check()?;
+    plan.schedule.check()?;
     let make_batch = training.batches(samples);
-    let save = |training: &mut T, step: u64, seconds: f64| -> Result<(), TrainError> {
-        training.before_checkpoint(folder);
-        let checkpoint = CheckpointWriter::new(step).state("options", settings)?.state("seconds", &seconds)?;
-        let saved = training.learners().iter().try_fold(checkpoint, |written, l| l.save(written))?;
-        saved.write(folder)?;
-        Ok(())
-    };
-    let (mut step, mut before) = (0, 0.0);
-    if let Some(checkpoint) = Checkpoint::latest(folder)? {
-        let found: serde_json::Value = checkpoint.state("options")?;
-        if let Some(difference) = difference(&found, settings) {
-            return Err(TrainError::OtherTraining { folder: folder.to_owned(), difference });
-        }
-        restore(training, &checkpoint)?;
-        before = checkpoint.state("seconds")?;
-        step = checkpoint.step();
-    } else {
-        save(training, 0, 0.0)?;
-    }
-    let log_path = folder.join("log.jsonl");
-    let mut log = TrainingLog::open(&log_path, step)?;
-    let started = Instant::now();
-    let producers = pace.sample_threads.max(1);
+    let mut run = Run::start(training, plan, folder)?;
+    let (first, steps) = (run.step, run.plan.steps);
+    let producers = run.plan.pace.sample_threads.max(1);
     let quit = AtomicBool::new(false);
     std::thread::scope(|scope| {
         // Thread i makes the batches i, i + n, i + 2n, ...: which thread makes a batch does not change it.
         let batches: Vec<Receiver<T::Batch>> = (0..producers)
             .map(|producer| {
                 let (send, receive) = sync_channel(2);
-                let (first, quit, make_batch) = (step + producer as u64, &quit, &make_batch);
+                let (first, quit, make_batch) = (first + producer as u64, &quit, &make_batch);
                 scope.spawn(move || {
                     for number in (first..steps).step_by(producers) {
                         if quit.load(Ordering::Relaxed) || send.send(make_batch(number)).is_err() {
@@ -145,60 +124,139 @@ pub fn fit<T: Training>(
                 receive
             })
             .collect();
-        let outcome = (|| {
-            let first = step;
-            let mut sums: BTreeMap<String, f64> = BTreeMap::new();
-            let (mut since, mut counted) = (Instant::now(), 0);
-            while step < steps {
-                let Ok(batch) = batches[((step - first) % producers as u64) as usize].recv() else {
-                    // A thread of samples ended early: it panicked, and the scope will say so.
-                    return Ok(Outcome::Interrupted { step });
-                };
-                let rate = schedule.at(step);
-                let losses = training.step(batch, rate);
-                if losses.values().any(|v| !v.is_finite()) {
-                    return Err(TrainError::NotFinite { step, rate });
-                }
-                step += 1;
-                counted += 1;
-                for (name, value) in losses {
-                    *sums.entry(name).or_default() += value;
-                }
-                let last = step == steps;
-                if step % pace.log_every == 0 || last {
-                    let record = TrainingRecord {
-                        step,
-                        seconds: before + started.elapsed().as_secs_f64(),
-                        learning_rate: rate,
-                        samples_per_second: (counted as usize * samples_per_step) as f64
-                            / since.elapsed().as_secs_f64(),
-                        losses: std::mem::take(&mut sums)
-                            .into_iter()
-                            .map(|(name, sum)| (name, sum / f64::from(counted)))
-                            .collect(),
-                    };
-                    (since, counted) = (Instant::now(), 0);
-                    log.append(&record)?;
-                    progress(&record);
-                }
-                let stopped = stop.load(Ordering::Relaxed);
-                if step % pace.checkpoint_every == 0 || last || stopped {
-                    save(training, step, before + started.elapsed().as_secs_f64())?;
-                    let records = read_training_log(&log_path)?;
-                    if !records.is_empty() {
-                        draw_curves(&records, &folder.join("curves.png"))?;
-                    }
-                }
-                if stopped && !last {
-                    return Ok(Outcome::Interrupted { step });
-                }
-            }
-            Ok(Outcome::Finished(()))
-        })();
+        let batch = |step: u64| batches[((step - first) % producers as u64) as usize].recv().ok();
+        let outcome = run.steps(training, batch, stop, &mut progress);
         quit.store(true, Ordering::Relaxed);
         drop(batches);
         outcome
     })
+}
+
+/// A training under way.
+struct Run<'a> {
+    plan: Plan,
+    folder: &'a Path,
+    log: TrainingLog,
+    /// Steps done.
+    step: u64,
+    /// Seconds until the last interruption.
+    before: f64,
+    started: Instant,
+}
+
+impl<'a> Run<'a> {
+    /// Restores the training from the last checkpoint in `folder`, or writes the first one.
+    fn start(training: &mut impl Training, plan: Plan, folder: &'a Path) -> Result<Self, TrainError> {
+        let (mut step, mut before) = (0, 0.0);
+        if let Some(checkpoint) = Checkpoint::latest(folder)? {
+            let found: serde_json::Value = checkpoint.state("options")?;
+            if let Some(difference) = difference(&found, &plan.settings) {
+                return Err(TrainError::OtherTraining { folder: folder.to_owned(), difference });
+            }
+            restore(training, &checkpoint)?;
+            before = checkpoint.state("seconds")?;
+            step = checkpoint.step();
+        } else {
+            save(training, &plan.settings, folder, (0, 0.0))?;
+        }
+        let log = TrainingLog::open(&folder.join("log.jsonl"), step)?;
+        Ok(Run { plan, folder, log, step, before, started: Instant::now() })
+    }
+
+    fn seconds(&self) -> f64 {
+        self.before + self.started.elapsed().as_secs_f64()
+    }
+
+    /// The steps that are left.
+    fn steps<T: Training>(
+        &mut self,
+        training: &mut T,
+        batch: impl Fn(u64) -> Option<T::Batch>,
+        stop: &AtomicBool,
+        progress: &mut impl FnMut(&TrainingRecord),
+    ) -> Result<Outcome<()>, TrainError> {
+        let pace = self.plan.pace;
+        let mut sums = Sums::new();
+        while self.step < self.plan.steps {
+            let Some(batch) = batch(self.step) else {
+                // A thread of samples ended early: it panicked, and the scope will say so.
+                return Ok(Outcome::Interrupted { step: self.step });
+            };
+            let rate = self.plan.schedule.at(self.step);
+            let losses = training.step(batch, rate);
+            if losses.values().any(|v| !v.is_finite()) {
+                return Err(TrainError::NotFinite { step: self.step, rate });
+            }
+            self.step += 1;
+            sums.add(losses);
+            let last = self.step == self.plan.steps;
+            if self.step.is_multiple_of(pace.log_every) || last {
+                let samples = std::mem::replace(&mut sums, Sums::new());
+                let record = samples.record(self.step, self.seconds(), rate, self.plan.samples_per_step);
+                self.log.append(&record)?;
+                progress(&record);
+            }
+            let stopped = stop.load(Ordering::Relaxed);
+            if self.step.is_multiple_of(pace.checkpoint_every) || last || stopped {
+                save(training, &self.plan.settings, self.folder, (self.step, self.seconds()))?;
+                let records = read_training_log(&self.folder.join("log.jsonl"))?;
+                if !records.is_empty() {
+                    draw_curves(&records, &self.folder.join("curves.png"))?;
+                }
+            }
+            if stopped && !last {
+                return Ok(Outcome::Interrupted { step: self.step });
+            }
+        }
+        Ok(Outcome::Finished(()))
+    }
+}
+
+/// Writes the checkpoint of a step, with the seconds until then.
+fn save(
+    training: &mut impl Training,
+    settings: &serde_json::Value,
+    folder: &Path,
+    (step, seconds): (u64, f64),
+) -> Result<(), TrainError> {
+    training.before_checkpoint(folder);
+    let checkpoint = CheckpointWriter::new(step).state("options", settings)?.state("seconds", &seconds)?;
+    let learners = training.learners();
+    let checkpoint = learners.iter().try_fold(checkpoint, |checkpoint, learner| learner.save(checkpoint))?;
+    checkpoint.write(folder)?;
+    Ok(())
+}
+
+/// Losses since the last record.
+struct Sums {
+    losses: Losses,
+    steps: u32,
+    since: Instant,
+}
+
+impl Sums {
+    fn new() -> Self {
+        Sums { losses: Losses::new(), steps: 0, since: Instant::now() }
+    }
+
+    fn add(&mut self, losses: Losses) {
+        self.steps += 1;
+        for (name, value) in losses {
+            *self.losses.entry(name).or_default() += value;
+        }
+    }
+
+    /// Their means.
+    fn record(self, step: u64, seconds: f64, learning_rate: f64, samples_per_step: usize) -> TrainingRecord {
+        let samples = self.steps as usize * samples_per_step;
+        TrainingRecord {
+            step,
+            seconds,
+            learning_rate,
+            samples_per_second: samples as f64 / self.since.elapsed().as_secs_f64(),
+            losses: self.losses.into_iter().map(|(n, sum)| (n, sum / f64::from(self.steps))).collect(),
+        }
+    }
 }
 
 /// The first field that differs, in words.

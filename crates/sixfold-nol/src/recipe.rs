@@ -121,11 +121,7 @@ impl Recipe for NolRecipe {
         self.options().check()
     }
 
-    fn prepare(
-        &self,
-        _: (),
-        _: &mut Session<'_>,
-    ) -> Result<Prepared<NolTraining, Backgrounds>, TrainError> {
+    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<NolTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
         let parts = self.parts;
         let network = match (self.network, &self.encoder) {
@@ -153,8 +149,7 @@ impl Recipe for NolRecipe {
         let options = self.options();
         card.extra = serde_json::json!({ "training": options });
         let perceptual = Perceptual::of(&network, &device)?;
-        let training =
-            NolTraining::new(network, parts, perceptual, options, device).with_preview(&textures);
+        let training = NolTraining::new(network, parts, perceptual, options, device).with_preview(&textures);
         Ok(Prepared { training, card, context: textures })
     }
 

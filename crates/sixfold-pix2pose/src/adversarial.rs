@@ -68,8 +68,7 @@ impl AdversarialOptions {
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
-        let counts =
-            [("steps", self.steps), ("batch", self.batch as u64), ("decay_every", self.decay_every)];
+        let counts = [("steps", self.steps), ("batch", self.batch as u64), ("decay_every", self.decay_every)];
         for (field, value) in counts {
             OptionError::unless(value > 0, field, value, "1 or more")?;
         }
@@ -128,7 +127,12 @@ pub struct AdversarialTraining<G> {
 
 impl<G: Generator> AdversarialTraining<G> {
     /// Of a generator on the autodiff `device` for one object; `pool` holds the object's symmetries, the identity first.
-    pub fn new(generator: G, mut pool: Vec<SymmetryMap>, options: AdversarialOptions, device: Device) -> Self {
+    pub fn new(
+        generator: G,
+        mut pool: Vec<SymmetryMap>,
+        options: AdversarialOptions,
+        device: Device,
+    ) -> Self {
         if !options.transformer_loss {
             pool.truncate(1);
         }

@@ -242,8 +242,7 @@ impl Pix2PoseRecipe {
     fn card(&self, description: String) -> Result<ModelCard, TrainError> {
         if let (Some(file), Some(0)) = (&self.init, self.steps) {
             let mut card = Pix2PoseModel::load(file).map_err(TrainError::method)?.card().clone();
-            card.extra["corrections"] =
-                serde_json::json!({ "command": self.command, "data": description });
+            card.extra["corrections"] = serde_json::json!({ "command": self.command, "data": description });
             return Ok(card);
         }
         let mut card = ModelCard::new("", "Pix2Pose, compact network");

@@ -85,7 +85,8 @@ fn make_batch(source: &SampleSource, options: &Pix2PoseTrainingOptions, step: u6
     let mut batch = CompactBatch { rgb: vec![], coordinates: vec![], object: vec![], visible: vec![], step };
     for object in 0..source.objects() {
         for image in 0..options.per_object {
-            let sample = source.sample(object, options.common.seed, step * options.per_object as u64 + image as u64);
+            let sample =
+                source.sample(object, options.common.seed, step * options.per_object as u64 + image as u64);
             batch.rgb.extend(network_input(&sample.rgb));
             batch.coordinates.extend(sample.coordinates);
             batch.object.extend(sample.object);
@@ -210,8 +211,7 @@ impl Training for CompactTraining {
                 let silhouette = of(targets.object, 1);
                 let rendered = of(targets.coordinates, 3) * silhouette.clone();
                 let generated = output.narrow(1, 0, 3) * silhouette;
-                adversarial[0] +=
-                    critic.step(generated.clone().detach(), rendered, batch.step, rate, device);
+                adversarial[0] += critic.step(generated.clone().detach(), rendered, batch.step, rate, device);
                 let loss = critic.generator_loss(generated);
                 adversarial[1] += f64::from(loss.clone().inner().into_scalar::<f32>());
                 total = total + loss.mul_scalar(options.adversarial * count as f32 / images as f32);

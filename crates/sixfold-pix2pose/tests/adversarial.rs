@@ -90,12 +90,7 @@ fn run(folder: &Path, options: &AdversarialOptions, stop_at: Option<u64>) -> Res
 }
 
 fn options(steps: u64) -> AdversarialOptions {
-    AdversarialOptions {
-        steps,
-        batch: 2,
-        learning_rate: 1e-2,
-        ..AdversarialOptions::default()
-    }
+    AdversarialOptions { steps, batch: 2, learning_rate: 1e-2, ..AdversarialOptions::default() }
 }
 
 #[test]

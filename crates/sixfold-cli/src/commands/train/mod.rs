@@ -141,7 +141,8 @@ fn train_in<R: Recipe>(
     let mut bars = Bars { shown, bar: None };
     let mut receive = |event: TrainingEvent<'_>| bars.receive(event);
     let mut session = Session::new(out, interrupted(), &mut receive);
-    let ended = if export_only { export(recipe, data, &mut session) } else { train(recipe, data, &mut session) };
+    let ended =
+        if export_only { export(recipe, data, &mut session) } else { train(recipe, data, &mut session) };
     bars.finish();
     match ended {
         Ok(Ended::Finished(trained)) => Ok(trained),
@@ -160,7 +161,8 @@ fn train_in<R: Recipe>(
 fn by_flag(error: &OptionError) -> anyhow::Error {
     let flag = error.field.replace('_', "-");
     let command = Arguments::command();
-    let mut trainings = command.find_subcommand("train").into_iter().flat_map(|train| train.get_subcommands());
+    let mut trainings =
+        command.find_subcommand("train").into_iter().flat_map(|train| train.get_subcommands());
     if trainings.any(|training| training.get_arguments().any(|a| a.get_long() == Some(flag.as_str()))) {
         return anyhow!("--{flag}: found {}, expected {}", error.found, error.expected);
     }
