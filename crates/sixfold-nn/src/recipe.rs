@@ -250,3 +250,153 @@ pub fn continued_from(init: Option<&Path>) -> Result<serde_json::Value, WeightsE
         "continued_from": card.extra["continued_from"],
     }))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint::{CheckpointError, CheckpointWriter};
+    use crate::learner::Checkpointed;
+    use crate::options::Pace;
+    use crate::schedule::LearningRate;
+    use crate::training::{Batches, Losses, Plan};
+    use crate::weights::ModelCard;
+
+    /// Sums its batches; the model file holds the sum.
+    struct Sum {
+        value: u64,
+        steps: u64,
+    }
+
+    impl Checkpointed for Sum {
+        fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
+            checkpoint.state("sum", &self.value)
+        }
+
+        fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+            self.value = checkpoint.state("sum")?;
+            Ok(())
+        }
+    }
+
+    impl Training for Sum {
+        type Samples = u64;
+        type Batch = u64;
+
+        fn plan(&self, _: &u64) -> Result<Plan, TrainError> {
+            Ok(Plan {
+                steps: self.steps,
+                schedule: LearningRate::Constant { rate: 1.0 },
+                samples_per_step: 1,
+                pace: Pace { log_every: 1, ..Pace::default() },
+                settings: serde_json::json!({ "steps": self.steps }),
+            })
+        }
+
+        fn batches<'a>(&self, offset: &'a u64) -> Batches<'a, u64> {
+            Box::new(move |step| step + offset)
+        }
+
+        fn step(&mut self, batch: u64, _: f64) -> Losses {
+            self.value += batch;
+            Losses::from([("sum".to_owned(), self.value as f64)])
+        }
+
+        fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+            vec![self]
+        }
+    }
+
+    #[derive(Default)]
+    struct SumRecipe {
+        steps: u64,
+    }
+
+    impl Recipe for SumRecipe {
+        type Data = u64;
+        type Samples = u64;
+        type Training = Sum;
+        type Context = u64;
+        type Report = String;
+
+        fn steps(&self) -> u64 {
+            self.steps
+        }
+
+        fn seed(&self) -> u64 {
+            7
+        }
+
+        fn command(&self) -> &str {
+            "sum"
+        }
+
+        fn check(&self) -> Result<(), OptionError> {
+            OptionError::unless(self.steps < 100, "steps", self.steps, "less than 100")
+        }
+
+        fn prepare(&self, data: u64, _: &mut Session<'_>) -> Result<Prepared<Sum, u64>, TrainError> {
+            let card = ModelCard::new("sum", "Sum");
+            Ok(Prepared { training: Sum { value: 0, steps: self.steps }, card, context: data })
+        }
+
+        fn samples(&self, data: &mut u64, session: &mut Session<'_>) -> Result<Option<u64>, TrainError> {
+            session.note("making samples");
+            Ok((!session.is_stopped()).then_some(*data))
+        }
+
+        fn finish(
+            &self,
+            Prepared { training, card, .. }: Prepared<Sum, u64>,
+            session: &mut Session<'_>,
+        ) -> Result<Option<String>, TrainError> {
+            std::fs::write(session.model(), training.value.to_string()).map_err(TrainError::method)?;
+            Ok(Some(format!("{} {} {}", card.command, card.seed, card.steps)))
+        }
+    }
+
+    #[test]
+    fn it_trains_resumes_exports_and_measures() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let stop = AtomicBool::new(false);
+        let mut seen = vec![];
+        let mut events = |event: TrainingEvent<'_>| {
+            if let TrainingEvent::Steps(record, steps) = event {
+                seen.push((record.step, steps));
+                stop.store(record.step == 2, Ordering::Relaxed);
+            }
+        };
+        let mut session = Session::new(&out, &stop, &mut events);
+        let recipe = SumRecipe { steps: 4 };
+        let error = export(&recipe, 10, &mut session).unwrap_err();
+        assert!(matches!(error, TrainError::NoCheckpoint { .. }), "{error}");
+        let interrupted = train(&recipe, 10, &mut session).unwrap();
+        assert!(matches!(interrupted, Outcome::Interrupted { step: 2 }));
+        assert!(!session.model().exists());
+        // Stopped before there are samples: nothing more is done.
+        assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Interrupted { step: 2 }));
+        let Outcome::Finished(exported) = export(&recipe, 10, &mut session).unwrap() else { panic!() };
+        assert_eq!((exported.steps, exported.seconds, exported.report.as_str()), (2, None, "sum 7 2"));
+        assert_eq!(std::fs::read_to_string(&exported.model).unwrap(), "21");
+        stop.store(false, Ordering::Relaxed);
+        let Outcome::Finished(trained) = train(&recipe, 10, &mut session).unwrap() else { panic!() };
+        assert_eq!((trained.steps, trained.report.as_str()), (4, "sum 7 4"));
+        assert!(trained.seconds.unwrap() > 0.0 && trained.losses["sum"] == 46.0);
+        assert_eq!(std::fs::read_to_string(&trained.model).unwrap(), "46");
+        assert_eq!(seen, [(1, 4), (2, 4), (3, 4), (4, 4)]);
+    }
+
+    #[test]
+    fn without_steps_what_there_is_is_measured_and_wrong_options_come_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let (stop, mut events) = (AtomicBool::new(false), |_: TrainingEvent<'_>| ());
+        let mut session = Session::new(folder.path(), &stop, &mut events);
+        let Outcome::Finished(measured) = train(&SumRecipe { steps: 0 }, 3, &mut session).unwrap() else {
+            panic!()
+        };
+        assert_eq!((measured.seconds, measured.report.as_str()), (None, " 0 0"));
+        assert!(!session.folder().exists());
+        let error = train(&SumRecipe { steps: 100 }, 3, &mut session).unwrap_err().to_string();
+        assert_eq!(error, "steps: found 100, expected less than 100");
+    }
+}

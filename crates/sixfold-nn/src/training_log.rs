@@ -255,8 +255,9 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
     canvas.rectangle(left - 1.0, top, 1.5, height + 1.0, INK);
     canvas.rectangle(left - 1.0, top + height - 0.5, width + 1.0, 1.5, INK);
 
-    let place =
-        |p: (f64, f64)| (left + width * p.0 / horizontal.high, top + height * (1.0 - fraction(&vertical, p.1)));
+    let place = |p: (f64, f64)| {
+        (left + width * p.0 / horizontal.high, top + height * (1.0 - fraction(&vertical, p.1)))
+    };
     let mut curve = |points: &[(f64, f64)], thickness: f64, color: [u8; 3]| {
         let points = at_most_one_a_pixel(points, 2 * PANEL_WIDTH as usize);
         if let [only] = points[..] {
