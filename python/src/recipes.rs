@@ -1,14 +1,15 @@
-//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`: material in, a model file out. They tell of their progress,
-//! stop after the step in which Ctrl-C is heard, and go on when they are called again with the same arguments.
+//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`: data in, a model file out. They report their
+//! progress, stop after the step in which Ctrl-C comes, and resume when they are called again with the same arguments. Without
+//! an argument, or with None, they take the default of the recipe.
 
 use std::path::PathBuf;
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays::{positive, seed, whole};
+use crate::arrays::{positive, whole};
 use crate::bop::json_to_python;
-use crate::training::{Source, kind, run, share, steps_of, summary, turn};
+use crate::training::{Source, checked, choice, count, run, single, steps, summary};
 
 /// Trains Pix2Pose (dissertation, chapter 3) on posed photographs and renders of objects; the model is what Pix2Pose.load
 /// reads. A dict with model (its path), steps, seconds, losses.
@@ -34,7 +35,7 @@ use crate::training::{Source, kind, run, share, steps_of, summary, turn};
 /// >>> trained = train_pix2pose("data/demo", "out/pix2pose", ids=[8], steps=200, progress=print)  # doctest: +SKIP
 /// >>> pix2pose = Pix2Pose.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network="compact", steps=None, per_object=None, learning_rate=None, adversarial=None, frozen_stages=2, render_share=0.5, near_photographs=0.5, rotation=None, size=128, init=None, encoder=None, backgrounds=None, mesh_colors=true, convex_hull=false, transformer_loss=true, view_limits=false, preset=None, progress=None, seed=0))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, steps=None, per_object=None, learning_rate=None, adversarial=None, frozen_stages=None, render_share=None, near_photographs=None, rotation=None, size=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, convex_hull=None, transformer_loss=None, view_limits=None, preset=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_pix2pose<'py>(
     py: Python<'py>,
@@ -44,54 +45,54 @@ pub(crate) fn train_pix2pose<'py>(
     frames: Option<&Bound<'py, PyAny>>,
     split: Option<String>,
     renders_only: bool,
-    network: &str,
+    network: Option<&str>,
     steps: Option<i64>,
     per_object: Option<i64>,
     learning_rate: Option<f64>,
     adversarial: Option<bool>,
-    frozen_stages: i64,
-    render_share: f64,
-    near_photographs: f64,
+    frozen_stages: Option<i64>,
+    render_share: Option<f64>,
+    near_photographs: Option<f64>,
     rotation: Option<f64>,
-    size: i64,
+    size: Option<i64>,
     init: Option<PathBuf>,
     encoder: Option<PathBuf>,
     backgrounds: Option<PathBuf>,
-    mesh_colors: bool,
-    convex_hull: bool,
-    transformer_loss: bool,
-    view_limits: bool,
+    mesh_colors: Option<bool>,
+    convex_hull: Option<bool>,
+    transformer_loss: Option<bool>,
+    view_limits: Option<bool>,
     preset: Option<&str>,
     progress: Option<Py<PyAny>>,
-    seed: i64,
+    seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold_pix2pose::preset::Preset;
-    use sixfold_pix2pose::recipe::{LEAST_VISIBLE, NetworkKind, Recipe};
-    let recipe = Recipe {
-        network: kind("network", network, NetworkKind::ALL, NetworkKind::name)?,
-        steps: steps_of(steps)?,
-        per_object: per_object.map(|n| whole("per_object", n, 1)).transpose()?,
-        learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
+    use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
+    let default = Pix2PoseRecipe::default();
+    let recipe = checked(Pix2PoseRecipe {
+        network: choice("network", network, default.network)?,
+        steps: self::steps(steps)?,
+        per_object: per_object.map(|n| whole("per_object", n, 0)).transpose()?,
+        learning_rate,
         adversarial,
         encoder,
-        frozen_stages: whole("frozen_stages", frozen_stages, 0)?,
-        render_share: share("render_share", render_share)?,
-        near_photographs: share("near_photographs", near_photographs)?,
-        rotation: turn("rotation", rotation, Recipe::default().rotation)?,
-        size: whole("size", size, 32)?,
+        frozen_stages: count("frozen_stages", frozen_stages, default.frozen_stages)?,
+        render_share: single(render_share, default.render_share),
+        near_photographs: single(near_photographs, default.near_photographs),
+        rotation: single(rotation, default.rotation),
+        size: count("size", size, default.size)?,
         init,
-        mesh_colors,
-        convex_hull,
-        transformer_loss,
-        view_limits,
-        preset: preset.map(|name| kind("preset", name, Preset::ALL, Preset::name)).transpose()?,
+        mesh_colors: mesh_colors.unwrap_or(default.mesh_colors),
+        convex_hull: convex_hull.unwrap_or(default.convex_hull),
+        transformer_loss: transformer_loss.unwrap_or(default.transformer_loss),
+        view_limits: view_limits.unwrap_or(default.view_limits),
+        preset: preset.map(|name| choice("preset", Some(name), Preset::Bop)).transpose()?,
         backgrounds,
-        seed: self::seed(seed)?,
+        seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_pix2pose".to_owned(),
-    };
-    let material = Source::new(material, ids, frames, split, renders_only)?.read(py, LEAST_VISIBLE)?;
-    let trained = run(py, progress, move |stop, hear| recipe.train(material, &out, stop, hear))?;
-    summary(py, trained)
+    })?;
+    let material = Source::new(material, ids, frames, split, renders_only)?.read(py, MIN_VISIBILITY)?;
+    summary(py, run(py, progress, recipe, material, out)?)
 }
 
 /// Trains a detector of known objects on photographs with their ground truth and renders; the model is what Detector.load
@@ -109,7 +110,7 @@ pub(crate) fn train_pix2pose<'py>(
 /// >>> trained = train_detector("data/demo", "out/detector", steps=200)  # doctest: +SKIP
 /// >>> detector = Detector.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network="compact", steps=8000, batch=4, learning_rate=0.002, encoder_share=0.3, frozen_stages=2, size=320, photograph_share=0.45, render_share=0.4, rotation=None, longest_side=640, threshold=0.4, init=None, encoder=None, backgrounds=None, mesh_colors=true, progress=None, seed=0))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, steps=None, batch=None, learning_rate=None, encoder_share=None, frozen_stages=None, size=None, photograph_share=None, render_share=None, rotation=None, longest_side=None, threshold=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_detector<'py>(
     py: Python<'py>,
@@ -119,50 +120,49 @@ pub(crate) fn train_detector<'py>(
     frames: Option<&Bound<'py, PyAny>>,
     split: Option<String>,
     renders_only: bool,
-    network: &str,
-    steps: i64,
-    batch: i64,
-    learning_rate: f64,
-    encoder_share: f64,
-    frozen_stages: i64,
-    size: i64,
-    photograph_share: f64,
-    render_share: f64,
+    network: Option<&str>,
+    steps: Option<i64>,
+    batch: Option<i64>,
+    learning_rate: Option<f64>,
+    encoder_share: Option<f64>,
+    frozen_stages: Option<i64>,
+    size: Option<i64>,
+    photograph_share: Option<f64>,
+    render_share: Option<f64>,
     rotation: Option<f64>,
-    longest_side: i64,
-    threshold: f64,
+    longest_side: Option<i64>,
+    threshold: Option<f64>,
     init: Option<PathBuf>,
     encoder: Option<PathBuf>,
     backgrounds: Option<PathBuf>,
-    mesh_colors: bool,
+    mesh_colors: Option<bool>,
     progress: Option<Py<PyAny>>,
-    seed: i64,
+    seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_detect::recipe::{DetectorKind, LEAST_VISIBLE, Recipe};
-    share("encoder_share", encoder_share)?;
-    let recipe = Recipe {
-        network: kind("network", network, DetectorKind::ALL, DetectorKind::name)?,
-        steps: whole("steps", steps, 1)? as u64,
-        batch: whole("batch", batch, 1)?,
-        learning_rate: positive("learning_rate", learning_rate)?,
-        encoder_share,
-        frozen_stages: whole("frozen_stages", frozen_stages, 0)?,
+    use sixfold_detect::recipe::{DetectorRecipe, MIN_VISIBILITY};
+    let default = DetectorRecipe::default();
+    let recipe = checked(DetectorRecipe {
+        network: choice("network", network, default.network)?,
+        steps: self::steps(steps)?.unwrap_or(default.steps),
+        batch: count("batch", batch, default.batch)?,
+        learning_rate: learning_rate.unwrap_or(default.learning_rate),
+        encoder_share: encoder_share.unwrap_or(default.encoder_share),
+        frozen_stages: count("frozen_stages", frozen_stages, default.frozen_stages)?,
         encoder,
-        size: whole("size", size, 32)?,
-        photograph_share: share("photograph_share", photograph_share)?,
-        render_share: share("render_share", render_share)?,
-        rotation: turn("rotation", rotation, Recipe::default().rotation)?,
-        mesh_colors,
-        longest_side: whole("longest_side", longest_side, 32)?,
-        threshold: share("threshold", threshold)?,
+        size: count("size", size, default.size)?,
+        photograph_share: single(photograph_share, default.photograph_share),
+        render_share: single(render_share, default.render_share),
+        rotation: single(rotation, default.rotation),
+        mesh_colors: mesh_colors.unwrap_or(default.mesh_colors),
+        longest_side: count("longest_side", longest_side, default.longest_side)?,
+        threshold: single(threshold, default.threshold),
         init,
         backgrounds,
-        seed: self::seed(seed)?,
+        seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_detector".to_owned(),
-    };
-    let material = Source::new(material, ids, frames, split, renders_only)?.read(py, LEAST_VISIBLE)?;
-    let trained = run(py, progress, move |stop, hear| recipe.train(material, &out, stop, hear))?;
-    summary(py, trained)
+    })?;
+    let material = Source::new(material, ids, frames, split, renders_only)?.read(py, MIN_VISIBILITY)?;
+    summary(py, run(py, progress, recipe, material, out)?)
 }
 
 /// Trains the network for grasps from experience (dissertation, chapter 6) on made-up objects; the model is what
@@ -177,35 +177,35 @@ pub(crate) fn train_detector<'py>(
 ///
 /// >>> network = DgcmNet.load(train_dgcm("out/dgcm", steps=100, views=500)["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (out, *, network="compact", steps=None, pairs=None, learning_rate=None, lambda_=None, views=6000, encoder=None, progress=None, seed=0))]
+#[pyo3(signature = (out, *, network=None, steps=None, pairs=None, learning_rate=None, lambda_=None, views=None, encoder=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_dgcm<'py>(
     py: Python<'py>,
     out: PathBuf,
-    network: &str,
+    network: Option<&str>,
     steps: Option<i64>,
     pairs: Option<i64>,
     learning_rate: Option<f64>,
     lambda_: Option<f64>,
-    views: i64,
+    views: Option<i64>,
     encoder: Option<PathBuf>,
     progress: Option<Py<PyAny>>,
-    seed: i64,
+    seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_dgcm::recipe::{DgcmKind, Recipe};
-    let recipe = Recipe {
-        network: kind("network", network, DgcmKind::ALL, DgcmKind::name)?,
+    use sixfold_dgcm::recipe::DgcmRecipe;
+    let default = DgcmRecipe::default();
+    let recipe = checked(DgcmRecipe {
+        network: choice("network", network, default.network)?,
         encoder,
-        steps: steps_of(steps)?,
-        pairs: pairs.map(|n| whole("pairs", n, 1)).transpose()?,
-        learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
+        steps: self::steps(steps)?,
+        pairs: pairs.map(|n| whole("pairs", n, 0)).transpose()?,
+        learning_rate,
         lambda: lambda_.map(|weight| positive("lambda_", weight)).transpose()?,
-        views: whole("views", views, 64)?,
-        seed: self::seed(seed)?,
+        views: count("views", views, default.views)?,
+        seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_dgcm".to_owned(),
-    };
-    let trained = run(py, progress, move |stop, hear| recipe.train(&out, stop, hear))?;
-    summary(py, trained)
+    })?;
+    summary(py, run(py, progress, recipe, (), out)?)
 }
 
 /// Trains the network that matches regions of depth images with templates (dissertation, chapter 5) on made-up objects that
@@ -224,36 +224,38 @@ pub(crate) fn train_dgcm<'py>(
 /// >>> trained = train_mttm("out/mttm", steps=100, objects=32, scenes=16)  # doctest: +SKIP
 /// >>> known = Mttm(mesh, weights=trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (out, *, network="compact", steps=None, anchors=None, learning_rate=None, objects=300, scenes=500, encoder=None, progress=None, seed=0))]
+#[pyo3(signature = (out, *, network=None, steps=None, anchors=None, learning_rate=None, objects=None, scenes=None, encoder=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_mttm<'py>(
     py: Python<'py>,
     out: PathBuf,
-    network: &str,
+    network: Option<&str>,
     steps: Option<i64>,
     anchors: Option<i64>,
     learning_rate: Option<f64>,
-    objects: i64,
-    scenes: i64,
+    objects: Option<i64>,
+    scenes: Option<i64>,
     encoder: Option<PathBuf>,
     progress: Option<Py<PyAny>>,
-    seed: i64,
+    seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_mttm::recipe::{MttmKind, Recipe};
-    let recipe = Recipe {
-        network: kind("network", network, MttmKind::ALL, MttmKind::name)?,
+    use sixfold_mttm::recipe::MttmRecipe;
+    let default = MttmRecipe::default();
+    let recipe = checked(MttmRecipe {
+        network: choice("network", network, default.network)?,
         encoder,
-        steps: steps_of(steps)?,
-        anchors: anchors.map(|n| whole("anchors", n, 2)).transpose()?,
-        learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
-        objects: whole("objects", objects, 16)?,
-        scenes: whole("scenes", scenes, 4)?,
-        seed: self::seed(seed)?,
+        steps: self::steps(steps)?,
+        anchors: anchors.map(|n| whole("anchors", n, 0)).transpose()?,
+        learning_rate,
+        objects: count("objects", objects, default.objects)?,
+        scenes: count("scenes", scenes, default.scenes)?,
+        seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_mttm".to_owned(),
-    };
-    let (trained, quality) = run(py, progress, move |stop, hear| recipe.train(&out, stop, hear))?;
+    })?;
+    let trained = run(py, progress, recipe, (), out)?;
+    let quality = json_to_python(py, &trained.report)?;
     let dict = summary(py, trained)?;
-    dict.set_item("quality", json_to_python(py, &quality)?)?;
+    dict.set_item("quality", quality)?;
     Ok(dict)
 }
 
@@ -270,38 +272,41 @@ pub(crate) fn train_mttm<'py>(
 ///
 /// >>> trained = train_nol("out/nol", steps=100)  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (out, *, network="compact", steps=None, learning_rate=None, backgrounds=None, lstm=true, decoder=true, encoder=None, progress=None, seed=0))]
+#[pyo3(signature = (out, *, network=None, steps=None, learning_rate=None, backgrounds=None, lstm=None, decoder=None, encoder=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_nol<'py>(
     py: Python<'py>,
     out: PathBuf,
-    network: &str,
+    network: Option<&str>,
     steps: Option<i64>,
     learning_rate: Option<f64>,
     backgrounds: Option<PathBuf>,
-    lstm: bool,
-    decoder: bool,
+    lstm: Option<bool>,
+    decoder: Option<bool>,
     encoder: Option<PathBuf>,
     progress: Option<Py<PyAny>>,
-    seed: i64,
+    seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold_nol::network::{IntegratorKind, Parts};
-    use sixfold_nol::recipe::{NolKind, Recipe};
-    let recipe = Recipe {
-        network: kind("network", network, NolKind::ALL, NolKind::name)?,
+    use sixfold_nol::recipe::NolRecipe;
+    let default = NolRecipe::default();
+    let integrator = lstm.map(|lstm| if lstm { IntegratorKind::Lstm } else { IntegratorKind::Average });
+    let recipe = checked(NolRecipe {
+        network: choice("network", network, default.network)?,
         encoder,
         parts: Parts {
-            integrator: if lstm { IntegratorKind::Lstm } else { IntegratorKind::Average },
-            decoder,
+            integrator: integrator.unwrap_or(default.parts.integrator),
+            decoder: decoder.unwrap_or(default.parts.decoder),
         },
         backgrounds,
-        steps: steps_of(steps)?,
-        learning_rate: learning_rate.map(|rate| positive("learning_rate", rate)).transpose()?,
-        seed: self::seed(seed)?,
+        steps: self::steps(steps)?,
+        learning_rate,
+        seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_nol".to_owned(),
-    };
-    let (trained, quality) = run(py, progress, move |stop, hear| recipe.train(&out, stop, hear))?;
+    })?;
+    let trained = run(py, progress, recipe, (), out)?;
+    let scores = trained.report.scores();
     let dict = summary(py, trained)?;
-    dict.set_item("quality", quality.scores())?;
+    dict.set_item("quality", scores)?;
     Ok(dict)
 }

@@ -1,17 +1,17 @@
-//! What trainings have in common: what they learn from, what they tell, and how they are stopped.
+//! What trainings have in common: what they learn from, what they report, and how they are stopped.
 
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
 
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sixfold_data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
 use sixfold_mesh::ModelInfo;
-use sixfold_nn::recipe::{Listener, News, Trained};
-use sixfold_nn::training::Ending;
+use sixfold_nn::choice::Choice;
+use sixfold_nn::recipe::{Recipe, Session, Trained, TrainingEvent, train};
+use sixfold_nn::training::Outcome;
 use sixfold_nn::training_log::TrainingRecord;
 
 use crate::arrays::{self, bad, whole};
@@ -31,80 +31,83 @@ pub(crate) fn file_or_value(error: &(dyn Error + 'static)) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-/// What a training tells, as it crosses from its thread.
-enum Told {
+/// What a training reports, as it crosses from its thread.
+enum Event {
     Warning(String),
     Preparing(usize, usize),
     Steps(TrainingRecord, u64),
     Measuring(usize, usize),
 }
 
-impl Told {
-    /// What is worth hearing; that something begins, the callback tells by its stage.
-    fn of(news: News<'_>) -> Option<Told> {
-        Some(match news {
-            News::Note(_) => return None,
-            News::Warning(text) => Told::Warning(text.to_owned()),
-            News::Preparing(done, all) => Told::Preparing(done, all),
-            News::Steps(record, steps) => Told::Steps(record.clone(), steps),
-            News::Measuring(done, all) => Told::Measuring(done, all),
+impl Event {
+    /// That something begins, the callback sees by its stage.
+    fn of(event: TrainingEvent<'_>) -> Option<Event> {
+        Some(match event {
+            TrainingEvent::Note(_) => return None,
+            TrainingEvent::Warning(text) => Event::Warning(text.to_owned()),
+            TrainingEvent::Preparing(done, all) => Event::Preparing(done, all),
+            TrainingEvent::Steps(record, steps) => Event::Steps(record.clone(), steps),
+            TrainingEvent::Measuring(done, all) => Event::Measuring(done, all),
         })
     }
 
     /// Warnings as Python's own; the rest for the user's callback.
-    fn hear(self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
-        if let Told::Warning(text) = &self {
+    fn report(self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
+        if let Event::Warning(text) = &self {
             py.import("warnings")?.call_method1("warn", (text,))?;
             return Ok(());
         }
         let Some(progress) = progress else { return Ok(()) };
-        let news = PyDict::new(py);
-        let share = |stage: &str, done: usize, all: usize| -> PyResult<()> {
-            news.set_item("stage", stage)?;
-            news.set_item("done", done)?;
-            news.set_item("total", all)
+        let event = PyDict::new(py);
+        let stage = |stage: &str, done: usize, all: usize| -> PyResult<()> {
+            event.set_item("stage", stage)?;
+            event.set_item("done", done)?;
+            event.set_item("total", all)
         };
         match self {
-            Told::Warning(_) => return Ok(()),
-            Told::Preparing(done, all) => share("preparing", done, all)?,
-            Told::Measuring(done, all) => share("measuring", done, all)?,
-            Told::Steps(record, steps) => {
-                share("training", record.step as usize, steps as usize)?;
-                news.set_item("seconds", record.seconds)?;
-                news.set_item("learning_rate", record.learning_rate)?;
-                news.set_item("samples_per_second", record.samples_per_second)?;
-                news.set_item("losses", record.losses)?;
+            Event::Warning(_) => return Ok(()),
+            Event::Preparing(done, all) => stage("preparing", done, all)?,
+            Event::Measuring(done, all) => stage("measuring", done, all)?,
+            Event::Steps(record, steps) => {
+                stage("training", record.step as usize, steps as usize)?;
+                event.set_item("seconds", record.seconds)?;
+                event.set_item("learning_rate", record.learning_rate)?;
+                event.set_item("samples_per_second", record.samples_per_second)?;
+                event.set_item("losses", record.losses)?;
             }
         }
-        progress.call1(py, (news,)).map(drop)
+        progress.call1(py, (event,)).map(drop)
     }
 }
 
-/// Runs a training. Ctrl-C, or an error of the callback, ends it after the current step, which is kept on the disk.
-pub(crate) fn run<T, E>(
+/// Trains in `out`. Ctrl-C, or an error of the callback, ends the training after the current step, which is kept on the disk.
+pub(crate) fn run<R: Recipe + Send + 'static>(
     py: Python<'_>,
     progress: Option<Py<PyAny>>,
-    train: impl FnOnce(&AtomicBool, &mut Listener<'_>) -> Result<Ending<T>, E> + Send + 'static,
-) -> PyResult<T>
+    recipe: R,
+    data: R::Data,
+    out: PathBuf,
+) -> PyResult<Trained<R::Report>>
 where
-    T: Send + 'static,
-    E: Error + Send + 'static,
+    R::Data: Send + 'static,
+    R::Report: Send + 'static,
 {
-    let ending = reporting(
+    let outcome = reporting(
         py,
         Leave::WhenDone,
-        move |stop, tell: &Tell<Told>| {
-            train(stop.flag(), &mut |news| {
-                if let Some(told) = Told::of(news) {
-                    tell.tell(told);
+        move |stop, tell: &Tell<Event>| {
+            let mut events = |event: TrainingEvent<'_>| {
+                if let Some(event) = Event::of(event) {
+                    tell.tell(event);
                 }
-            })
+            };
+            train(&recipe, data, &mut Session::new(&out, stop.flag(), &mut events))
         },
-        |told| told.hear(py, progress.as_ref()),
+        |event| event.report(py, progress.as_ref()),
     )?;
-    match ending {
-        Ok(Ending::Finished(trained)) => Ok(trained),
-        Ok(Ending::Interrupted { step }) => Err(PyRuntimeError::new_err(format!(
+    match outcome {
+        Ok(Outcome::Finished(trained)) => Ok(trained),
+        Ok(Outcome::Interrupted { step }) => Err(PyRuntimeError::new_err(format!(
             "the training ended after step {step}; call it again to go on"
         ))),
         Err(error) => Err(file_or_value(&error)),
@@ -112,8 +115,8 @@ where
 }
 
 /// What a training came to, as a dict.
-pub(crate) fn summary<'py>(py: Python<'py>, trained: Trained) -> PyResult<Bound<'py, PyDict>> {
-    let Trained { model, steps, seconds, losses } = trained;
+pub(crate) fn summary<'py, R>(py: Python<'py>, trained: Trained<R>) -> PyResult<Bound<'py, PyDict>> {
+    let Trained { model, steps, seconds, losses, .. } = trained;
     let dict = PyDict::new(py);
     dict.set_item("model", model)?;
     dict.set_item("steps", steps)?;
@@ -122,40 +125,32 @@ pub(crate) fn summary<'py>(py: Python<'py>, trained: Trained) -> PyResult<Bound<
     Ok(dict)
 }
 
-/// One of the names of a kind of network.
-pub(crate) fn kind<K: Copy, const N: usize>(
-    argument: &str,
-    name: &str,
-    all: [K; N],
-    name_of: impl Fn(K) -> &'static str,
-) -> PyResult<K> {
-    let expected = || all.map(&name_of).join(" or ");
-    all.into_iter()
-        .find(|k| name_of(*k) == name)
-        .ok_or_else(|| bad(argument, expected(), format!("{name:?}")))
+/// A recipe whose options are in their ranges, before its data are read.
+pub(crate) fn checked<R: Recipe>(recipe: R) -> PyResult<R> {
+    recipe.check().map_err(|error| bad(error.field, error.expected, error.found))?;
+    Ok(recipe)
 }
 
-/// 0 to 1.
-pub(crate) fn share(argument: &str, value: f64) -> PyResult<f32> {
-    if (0.0..=1.0).contains(&value) {
-        return Ok(value as f32);
-    }
-    Err(bad(argument, "a number from 0 to 1", value.to_string()))
+/// One of the names of a choice, or the default.
+pub(crate) fn choice<C: Choice>(argument: &str, name: Option<&str>, default: C) -> PyResult<C> {
+    let Some(name) = name else { return Ok(default) };
+    let names = || C::ALL.iter().map(|choice| choice.name()).collect::<Vec<_>>().join(" or ");
+    C::named(name).ok_or_else(|| bad(argument, names(), format!("{name:?}")))
 }
 
-/// Radians from 0 to half a turn, or the default.
-pub(crate) fn turn(argument: &str, value: Option<f64>, default: f32) -> PyResult<f32> {
-    match value {
-        None => Ok(default),
-        Some(value) if (0.0..=std::f64::consts::PI).contains(&value) => {
-            Ok((value as f32).min(std::f32::consts::PI))
-        }
-        Some(value) => Err(bad(argument, "radians from 0 to half a turn", value.to_string())),
-    }
+/// A whole number, or the default.
+pub(crate) fn count(argument: &str, value: Option<i64>, default: usize) -> PyResult<usize> {
+    value.map_or(Ok(default), |value| whole(argument, value, 0))
 }
 
-pub(crate) fn steps_of(steps: Option<i64>) -> PyResult<Option<u64>> {
-    steps.map(|n| whole("steps", n, 1).map(|n| n as u64)).transpose()
+/// Steps, where some are given.
+pub(crate) fn steps(value: Option<i64>) -> PyResult<Option<u64>> {
+    value.map(|n| whole("steps", n, 0).map(|n| n as u64)).transpose()
+}
+
+/// A number of fewer digits, or the default.
+pub(crate) fn single(value: Option<f64>, default: f32) -> f32 {
+    value.map_or(default, |value| value as f32)
 }
 
 /// A BOP dataset by its folder, an opened one, or meshes by their ids.

@@ -1,5 +1,6 @@
 """Trainings of a few steps: what they write, that they go on, that Ctrl-C keeps what was learnt."""
 
+import inspect
 import os
 import signal
 import subprocess
@@ -44,6 +45,15 @@ def test_pix2pose_learns_and_goes_on(demo, tmp_path):
     assert again["model"].read_bytes() == before
     with pytest.raises(ValueError, match="steps was 2, is 3"):
         sixfold.train_pix2pose(demo, tmp_path / "whole", steps=3, **options)
+
+
+@pytest.mark.parametrize("method", ["pix2pose", "detector", "dgcm", "mttm", "nol"])
+def test_defaults_are_those_of_the_recipes(method):
+    """No number stands here: None is the recipe's default, which a test of the command line compares with the stub's."""
+    parameters = inspect.signature(getattr(sixfold, f"train_{method}")).parameters
+    defaults = {name: p.default for name, p in parameters.items() if p.default is not p.empty}
+    assert not defaults.pop("renders_only", False)
+    assert set(defaults.values()) == {None} and {"network", "steps", "seed"} <= set(defaults)
 
 
 def test_an_error_of_the_callback_stops_and_keeps(colored, tmp_path):

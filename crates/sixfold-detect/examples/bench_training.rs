@@ -7,14 +7,13 @@ use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use sixfold_synth::augment::Backgrounds;
-use sixfold_data::TrainingObject;
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneOptions, SceneSource};
-use sixfold_detect::training::{TrainingOptions, TrainingPace, train};
+use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::Vec3;
-use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_mesh::Mesh;
 use sixfold_nn::lite0::imagenet_encoder;
-use sixfold_synth::augment::Backgrounds;
+use sixfold_nn::training::fit;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let steps = std::env::args().nth(1).map_or(Ok(60), |text| text.parse())?;
@@ -22,18 +21,19 @@ fn main() -> Result<(), Box<dyn Error>> {
         .map(Vec3::from)
         .to_vec();
     let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])?;
-    let info = ModelInfo { diameter: 0.12, ..ModelInfo::of_mesh(&mesh) };
-    let objects = vec![TrainingObject::new(1, mesh, info)];
+    let objects = vec![SceneObject { id: 1, mesh, diameter: 0.12 }];
     let options = SceneOptions { random_color_chance: 1.0, ..SceneOptions::default() };
     let source = SceneSource::new(objects, &[], &[], Backgrounds::procedural(), options)?;
     let device = Device::flex().autodiff();
     let config = DetectorConfig::compact(1);
     let network = config.init_with(Encoder::Lite0(imagenet_encoder(&device)?), 1, &device);
-    let options = TrainingOptions { steps, ..TrainingOptions::default() };
-    let pace = TrainingPace { log_every: 20, ..TrainingPace::default() };
+    let mut options = DetectorTrainingOptions::default();
+    options.common.steps = steps;
+    let mut training = DetectorTraining::new(network, config, source.options().size, options, device);
+    training.pace.log_every = 20;
     let folder = std::env::temp_dir().join(format!("sixfold-bench-training-{}", std::process::id()));
     let stop = AtomicBool::new(false);
-    train(&source, network, &config, &device, &folder, &options, &pace, &stop, |record| {
+    fit(&mut training, &source, &folder, &stop, |record| {
         println!("step {}: {:.1} images/s, {:?}", record.step, record.samples_per_second, record.losses);
     })?;
     Ok(std::fs::remove_dir_all(folder)?)

@@ -4,15 +4,13 @@
 
 use std::error::Error;
 use std::path::Path;
-
-use sixfold_bop::{BopDataset, Models, write_rgb};
-use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
+use sixfold_bop::{BopDataset, Models};
+use sixfold_io::write_rgb;
+use sixfold_data::{FrameId, TrainingObject, read_posed_images};
+use sixfold_detect::samples::{SceneOptions, SceneSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
-use sixfold_io::write_rgb;
-use sixfold_pix2pose::samples::read_real_crops;
-use sixfold_synth::augment::{Backgrounds, PhotographOptions};
-use sixfold_data::{FrameId, TrainingObject, read_posed_images};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();

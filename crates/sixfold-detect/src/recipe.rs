@@ -1,29 +1,24 @@
 //! A whole training: photographs with their ground truth, and models, in; a detector's file out. Interrupted at any time, it
-//! goes on.
+//! is resumed.
 
-use std::collections::BTreeMap;
 use std::f32::consts::PI;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
+use std::path::PathBuf;
 
 use burn::tensor::Device;
-use sixfold_synth::augment::AugmentError;
-use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
+use sixfold_nn::choice::Choice;
 use sixfold_nn::lite0::imagenet_encoder;
-use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, NotReady, Trained, continued_from};
+use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
-use sixfold_nn::training_log::TrainingRecord;
-use sixfold_nn::weights::{ModelCard, WeightsError, training_frames};
-use sixfold_pix2pose::material::{Material, plain_backgrounds};
-use sixfold_pix2pose::samples::{SampleError, read_real_crops};
-use sixfold_synth::augment::AugmentError;
-use thiserror::Error;
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::weights::ModelCard;
+use sixfold_data::{TrainingSet, plain_backgrounds};
+use sixfold_pix2pose::samples::read_real_crops;
 
-use crate::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
+use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};
-use crate::samples::{SceneError, SceneOptions, SceneSource};
-use crate::training::{Ending, TrainingError, TrainingOptions, TrainingPace, last_checkpoint, train};
+use crate::samples::{SceneObject, SceneOptions, SceneSource};
+use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -35,22 +30,29 @@ pub enum DetectorKind {
     Retinanet,
 }
 
-impl DetectorKind {
-    /// All kinds.
-    pub const ALL: [DetectorKind; 2] = [DetectorKind::Compact, DetectorKind::Retinanet];
+impl Choice for DetectorKind {
+    const ALL: &'static [DetectorKind] = &[DetectorKind::Compact, DetectorKind::Retinanet];
 
-    /// As it is typed.
-    pub fn name(self) -> &'static str {
+    fn name(self) -> &'static str {
         match self {
             DetectorKind::Compact => "compact",
             DetectorKind::Retinanet => "retinanet",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            DetectorKind::Compact => "EfficientNet-Lite0 with a pyramid of three levels; trains on two cores",
+            DetectorKind::Retinanet => {
+                "ResNet-50 with RetinaNet's pyramid and heads, as in the dissertation; asks for a GPU or patience"
+            }
         }
     }
 }
 
 /// How a detector is trained.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Recipe {
+pub struct DetectorRecipe {
     /// Which network learns.
     pub network: DetectorKind,
     /// Steps in all.
@@ -89,198 +91,180 @@ pub struct Recipe {
     pub command: String,
 }
 
-impl Default for Recipe {
+impl Default for DetectorRecipe {
     fn default() -> Self {
-        Recipe {
+        let DetectorTrainingOptions { common, batch, encoder_share, frozen_stages } = Default::default();
+        let DetectorUse { longest_side, threshold } = DetectorUse::default();
+        let samples = SceneOptions::default();
+        DetectorRecipe {
             network: DetectorKind::Compact,
-            steps: 8000,
-            batch: 4,
-            learning_rate: 0.002,
-            encoder_share: 0.3,
-            frozen_stages: 2,
+            steps: common.steps,
+            batch,
+            learning_rate: common.learning_rate,
+            encoder_share,
+            frozen_stages,
             encoder: None,
-            size: 320,
-            photograph_share: 0.45,
-            render_share: 0.4,
-            rotation: 15f32.to_radians(),
+            size: samples.size,
+            photograph_share: samples.photograph_share,
+            render_share: samples.render_share,
+            rotation: samples.rotation,
             mesh_colors: true,
-            longest_side: 640,
-            threshold: 0.4,
+            longest_side,
+            threshold,
             init: None,
             backgrounds: None,
-            seed: 0,
+            seed: common.seed,
             command: String::new(),
         }
     }
 }
 
-/// Why no detector could be trained. What was trained until then is kept.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RecipeError {
-    /// An option out of its range, or nothing to export.
-    #[error(transparent)]
-    NotReady(#[from] NotReady),
-    /// Backgrounds.
-    #[error(transparent)]
-    Backgrounds(#[from] AugmentError),
-    /// Training images.
-    #[error(transparent)]
-    Scenes(#[from] SceneError),
-    /// Weights to begin with.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// Weights in torchvision's layout.
-    #[error(transparent)]
-    Pretrained(#[from] PretrainedError),
-    /// A model file.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The training itself.
-    #[error(transparent)]
-    Training(#[from] TrainingError),
-}
-
 /// Less complete instances are not cut out to be pasted elsewhere.
 const CUT_VISIBLE: f64 = 0.6;
 /// Instances in photographs count however little of them is visible.
-pub const LEAST_VISIBLE: f64 = 0.0;
+pub const MIN_VISIBILITY: f64 = 0.0;
 
-/// Everything that stands before the first step.
-struct Prepared {
-    network: Detector,
-    config: DetectorConfig,
-    options: TrainingOptions,
-    card: ModelCard,
+/// What is known beside the network before the first step.
+pub struct Context {
+    material: TrainingSet,
     classes: Vec<ClassEntry>,
-    usage: DetectorUse,
-    device: Device,
-    folder: PathBuf,
-    path: PathBuf,
 }
 
-impl Recipe {
-    /// Trains, or goes on with the training in `out`, and writes the model there. `stop` ends it after the current step.
-    ///
-    /// # Errors
-    /// [`RecipeError`].
-    pub fn train(
-        &self,
-        material: TrainingSet,
-        out: &Path,
-        stop: &AtomicBool,
-        hear: &mut Listener<'_>,
-    ) -> Result<Ending<Trained>, RecipeError> {
-        let Prepared { network, config, options, mut card, classes, usage, device, folder, path } =
-            self.prepare(&material, out)?;
-        let ids: Vec<u32> = classes.iter().map(|c| c.id).collect();
-        let scene_options = SceneOptions {
+impl DetectorRecipe {
+    /// How the network is trained.
+    pub fn options(&self) -> DetectorTrainingOptions {
+        DetectorTrainingOptions {
+            common: TrainingOptions {
+                steps: self.steps,
+                learning_rate: self.learning_rate,
+                seed: self.seed,
+                ..DetectorTrainingOptions::default().common
+            },
+            batch: self.batch,
+            encoder_share: self.encoder_share,
+            frozen_stages: self.frozen_stages,
+        }
+    }
+
+    fn scenes(&self) -> SceneOptions {
+        SceneOptions {
             size: self.size,
             photograph_share: self.photograph_share,
             render_share: self.render_share,
             rotation: self.rotation,
             random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
             ..SceneOptions::default()
-        };
-        let photographs = material.images.len();
-        hear(News::Note(&format!(
-            "making {} objects and {photographs} photographed instances ready",
-            ids.len()
-        )));
-        let complete = |image: &&PosedImage| image.visible_fraction().is_some_and(|f| f >= CUT_VISIBLE);
-        let cut: Vec<PosedImage> = material.images.iter().filter(complete).cloned().collect();
-        let (backgrounds, share) = plain_backgrounds(self.backgrounds.as_deref())?;
-        let backgrounds = backgrounds.with_procedural_share(share);
-        let source = SceneSource::new(material.objects, &material.images, &cut, backgrounds, scene_options)?;
-        let mut last = TrainingRecord::default();
-        let shown = |record: &TrainingRecord| {
-            hear(News::Steps(record, self.steps));
-            last = record.clone();
-        };
-        let pace = TrainingPace::default();
-        let ending = train(&source, network, &config, &device, &folder, &options, &pace, stop, shown)?;
-        let network = match ending {
-            Ending::Finished(network) => network,
-            Ending::Interrupted { step } => return Ok(Ending::Interrupted { step }),
-        };
-        card.steps = self.steps;
-        DetectorModel::new(network, config, classes, usage, card).save(&path)?;
-        let (seconds, losses) = (Some(last.seconds), last.losses);
-        Ok(Ending::Finished(Trained { model: path, steps: self.steps, seconds, losses }))
+        }
     }
 
-    /// Writes the model of the last checkpoint in `out`.
-    ///
-    /// # Errors
-    /// [`RecipeError`].
-    pub fn export(&self, material: &TrainingSet, out: &Path) -> Result<Trained, RecipeError> {
-        let p = self.prepare(material, out)?;
-        let Some((network, step)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
+    fn network(&self, ids: &[u32], device: &Device) -> Result<(Detector, DetectorConfig), TrainError> {
+        if let Some(file) = &self.init {
+            return DetectorModel::network_for_training(file, ids, device).map_err(TrainError::method);
+        }
+        let (config, encoder) = match self.network {
+            DetectorKind::Compact => {
+                (DetectorConfig::compact(ids.len()), Encoder::Lite0(imagenet_encoder(device)?))
+            }
+            DetectorKind::Retinanet => {
+                let encoder = match &self.encoder {
+                    Some(file) => {
+                        ResNet50Config::features(4).from_pytorch(file, device).map_err(TrainError::method)?
+                    }
+                    None => ResNet50Config::features(4).init(self.seed, device),
+                };
+                (DetectorConfig::retinanet(ids.len()), Encoder::ResNet50(encoder))
+            }
         };
-        let card = ModelCard { steps: step, ..p.card };
-        DetectorModel::new(network, p.config, p.classes, p.usage, card).save(&p.path)?;
-        Ok(Trained { model: p.path, steps: step, seconds: None, losses: BTreeMap::new() })
+        Ok((config.init_with(encoder, self.seed, device), config))
+    }
+}
+
+impl Recipe for DetectorRecipe {
+    type Data = TrainingSet;
+    type Samples = SceneSource;
+    type Training = DetectorTraining;
+    type Context = Context;
+    type Report = ();
+
+    fn steps(&self) -> u64 {
+        self.steps
     }
 
-    fn check(&self) -> Result<(), RecipeError> {
-        let wrong = |field, found: String, expected| Err(NotReady::option(field, found, expected).into());
-        if !(0.0..=1.0).contains(&self.threshold) {
-            return wrong("threshold", self.threshold.to_string(), "0 to 1");
-        }
-        if !(32..=16_384).contains(&self.longest_side) {
-            return wrong("longest_side", self.longest_side.to_string(), "32 to 16384 pixels");
-        }
-        if !(0.0..=PI).contains(&self.rotation) {
-            return wrong("rotation", self.rotation.to_string(), "radians from 0 to half a turn");
-        }
-        if self.encoder.is_some() && self.network == DetectorKind::Compact {
-            let expected = "network retinanet; the compact network brings its ImageNet encoder along";
-            return wrong("encoder", "one for the compact network".to_owned(), expected);
-        }
-        Ok(())
+    fn seed(&self) -> u64 {
+        self.seed
     }
 
-    fn prepare(&self, material: &TrainingSet, out: &Path) -> Result<Prepared, RecipeError> {
-        self.check()?;
+    fn command(&self) -> &str {
+        &self.command
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_fraction("threshold", self.threshold)?;
+        let side = (32..=16_384).contains(&self.longest_side);
+        OptionError::unless(side, "longest_side", self.longest_side, "32 to 16384 pixels")?;
+        let rotation = (0.0..=PI).contains(&self.rotation);
+        OptionError::unless(rotation, "rotation", self.rotation, "radians from 0 to half a turn")?;
+        let wrong = self.encoder.is_some() && self.network == DetectorKind::Compact;
+        let expected = "network retinanet; the compact network brings its ImageNet encoder along";
+        OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
+        self.options().check()
+    }
+
+    fn prepare(
+        &self,
+        material: TrainingSet,
+        _: &mut Session<'_>,
+    ) -> Result<Prepared<DetectorTraining, Context>, TrainError> {
+        self.scenes().check().map_err(TrainError::method)?;
         let ids: Vec<u32> = material.objects.iter().map(|o| o.id).collect();
         let device = Device::flex().autodiff();
-        let (network, config) = match (&self.init, self.network) {
-            (Some(file), _) => DetectorModel::network_for_training(file, &ids, &device)?,
-            (None, DetectorKind::Compact) => {
-                let config = DetectorConfig::compact(ids.len());
-                let encoder = Encoder::Lite0(imagenet_encoder(&device)?);
-                (config.init_with(encoder, self.seed, &device), config)
-            }
-            (None, DetectorKind::Retinanet) => {
-                let config = DetectorConfig::retinanet(ids.len());
-                let encoder = match &self.encoder {
-                    Some(file) => ResNet50Config::features(4).from_pytorch(file, &device)?,
-                    None => ResNet50Config::features(4).init(self.seed, &device),
-                };
-                (config.init_with(Encoder::ResNet50(encoder), self.seed, &device), config)
-            }
-        };
-        let options = TrainingOptions {
-            steps: self.steps,
-            batch: self.batch,
-            learning_rate: self.learning_rate,
-            encoder_share: self.encoder_share,
-            frozen_stages: self.frozen_stages,
-            seed: self.seed,
-            ..TrainingOptions::default()
-        };
+        let (network, config) = self.network(&ids, &device)?;
+        let options = self.options();
         let mut card = ModelCard::new("", &format!("Detector, {} network", self.network.name()));
         card.data.clone_from(&material.description);
-        card.training_frames = training_frames(self.init.as_deref(), &material.frames)?;
-        card.seed = self.seed;
-        card.command.clone_from(&self.command);
         card.extra = serde_json::json!({
             "training": options, "continued_from": continued_from(self.init.as_deref())?
         });
-        let usage = DetectorUse { longest_side: self.longest_side, threshold: self.threshold };
+        let training = DetectorTraining::new(network, config, self.size, options, device);
         let classes = ids.iter().map(|id| ClassEntry { id: *id }).collect();
-        let (folder, path) = (out.join("training"), out.join("model.safetensors"));
-        Ok(Prepared { network, config, options, card, classes, usage, device, folder, path })
+        Ok(Prepared { training, card, context: Context { material, classes } })
+    }
+
+    fn samples(
+        &self,
+        Context { material, classes }: &mut Context,
+        session: &mut Session<'_>,
+    ) -> Result<Option<SceneSource>, TrainError> {
+        let ids: Vec<u32> = classes.iter().map(|c| c.id).collect();
+        let photographs = material.real.len();
+        session.note(&format!("making {} objects and {photographs} photographed instances ready", ids.len()));
+        let cut = match &material.frames {
+            Some((dataset, frames)) => {
+                read_real_crops(dataset, frames, &ids, CUT_VISIBLE).map_err(TrainError::method)?
+            }
+            None => vec![],
+        };
+        let objects = std::mem::take(&mut material.objects)
+            .into_iter()
+            .map(|o| SceneObject { id: o.id, mesh: o.mesh, diameter: o.info.diameter })
+            .collect();
+        let (backgrounds, fraction) =
+            plain_backgrounds(self.backgrounds.as_deref()).map_err(TrainError::method)?;
+        let backgrounds = backgrounds.with_procedural_share(fraction);
+        SceneSource::new(objects, &material.real, &cut, backgrounds, self.scenes())
+            .map(Some)
+            .map_err(TrainError::method)
+    }
+
+    fn finish(
+        &self,
+        Prepared { training, card, context }: Prepared<DetectorTraining, Context>,
+        session: &mut Session<'_>,
+    ) -> Result<Option<()>, TrainError> {
+        let usage = DetectorUse { longest_side: self.longest_side, threshold: self.threshold };
+        let (network, config) = training.into_network();
+        let model = DetectorModel::new(network, config, context.classes, usage, card);
+        model.save(&session.model()).map_err(TrainError::method)?;
+        Ok(Some(()))
     }
 }

@@ -7,18 +7,13 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-
+use sixfold_synth::distractors::{random_solid, random_turn};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
+use sixfold_synth::augment::{AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape, procedural_texture};
 use sixfold_geometry::random::{Random, stream, uniform};
-use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
-use sixfold_mesh::{Mesh, simplify};
-use sixfold_pix2pose::samples::{PoseRange, RealCrop, SampleOptions, color_patch};
-use sixfold_synth::augment::{AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Random, Shape, procedural_texture, stream, uniform};
-use sixfold_synth::distractors::{random_solid, random_turn};
-use sixfold_synth::randomly_colored;
 use sixfold_data::{DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject, color_patch, default_distances, distances, image_color_augmentation, is_textured, randomly_colored};
-
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use crate::targets::{Annotation, IGNORED, Instance};
 
 /// Objects with fewer visible pixels in a training image are not learnt.

@@ -6,20 +6,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use sixfold_synth::augment::Backgrounds;
-use sixfold_data::TrainingObject;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneOptions, SceneSource};
-use sixfold_detect::training::{Ending, TrainingError, TrainingOptions, TrainingPace, train};
+use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::{Image, RgbImage, Vec3};
-use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_mesh::Mesh;
 use sixfold_nn::lite0::imagenet_encoder;
+use sixfold_nn::options::{Pace, TrainingOptions};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Outcome, fit};
 use sixfold_nn::weights::ModelCard;
-use sixfold_synth::augment::Backgrounds;
 
 /// A pyramid or a flat box of one colour.
-fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {
+fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {
     let (vertices, faces): (Vec<[f64; 3]>, Vec<[u32; 3]>) = if pyramid {
         let corners = [[-0.05, -0.05, 0.0], [0.05, -0.05, 0.0], [0.05, 0.05, 0.0], [-0.05, 0.05, 0.0]];
         let tip = [[0.0, 0.0, 0.09]];
@@ -36,9 +37,7 @@ fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {
     };
     let colors = vec![color; vertices.len()];
     let mesh = Mesh::new(vertices.into_iter().map(Vec3::from).collect(), faces).unwrap();
-    let mesh = mesh.with_colors(colors).unwrap();
-    let info = ModelInfo { diameter: 0.14, ..ModelInfo::of_mesh(&mesh) };
-    TrainingObject::new(id, mesh, info)
+    SceneObject { id, mesh: mesh.with_colors(colors).unwrap(), diameter: 0.14 }
 }
 
 fn source(size: usize) -> SceneSource {
@@ -57,56 +56,56 @@ fn source(size: usize) -> SceneSource {
 fn run(
     folder: &Path,
     size: usize,
-    options: &TrainingOptions,
+    options: &DetectorTrainingOptions,
     stop_at: Option<u64>,
-) -> Result<Option<std::path::PathBuf>, TrainingError> {
+) -> Result<Option<std::path::PathBuf>, TrainError> {
     let device = Device::flex().autodiff();
     let config = DetectorConfig::compact(2);
     let network = config.init_with(Encoder::Lite0(imagenet_encoder(&device).unwrap()), 5, &device);
     let stop = AtomicBool::new(false);
-    let pace = TrainingPace { log_every: 1, checkpoint_every: 3, sample_threads: 2 };
-    let ending = train(
-        &source(size),
-        network,
-        &config,
-        &device,
-        &folder.join("training"),
-        options,
-        &pace,
-        &stop,
-        |record| stop.store(stop_at == Some(record.step), Ordering::Relaxed),
-    )?;
-    Ok(match ending {
-        Ending::Finished(network) => {
+    let mut training = DetectorTraining::new(network, config, size, options.clone(), device);
+    training.pace = Pace { log_every: 1, checkpoint_every: 3, sample_threads: 2 };
+    let outcome = fit(&mut training, &source(size), &folder.join("training"), &stop, |record| {
+        stop.store(stop_at == Some(record.step), Ordering::Relaxed);
+    })?;
+    Ok(match outcome {
+        Outcome::Finished(()) => {
+            let (network, config) = training.into_network();
             let path = folder.join("model.safetensors");
             let classes = vec![ClassEntry { id: 3 }, ClassEntry { id: 8 }];
             let card = ModelCard::new("", "test");
             DetectorModel::new(network, config, classes, DetectorUse::default(), card).save(&path).unwrap();
             Some(path)
         }
-        Ending::Interrupted { step } => {
+        Outcome::Interrupted { step } => {
             assert_eq!(Some(step), stop_at);
             None
         }
     })
 }
 
+fn short(steps: u64, warm_up: u64) -> DetectorTrainingOptions {
+    let default = DetectorTrainingOptions::default();
+    DetectorTrainingOptions { common: TrainingOptions { steps, warm_up, ..default.common }, ..default }
+}
+
 #[test]
 fn interrupted_and_resumed_it_ends_with_the_same_bytes() {
-    let options = TrainingOptions { steps: 4, batch: 3, warm_up: 1, ..TrainingOptions::default() };
+    let options = DetectorTrainingOptions { batch: 3, ..short(4, 1) };
     let folder = tempfile::tempdir().unwrap();
     let bytes = |path: Option<std::path::PathBuf>| std::fs::read(path.unwrap()).unwrap();
     let straight = bytes(run(&folder.path().join("a"), 64, &options, None).unwrap());
     assert!(run(&folder.path().join("b"), 64, &options, Some(2)).unwrap().is_none());
     assert!(straight == bytes(run(&folder.path().join("b"), 64, &options, None).unwrap()));
-    let other = TrainingOptions { learning_rate: 0.1, ..options };
+    let common = TrainingOptions { learning_rate: 0.1, ..options.common.clone() };
+    let other = DetectorTrainingOptions { common, ..options };
     let error = run(&folder.path().join("b"), 64, &other, None).unwrap_err().to_string();
     assert!(error.contains("learning_rate was 0.002, is 0.1"), "{error}");
 }
 
 #[test]
 fn it_learns_two_objects() {
-    let options = TrainingOptions { steps: 280, warm_up: 20, ..TrainingOptions::default() };
+    let options = short(280, 20);
     let folder = tempfile::tempdir().unwrap();
     let path = run(folder.path(), 128, &options, None).unwrap().unwrap();
     let model = DetectorModel::load(&path).unwrap();
@@ -172,9 +171,9 @@ fn samples_are_a_function_of_their_number() {
     }
     assert!(a.sample(4, 0) != a.sample(5, 0));
     // Without a mesh to render and a photograph there is nothing to see.
-    let bare = object(3, true, [0; 3]);
+    let bare = SceneObject { mesh: object(3, true, [0; 3]).mesh, ..object(3, true, [0; 3]) };
     let plain = Mesh::new(bare.mesh.vertices().to_vec(), bare.mesh.faces().to_vec()).unwrap();
-    let grey = TrainingObject { mesh: plain, ..bare };
+    let grey = SceneObject { mesh: plain, ..bare };
     let options = SceneOptions { size: 64, ..SceneOptions::default() };
     let error =
         SceneSource::new(vec![grey], &[], &[], Backgrounds::procedural(), options.clone()).unwrap_err();

@@ -1,107 +1,102 @@
 //! The training of DGCM-Net: pairs through the network, the losses of equations 6.2 to 6.4, AdamW.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
-
-use burn::grad_clipping::GradientClippingConfig;
-use burn::module::Module;
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use sixfold_nn::schedule::LearningRate;
-use sixfold_nn::training::{Course, Trainee, run};
-pub use sixfold_nn::training::{Ending, TrainingError};
-use sixfold_nn::training_log::TrainingRecord;
-use sixfold_synth::shapes::Family;
+use sixfold_nn::learner::{Checkpointed, Learner};
+use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
 use crate::networks::Network;
 use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
+use sixfold_synth::shapes::Family;
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct TrainingOptions {
-    /// Optimiser steps.
-    pub steps: u64,
+pub struct DgcmTrainingOptions {
+    /// Steps, learning rate, seed.
+    #[serde(flatten)]
+    pub common: TrainingOptions,
     /// Positive pairs in a step.
     pub pairs: usize,
     /// Negative pairs in a step.
     pub negatives: usize,
-    /// Highest learning rate; it falls to zero as a cosine.
-    pub learning_rate: f64,
-    /// Steps over which the rate rises at first.
-    pub warm_up: u64,
-    /// Decoupled weight decay.
-    pub weight_decay: f32,
     /// Weight of the coordinates in equation 6.4.
     pub lambda: f64,
     /// Weight of equation 6.2 for all pairs of views in a batch that show different families, beside the drawn pairs.
     pub cross_pairs: f64,
-    /// A tensor's gradient that is longer than this (Euclidean) is shortened to it.
-    pub longest_gradient: f32,
     /// How pairs are drawn.
     pub samples: PairOptions,
-    /// Seed of weights and pairs.
-    pub seed: u64,
 }
 
-impl Default for TrainingOptions {
+impl Default for DgcmTrainingOptions {
     fn default() -> Self {
-        TrainingOptions {
-            steps: 4000,
+        DgcmTrainingOptions {
+            common: TrainingOptions {
+                steps: 4000,
+                learning_rate: 5e-4,
+                warm_up: 200,
+                weight_decay: 1e-4,
+                max_grad_norm: Some(50.0),
+                seed: 0,
+            },
             pairs: 10,
             negatives: 3,
-            learning_rate: 5e-4,
-            warm_up: 200,
-            weight_decay: 1e-4,
             lambda: 300.0,
             cross_pairs: 1.0,
-            longest_gradient: 50.0,
             samples: PairOptions::default(),
-            seed: 0,
         }
     }
 }
 
-impl TrainingOptions {
+impl DgcmTrainingOptions {
     /// The dissertation's: 25 positive and 25 negative pairs, rate 0.0001, both losses alike. (It divides the rate by ten
     /// every 5 of 35 epochs; the cosine here ends at zero as well.)
     pub fn paper() -> Self {
-        TrainingOptions {
-            steps: 116_000,
+        let default = Self::default();
+        DgcmTrainingOptions {
+            common: TrainingOptions { steps: 116_000, learning_rate: 1e-4, ..default.common },
             pairs: 25,
-            learning_rate: 1e-4,
+            negatives: 25,
             lambda: 1.0,
             cross_pairs: 0.0,
-            ..Self::default()
+            ..default
         }
     }
-}
 
-/// What does not change the result.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TrainingPace {
-    /// Steps between checkpoints.
-    pub checkpoint_every: u64,
-    /// Steps between records of the log.
-    pub log_every: u64,
-    /// Threads that make pairs beside the training itself.
-    pub sample_threads: usize,
-}
-
-impl Default for TrainingPace {
-    fn default() -> Self {
-        TrainingPace { checkpoint_every: 250, log_every: 25, sample_threads: 1 }
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.common.check()?;
+        OptionError::unless(self.pairs > 0, "pairs", self.pairs, "1 or more")?;
+        OptionError::unless_weight("lambda", self.lambda)?;
+        OptionError::unless_weight("cross_pairs", self.cross_pairs)
     }
 }
 
-struct State<'a> {
-    network: Network,
-    optimiser: ModuleOptimizer,
-    options: &'a TrainingOptions,
-    device: &'a Device,
+/// A network in training.
+pub struct DgcmTraining {
+    learner: Learner<Network>,
+    options: DgcmTrainingOptions,
+    /// How often is logged and saved.
+    pub pace: Pace,
+    device: Device,
+}
+
+impl DgcmTraining {
+    /// Of a network whose tensors are on the autodiff `device`.
+    pub fn new(network: Network, options: DgcmTrainingOptions, device: Device) -> Self {
+        let learner = Learner::adam_w("network", network, &options.common);
+        DgcmTraining { learner, options, pace: Pace::default(), device }
+    }
+
+    /// The trained network.
+    pub fn into_network(self) -> Network {
+        self.learner.into_network()
+    }
 }
 
 /// Pairs as tensors' numbers: the positive ones first.
@@ -115,7 +110,7 @@ pub struct Batch {
     families: Vec<(Family, Family)>,
 }
 
-fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
+fn make_batch(pool: &Pool, options: &DgcmTrainingOptions, step: u64) -> Batch {
     let mut batch = Batch {
         input: vec![],
         experience: vec![],
@@ -127,7 +122,7 @@ fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
     for (positive, count) in [(true, options.pairs as u64), (false, options.negatives as u64)] {
         for number in 0..count {
             let number = 2 * (step * count + number) + u64::from(positive);
-            let pair: Pair = pool.pair(positive, &options.samples, options.seed, number);
+            let pair: Pair = pool.pair(positive, &options.samples, options.common.seed, number);
             batch.families.push(pair.families);
             batch.input.extend(pair.input);
             batch.experience.extend(pair.experience);
@@ -141,28 +136,59 @@ fn make_batch(pool: &Pool, options: &TrainingOptions, step: u64) -> Batch {
     batch
 }
 
-impl Trainee for State<'_> {
+impl Training for DgcmTraining {
+    type Samples = Pool;
     type Batch = Batch;
 
-    fn step(&mut self, batch: Batch, rate: f64) -> BTreeMap<String, f64> {
-        let (pairs, side) = (self.options.pairs, self.network.side());
+    fn plan(&self, pool: &Pool) -> Result<Plan, TrainError> {
+        let options = &self.options;
+        options.check()?;
+        let views = pool.views().len();
+        OptionError::unless(views >= 16, "views", views, "at least 16")?;
+        let (side, expected) = (pool.options().crop.side, self.learner.network().side());
+        let found = format!("views of {side}, network of {expected}");
+        let fits = side == expected;
+        OptionError::unless(fits, "crop.side", found, "the side of the network's input, pixels")?;
+        let settings = Settings {
+            training: options,
+            pool: pool.options(),
+            architecture: self.learner.network().architecture(),
+            margin: MARGIN,
+        };
+        Ok(Plan {
+            steps: options.common.steps,
+            schedule: options.common.schedule(),
+            samples_per_step: options.pairs + options.negatives,
+            pace: self.pace,
+            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
+        })
+    }
+
+    fn batches<'a>(&self, pool: &'a Pool) -> Batches<'a, Batch> {
+        let options = self.options.clone();
+        Box::new(move |step| make_batch(pool, &options, step))
+    }
+
+    fn step(&mut self, batch: Batch, rate: f64) -> Losses {
+        let network = self.learner.network();
+        let (pairs, side) = (self.options.pairs, network.side());
         let all = pairs + self.options.negatives;
         let tensor = |values: Vec<f32>, count: usize, channels: usize| {
-            Tensor::<4>::from_data(TensorData::new(values, [count, channels, side, side]), self.device)
+            Tensor::<4>::from_data(TensorData::new(values, [count, channels, side, side]), &self.device)
         };
-        let input = self.network.geometry(tensor(batch.input, all, 3));
-        let experience = self.network.geometry(tensor(batch.experience, all, 3));
+        let input = network.geometry(tensor(batch.input, all, 3));
+        let experience = network.geometry(tensor(batch.experience, all, 3));
         let (metric, near, far) = metric_loss(&input.feature, &experience.feature, pairs);
         let different: Vec<f32> = batch
             .families
             .iter()
             .flat_map(|a| batch.families.iter().map(|b| f32::from(u8::from(a.0 != b.1))))
             .collect();
-        let different = Tensor::from_data(TensorData::new(different, [all, all]), self.device);
+        let different = Tensor::from_data(TensorData::new(different, [all, all]), &self.device);
         let cross = cross_loss(&input.feature, &experience.feature, different);
-        let code = self.network.vd_noc(tensor(batch.vd_noc, pairs, 3));
+        let code = network.vd_noc(tensor(batch.vd_noc, pairs, 3));
         let features = experience.feature.narrow(0, 0, pairs);
-        let out = self.network.decode(&input.narrow(0, pairs), features, &code);
+        let out = network.decode(&input.narrow(0, pairs), features, &code);
         let (coordinates, error) =
             coordinate_loss(out, tensor(batch.target, pairs, 3), tensor(batch.mask, pairs, 1));
         let numbers = [&metric, &cross, &coordinates, &near, &far, &error].map(|t| {
@@ -170,9 +196,7 @@ impl Trainee for State<'_> {
             value.first().map_or(f64::NAN, |v| f64::from(*v))
         });
         let sum = metric + cross * self.options.cross_pairs + coordinates * self.options.lambda;
-        let gradients = sum.backward();
-        let gradients = GradientsParams::from_grads(gradients, &self.network);
-        self.network = self.optimiser.step(rate, self.network.clone(), gradients);
+        self.learner.descend(rate, sum);
         [
             "metric",
             "cross pairs",
@@ -187,130 +211,58 @@ impl Trainee for State<'_> {
         .collect()
     }
 
-    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        checkpoint.module("network", &self.network)?.optimiser("optimiser", &self.optimiser)
-    }
-
-    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
-        Ok(State {
-            network: checkpoint.module("network", self.network)?,
-            optimiser: checkpoint.optimiser("optimiser", self.optimiser)?,
-            ..self
-        })
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        vec![&mut self.learner]
     }
 }
 
 /// All that decides about the result.
 #[derive(Serialize)]
-struct Recorded<'a> {
+struct Settings<'a> {
     #[serde(flatten)]
-    training: &'a TrainingOptions,
+    training: &'a DgcmTrainingOptions,
     pool: &'a PoolOptions,
     architecture: &'static str,
     margin: f64,
-}
-
-/// Trains a network, whose tensors are on the autodiff `device`, on a pool of views.
-///
-/// Checkpoints, log and learning curves go to `folder`; a training that was interrupted there goes on, with the same result
-/// as one that was not. `stop` ends it after the current step.
-///
-/// # Errors
-/// [`TrainingError`]; the last checkpoints stay.
-#[allow(clippy::too_many_arguments)]
-pub fn train(
-    pool: &Pool,
-    network: Network,
-    device: &Device,
-    folder: &Path,
-    options: &TrainingOptions,
-    pace: &TrainingPace,
-    stop: &AtomicBool,
-    progress: impl FnMut(&TrainingRecord),
-) -> Result<Ending<Network>, TrainingError> {
-    let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
-    if options.steps == 0 || options.pairs == 0 {
-        return wrong("steps and pairs", "at least 1", format!("{} and {}", options.steps, options.pairs));
-    }
-    if pool.views().len() < 16 {
-        return wrong("views", "at least 16", pool.views().len().to_string());
-    }
-    if pool.options().crop.side != network.side() {
-        let found = format!("views of {}, network of {}", pool.options().crop.side, network.side());
-        return wrong("crop.side", "the side of the network's input, pixels", found);
-    }
-    if !(options.lambda >= 0.0 && options.lambda.is_finite()) {
-        return wrong("lambda", "a finite number, 0 or more", options.lambda.to_string());
-    }
-    let clip = GradientClippingConfig::Norm(options.longest_gradient);
-    let optimiser =
-        AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(Some(clip)).init();
-    let recorded = Recorded {
-        training: options,
-        pool: pool.options(),
-        architecture: network.architecture(),
-        margin: MARGIN,
-    };
-    let state = State { network, optimiser, options, device };
-    let course = Course {
-        steps: options.steps,
-        schedule: LearningRate::Cosine {
-            rate: options.learning_rate,
-            last: 0.0,
-            warm_up: options.warm_up.min(options.steps.saturating_sub(1)),
-            steps: options.steps,
-        },
-        samples_per_step: options.pairs + options.negatives,
-        log_every: pace.log_every,
-        checkpoint_every: pace.checkpoint_every,
-        sample_threads: pace.sample_threads,
-    };
-    let batches = |step| make_batch(pool, options, step);
-    Ok(run(state, batches, &course, &recorded, folder, stop, progress)?.map(|state| state.network.valid()))
-}
-
-/// The network of the last checkpoint in `folder`, filled into `network`, and the steps it has done; `None` if there is no
-/// checkpoint.
-///
-/// # Errors
-/// [`TrainingError::Checkpoint`].
-pub fn last_checkpoint(folder: &Path, network: Network) -> Result<Option<(Network, u64)>, TrainingError> {
-    let Some(checkpoint) = Checkpoint::latest(folder)? else { return Ok(None) };
-    Ok(Some((checkpoint.module("network", network)?.valid(), checkpoint.step())))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::networks::CompactConfig;
+    use sixfold_nn::training::{Outcome, fit};
+    use std::path::Path;
+    use std::sync::atomic::{AtomicBool, Ordering};
 
     #[test]
     fn it_learns_and_goes_on_where_it_stopped() {
         let pool = Pool::new(&PoolOptions { views: 64, ..PoolOptions::default() }, |_| ());
         let device = Device::flex().autodiff();
-        let options =
-            TrainingOptions { steps: 16, pairs: 2, negatives: 1, warm_up: 2, ..TrainingOptions::default() };
-        let pace = TrainingPace { checkpoint_every: 5, log_every: 4, sample_threads: 1 };
+        let default = DgcmTrainingOptions::default();
+        let common = TrainingOptions { steps: 16, warm_up: 2, ..default.common.clone() };
+        let options = DgcmTrainingOptions { common, pairs: 2, negatives: 1, ..default };
         let go = |folder: &Path, stop_at: Option<u64>| {
             let stop = AtomicBool::new(false);
             let network = Network::Compact(CompactConfig.init(3, &device));
+            let mut training = DgcmTraining::new(network, options.clone(), device.clone());
+            training.pace = Pace { checkpoint_every: 5, log_every: 4, sample_threads: 1 };
             let mut records = vec![];
-            let ending = train(&pool, network, &device, folder, &options, &pace, &stop, |r| {
-                stop.store(stop_at.is_some_and(|s| r.step >= s), std::sync::atomic::Ordering::Relaxed);
+            let outcome = fit(&mut training, &pool, folder, &stop, |r| {
+                stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
                 records.push(r.losses["metric"]);
             });
-            (ending.unwrap(), records)
+            (outcome.unwrap(), records, training.into_network())
         };
         let numbers = |n: &Network| -> Vec<f32> {
             let x = Tensor::<4>::ones([1, 3, 96, 96], &Device::flex()) * 0.5;
             n.geometry(x).feature.into_data().try_to_vec().unwrap()
         };
         let folder = tempfile::tempdir().unwrap();
-        let (Ending::Finished(straight), losses) = go(&folder.path().join("a"), None) else { panic!() };
+        let (Outcome::Finished(()), losses, straight) = go(&folder.path().join("a"), None) else { panic!() };
         assert!(losses.last() < losses.first(), "{losses:?}");
         let b = folder.path().join("b");
-        assert!(matches!(go(&b, Some(8)).0, Ending::Interrupted { step: 8 }));
-        let (Ending::Finished(resumed), _) = go(&b, None) else { panic!() };
+        assert!(matches!(go(&b, Some(8)).0, Outcome::Interrupted { step: 8 }));
+        let (Outcome::Finished(()), _, resumed) = go(&b, None) else { panic!() };
         assert_eq!(numbers(&straight), numbers(&resumed));
     }
 }

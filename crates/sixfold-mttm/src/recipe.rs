@@ -1,31 +1,29 @@
 //! A whole training: nothing but a seed in, a network for template matching out. Made-up objects fall on a table, depth cameras
-//! look at them, and the network learns to match regions with templates. Interrupted at any time, it goes on.
+//! look at them, and the network learns to match regions with templates. Interrupted at any time, it is resumed.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use burn::tensor::Device;
-use rand::RngExt;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use sixfold_geometry::random::stream;
-use sixfold_io::{ImageFileError, write_rgb};
-use sixfold_mesh::{Mesh, MeshError};
-use sixfold_nn::checkpoint::Checkpoint;
-use sixfold_nn::pretrained::PretrainedError;
-use sixfold_nn::recipe::{Listener, News, NotReady, Trained};
-use sixfold_nn::training_log::TrainingRecord;
+use sixfold_io::write_rgb;
+use sixfold_mesh::Mesh;
+use sixfold_nn::choice::Choice;
+use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
+use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
-use sixfold_simulation::{ConvexParts, PileOptions, SimulationError, drop_objects};
 use sixfold_synth::shapes::{Family, member, toy};
-use thiserror::Error;
+use sixfold_simulation::{ConvexParts, PileOptions, drop_objects};
 
-use crate::model::{ModelError, MttmModel};
+use crate::model::MttmModel;
 use crate::network::{CompactConfig, Network, PaperConfig};
 use crate::quality::{Quality, quality};
-use crate::samples::{Arrangement, Batch, Pool, PoolOptions, preview};
-use crate::training::{Ending, TrainingError, TrainingOptions, TrainingPace, last_checkpoint, train};
+use crate::samples::{Arrangement, Batch, BatchOptions, Pool, PoolOptions, preview};
+use crate::training::{MttmTraining, MttmTrainingOptions};
 
 /// Objects of a scene, fewest and most.
 const OBJECTS: (usize, usize) = (5, 12);
@@ -33,7 +31,7 @@ const OBJECTS: (usize, usize) = (5, 12);
 const TEST_SCENES: (usize, usize) = (12, 4);
 /// Objects of theirs: one for so many of the training's, at least so many.
 const TEST_OBJECTS: (usize, usize) = (4, 16);
-/// Scenes that are made between two looks at `stop`.
+/// Scenes that are made between two checks of `stop`.
 const AT_A_TIME: usize = 16;
 
 /// Which network learns.
@@ -46,31 +44,46 @@ pub enum MttmKind {
     Paper,
 }
 
-impl MttmKind {
-    /// All kinds.
-    pub const ALL: [MttmKind; 2] = [MttmKind::Compact, MttmKind::Paper];
+impl Choice for MttmKind {
+    const ALL: &'static [MttmKind] = &[MttmKind::Compact, MttmKind::Paper];
 
-    /// As it is typed.
-    pub fn name(self) -> &'static str {
+    fn name(self) -> &'static str {
         match self {
             MttmKind::Compact => "compact",
             MttmKind::Paper => "paper",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            MttmKind::Compact => "Plain convolutions on regions of 28x28 pixels; trains on two cores",
+            MttmKind::Paper => "The dissertation's sizes: ResNet-50; needs days on two cores",
+        }
+    }
+}
+
+impl MttmKind {
+    /// How it is trained unless something else is asked for.
+    pub fn options(self) -> MttmTrainingOptions {
+        match self {
+            MttmKind::Compact => MttmTrainingOptions::default(),
+            MttmKind::Paper => MttmTrainingOptions::paper(),
         }
     }
 }
 
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Recipe {
+pub struct MttmRecipe {
     /// Which network learns.
     pub network: MttmKind,
     /// ImageNet weights of ResNet-50 in torchvision's layout for [`MttmKind::Paper`]; random ones without.
     pub encoder: Option<PathBuf>,
-    /// Steps in all; `None`: 8000, the dissertation's network 100000.
+    /// Steps in all; `None`: the network's of [`MttmKind::options`], as for the next two.
     pub steps: Option<u64>,
-    /// Regions with an object in a step; `None`: 40, the dissertation's network 16.
+    /// Regions with an object in a step.
     pub anchors: Option<usize>,
-    /// Highest learning rate; `None`: 0.001, the dissertation's network 0.0001.
+    /// Highest learning rate.
     pub learning_rate: Option<f64>,
     /// Made-up objects: half of them household shapes, half of them toys.
     pub objects: usize,
@@ -82,9 +95,9 @@ pub struct Recipe {
     pub command: String,
 }
 
-impl Default for Recipe {
+impl Default for MttmRecipe {
     fn default() -> Self {
-        Recipe {
+        MttmRecipe {
             network: MttmKind::Compact,
             encoder: None,
             steps: None,
@@ -98,169 +111,65 @@ impl Default for Recipe {
     }
 }
 
-/// Why no network could be trained. What was trained until then is kept.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RecipeError {
-    /// An option out of its range, or nothing to export.
-    #[error(transparent)]
-    NotReady(#[from] NotReady),
-    /// Weights in torchvision's layout.
-    #[error("encoder: {0}")]
-    Pretrained(#[from] PretrainedError),
-    /// A made-up object.
-    #[error("a made-up object: {0}")]
-    Shape(#[from] MeshError),
-    /// A made-up object that cannot fall.
-    #[error("a made-up object: {0}")]
-    Simulation(#[from] SimulationError),
-    /// The picture of the first samples.
-    #[error(transparent)]
-    Picture(#[from] ImageFileError),
-    /// The model file.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The training itself.
-    #[error(transparent)]
-    Training(#[from] TrainingError),
-}
-
-/// Everything that stands before the first step.
-struct Prepared {
-    network: Network,
-    options: TrainingOptions,
-    pool: PoolOptions,
-    card: ModelCard,
-    device: Device,
-    folder: PathBuf,
-    path: PathBuf,
-}
-
-/// Hears how many of how many things are made.
+/// Reports how many of how many things are made.
 type Made<'a> = dyn FnMut(usize, usize) + Send + 'a;
 
-impl Recipe {
-    /// Trains, or goes on with the training in `out`, and writes the model there with how well it matches made-up objects that
-    /// it was not trained on. `stop` ends it after the current step.
-    ///
-    /// # Errors
-    /// [`RecipeError`].
-    pub fn train(
-        &self,
-        out: &Path,
-        stop: &AtomicBool,
-        hear: &mut Listener<'_>,
-    ) -> Result<Ending<(Trained, Quality)>, RecipeError> {
-        let Prepared { network, options, pool: pool_options, card, device, folder, path } =
-            self.prepare(out)?;
-        let made = &mut |done, all| hear(News::Preparing(done, all));
-        let Some(pool) = make_pool(self.objects, self.scenes, &pool_options, stop, made)? else {
-            let step = Checkpoint::latest(&folder).map_err(TrainingError::from)?.map_or(0, |c| c.step());
-            return Ok(Ending::Interrupted { step });
-        };
-        hear(News::Note(&format!("scenes: {} regions with an object", pool.with_object().len())));
-        let first = Batch::of_step(&pool, &options.batch, options.seed, 0);
-        write_rgb(&out.join("samples.png"), &preview(&first, pool_options.anchors.side, 10))?;
-        let mut last = TrainingRecord::default();
-        let shown = |record: &TrainingRecord| {
-            hear(News::Steps(record, options.steps));
-            last = record.clone();
-        };
-        let pace = TrainingPace::default();
-        let network = match train(&pool, network, &device, &folder, &options, &pace, stop, shown)? {
-            Ending::Finished(network) => network,
-            Ending::Interrupted { step } => return Ok(Ending::Interrupted { step }),
-        };
-        drop(pool);
-        let steps = options.steps;
-        let card = ModelCard { steps, ..card };
-        let measured = self.finish(network, &options, &pool_options, card, &path, stop, hear)?;
-        let Some(quality) = measured else { return Ok(Ending::Interrupted { step: steps }) };
-        let trained = Trained { model: path, steps, seconds: Some(last.seconds), losses: last.losses };
-        Ok(Ending::Finished((trained, quality)))
-    }
-
-    /// Writes the model of the last checkpoint in `out`, as [`Recipe::train`] does at the end.
-    ///
-    /// # Errors
-    /// [`RecipeError`].
-    pub fn export(
-        &self,
-        out: &Path,
-        stop: &AtomicBool,
-        hear: &mut Listener<'_>,
-    ) -> Result<Ending<(Trained, Quality)>, RecipeError> {
-        let p = self.prepare(out)?;
-        let Some((network, steps)) = last_checkpoint(&p.folder, p.network)? else {
-            return Err(NotReady::NoCheckpoint { folder: p.folder }.into());
-        };
-        let card = ModelCard { steps, ..p.card };
-        let measured = self.finish(network, &p.options, &p.pool, card, &p.path, stop, hear)?;
-        let Some(quality) = measured else { return Ok(Ending::Interrupted { step: steps }) };
-        let trained = Trained { model: p.path, steps, seconds: None, losses: BTreeMap::new() };
-        Ok(Ending::Finished((trained, quality)))
-    }
-
-    /// Writes the model and measures it on objects and scenes that the training never saw; `None` when asked to stop meanwhile.
-    #[allow(clippy::too_many_arguments)]
-    fn finish(
-        &self,
-        network: Network,
-        options: &TrainingOptions,
-        pool: &PoolOptions,
-        mut card: ModelCard,
-        path: &Path,
-        stop: &AtomicBool,
-        hear: &mut Listener<'_>,
-    ) -> Result<Option<Quality>, RecipeError> {
-        card.extra = serde_json::json!({ "training": options, "pool": pool });
-        // First without scores: nothing that was trained may be lost.
-        MttmModel::new(network.clone(), card.clone()).save(path)?;
-        let test = PoolOptions { seed: self.seed ^ 0x7e57, ..*pool };
-        let objects = (self.objects / TEST_OBJECTS.0).max(TEST_OBJECTS.1);
-        let scenes = (self.scenes / TEST_SCENES.0).max(TEST_SCENES.1);
-        let made = &mut |done, all| hear(News::Measuring(done, all));
-        let Some(test) = make_pool(objects, scenes, &test, stop, made)? else { return Ok(None) };
-        hear(News::Note(&format!("test scenes: {} regions with an object", test.with_object().len())));
-        let quality = quality(&network, &test);
-        card.extra = serde_json::json!({ "training": options, "pool": pool, "quality": quality });
-        MttmModel::new(network, card).save(path)?;
-        Ok(Some(quality))
-    }
-
-    fn prepare(&self, out: &Path) -> Result<Prepared, RecipeError> {
-        let wrong = |field, found: String, expected| Err(NotReady::option(field, found, expected).into());
-        if !(16..=100_000).contains(&self.objects) {
-            return wrong("objects", self.objects.to_string(), "16 to 100000");
-        }
-        if !(4..=1_000_000).contains(&self.scenes) {
-            return wrong("scenes", self.scenes.to_string(), "4 to 1000000");
-        }
-        if self.encoder.is_some() && self.network == MttmKind::Compact {
-            let expected = "network paper; the compact network starts from random weights";
-            return wrong("encoder", "one for the compact network".to_owned(), expected);
-        }
-        let device = Device::flex().autodiff();
-        let (network, default) = match self.network {
-            MttmKind::Compact => {
-                (Network::Compact(CompactConfig.init(self.seed, &device)), TrainingOptions::default())
-            }
-            MttmKind::Paper => {
-                let network = match &self.encoder {
-                    Some(file) => PaperConfig.from_imagenet(file, self.seed, &device)?,
-                    None => PaperConfig.init(self.seed, &device),
-                };
-                (Network::Paper(network), TrainingOptions::paper())
-            }
-        };
-        let mut batch = default.batch;
-        batch.anchors = self.anchors.unwrap_or(batch.anchors);
-        let options = TrainingOptions {
-            steps: self.steps.unwrap_or(default.steps),
-            learning_rate: self.learning_rate.unwrap_or(default.learning_rate),
-            seed: self.seed,
-            batch,
+impl MttmRecipe {
+    /// How the network is trained.
+    pub fn options(&self) -> MttmTrainingOptions {
+        let default = self.network.options();
+        MttmTrainingOptions {
+            common: TrainingOptions {
+                steps: self.steps.unwrap_or(default.common.steps),
+                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
+                seed: self.seed,
+                ..default.common
+            },
+            batch: BatchOptions { anchors: self.anchors.unwrap_or(default.batch.anchors), ..default.batch },
             ..default
+        }
+    }
+}
+
+impl Recipe for MttmRecipe {
+    type Data = ();
+    type Samples = Pool;
+    type Training = MttmTraining;
+    type Context = PoolOptions;
+    type Report = Quality;
+
+    fn steps(&self) -> u64 {
+        self.options().common.steps
+    }
+
+    fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    fn command(&self) -> &str {
+        &self.command
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        let objects = (16..=100_000).contains(&self.objects);
+        OptionError::unless(objects, "objects", self.objects, "16 to 100000")?;
+        let scenes = (4..=1_000_000).contains(&self.scenes);
+        OptionError::unless(scenes, "scenes", self.scenes, "4 to 1000000")?;
+        let wrong = self.encoder.is_some() && self.network == MttmKind::Compact;
+        let expected = "network paper; the compact network starts from random weights";
+        OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
+        self.options().check()
+    }
+
+    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<MttmTraining, PoolOptions>, TrainError> {
+        let device = Device::flex().autodiff();
+        let network = match (self.network, &self.encoder) {
+            (MttmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
+            (MttmKind::Paper, None) => Network::Paper(PaperConfig.init(self.seed, &device)),
+            (MttmKind::Paper, Some(file)) => {
+                let network = PaperConfig.from_imagenet(file, self.seed, &device);
+                Network::Paper(network.map_err(TrainError::about("encoder"))?)
+            }
         };
         let pool = PoolOptions { seed: self.seed, ..PoolOptions::for_side(network.side()) };
         let mut card =
@@ -270,10 +179,48 @@ impl Recipe {
              seen by {} simulated depth cameras; no scanned object and no photograph",
             self.scenes, self.objects, pool.views
         );
-        card.seed = self.seed;
-        card.command.clone_from(&self.command);
-        let (folder, path) = (out.join("training"), out.join("model.safetensors"));
-        Ok(Prepared { network, options, pool, card, device, folder, path })
+        let options = self.options();
+        card.extra = serde_json::json!({ "training": options, "pool": pool });
+        Ok(Prepared { training: MttmTraining::new(network, options, device), card, context: pool })
+    }
+
+    fn samples(
+        &self,
+        options: &mut PoolOptions,
+        session: &mut Session<'_>,
+    ) -> Result<Option<Pool>, TrainError> {
+        let events = &mut *session.events;
+        let made = &mut |done, all| events(TrainingEvent::Preparing(done, all));
+        let Some(pool) = make_pool(self.objects, self.scenes, options, session.stop, made)? else {
+            return Ok(None);
+        };
+        session.note(&format!("scenes: {} regions with an object", pool.with_object().len()));
+        let first = Batch::of_step(&pool, &self.options().batch, self.seed, 0);
+        write_rgb(&session.out.join("samples.png"), &preview(&first, options.anchors.side, 10))
+            .map_err(TrainError::method)?;
+        Ok(Some(pool))
+    }
+
+    /// Measures how well the model matches objects and scenes that the training never saw.
+    fn finish(
+        &self,
+        Prepared { training, mut card, context: pool }: Prepared<MttmTraining, PoolOptions>,
+        session: &mut Session<'_>,
+    ) -> Result<Option<Quality>, TrainError> {
+        let network = training.into_network();
+        let path = session.model();
+        MttmModel::new(network.clone(), card.clone()).save(&path).map_err(TrainError::method)?;
+        let test = PoolOptions { seed: self.seed ^ 0x7e57, ..pool };
+        let objects = (self.objects / TEST_OBJECTS.0).max(TEST_OBJECTS.1);
+        let scenes = (self.scenes / TEST_SCENES.0).max(TEST_SCENES.1);
+        let events = &mut *session.events;
+        let made = &mut |done, all| events(TrainingEvent::Measuring(done, all));
+        let Some(test) = make_pool(objects, scenes, &test, session.stop, made)? else { return Ok(None) };
+        session.note(&format!("test scenes: {} regions with an object", test.with_object().len()));
+        let quality = quality(&network, &test);
+        card.extra["quality"] = serde_json::to_value(&quality).map_err(TrainError::method)?;
+        MttmModel::new(network, card).save(&path).map_err(TrainError::method)?;
+        Ok(Some(quality))
     }
 }
 
@@ -284,22 +231,24 @@ fn make_pool(
     options: &PoolOptions,
     stop: &AtomicBool,
     made: &mut Made<'_>,
-) -> Result<Option<Pool>, RecipeError> {
+) -> Result<Option<Pool>, TrainError> {
     let objects: Vec<(Mesh, ConvexParts)> = (0..objects)
         .into_par_iter()
-        .map(|number| -> Result<_, RecipeError> {
-            let mut random = stream(options.seed, number as u64);
+        .map(|number| -> Result<_, TrainError> {
+            let mut random = ChaCha8Rng::seed_from_u64(options.seed);
+            random.set_stream(number as u64);
             let mesh = match number % 2 {
-                0 => member(Family::ALL[number / 2 % Family::ALL.len()], &mut random)?.mesh,
-                _ => toy(&mut random)?,
+                0 => member(Family::ALL[number / 2 % Family::ALL.len()], &mut random).map(|m| m.mesh),
+                _ => toy(&mut random),
             };
-            let hull = ConvexParts::of_convex(&mesh)?;
+            let mesh = mesh.map_err(TrainError::about("a made-up object"))?;
+            let hull = ConvexParts::of_convex(&mesh).map_err(TrainError::about("a made-up object"))?;
             Ok((mesh, hull))
         })
         .collect::<Result<_, _>>()?;
     let (meshes, hulls): (Vec<Mesh>, Vec<ConvexParts>) = objects.into_iter().unzip();
     let pile = PileOptions::default();
-    // In parts, so that progress is seen and an interruption heard.
+    // In parts, so that progress is shown and an interruption noticed.
     let mut arrangements: Vec<Arrangement> = vec![];
     for start in (0..scenes).step_by(AT_A_TIME) {
         if stop.load(Ordering::Relaxed) {
@@ -324,7 +273,8 @@ fn make_pool(
 
 /// Some of the objects, fallen.
 fn arrange(hulls: &[ConvexParts], pile: &PileOptions, seed: u64, scene: u64) -> Arrangement {
-    let mut random = stream(seed ^ 0x5ce7e, scene);
+    let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5ce7e);
+    random.set_stream(scene);
     let count = random.random_range(OBJECTS.0..=OBJECTS.1);
     let mut chosen: Vec<usize> = vec![];
     while chosen.len() < count {

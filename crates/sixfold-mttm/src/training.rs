@@ -1,19 +1,11 @@
 //! The training: regions and templates through the network, the losses of equations 5.3 to 5.6, AdamW.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
-
-use burn::grad_clipping::GradientClippingConfig;
-use burn::module::Module;
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use sixfold_nn::schedule::LearningRate;
-use sixfold_nn::training::{Course, Trainee, run};
-pub use sixfold_nn::training::{Ending, TrainingError};
-use sixfold_nn::training_log::TrainingRecord;
+use sixfold_nn::learner::{Checkpointed, Learner};
+use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
 use crate::loss::{GAMMA, column, cross_loss, distance_loss, mask_loss, pair_loss, triplet_loss};
 use crate::network::{MAP, Network, masked};
@@ -22,17 +14,10 @@ use crate::samples::{Batch, BatchOptions, Pool, PoolOptions};
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct TrainingOptions {
-    /// Optimiser steps.
-    pub steps: u64,
-    /// Highest learning rate; it falls to zero as a cosine.
-    pub learning_rate: f64,
-    /// Steps over which the rate rises at first.
-    pub warm_up: u64,
-    /// Decoupled weight decay.
-    pub weight_decay: f32,
-    /// A tensor's gradient that is longer than this (Euclidean) is shortened to it.
-    pub longest_gradient: f32,
+pub struct MttmTrainingOptions {
+    /// Steps, learning rate, seed.
+    #[serde(flatten)]
+    pub common: TrainingOptions,
     /// What is in a step.
     pub batch: BatchOptions,
     /// Weight of the positive templates of all other objects in the batch as negative ones (equation 5.3).
@@ -41,92 +26,129 @@ pub struct TrainingOptions {
     pub offset: f64,
     /// See `offset`.
     pub matching: f64,
-    /// Seed of weights and samples.
-    pub seed: u64,
 }
 
-impl Default for TrainingOptions {
+impl Default for MttmTrainingOptions {
     fn default() -> Self {
-        TrainingOptions {
-            steps: 8000,
-            learning_rate: 1e-3,
-            warm_up: 200,
-            weight_decay: 1e-4,
-            longest_gradient: 5.0,
+        MttmTrainingOptions {
+            common: TrainingOptions {
+                steps: 8000,
+                learning_rate: 1e-3,
+                warm_up: 200,
+                weight_decay: 1e-4,
+                max_grad_norm: Some(5.0),
+                seed: 0,
+            },
             batch: BatchOptions::default(),
             cross: 1.0,
             offset: 4.0,
             matching: 0.5,
-            seed: 0,
         }
     }
 }
 
-impl TrainingOptions {
+impl MttmTrainingOptions {
     /// The dissertation's losses alone (equation 5.6), and about 25 epochs of 20,000 scenes.
     pub fn paper() -> Self {
-        TrainingOptions {
-            steps: 100_000,
-            learning_rate: 1e-4,
+        MttmTrainingOptions {
+            common: TrainingOptions { steps: 100_000, learning_rate: 1e-4, ..Self::default().common },
             batch: BatchOptions { anchors: 16, without_object: 0, ..BatchOptions::default() },
             cross: 0.0,
             offset: 0.0,
             matching: 0.0,
-            ..Self::default()
         }
     }
-}
 
-/// What does not change the result.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TrainingPace {
-    /// Steps between checkpoints.
-    pub checkpoint_every: u64,
-    /// Steps between records of the log.
-    pub log_every: u64,
-    /// Threads that make batches beside the training itself.
-    pub sample_threads: usize,
-}
-
-impl Default for TrainingPace {
-    fn default() -> Self {
-        TrainingPace { checkpoint_every: 250, log_every: 25, sample_threads: 1 }
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.common.check()?;
+        OptionError::unless(self.batch.anchors >= 2, "anchors", self.batch.anchors, "2 or more")?;
+        OptionError::unless_weight("cross", self.cross)?;
+        OptionError::unless_weight("offset", self.offset)?;
+        OptionError::unless_weight("matching", self.matching)
     }
 }
 
-struct State<'a> {
-    network: Network,
-    optimiser: ModuleOptimizer,
-    options: &'a TrainingOptions,
-    device: &'a Device,
+/// A network in training.
+pub struct MttmTraining {
+    learner: Learner<Network>,
+    options: MttmTrainingOptions,
+    /// How often is logged and saved.
+    pub pace: Pace,
+    device: Device,
 }
 
-impl State<'_> {
+impl MttmTraining {
+    /// Of a network whose tensors are on the autodiff `device`.
+    pub fn new(network: Network, options: MttmTrainingOptions, device: Device) -> Self {
+        let learner = Learner::adam_w("network", network, &options.common);
+        MttmTraining { learner, options, pace: Pace::default(), device }
+    }
+
+    /// The trained network.
+    pub fn into_network(self) -> Network {
+        self.learner.into_network()
+    }
+
     fn patches(&self, values: Vec<f32>) -> Tensor<4> {
-        let side = self.network.side();
+        let side = self.learner.network().side();
         let count = values.len() / (PLANES * side * side);
-        Tensor::from_data(TensorData::new(values, [count, PLANES, side, side]), self.device)
+        Tensor::from_data(TensorData::new(values, [count, PLANES, side, side]), &self.device)
     }
 
     fn cells(&self, values: Vec<f32>) -> Tensor<4> {
         let count = values.len() / (MAP * MAP);
-        Tensor::from_data(TensorData::new(values, [count, 1, MAP, MAP]), self.device)
+        Tensor::from_data(TensorData::new(values, [count, 1, MAP, MAP]), &self.device)
     }
 
     fn rows(&self, values: Vec<f32>, length: usize) -> Tensor<2> {
         let count = values.len() / length;
-        Tensor::from_data(TensorData::new(values, [count, length]), self.device)
+        Tensor::from_data(TensorData::new(values, [count, length]), &self.device)
     }
 }
 
-impl Trainee for State<'_> {
+impl Training for MttmTraining {
+    type Samples = Pool;
     type Batch = Batch;
 
-    fn step(&mut self, batch: Batch, rate: f64) -> BTreeMap<String, f64> {
-        let options = self.options;
+    fn plan(&self, pool: &Pool) -> Result<Plan, TrainError> {
+        let options = &self.options;
+        options.check()?;
+        let regions = pool.with_object().len();
+        OptionError::unless(regions >= 8, "regions", regions, "at least 8 with an object")?;
+        let (side, expected) = (pool.options().anchors.side, self.learner.network().side());
+        let found = format!("regions of {side}, network of {expected}");
+        let fits = side == expected;
+        OptionError::unless(fits, "anchors.side", found, "the side of the network's input, pixels")?;
+        let settings = Settings {
+            training: options,
+            pool: pool.options(),
+            anchors: regions,
+            architecture: self.learner.network().architecture(),
+            gamma: GAMMA,
+        };
+        Ok(Plan {
+            steps: options.common.steps,
+            schedule: options.common.schedule(),
+            samples_per_step: options.batch.anchors,
+            pace: self.pace,
+            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
+        })
+    }
+
+    fn batches<'a>(&self, pool: &'a Pool) -> Batches<'a, Batch> {
+        let (options, seed) = (self.options.batch, self.options.common.seed);
+        Box::new(move |step| Batch::of_step(pool, &options, seed, step))
+    }
+
+    fn step(&mut self, batch: Batch, rate: f64) -> Losses {
+        let options = &self.options;
         let count = batch.objects.len();
         let others = options.batch.without_object;
-        let network = &self.network;
+        let network = self.learner.network();
 
         // Everything goes through the first part of the network at once.
         let values = [batch.regions, batch.positives, batch.negatives].concat();
@@ -144,8 +166,8 @@ impl Trainee for State<'_> {
         let rows = |k: usize| descriptors.clone().narrow(0, k * count, count);
         let (positive, negative) = (rows(2), rows(3));
         let counts: Vec<f32> = batch.distances.iter().map(|d| f32::from(u8::from(*d > 0.0))).collect();
-        let margins = column(batch.distances.iter().map(|d| 2.0 * d).collect(), self.device);
-        let counts = column(counts, self.device);
+        let margins = column(batch.distances.iter().map(|d| 2.0 * d).collect(), &self.device);
+        let counts = column(counts, &self.device);
         let different: Vec<f32> = batch
             .objects
             .iter()
@@ -182,7 +204,7 @@ impl Trainee for State<'_> {
         let mask = mask_loss(compared.mask.narrow(0, 0, count), region_masks);
         let rotation = distance_loss(compared.rotation.narrow(0, 0, count), self.rows(batch.rotations, 4));
         let offset = distance_loss(compared.offset.narrow(0, 0, count), self.rows(batch.offsets, 3));
-        let matching = mask_loss(compared.matching, column(truth, self.device));
+        let matching = mask_loss(compared.matching, column(truth, &self.device));
 
         let numbers = [&triplet, &cross, &pair, &mask, &rotation, &offset, &matching].map(|t| {
             let value: Vec<f32> = t.clone().inner().into_data().try_to_vec().unwrap_or_default();
@@ -195,8 +217,7 @@ impl Trainee for State<'_> {
             + rotation
             + offset * options.offset
             + matching * options.matching;
-        let gradients = GradientsParams::from_grads(sum.backward(), &self.network);
-        self.network = self.optimiser.step(rate, self.network.clone(), gradients);
+        self.learner.descend(rate, sum);
         ["triplet", "other objects", "pair", "mask", "rotation", "offset", "matching"]
             .into_iter()
             .map(str::to_owned)
@@ -204,103 +225,20 @@ impl Trainee for State<'_> {
             .collect()
     }
 
-    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        checkpoint.module("network", &self.network)?.optimiser("optimiser", &self.optimiser)
-    }
-
-    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
-        Ok(State {
-            network: checkpoint.module("network", self.network)?,
-            optimiser: checkpoint.optimiser("optimiser", self.optimiser)?,
-            ..self
-        })
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        vec![&mut self.learner]
     }
 }
 
 /// All that decides about the result.
 #[derive(Serialize)]
-struct Recorded<'a> {
+struct Settings<'a> {
     #[serde(flatten)]
-    training: &'a TrainingOptions,
+    training: &'a MttmTrainingOptions,
     pool: &'a PoolOptions,
     anchors: usize,
     architecture: &'static str,
     gamma: f64,
-}
-
-/// Trains a network, whose tensors are on the autodiff `device`, on a pool of regions.
-///
-/// Checkpoints, log and learning curves go to `folder`; a training that was interrupted there goes on, with the same result
-/// as one that was not. `stop` ends it after the current step.
-///
-/// # Errors
-/// [`TrainingError`]; the last checkpoints stay.
-#[allow(clippy::too_many_arguments)]
-pub fn train(
-    pool: &Pool,
-    network: Network,
-    device: &Device,
-    folder: &Path,
-    options: &TrainingOptions,
-    pace: &TrainingPace,
-    stop: &AtomicBool,
-    progress: impl FnMut(&TrainingRecord),
-) -> Result<Ending<Network>, TrainingError> {
-    let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
-    if options.steps == 0 || options.batch.anchors < 2 {
-        let found = format!("{} and {}", options.steps, options.batch.anchors);
-        return wrong("steps and batch.anchors", "at least 1 and 2", found);
-    }
-    if pool.with_object().len() < 8 {
-        return wrong("regions", "at least 8 with an object", pool.with_object().len().to_string());
-    }
-    if pool.options().anchors.side != network.side() {
-        let found = format!("regions of {}, network of {}", pool.options().anchors.side, network.side());
-        return wrong("anchors.side", "the side of the network's input, pixels", found);
-    }
-    for (field, weight) in
-        [("cross", options.cross), ("offset", options.offset), ("matching", options.matching)]
-    {
-        if !(weight >= 0.0 && weight.is_finite()) {
-            return wrong(field, "a finite number, 0 or more", weight.to_string());
-        }
-    }
-    let clip = GradientClippingConfig::Norm(options.longest_gradient);
-    let optimiser =
-        AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(Some(clip)).init();
-    let recorded = Recorded {
-        training: options,
-        pool: pool.options(),
-        anchors: pool.with_object().len(),
-        architecture: network.architecture(),
-        gamma: GAMMA,
-    };
-    let state = State { network, optimiser, options, device };
-    let course = Course {
-        steps: options.steps,
-        schedule: LearningRate::Cosine {
-            rate: options.learning_rate,
-            last: 0.0,
-            warm_up: options.warm_up.min(options.steps.saturating_sub(1)),
-            steps: options.steps,
-        },
-        samples_per_step: options.batch.anchors,
-        log_every: pace.log_every,
-        checkpoint_every: pace.checkpoint_every,
-        sample_threads: pace.sample_threads,
-    };
-    let batches = |step| Batch::of_step(pool, &options.batch, options.seed, step);
-    Ok(run(state, batches, &course, &recorded, folder, stop, progress)?.map(|state| state.network.valid()))
-}
-
-/// The network of the last checkpoint in `folder`, filled into `network`, and the steps it has done; `None` if there is no
-/// checkpoint.
-///
-/// # Errors
-/// [`TrainingError::Checkpoint`].
-pub fn last_checkpoint(folder: &Path, network: Network) -> Result<Option<(Network, u64)>, TrainingError> {
-    let Some(checkpoint) = Checkpoint::latest(folder)? else { return Ok(None) };
-    Ok(Some((checkpoint.module("network", network)?.valid(), checkpoint.step())))
 }
 
 #[cfg(test)]
@@ -313,7 +251,10 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::{Pose, Vec3};
     use sixfold_mesh::Mesh;
-    use sixfold_synth::shapes::{Family, member};
+    use sixfold_nn::training::{Outcome, fit};
+    use sixfold_shapes::{Family, member};
+    use std::path::Path;
+    use std::sync::atomic::{AtomicBool, Ordering};
 
     /// Household shapes side by side on a table.
     fn pool() -> Pool {
@@ -339,24 +280,27 @@ mod tests {
         assert!(!pool.without_object().is_empty());
         let device = Device::flex().autodiff();
         let batch = BatchOptions { anchors: 6, without_object: 2, ..BatchOptions::default() };
-        let options = TrainingOptions { steps: 24, warm_up: 2, batch, ..TrainingOptions::default() };
-        let pace = TrainingPace { checkpoint_every: 5, log_every: 4, sample_threads: 1 };
+        let default = MttmTrainingOptions::default();
+        let common = TrainingOptions { steps: 24, warm_up: 2, ..default.common.clone() };
+        let options = MttmTrainingOptions { common, batch, ..default };
         let go = |folder: &Path, stop_at: Option<u64>| {
             let stop = AtomicBool::new(false);
             let network = Network::Compact(CompactConfig.init(3, &device));
+            let mut training = MttmTraining::new(network, options.clone(), device.clone());
+            training.pace = Pace { checkpoint_every: 5, log_every: 4, sample_threads: 1 };
             let mut records = vec![];
-            let ending = train(&pool, network, &device, folder, &options, &pace, &stop, |r| {
-                stop.store(stop_at.is_some_and(|s| r.step >= s), std::sync::atomic::Ordering::Relaxed);
+            let outcome = fit(&mut training, &pool, folder, &stop, |r| {
+                stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
                 records.push(r.losses["mask"]);
             });
-            (ending.unwrap(), records)
+            (outcome.unwrap(), records, training.into_network())
         };
         let folder = tempfile::tempdir().unwrap();
-        let (Ending::Finished(straight), losses) = go(&folder.path().join("a"), None) else { panic!() };
+        let (Outcome::Finished(()), losses, straight) = go(&folder.path().join("a"), None) else { panic!() };
         assert!(losses.last() < losses.first(), "{losses:?}");
         let b = folder.path().join("b");
-        assert!(matches!(go(&b, Some(8)).0, Ending::Interrupted { step: 8 }));
-        let (Ending::Finished(resumed), _) = go(&b, None) else { panic!() };
+        assert!(matches!(go(&b, Some(8)).0, Outcome::Interrupted { step: 8 }));
+        let (Outcome::Finished(()), _, resumed) = go(&b, None) else { panic!() };
         assert_eq!(quality(&straight, &pool), quality(&resumed, &pool));
     }
 

@@ -1,11 +1,11 @@
-//! Checkpoints: everything a training needs to go on as if it had never stopped.
+//! Checkpoints: everything a training needs to resume as if it had never stopped.
 //!
 //! A folder holds the last two checkpoints, one file each (`step-000001000.checkpoint`). A file has named sections (networks
 //! in f32, optimiser states, the caller's own state as JSON) and a checksum, and is there whole or not at all. A trainer
 //! with several networks, such as a generator and a discriminator, gives each a name.
 //!
 //! The state of Burn's random numbers is not in it, because Burn does not hand it out: a training that draws random numbers
-//! on the device seeds it anew at every step from its own seed and the step.
+//! on the device seeds it again at every step from its own seed and the step.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -27,7 +27,7 @@ const ENDING: &str = ".checkpoint";
 /// Files kept in the folder.
 const KEPT: usize = 2;
 
-/// Why a checkpoint could not be written or a training could not go on from one.
+/// Why a checkpoint could not be written or a training not be resumed from one.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// A file or the folder could not be read.

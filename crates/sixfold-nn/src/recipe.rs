@@ -1,18 +1,22 @@
-//! What whole trainings (material in, a model file out) have in common: what they tell on their way, what they come to, and
-//! what a card says of where weights come from.
+//! Whole trainings, data in and a model file out: the one driver of all methods. It makes samples ready, resumes from the
+//! last checkpoint, trains, and has the method save its model and measure it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
-use thiserror::Error;
 
+use crate::checkpoint::Checkpoint;
+use crate::options::OptionError;
+use crate::train_error::TrainError;
+use crate::training::{Outcome, Training, fit, restore};
 use crate::training_log::TrainingRecord;
-use crate::weights::{WeightsError, read_card};
+use crate::weights::{ModelCard, WeightsError, read_card};
 
-/// What a training tells on its way.
+/// What a training reports while it runs.
 #[derive(Debug, Clone, Copy)]
-pub enum News<'a> {
+pub enum TrainingEvent<'a> {
     /// Something that the user should know, such as what begins now.
     Note(&'a str),
     /// Something that is probably wrong.
@@ -25,12 +29,125 @@ pub enum News<'a> {
     Measuring(usize, usize),
 }
 
-/// Who hears it; from any thread, one at a time.
-pub type Listener<'a> = dyn FnMut(News<'_>) + Send + 'a;
+/// Receives the events, from any thread, one at a time.
+pub type TrainingEvents<'a> = dyn FnMut(TrainingEvent<'_>) + Send + 'a;
+
+/// The caller's side of a training: where it is kept, when it is to stop, and who is shown how far it is.
+pub struct Session<'a> {
+    /// The folder that gets the model, and in `training` checkpoints, log and curves.
+    pub out: &'a Path,
+    /// Set to end the training after the current step.
+    pub stop: &'a AtomicBool,
+    /// Receives the events.
+    pub events: &'a mut TrainingEvents<'a>,
+}
+
+impl<'a> Session<'a> {
+    /// A training in `out`.
+    pub fn new(out: &'a Path, stop: &'a AtomicBool, events: &'a mut TrainingEvents<'a>) -> Self {
+        Session { out, stop, events }
+    }
+
+    /// The model file.
+    pub fn model(&self) -> PathBuf {
+        self.out.join("model.safetensors")
+    }
+
+    /// The folder of checkpoints, log and curves.
+    pub fn folder(&self) -> PathBuf {
+        self.out.join("training")
+    }
+
+    /// Whether the training is to stop.
+    pub fn is_stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Says something that the user should know.
+    pub fn note(&mut self, text: &str) {
+        (self.events)(TrainingEvent::Note(text));
+    }
+
+    /// Says something that is probably wrong.
+    pub fn warn(&mut self, text: &str) {
+        (self.events)(TrainingEvent::Warning(text));
+    }
+}
+
+/// How one method's model is trained: options with their defaults (`Default`), and what the method does for [`train`].
+pub trait Recipe: Default {
+    /// What is learnt from beside the options; `()` where everything is generated.
+    type Data;
+    /// What batches are made from.
+    type Samples;
+    /// Networks with their optimisers.
+    type Training: Training<Samples = Self::Samples>;
+    /// What else is known before the first step, for the samples and the model.
+    type Context;
+    /// What is measured of the trained model.
+    type Report;
+
+    /// Steps in all. With 0 the initial network is saved and measured as it is.
+    fn steps(&self) -> u64;
+
+    /// Seed of weights and samples.
+    fn seed(&self) -> u64;
+
+    /// What was asked for, for the model's card.
+    fn command(&self) -> &str;
+
+    /// Checks every option that can be checked without data.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first one that is out of its range.
+    fn check(&self) -> Result<(), OptionError>;
+
+    /// The initial network with its optimisers, and the card as far as it is known. Tells of wrong weights and data before
+    /// anything else begins.
+    ///
+    /// # Errors
+    /// [`TrainError`].
+    fn prepare(
+        &self,
+        data: Self::Data,
+        session: &mut Session<'_>,
+    ) -> Result<Prepared<Self::Training, Self::Context>, TrainError>;
+
+    /// Makes what batches are made from; `None` when asked to stop meanwhile.
+    ///
+    /// # Errors
+    /// [`TrainError`].
+    fn samples(
+        &self,
+        context: &mut Self::Context,
+        session: &mut Session<'_>,
+    ) -> Result<Option<Self::Samples>, TrainError>;
+
+    /// Saves the model in [`Session::model`], first as it is: nothing that was trained may be lost. Then measures it and saves
+    /// it with the result; `None` when asked to stop meanwhile.
+    ///
+    /// # Errors
+    /// [`TrainError`].
+    fn finish(
+        &self,
+        prepared: Prepared<Self::Training, Self::Context>,
+        session: &mut Session<'_>,
+    ) -> Result<Option<Self::Report>, TrainError>;
+}
+
+/// What stands before the first step, and with other weights after the last.
+pub struct Prepared<T, C> {
+    /// Networks with their optimisers.
+    pub training: T,
+    /// Says how the model came about.
+    pub card: ModelCard,
+    /// What else is known.
+    pub context: C,
+}
 
 /// What a training came to.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Trained {
+pub struct Trained<R = ()> {
     /// The model file.
     pub model: PathBuf,
     /// Steps in all.
@@ -39,35 +156,82 @@ pub struct Trained {
     pub seconds: Option<f64>,
     /// The last record's losses by name.
     pub losses: BTreeMap<String, f64>,
+    /// What was measured of the model.
+    pub report: R,
 }
 
-/// Why a training cannot begin, or its model not be exported.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[non_exhaustive]
-pub enum NotReady {
-    /// An option is out of its range.
-    #[error("{field}: found {found}, expected {expected}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it held.
-        found: String,
-        /// What it should hold.
-        expected: &'static str,
-    },
-    /// There is nothing to export.
-    #[error("{}: holds no checkpoint; train first", folder.display())]
-    NoCheckpoint {
-        /// The training's folder.
-        folder: PathBuf,
-    },
-}
-
-impl NotReady {
-    /// An option that is out of its range.
-    pub fn option(field: &'static str, found: impl ToString, expected: &'static str) -> NotReady {
-        NotReady::Option { field, found: found.to_string(), expected }
+/// Trains, or resumes the training in the session's folder, and writes the model there.
+///
+/// # Errors
+/// [`TrainError`]; the last checkpoints stay.
+pub fn train<R: Recipe>(
+    recipe: &R,
+    data: R::Data,
+    session: &mut Session<'_>,
+) -> Result<Outcome<Trained<R::Report>>, TrainError> {
+    recipe.check()?;
+    let mut prepared = recipe.prepare(data, session)?;
+    let steps = recipe.steps();
+    if steps == 0 {
+        return finish(recipe, prepared, None, session);
     }
+    let folder = session.folder();
+    let Some(samples) = recipe.samples(&mut prepared.context, session)? else {
+        return Ok(Outcome::Interrupted { step: Checkpoint::latest(&folder)?.map_or(0, |c| c.step()) });
+    };
+    let mut last = TrainingRecord::default();
+    let outcome = fit(&mut prepared.training, &samples, &folder, session.stop, |record| {
+        (session.events)(TrainingEvent::Steps(record, steps));
+        last = record.clone();
+    })?;
+    if let Outcome::Interrupted { step } = outcome {
+        return Ok(Outcome::Interrupted { step });
+    }
+    drop(samples);
+    describe(recipe, &mut prepared.card, steps);
+    finish(recipe, prepared, Some(last), session)
+}
+
+/// Writes the model of the last checkpoint in the session's folder, as [`train`] does at the end.
+///
+/// # Errors
+/// [`TrainError`]; [`TrainError::NoCheckpoint`] where nothing was trained yet.
+pub fn export<R: Recipe>(
+    recipe: &R,
+    data: R::Data,
+    session: &mut Session<'_>,
+) -> Result<Outcome<Trained<R::Report>>, TrainError> {
+    recipe.check()?;
+    let mut prepared = recipe.prepare(data, session)?;
+    let folder = session.folder();
+    let Some(checkpoint) = Checkpoint::latest(&folder)? else {
+        return Err(TrainError::NoCheckpoint { folder });
+    };
+    restore(&mut prepared.training, &checkpoint)?;
+    describe(recipe, &mut prepared.card, checkpoint.step());
+    finish(recipe, prepared, None, session)
+}
+
+fn describe(recipe: &impl Recipe, card: &mut ModelCard, steps: u64) {
+    card.steps = steps;
+    card.seed = recipe.seed();
+    recipe.command().clone_into(&mut card.command);
+}
+
+fn finish<R: Recipe>(
+    recipe: &R,
+    prepared: Prepared<R::Training, R::Context>,
+    last: Option<TrainingRecord>,
+    session: &mut Session<'_>,
+) -> Result<Outcome<Trained<R::Report>>, TrainError> {
+    let (model, steps) = (session.model(), prepared.card.steps);
+    std::fs::create_dir_all(session.out)
+        .map_err(|source| WeightsError::Write { file: model.clone(), source })?;
+    let Some(report) = recipe.finish(prepared, session)? else {
+        return Ok(Outcome::Interrupted { step: steps });
+    };
+    let (seconds, losses) = last.map_or((None, BTreeMap::new()), |r| (Some(r.seconds), r.losses));
+    Ok(Outcome::Finished(Trained { model, steps, seconds, losses, report }))
 }
 
 /// What a card says of the weights that a training began with: how they came about, and theirs in turn.
@@ -85,4 +249,154 @@ pub fn continued_from(init: Option<&Path>) -> Result<serde_json::Value, WeightsE
         "seed": card.seed,
         "continued_from": card.extra["continued_from"],
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint::{CheckpointError, CheckpointWriter};
+    use crate::learner::Checkpointed;
+    use crate::options::Pace;
+    use crate::schedule::LearningRate;
+    use crate::training::{Batches, Losses, Plan};
+    use crate::weights::ModelCard;
+
+    /// Sums its batches; the model file holds the sum.
+    struct Sum {
+        value: u64,
+        steps: u64,
+    }
+
+    impl Checkpointed for Sum {
+        fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
+            checkpoint.state("sum", &self.value)
+        }
+
+        fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+            self.value = checkpoint.state("sum")?;
+            Ok(())
+        }
+    }
+
+    impl Training for Sum {
+        type Samples = u64;
+        type Batch = u64;
+
+        fn plan(&self, _: &u64) -> Result<Plan, TrainError> {
+            Ok(Plan {
+                steps: self.steps,
+                schedule: LearningRate::Constant { rate: 1.0 },
+                samples_per_step: 1,
+                pace: Pace { log_every: 1, ..Pace::default() },
+                settings: serde_json::json!({ "steps": self.steps }),
+            })
+        }
+
+        fn batches<'a>(&self, offset: &'a u64) -> Batches<'a, u64> {
+            Box::new(move |step| step + offset)
+        }
+
+        fn step(&mut self, batch: u64, _: f64) -> Losses {
+            self.value += batch;
+            Losses::from([("sum".to_owned(), self.value as f64)])
+        }
+
+        fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+            vec![self]
+        }
+    }
+
+    #[derive(Default)]
+    struct SumRecipe {
+        steps: u64,
+    }
+
+    impl Recipe for SumRecipe {
+        type Data = u64;
+        type Samples = u64;
+        type Training = Sum;
+        type Context = u64;
+        type Report = String;
+
+        fn steps(&self) -> u64 {
+            self.steps
+        }
+
+        fn seed(&self) -> u64 {
+            7
+        }
+
+        fn command(&self) -> &str {
+            "sum"
+        }
+
+        fn check(&self) -> Result<(), OptionError> {
+            OptionError::unless(self.steps < 100, "steps", self.steps, "less than 100")
+        }
+
+        fn prepare(&self, data: u64, _: &mut Session<'_>) -> Result<Prepared<Sum, u64>, TrainError> {
+            let card = ModelCard::new("sum", "Sum");
+            Ok(Prepared { training: Sum { value: 0, steps: self.steps }, card, context: data })
+        }
+
+        fn samples(&self, data: &mut u64, session: &mut Session<'_>) -> Result<Option<u64>, TrainError> {
+            session.note("making samples");
+            Ok((!session.is_stopped()).then_some(*data))
+        }
+
+        fn finish(
+            &self,
+            Prepared { training, card, .. }: Prepared<Sum, u64>,
+            session: &mut Session<'_>,
+        ) -> Result<Option<String>, TrainError> {
+            std::fs::write(session.model(), training.value.to_string()).map_err(TrainError::method)?;
+            Ok(Some(format!("{} {} {}", card.command, card.seed, card.steps)))
+        }
+    }
+
+    #[test]
+    fn it_trains_resumes_exports_and_measures() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let stop = AtomicBool::new(false);
+        let mut seen = vec![];
+        let mut events = |event: TrainingEvent<'_>| {
+            if let TrainingEvent::Steps(record, steps) = event {
+                seen.push((record.step, steps));
+                stop.store(record.step == 2, Ordering::Relaxed);
+            }
+        };
+        let mut session = Session::new(&out, &stop, &mut events);
+        let recipe = SumRecipe { steps: 4 };
+        let error = export(&recipe, 10, &mut session).unwrap_err();
+        assert!(matches!(error, TrainError::NoCheckpoint { .. }), "{error}");
+        let interrupted = train(&recipe, 10, &mut session).unwrap();
+        assert!(matches!(interrupted, Outcome::Interrupted { step: 2 }));
+        assert!(!session.model().exists());
+        // Stopped before there are samples: nothing more is done.
+        assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Interrupted { step: 2 }));
+        let Outcome::Finished(exported) = export(&recipe, 10, &mut session).unwrap() else { panic!() };
+        assert_eq!((exported.steps, exported.seconds, exported.report.as_str()), (2, None, "sum 7 2"));
+        assert_eq!(std::fs::read_to_string(&exported.model).unwrap(), "21");
+        stop.store(false, Ordering::Relaxed);
+        let Outcome::Finished(trained) = train(&recipe, 10, &mut session).unwrap() else { panic!() };
+        assert_eq!((trained.steps, trained.report.as_str()), (4, "sum 7 4"));
+        assert!(trained.seconds.unwrap() > 0.0 && trained.losses["sum"] == 46.0);
+        assert_eq!(std::fs::read_to_string(&trained.model).unwrap(), "46");
+        assert_eq!(seen, [(1, 4), (2, 4), (3, 4), (4, 4)]);
+    }
+
+    #[test]
+    fn without_steps_what_there_is_is_measured_and_wrong_options_come_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let (stop, mut events) = (AtomicBool::new(false), |_: TrainingEvent<'_>| ());
+        let mut session = Session::new(folder.path(), &stop, &mut events);
+        let Outcome::Finished(measured) = train(&SumRecipe { steps: 0 }, 3, &mut session).unwrap() else {
+            panic!()
+        };
+        assert_eq!((measured.seconds, measured.report.as_str()), (None, " 0 0"));
+        assert!(!session.folder().exists());
+        let error = train(&SumRecipe { steps: 100 }, 3, &mut session).unwrap_err().to_string();
+        assert_eq!(error, "steps: found 100, expected less than 100");
+    }
 }

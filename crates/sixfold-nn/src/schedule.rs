@@ -4,6 +4,8 @@ use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
+use crate::options::OptionError;
+
 /// Learning rate as a function of the step. Steps count from 0.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
@@ -36,40 +38,33 @@ pub enum LearningRate {
     },
 }
 
-/// Why a [`LearningRate`] cannot be used.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("learning rate: {field} is {found}, expected {expected}")]
-pub struct LearningRateError {
-    /// Which number is wrong.
-    pub field: &'static str,
-    /// What it must be.
-    pub expected: &'static str,
-    /// What it is.
-    pub found: String,
-}
-
 impl LearningRate {
     /// Checks every number.
     ///
     /// # Errors
-    /// [`LearningRateError`] with the first field that is out of its range.
-    pub fn check(&self) -> Result<(), LearningRateError> {
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
         let positive = |field, value: f64| {
-            let expected = "a finite number above 0";
-            require(value.is_finite() && value > 0.0, field, expected, value)
+            let fits = value.is_finite() && value > 0.0;
+            OptionError::unless(fits, field, value, "a finite number above 0")
         };
         match self {
             LearningRate::Constant { rate } => positive("rate", *rate),
             LearningRate::StepDecay { rate, factor, at } => {
                 positive("rate", *rate)?;
-                require(*factor > 0.0 && *factor <= 1.0, "factor", "above 0 and at most 1", factor)?;
+                OptionError::unless(
+                    *factor > 0.0 && *factor <= 1.0,
+                    "factor",
+                    factor,
+                    "above 0 and at most 1",
+                )?;
                 let rising = at.windows(2).all(|w| w[0] < w[1]);
-                require(rising, "at", "steps in rising order", format!("{at:?}"))
+                OptionError::unless(rising, "at", format!("{at:?}"), "steps in rising order")
             }
             LearningRate::Cosine { rate, last, warm_up, steps } => {
                 positive("rate", *rate)?;
-                require(*last >= 0.0 && last <= rate, "last", "between 0 and rate", last)?;
-                require(warm_up < steps, "warm_up", "less than steps", warm_up)
+                OptionError::unless(*last >= 0.0 && last <= rate, "last", last, "between 0 and rate")?;
+                OptionError::unless(warm_up < steps, "warm_up", warm_up, "less than steps")
             }
         }
     }
@@ -91,15 +86,6 @@ impl LearningRate {
             }
         }
     }
-}
-
-fn require(
-    fits: bool,
-    field: &'static str,
-    expected: &'static str,
-    found: impl ToString,
-) -> Result<(), LearningRateError> {
-    if fits { Ok(()) } else { Err(LearningRateError { field, expected, found: found.to_string() }) }
 }
 
 #[cfg(test)]
@@ -130,7 +116,7 @@ mod tests {
     #[test]
     fn wrong_numbers_are_named() {
         let error = LearningRate::Constant { rate: -1.0 }.check().unwrap_err();
-        assert_eq!(error.to_string(), "learning rate: rate is -1, expected a finite number above 0");
+        assert_eq!(error.to_string(), "rate: found -1, expected a finite number above 0");
         let schedule = LearningRate::StepDecay { rate: 1.0, factor: 0.5, at: vec![20, 10] };
         assert_eq!(schedule.check().unwrap_err().field, "at");
         let schedule = LearningRate::Cosine { rate: 1.0, last: 0.0, warm_up: 5, steps: 5 };

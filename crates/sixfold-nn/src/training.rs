@@ -1,101 +1,71 @@
 //! The training loop whatever is trained: batches made by threads of their own, the learning rate, the log with its
-//! curves, checkpoints, and going on after an interruption with the same bits as without one.
+//! curves, checkpoints, and resuming after an interruption with the same bits as without one.
 
 use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use crate::schedule::{LearningRate, LearningRateError};
-use crate::training_log::{TrainingLog, TrainingLogError, TrainingRecord, draw_curves, read_training_log};
-use serde::Serialize;
+use crate::learner::Checkpointed;
+use crate::options::Pace;
+use crate::schedule::LearningRate;
+use crate::train_error::TrainError;
+use crate::training_log::{TrainingLog, TrainingRecord, draw_curves, read_training_log};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::Instant;
 
-/// Networks and optimisers in training.
-pub trait Trainee: Sized {
+/// Losses and scores of a step by name.
+pub type Losses = BTreeMap<String, f64>;
+
+/// Gives the batch of a step, the same for the same step on any thread.
+pub type Batches<'a, B> = Box<dyn Fn(u64) -> B + Sync + 'a>;
+
+/// What a method brings to the loop: networks with their optimisers, batches, and what a step does with one.
+pub trait Training {
+    /// What batches are made from.
+    type Samples;
     /// What a step learns from.
     type Batch: Send;
 
-    /// One step at a learning rate: losses by name.
-    fn step(&mut self, batch: Self::Batch, rate: f64) -> BTreeMap<String, f64>;
-
-    /// Adds networks and optimisers to a checkpoint.
+    /// How to train on `samples`.
     ///
     /// # Errors
-    /// [`CheckpointError`].
-    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError>;
+    /// [`TrainError::Option`] for options out of their range, and samples that do not fit the network.
+    fn plan(&self, samples: &Self::Samples) -> Result<Plan, TrainError>;
 
-    /// Takes networks and optimisers from a checkpoint.
-    ///
-    /// # Errors
-    /// [`CheckpointError`].
-    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError>;
+    /// The batches of all steps.
+    fn batches<'a>(&self, samples: &'a Self::Samples) -> Batches<'a, Self::Batch>;
+
+    /// One step at a learning rate.
+    fn step(&mut self, batch: Self::Batch, rate: f64) -> Losses;
+
+    /// What checkpoints hold.
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed>;
+
+    /// Called after `learners` were taken from a checkpoint, for what a checkpoint does not keep.
+    fn restored(&mut self) {}
+
+    /// Called before a checkpoint is written to `folder`.
+    fn before_checkpoint(&mut self, _folder: &Path) {}
 }
 
-/// How long and at what pace. Nothing here but `steps` and `schedule` changes the result.
+/// How long and at what pace. The result depends on `steps`, `schedule` and `settings` alone.
 #[derive(Debug, Clone)]
-pub struct Course {
+pub struct Plan {
     /// Steps in all.
     pub steps: u64,
     /// Learning rate of every step.
     pub schedule: LearningRate,
     /// Samples in a batch, for the speed in the log.
     pub samples_per_step: usize,
-    /// Steps between records of the log.
-    pub log_every: u64,
-    /// Steps between checkpoints.
-    pub checkpoint_every: u64,
-    /// Threads that make batches beside the training itself.
-    pub sample_threads: usize,
+    /// How often is logged and saved.
+    pub pace: Pace,
+    /// All that the result depends on, an object: a training with other settings is not resumed.
+    pub settings: serde_json::Value,
 }
 
-/// Why a training could not go on. What was trained until the last checkpoint is kept.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainingError {
-    /// An option is out of range.
-    #[error("training option {field}: expected {expected}, found {found}")]
-    Option {
-        /// Its name.
-        field: &'static str,
-        /// What it must be.
-        expected: &'static str,
-        /// What it is.
-        found: String,
-    },
-    /// The learning rate.
-    #[error(transparent)]
-    LearningRate(#[from] LearningRateError),
-    /// Reading or writing a checkpoint.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// Reading or writing the log.
-    #[error(transparent)]
-    Log(#[from] TrainingLogError),
-    /// The folder holds a training with other options.
-    #[error(
-        "{folder}: holds a training with other options ({difference}); go on with the same ones, or start anew in another folder"
-    )]
-    OtherTraining {
-        /// The folder.
-        folder: String,
-        /// Which option differs, and how.
-        difference: String,
-    },
-    /// The loss is no number any more.
-    #[error(
-        "step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})"
-    )]
-    NotFinite {
-        /// The step.
-        step: u64,
-        /// The learning rate.
-        rate: f64,
-    },
-}
-
-/// How a call of [`run`] ended.
+/// How a training ended.
 #[derive(Debug)]
-pub enum Ending<T> {
+pub enum Outcome<T> {
     /// All steps are done.
     Finished(T),
     /// It was asked to stop; a checkpoint of this step was written.
@@ -105,68 +75,47 @@ pub enum Ending<T> {
     },
 }
 
-impl<T> Ending<T> {
-    /// The same with another form of what was trained.
-    pub fn map<U>(self, change: impl FnOnce(T) -> U) -> Ending<U> {
-        match self {
-            Ending::Finished(trained) => Ending::Finished(change(trained)),
-            Ending::Interrupted { step } => Ending::Interrupted { step },
-        }
-    }
-}
-
-/// Trains in `folder`, which gets checkpoints, `log.jsonl` and `curves.png`; goes on where a training with the same
-/// `options` left off there. `make_batch` gives the batch of a step, the same for the same step on any thread. `options`
-/// (a structure of named fields) is what the result depends on. `stop` ends the training after the current step.
+/// Takes the learners of a training from a checkpoint.
 ///
 /// # Errors
-/// [`TrainingError`]; the last checkpoints stay.
-pub fn run<T: Trainee>(
-    mut trainee: T,
-    make_batch: impl Fn(u64) -> T::Batch + Sync,
-    course: &Course,
-    options: &impl Serialize,
+/// [`CheckpointError`] for a checkpoint of another network.
+pub fn restore<T: Training>(training: &mut T, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+    for learner in training.learners() {
+        learner.restore(checkpoint)?;
+    }
+    training.restored();
+    Ok(())
+}
+
+/// Trains on `samples` in `folder`, which gets checkpoints, `log.jsonl` and `curves.png`; resumes where a training with the
+/// same settings left off there, and ends with the same bits as one that was not interrupted. `stop` ends it after the
+/// current step.
+///
+/// # Errors
+/// [`TrainError`]; the last checkpoints stay.
+pub fn fit<T: Training>(
+    training: &mut T,
+    samples: &T::Samples,
     folder: &Path,
     stop: &AtomicBool,
     mut progress: impl FnMut(&TrainingRecord),
-) -> Result<Ending<T>, TrainingError> {
-    for (field, value) in [("log_every", course.log_every), ("checkpoint_every", course.checkpoint_every)] {
-        if value == 0 {
-            return Err(TrainingError::Option { field, expected: "at least 1", found: "0".to_string() });
-        }
-    }
-    course.schedule.check()?;
-    let asked = serde_json::to_value(options).unwrap_or_default();
-    let save = |trainee: &T, step: u64, seconds: f64| -> Result<(), TrainingError> {
-        let checkpoint = trainee.save(CheckpointWriter::new(step))?;
-        checkpoint.state("options", &asked)?.state("seconds", &seconds)?.write(folder)?;
-        Ok(())
-    };
-    let (mut step, mut before) = (0, 0.0);
-    if let Some(checkpoint) = Checkpoint::latest(folder)? {
-        let found: serde_json::Value = checkpoint.state("options")?;
-        if let Some(difference) = difference(&found, &asked) {
-            return Err(TrainingError::OtherTraining { folder: folder.display().to_string(), difference });
-        }
-        trainee = trainee.restore(&checkpoint)?;
-        before = checkpoint.state("seconds")?;
-        step = checkpoint.step();
-    } else {
-        save(&trainee, 0, 0.0)?;
-    }
-    let log_path = folder.join("log.jsonl");
-    let mut log = TrainingLog::open(&log_path, step)?;
-    let began = Instant::now();
-    let producers = course.sample_threads.max(1);
+) -> Result<Outcome<()>, TrainError> {
+    let plan = training.plan(samples)?;
+    plan.pace.check()?;
+    plan.schedule.check()?;
+    let make_batch = training.batches(samples);
+    let mut run = Run::start(training, plan, folder)?;
+    let (first, steps) = (run.step, run.plan.steps);
+    let producers = run.plan.pace.sample_threads.max(1);
     let quit = AtomicBool::new(false);
     std::thread::scope(|scope| {
         // Thread i makes the batches i, i + n, i + 2n, ...: which thread makes a batch does not change it.
         let batches: Vec<Receiver<T::Batch>> = (0..producers)
             .map(|producer| {
                 let (send, receive) = sync_channel(2);
-                let (first, quit, make_batch) = (step + producer as u64, &quit, &make_batch);
+                let (first, quit, make_batch) = (first + producer as u64, &quit, &make_batch);
                 scope.spawn(move || {
-                    for number in (first..course.steps).step_by(producers) {
+                    for number in (first..steps).step_by(producers) {
                         if quit.load(Ordering::Relaxed) || send.send(make_batch(number)).is_err() {
                             return;
                         }
@@ -175,60 +124,139 @@ pub fn run<T: Trainee>(
                 receive
             })
             .collect();
-        let outcome = (|| {
-            let first = step;
-            let mut sums: BTreeMap<String, f64> = BTreeMap::new();
-            let (mut since, mut counted) = (Instant::now(), 0);
-            while step < course.steps {
-                let Ok(batch) = batches[((step - first) % producers as u64) as usize].recv() else {
-                    // A thread of samples ended early: it panicked, and the scope will say so.
-                    return Ok(Ending::Interrupted { step });
-                };
-                let rate = course.schedule.at(step);
-                let losses = trainee.step(batch, rate);
-                if losses.values().any(|v| !v.is_finite()) {
-                    return Err(TrainingError::NotFinite { step, rate });
-                }
-                step += 1;
-                counted += 1;
-                for (name, value) in losses {
-                    *sums.entry(name).or_default() += value;
-                }
-                let last = step == course.steps;
-                if step % course.log_every == 0 || last {
-                    let record = TrainingRecord {
-                        step,
-                        seconds: before + began.elapsed().as_secs_f64(),
-                        learning_rate: rate,
-                        samples_per_second: (counted as usize * course.samples_per_step) as f64
-                            / since.elapsed().as_secs_f64(),
-                        losses: std::mem::take(&mut sums)
-                            .into_iter()
-                            .map(|(name, sum)| (name, sum / f64::from(counted)))
-                            .collect(),
-                    };
-                    (since, counted) = (Instant::now(), 0);
-                    log.append(&record)?;
-                    progress(&record);
-                }
-                let stopped = stop.load(Ordering::Relaxed);
-                if step % course.checkpoint_every == 0 || last || stopped {
-                    save(&trainee, step, before + began.elapsed().as_secs_f64())?;
-                    let records = read_training_log(&log_path)?;
-                    if !records.is_empty() {
-                        draw_curves(&records, &folder.join("curves.png"))?;
-                    }
-                }
-                if stopped && !last {
-                    return Ok(Ending::Interrupted { step });
-                }
-            }
-            Ok(Ending::Finished(trainee))
-        })();
+        let batch = |step: u64| batches[((step - first) % producers as u64) as usize].recv().ok();
+        let outcome = run.steps(training, batch, stop, &mut progress);
         quit.store(true, Ordering::Relaxed);
         drop(batches);
         outcome
     })
+}
+
+/// A training under way.
+struct Run<'a> {
+    plan: Plan,
+    folder: &'a Path,
+    log: TrainingLog,
+    /// Steps done.
+    step: u64,
+    /// Seconds until the last interruption.
+    before: f64,
+    started: Instant,
+}
+
+impl<'a> Run<'a> {
+    /// Restores the training from the last checkpoint in `folder`, or writes the first one.
+    fn start(training: &mut impl Training, plan: Plan, folder: &'a Path) -> Result<Self, TrainError> {
+        let (mut step, mut before) = (0, 0.0);
+        if let Some(checkpoint) = Checkpoint::latest(folder)? {
+            let found: serde_json::Value = checkpoint.state("options")?;
+            if let Some(difference) = difference(&found, &plan.settings) {
+                return Err(TrainError::OtherTraining { folder: folder.to_owned(), difference });
+            }
+            restore(training, &checkpoint)?;
+            before = checkpoint.state("seconds")?;
+            step = checkpoint.step();
+        } else {
+            save(training, &plan.settings, folder, (0, 0.0))?;
+        }
+        let log = TrainingLog::open(&folder.join("log.jsonl"), step)?;
+        Ok(Run { plan, folder, log, step, before, started: Instant::now() })
+    }
+
+    fn seconds(&self) -> f64 {
+        self.before + self.started.elapsed().as_secs_f64()
+    }
+
+    /// The steps that are left.
+    fn steps<T: Training>(
+        &mut self,
+        training: &mut T,
+        batch: impl Fn(u64) -> Option<T::Batch>,
+        stop: &AtomicBool,
+        progress: &mut impl FnMut(&TrainingRecord),
+    ) -> Result<Outcome<()>, TrainError> {
+        let pace = self.plan.pace;
+        let mut sums = Sums::new();
+        while self.step < self.plan.steps {
+            let Some(batch) = batch(self.step) else {
+                // A thread of samples ended early: it panicked, and the scope will say so.
+                return Ok(Outcome::Interrupted { step: self.step });
+            };
+            let rate = self.plan.schedule.at(self.step);
+            let losses = training.step(batch, rate);
+            if losses.values().any(|v| !v.is_finite()) {
+                return Err(TrainError::NotFinite { step: self.step, rate });
+            }
+            self.step += 1;
+            sums.add(losses);
+            let last = self.step == self.plan.steps;
+            if self.step.is_multiple_of(pace.log_every) || last {
+                let samples = std::mem::replace(&mut sums, Sums::new());
+                let record = samples.record(self.step, self.seconds(), rate, self.plan.samples_per_step);
+                self.log.append(&record)?;
+                progress(&record);
+            }
+            let stopped = stop.load(Ordering::Relaxed);
+            if self.step.is_multiple_of(pace.checkpoint_every) || last || stopped {
+                save(training, &self.plan.settings, self.folder, (self.step, self.seconds()))?;
+                let records = read_training_log(&self.folder.join("log.jsonl"))?;
+                if !records.is_empty() {
+                    draw_curves(&records, &self.folder.join("curves.png"))?;
+                }
+            }
+            if stopped && !last {
+                return Ok(Outcome::Interrupted { step: self.step });
+            }
+        }
+        Ok(Outcome::Finished(()))
+    }
+}
+
+/// Writes the checkpoint of a step, with the seconds until then.
+fn save(
+    training: &mut impl Training,
+    settings: &serde_json::Value,
+    folder: &Path,
+    (step, seconds): (u64, f64),
+) -> Result<(), TrainError> {
+    training.before_checkpoint(folder);
+    let checkpoint = CheckpointWriter::new(step).state("options", settings)?.state("seconds", &seconds)?;
+    let learners = training.learners();
+    let checkpoint = learners.iter().try_fold(checkpoint, |checkpoint, learner| learner.save(checkpoint))?;
+    checkpoint.write(folder)?;
+    Ok(())
+}
+
+/// Losses since the last record.
+struct Sums {
+    losses: Losses,
+    steps: u32,
+    since: Instant,
+}
+
+impl Sums {
+    fn new() -> Self {
+        Sums { losses: Losses::new(), steps: 0, since: Instant::now() }
+    }
+
+    fn add(&mut self, losses: Losses) {
+        self.steps += 1;
+        for (name, value) in losses {
+            *self.losses.entry(name).or_default() += value;
+        }
+    }
+
+    /// Their means.
+    fn record(self, step: u64, seconds: f64, learning_rate: f64, samples_per_step: usize) -> TrainingRecord {
+        let samples = self.steps as usize * samples_per_step;
+        TrainingRecord {
+            step,
+            seconds,
+            learning_rate,
+            samples_per_second: samples as f64 / self.since.elapsed().as_secs_f64(),
+            losses: self.losses.into_iter().map(|(n, sum)| (n, sum / f64::from(self.steps))).collect(),
+        }
+    }
 }
 
 /// The first field that differs, in words.
@@ -250,67 +278,86 @@ fn difference(found: &serde_json::Value, asked: &serde_json::Value) -> Option<St
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::{Value, json};
 
     /// A number that remembers its batches.
-    struct Sum(f64);
+    struct Sum {
+        value: f64,
+        sample_threads: usize,
+        log_every: u64,
+        settings: Value,
+    }
 
-    impl Trainee for Sum {
-        type Batch = u64;
-
-        fn step(&mut self, batch: u64, rate: f64) -> BTreeMap<String, f64> {
-            self.0 = 0.9 * self.0 + rate * batch as f64;
-            BTreeMap::from([("sum".to_string(), self.0)])
-        }
-
+    impl Checkpointed for Sum {
         fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-            checkpoint.state("sum", &self.0)
+            checkpoint.state("sum", &self.value)
         }
 
-        fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
-            Ok(Sum(checkpoint.state("sum")?))
+        fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+            self.value = checkpoint.state("sum")?;
+            Ok(())
         }
     }
 
-    fn course(sample_threads: usize) -> Course {
-        Course {
-            steps: 20,
-            schedule: LearningRate::Constant { rate: 0.5 },
-            samples_per_step: 1,
-            log_every: 3,
-            checkpoint_every: 4,
-            sample_threads,
+    impl Training for Sum {
+        type Samples = fn(u64) -> u64;
+        type Batch = u64;
+
+        fn plan(&self, _: &Self::Samples) -> Result<Plan, TrainError> {
+            Ok(Plan {
+                steps: 20,
+                schedule: LearningRate::Constant { rate: 0.5 },
+                samples_per_step: 1,
+                pace: Pace {
+                    log_every: self.log_every,
+                    checkpoint_every: 4,
+                    sample_threads: self.sample_threads,
+                },
+                settings: self.settings.clone(),
+            })
         }
+
+        fn batches<'a>(&self, samples: &'a Self::Samples) -> Batches<'a, u64> {
+            Box::new(samples)
+        }
+
+        fn step(&mut self, batch: u64, rate: f64) -> Losses {
+            self.value = 0.9 * self.value + rate * batch as f64;
+            BTreeMap::from([("sum".to_string(), self.value)])
+        }
+
+        fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+            vec![self]
+        }
+    }
+
+    fn sum(value: f64, sample_threads: usize) -> Sum {
+        Sum { value, sample_threads, log_every: 3, settings: json!({"seed": 1, "name": "a"}) }
     }
 
     #[test]
     fn stopped_and_taken_up_again_it_ends_the_same() {
-        let options = serde_json::json!({"seed": 1, "name": "a"});
         let go = |folder: &Path, threads: usize, stop_at: Option<u64>| {
             let stop = AtomicBool::new(false);
-            run(
-                Sum(0.0),
-                |n| n * n % 7,
-                &course(threads),
-                &options,
-                folder,
-                &stop,
-                |r| {
-                    stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
-                },
-            )
+            let mut sum = sum(0.0, threads);
+            let outcome = fit(&mut sum, &((|n| n * n % 7) as fn(u64) -> u64), folder, &stop, |r| {
+                stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
+            });
+            (outcome.unwrap(), sum.value)
         };
         let folder = tempfile::tempdir().unwrap();
-        let Ending::Finished(straight) = go(&folder.path().join("a"), 1, None).unwrap() else { panic!() };
+        let (Outcome::Finished(()), straight) = go(&folder.path().join("a"), 1, None) else { panic!() };
         let b = folder.path().join("b");
-        assert!(matches!(go(&b, 2, Some(6)).unwrap(), Ending::Interrupted { step: 6 }));
-        let Ending::Finished(resumed) = go(&b, 3, None).unwrap() else { panic!() };
-        assert_eq!(straight.0.to_bits(), resumed.0.to_bits());
+        assert!(matches!(go(&b, 2, Some(6)).0, Outcome::Interrupted { step: 6 }));
+        let (Outcome::Finished(()), resumed) = go(&b, 3, None) else { panic!() };
+        assert_eq!(straight.to_bits(), resumed.to_bits());
         let steps: Vec<u64> =
             read_training_log(&b.join("log.jsonl")).unwrap().iter().map(|r| r.step).collect();
         assert_eq!(steps, [3, 6, 9, 12, 15, 18, 20]);
-        let other = serde_json::json!({"seed": 2, "name": "a"});
+        let mut other = Sum { settings: json!({"seed": 2, "name": "a"}), ..sum(0.0, 1) };
         let stop = AtomicBool::new(false);
-        let message = run(Sum(0.0), |n| n, &course(1), &other, &b, &stop, |_| ()).err().unwrap().to_string();
+        let message =
+            fit(&mut other, &((|n| n) as fn(u64) -> u64), &b, &stop, |_| ()).unwrap_err().to_string();
         assert!(message.contains("seed was 1, is 2"), "{message}");
     }
 
@@ -318,10 +365,11 @@ mod tests {
     fn numbers_that_are_none_end_it() {
         let folder = tempfile::tempdir().unwrap();
         let stop = AtomicBool::new(false);
-        let out = run(Sum(f64::NAN), |n| n, &course(1), &serde_json::json!({}), folder.path(), &stop, |_| ());
-        assert!(out.err().unwrap().to_string().contains("step 0: the loss is not a number"));
-        let endless = Course { log_every: 0, ..course(1) };
-        let out = run(Sum(0.0), |n| n, &endless, &serde_json::json!({}), folder.path(), &stop, |_| ());
-        assert!(out.err().unwrap().to_string().contains("log_every"));
+        let numbers: fn(u64) -> u64 = |n| n;
+        let out = fit(&mut sum(f64::NAN, 1), &numbers, folder.path(), &stop, |_| ());
+        assert!(out.unwrap_err().to_string().contains("step 0: the loss is not a number"));
+        let mut endless = Sum { log_every: 0, ..sum(0.0, 1) };
+        let out = fit(&mut endless, &numbers, folder.path(), &stop, |_| ());
+        assert!(out.unwrap_err().to_string().contains("log_every"));
     }
 }

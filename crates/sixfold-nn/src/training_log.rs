@@ -1,4 +1,4 @@
-//! The training's log: one JSON object a line, only ever added to, and its learning curves as a picture.
+//! The training's log: one JSON object a line, only ever added to, and its learning curves as a figure.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -11,7 +11,7 @@ use sixfold_plot::{COLORS, Canvas, FAINT, INK, Ticks, text_width, ticks, ticks_l
 
 use crate::files::explain;
 
-/// What is known after a step.
+/// Means over the steps since the last record.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrainingRecord {
     /// Steps done.
@@ -25,7 +25,7 @@ pub struct TrainingRecord {
     /// Training samples a second since the record before.
     #[serde(deserialize_with = "number")]
     pub samples_per_second: f64,
-    /// Losses and scores by name. Not a number where the training went astray; JSON's `null` stands for it.
+    /// Losses and scores by name. Not a number where the training diverged; JSON's `null` stands for it.
     #[serde(deserialize_with = "numbers")]
     pub losses: BTreeMap<String, f64>,
 }
@@ -72,10 +72,10 @@ pub enum TrainingLogError {
         /// What is wrong with it.
         reason: String,
     },
-    /// The picture could not be made.
+    /// The figure could not be made.
     #[error("{}: expected records with losses to draw, found none; train a few steps first", file.display())]
     NothingToDraw {
-        /// The picture's file.
+        /// The figure's file.
         file: PathBuf,
     },
 }
@@ -89,7 +89,7 @@ pub struct TrainingLog {
 }
 
 impl TrainingLog {
-    /// Opens the log of a training that begins (`resumed_step` 0) or goes on after `resumed_step` steps. Records of later
+    /// Opens the log of a training that begins (`resumed_step` 0) or resumes after `resumed_step` steps. Records of later
     /// steps and a last line that was torn by an interruption are taken out: those steps are done again.
     ///
     /// # Errors
@@ -231,7 +231,7 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
     let room = (width / 12.0) as usize;
     let title: String = format!("{name}   {last}").chars().take(room).collect();
     canvas.text(left, corner.1 + 16.0, 2.0, &title, INK);
-    let share = |ticks: &Ticks, value: f64| {
+    let fraction = |ticks: &Ticks, value: f64| {
         if logarithmic {
             (value / ticks.low).ln() / (ticks.high / ticks.low).ln()
         } else {
@@ -239,7 +239,7 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
         }
     };
     for (value, label) in &vertical.marks {
-        let y = top + height * (1.0 - share(&vertical, *value));
+        let y = top + height * (1.0 - fraction(&vertical, *value));
         canvas.rectangle(left, y - 0.5, width, 1.0, FAINT);
         canvas.text(left - 10.0 - text_width(label, 1.6), y - 5.5, 1.6, label, INK);
     }
@@ -252,8 +252,9 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
     canvas.rectangle(left - 1.0, top, 1.5, height + 1.0, INK);
     canvas.rectangle(left - 1.0, top + height - 0.5, width + 1.0, 1.5, INK);
 
-    let place =
-        |p: (f64, f64)| (left + width * p.0 / horizontal.high, top + height * (1.0 - share(&vertical, p.1)));
+    let place = |p: (f64, f64)| {
+        (left + width * p.0 / horizontal.high, top + height * (1.0 - fraction(&vertical, p.1)))
+    };
     let mut curve = |points: &[(f64, f64)], thickness: f64, color: [u8; 3]| {
         let points = at_most_one_a_pixel(points, 2 * PANEL_WIDTH as usize);
         if let [only] = points[..] {
@@ -280,12 +281,12 @@ fn running_mean(points: &[(f64, f64)], window: usize) -> Vec<(f64, f64)> {
 }
 
 /// Keeps lowest and highest of every stretch, so that no outlier is lost.
-fn at_most_one_a_pixel(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
-    if points.len() <= most {
+fn at_most_one_a_pixel(points: &[(f64, f64)], max: usize) -> Vec<(f64, f64)> {
+    if points.len() <= max {
         return points.to_vec();
     }
     points
-        .chunks(2 * points.len().div_ceil(most))
+        .chunks(2 * points.len().div_ceil(max))
         .flat_map(|chunk| {
             let index = |best: fn(f64, f64) -> bool| {
                 (0..chunk.len()).fold(0, |b, i| if best(chunk[i].1, chunk[b].1) { i } else { b })

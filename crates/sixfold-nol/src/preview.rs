@@ -1,6 +1,6 @@
 //! A picture of what the training has come to, drawn with every checkpoint.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
 use sixfold_synth::augment::Backgrounds;
@@ -17,20 +17,19 @@ const SIDE: usize = 128;
 /// The same made-up objects every time.
 pub(crate) struct Preview {
     batch: Batch,
-    file: PathBuf,
 }
 
 impl Preview {
-    pub fn new(textures: &Backgrounds, options: &SampleOptions, seed: u64, folder: &Path) -> Self {
+    pub fn new(textures: &Backgrounds, options: &SampleOptions, seed: u64) -> Self {
         // Numbers that no training comes to.
         let sample = |row| make_sample(textures, options, SIDE, SOURCES, seed, u64::MAX - row);
         let samples: Vec<_> = (0..ROWS).map(sample).collect();
-        Preview { batch: Batch::of_samples(&samples), file: folder.join("preview.png") }
+        Preview { batch: Batch::of_samples(&samples) }
     }
 
-    /// Draws sources, the true target, the sources' average, X^D and X^phi. A picture that cannot be written is no reason to stop
-    /// a training.
-    pub fn draw(&self, network: &Network) {
+    /// Draws sources, the true target, the sources' average, X^D and X^phi into `folder`. A picture that cannot be written is no
+    /// reason to stop a training.
+    pub fn draw(&self, network: &Network, folder: &Path) {
         let passed = pass(network, self.batch.clone(), &Device::flex());
         let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
         let (average, _) = self.batch.average();
@@ -61,13 +60,13 @@ impl Preview {
             }
         }
         let (width, height) = ((columns * SIDE) as u32, (rows * SIDE) as u32);
+        let file = folder.join("preview.png");
         // The first picture comes before the first checkpoint, which makes the folder.
-        let folder = self.file.parent().map_or(Ok(()), std::fs::create_dir_all);
-        let saved = folder.map_err(image::ImageError::IoError).and_then(|()| {
-            image::save_buffer(&self.file, &picture, width, height, image::ExtendedColorType::Rgb8)
+        let saved = std::fs::create_dir_all(folder).map_err(image::ImageError::IoError).and_then(|()| {
+            image::save_buffer(&file, &picture, width, height, image::ExtendedColorType::Rgb8)
         });
         if let Err(error) = saved {
-            eprintln!("{}: cannot be written: {error}", self.file.display());
+            eprintln!("{}: cannot be written: {error}", file.display());
         }
     }
 }

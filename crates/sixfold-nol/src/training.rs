@@ -1,92 +1,79 @@
 //! The training: samples through the network, the losses of equations 4.1 and 4.2, AdamW.
 
-use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
-use burn::grad_clipping::GradientClippingConfig;
 use burn::module::Module;
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
-use sixfold_nn::recurrent::gather;
-use sixfold_nn::schedule::LearningRate;
-use sixfold_nn::training::{Course, Trainee, run};
-pub use sixfold_nn::training::{Ending, TrainingError};
-use sixfold_nn::training_log::TrainingRecord;
 use sixfold_synth::augment::Backgrounds;
+use sixfold_nn::learner::{Checkpointed, Learner};
+use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
+use sixfold_nn::recurrent::gather;
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
 use crate::loss::{Perceptual, WEIGHTS, image_loss, smooth_loss, squared_error};
-use crate::network::{Blend, COLOURS, Network};
+use crate::network::{Blend, COLOURS, Network, Parts};
 use crate::preview::Preview;
 use crate::samples::{Batch, BatchOptions, SampleOptions};
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct TrainingOptions {
-    /// Optimiser steps.
-    pub steps: u64,
-    /// Highest learning rate; it falls to zero as a cosine.
-    pub learning_rate: f64,
-    /// Steps over which the rate rises at first.
-    pub warm_up: u64,
-    /// Decoupled weight decay.
-    pub weight_decay: f32,
-    /// A tensor's gradient that is longer than this (Euclidean) is shortened to it.
-    pub longest_gradient: f32,
+pub struct NolTrainingOptions {
+    /// Steps, learning rate, seed.
+    #[serde(flatten)]
+    pub common: TrainingOptions,
     /// Weights of colours, features and smoothness.
     pub weights: [f64; 3],
     /// How samples are made.
     pub samples: SampleOptions,
     /// How many in a step.
     pub batch: BatchOptions,
-    /// Seed of weights and samples.
-    pub seed: u64,
 }
 
-impl Default for TrainingOptions {
+impl Default for NolTrainingOptions {
     fn default() -> Self {
-        TrainingOptions {
-            steps: 5000,
-            learning_rate: 2e-3,
-            warm_up: 100,
-            weight_decay: 1e-4,
-            longest_gradient: 5.0,
+        NolTrainingOptions {
+            common: TrainingOptions {
+                steps: 5000,
+                learning_rate: 2e-3,
+                warm_up: 100,
+                weight_decay: 1e-4,
+                max_grad_norm: Some(5.0),
+                seed: 0,
+            },
             weights: WEIGHTS,
             samples: SampleOptions::default(),
             batch: BatchOptions { sides: vec![96, 128, 160], most_sources: 8, sources: 10, most_samples: 4 },
-            seed: 0,
         }
     }
 }
 
-impl TrainingOptions {
+impl NolTrainingOptions {
     /// The dissertation's: one target with eight sources of 256x256 pixels in a step, 35 epochs of 10,000 images.
     pub fn paper() -> Self {
-        TrainingOptions {
-            steps: 350_000,
-            learning_rate: 1e-3,
+        let default = Self::default();
+        NolTrainingOptions {
+            common: TrainingOptions { steps: 350_000, learning_rate: 1e-3, ..default.common },
             batch: BatchOptions { sides: vec![256], most_sources: 8, sources: 8, most_samples: 1 },
-            ..Self::default()
+            ..default
         }
     }
-}
 
-/// What does not change the result.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TrainingPace {
-    /// Steps between checkpoints.
-    pub checkpoint_every: u64,
-    /// Steps between records of the log.
-    pub log_every: u64,
-    /// Threads that make samples beside the training itself.
-    pub sample_threads: usize,
-}
-
-impl Default for TrainingPace {
-    fn default() -> Self {
-        TrainingPace { checkpoint_every: 100, log_every: 25, sample_threads: 1 }
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.common.check()?;
+        let sides = &self.batch.sides;
+        let fits = |side: &usize| side.is_multiple_of(16) && (32..=1024).contains(side);
+        let expected = "multiples of 16 from 32 to 1024 pixels";
+        let all = !sides.is_empty() && sides.iter().all(fits);
+        OptionError::unless(all, "batch.sides", format!("{sides:?}"), expected)?;
+        let sources = self.batch.most_sources;
+        OptionError::unless((1..=16).contains(&sources), "batch.most_sources", sources, "1 to 16")?;
+        self.weights.iter().try_for_each(|weight| OptionError::unless_weight("weights", *weight))
     }
 }
 
@@ -127,23 +114,79 @@ pub(crate) fn pass(network: &Network, batch: Batch, device: &Device) -> Passed {
     }
 }
 
-struct State<'a> {
-    network: Network,
-    optimiser: ModuleOptimizer,
-    perceptual: &'a Perceptual,
-    preview: &'a Preview,
-    options: &'a TrainingOptions,
-    device: &'a Device,
+/// A network in training.
+pub struct NolTraining {
+    learner: Learner<Network>,
+    parts: Parts,
+    perceptual: Perceptual,
+    preview: Option<Preview>,
+    options: NolTrainingOptions,
+    /// How often is logged and saved.
+    pub pace: Pace,
+    device: Device,
 }
 
-impl Trainee for State<'_> {
+impl NolTraining {
+    /// Of a network of these `parts` whose tensors are on the autodiff `device`; `perceptual` is the loss on features.
+    pub fn new(
+        network: Network,
+        parts: Parts,
+        perceptual: Perceptual,
+        options: NolTrainingOptions,
+        device: Device,
+    ) -> Self {
+        let learner = Learner::adam_w("network", network, &options.common);
+        let pace = Pace { checkpoint_every: 100, ..Pace::default() };
+        NolTraining { learner, parts, perceptual, preview: None, options, pace, device }
+    }
+
+    /// Draws `preview.png` beside every checkpoint: a row a synthetic object with textures from `textures`: sources, the true
+    /// target, the sources' average, X^D, X^phi.
+    pub fn with_preview(mut self, textures: &Backgrounds) -> Self {
+        self.preview = Some(Preview::new(textures, &self.options.samples, self.options.common.seed));
+        self
+    }
+
+    /// The trained network.
+    pub fn into_network(self) -> Network {
+        self.learner.into_network()
+    }
+}
+
+impl Training for NolTraining {
+    /// What objects, backgrounds and clutter look like.
+    type Samples = Backgrounds;
     type Batch = Batch;
 
-    fn step(&mut self, batch: Batch, rate: f64) -> BTreeMap<String, f64> {
+    fn plan(&self, textures: &Backgrounds) -> Result<Plan, TrainError> {
+        let options = &self.options;
+        options.check()?;
+        let settings = Settings {
+            training: options,
+            architecture: self.learner.network().architecture(),
+            parts: self.parts,
+            textures: textures.images(),
+        };
+        Ok(Plan {
+            steps: options.common.steps,
+            schedule: options.common.schedule(),
+            samples_per_step: 1,
+            pace: self.pace,
+            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
+        })
+    }
+
+    fn batches<'a>(&self, textures: &'a Backgrounds) -> Batches<'a, Batch> {
+        let options = self.options.clone();
+        let seed = options.common.seed;
+        Box::new(move |step| Batch::of_step(textures, &options.samples, &options.batch, seed, step))
+    }
+
+    fn step(&mut self, batch: Batch, rate: f64) -> Losses {
         let (_, averaging) = batch.average();
-        let out = pass(&self.network, batch, self.device);
+        let out = pass(self.learner.network(), batch, &self.device);
         let (colours, features) =
-            image_loss(out.image.clone(), out.target.clone(), out.mask.clone(), self.perceptual);
+            image_loss(out.image.clone(), out.target.clone(), out.mask.clone(), &self.perceptual);
         let smoothness = smooth_loss(out.blend.sum.clone(), out.mask.clone());
         let number = |t: &Tensor<1>| f64::from(t.clone().inner().into_scalar::<f32>());
         let error = |image: &Tensor<4>| {
@@ -160,154 +203,65 @@ impl Trainee for State<'_> {
         ];
         let [of_colours, of_features, of_smoothness] = self.options.weights;
         let sum = colours * of_colours + features * of_features + smoothness * of_smoothness;
-        let gradients = GradientsParams::from_grads(sum.backward(), &self.network);
-        self.network = self.optimiser.step(rate, self.network.clone(), gradients);
+        self.learner.descend(rate, sum);
         losses.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
     }
 
-    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        self.preview.draw(&self.network.valid());
-        checkpoint.module("network", &self.network)?.optimiser("optimiser", &self.optimiser)
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        vec![&mut self.learner]
     }
 
-    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
-        Ok(State {
-            network: checkpoint.module("network", self.network)?,
-            optimiser: checkpoint.optimiser("optimiser", self.optimiser)?,
-            ..self
-        })
+    fn before_checkpoint(&mut self, folder: &Path) {
+        if let Some(preview) = &self.preview {
+            preview.draw(&self.learner.network().valid(), folder);
+        }
     }
 }
 
 /// All that decides about the result.
 #[derive(Serialize)]
-struct Recorded<'a> {
+struct Settings<'a> {
     #[serde(flatten)]
-    training: &'a TrainingOptions,
+    training: &'a NolTrainingOptions,
     architecture: &'static str,
-    parts: crate::network::Parts,
+    parts: Parts,
     textures: usize,
-}
-
-/// Trains a network, whose tensors are on the autodiff `device`; `textures` are what objects, backgrounds and clutter look like.
-///
-/// Checkpoints, log, learning curves and `preview.png` (a row a made-up object: sources, the true target, the sources' average,
-/// X^D, X^phi) go to `folder`; a training that was interrupted there goes on, with the same result as one that was not. `stop` ends it
-/// after the current step.
-///
-/// # Errors
-/// [`TrainingError`]; the last checkpoints stay.
-#[allow(clippy::too_many_arguments)]
-pub fn train(
-    textures: &Backgrounds,
-    network: Network,
-    parts: crate::network::Parts,
-    perceptual: &Perceptual,
-    device: &Device,
-    folder: &Path,
-    options: &TrainingOptions,
-    pace: &TrainingPace,
-    stop: &AtomicBool,
-    progress: impl FnMut(&TrainingRecord),
-) -> Result<Ending<Network>, TrainingError> {
-    check(options)?;
-    let clip = GradientClippingConfig::Norm(options.longest_gradient);
-    let optimiser =
-        AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(Some(clip)).init();
-    let preview = Preview::new(textures, &options.samples, options.seed, folder);
-    let recorded = Recorded {
-        training: options,
-        architecture: network.architecture(),
-        parts,
-        textures: textures.images(),
-    };
-    let state = State { network, optimiser, perceptual, preview: &preview, options, device };
-    let course = Course {
-        steps: options.steps,
-        schedule: LearningRate::Cosine {
-            rate: options.learning_rate,
-            last: 0.0,
-            warm_up: options.warm_up.min(options.steps.saturating_sub(1)),
-            steps: options.steps,
-        },
-        samples_per_step: 1,
-        log_every: pace.log_every,
-        checkpoint_every: pace.checkpoint_every,
-        sample_threads: pace.sample_threads,
-    };
-    let batches = |step| Batch::of_step(textures, &options.samples, &options.batch, options.seed, step);
-    Ok(run(state, batches, &course, &recorded, folder, stop, progress)?.map(|state| state.network.valid()))
-}
-
-fn check(options: &TrainingOptions) -> Result<(), TrainingError> {
-    let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
-    if options.steps == 0 {
-        return wrong("steps", "at least 1", "0".to_owned());
-    }
-    let sides = &options.batch.sides;
-    if sides.is_empty() || sides.iter().any(|s| !s.is_multiple_of(16) || !(32..=1024).contains(s)) {
-        return wrong("batch.sides", "multiples of 16 from 32 to 1024 pixels", format!("{sides:?}"));
-    }
-    if !(1..=16).contains(&options.batch.most_sources) {
-        return wrong("batch.most_sources", "1 to 16", options.batch.most_sources.to_string());
-    }
-    if options.weights.iter().any(|w| !(w.is_finite() && *w >= 0.0)) {
-        return wrong("weights", "finite numbers, 0 or more", format!("{:?}", options.weights));
-    }
-    Ok(())
-}
-
-/// The network of the last checkpoint in `folder`, filled into `network`, and the steps it has done; `None` if there is no
-/// checkpoint.
-///
-/// # Errors
-/// [`TrainingError::Checkpoint`].
-pub fn last_checkpoint(folder: &Path, network: Network) -> Result<Option<(Network, u64)>, TrainingError> {
-    let Some(checkpoint) = Checkpoint::latest(folder)? else { return Ok(None) };
-    Ok(Some((checkpoint.module("network", network)?.valid(), checkpoint.step())))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::network::{CHANNELS, CompactConfig, Parts};
-    use std::sync::atomic::Ordering;
+    use crate::network::{CHANNELS, CompactConfig};
+    use sixfold_nn::training::{Outcome, fit};
+    use std::sync::atomic::{AtomicBool, Ordering};
 
-    fn options(steps: u64) -> TrainingOptions {
-        TrainingOptions {
-            steps,
-            warm_up: 2,
+    fn options(steps: u64) -> NolTrainingOptions {
+        let default = NolTrainingOptions::default();
+        NolTrainingOptions {
+            common: TrainingOptions { steps, warm_up: 2, ..default.common },
             batch: BatchOptions { sides: vec![48, 64], most_sources: 3, sources: 4, most_samples: 2 },
-            ..TrainingOptions::default()
+            ..default
         }
     }
 
-    fn network(device: &Device) -> Network {
-        Network::Compact(CompactConfig::default().init(3, device).unwrap())
+    fn training(options: &NolTrainingOptions) -> NolTraining {
+        let device = Device::flex().autodiff();
+        let network = Network::Compact(CompactConfig::default().init(3, &device).unwrap());
+        let perceptual = Perceptual::of(&network, &device).unwrap();
+        NolTraining::new(network, Parts::default(), perceptual, options.clone(), device)
     }
 
     #[test]
     fn on_one_batch_the_loss_falls() {
-        let device = Device::flex().autodiff();
         let textures = Backgrounds::procedural();
-        let options = options(1);
-        let network = network(&device);
-        let perceptual = Perceptual::of(&network, &device).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        let preview = Preview::new(&textures, &options.samples, 0, folder.path());
-        let optimiser = AdamWConfig::new().init();
-        let mut state = State {
-            network,
-            optimiser,
-            perceptual: &perceptual,
-            preview: &preview,
-            options: &options,
-            device: &device,
-        };
+        let mut options = options(1);
+        // As AdamW comes without options.
+        options.common.max_grad_norm = None;
+        let mut training = training(&options);
         let batch = Batch::of_step(&textures, &options.samples, &options.batch, 0, 4);
         let losses: Vec<f64> = (0..12)
             .map(|_| {
-                let losses = state.step(batch.clone(), 2e-3);
+                let losses = training.step(batch.clone(), 2e-3);
                 options.weights[0] * losses["colours"] + options.weights[1] * losses["features"]
             })
             .collect();
@@ -316,19 +270,16 @@ mod tests {
 
     #[test]
     fn it_goes_on_where_it_stopped() {
-        let device = Device::flex().autodiff();
         let textures = Backgrounds::procedural();
         let options = options(6);
         let go = |folder: &Path, stop_at: Option<u64>, sample_threads: usize| {
             let stop = AtomicBool::new(false);
-            let network = network(&device);
-            let perceptual = Perceptual::of(&network, &device).unwrap();
-            let pace = TrainingPace { checkpoint_every: 4, log_every: 1, sample_threads };
-            let parts = Parts::default();
-            train(&textures, network, parts, &perceptual, &device, folder, &options, &pace, &stop, |r| {
+            let mut training = training(&options).with_preview(&textures);
+            training.pace = Pace { checkpoint_every: 4, log_every: 1, sample_threads };
+            let outcome = fit(&mut training, &textures, folder, &stop, |r| {
                 stop.store(stop_at.is_some_and(|s| r.step >= s), Ordering::Relaxed);
-            })
-            .unwrap()
+            });
+            (outcome.unwrap(), training.into_network())
         };
         let numbers = |n: &Network| -> Vec<f32> {
             let device = Device::flex();
@@ -340,16 +291,16 @@ mod tests {
             out
         };
         let folder = tempfile::tempdir().unwrap();
-        let Ending::Finished(straight) = go(&folder.path().join("a"), None, 1) else { panic!() };
+        let (Outcome::Finished(()), straight) = go(&folder.path().join("a"), None, 1) else { panic!() };
         let b = folder.path().join("b");
-        assert!(matches!(go(&b, Some(3), 2), Ending::Interrupted { step: 3 }));
-        let Ending::Finished(resumed) = go(&b, None, 1) else { panic!() };
+        assert!(matches!(go(&b, Some(3), 2).0, Outcome::Interrupted { step: 3 }));
+        let (Outcome::Finished(()), resumed) = go(&b, None, 1) else { panic!() };
         assert_eq!(numbers(&straight), numbers(&resumed));
         assert!(b.join("preview.png").exists());
-        let wrong = TrainingOptions {
+        let wrong = NolTrainingOptions {
             batch: BatchOptions { sides: vec![50], ..options.batch.clone() },
             ..options.clone()
         };
-        assert!(check(&wrong).unwrap_err().to_string().contains("batch.sides"));
+        assert!(wrong.check().unwrap_err().to_string().contains("batch.sides"));
     }
 }

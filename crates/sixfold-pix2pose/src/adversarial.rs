@@ -1,7 +1,7 @@
 //! Training of the dissertation's generators: reconstruction, error prediction and a discriminator (equations 3.1 to
 //! 3.5), for one object.
 //!
-//! Each iteration teaches the discriminator on rendered and on generated coordinate images, then the generator on
+//! Each iteration trains the discriminator on rendered and on generated coordinate images, then the generator on
 //! `lambda_1 * reconstruction + lambda_2 * error + adversarial`.
 
 use crate::critic::Critic;
@@ -11,18 +11,17 @@ use crate::networks::ResNet50Generator;
 use crate::networks::{GeneratorOutput, PaperGenerator};
 use crate::object::SymmetryMap;
 use crate::samples::{Sample, SampleSource};
-use crate::training::{TrainingError, TrainingOutcome};
 use burn::module::Module;
-use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_nn::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
+use sixfold_nn::learner::{Checkpointed, Learner};
+use sixfold_nn::options::{OptionError, Pace};
 use sixfold_nn::schedule::LearningRate;
-use sixfold_nn::training::{Course, Trainee, run};
-use sixfold_nn::training_log::TrainingRecord;
-use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Batches, Losses, Plan, Training};
+
+/// Side of images and targets, pixels.
+const SIDE: usize = 128;
 
 /// How to train. The defaults are the dissertation's (section 3.4.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,16 +38,12 @@ pub struct AdversarialOptions {
     pub reconstruction: f32,
     /// Weight of the error prediction, lambda_2.
     pub error: f32,
-    /// Teach a discriminator; without, the generator learns from its targets alone.
+    /// Train a discriminator; without, the generator learns from its targets alone.
     pub adversarial: bool,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
     /// Seed of samples and labels.
     pub seed: u64,
-    /// Iterations between checkpoints.
-    pub checkpoint_every: u64,
-    /// Iterations between records of the log.
-    pub log_every: u64,
 }
 
 impl Default for AdversarialOptions {
@@ -63,8 +58,32 @@ impl Default for AdversarialOptions {
             adversarial: true,
             transformer_loss: true,
             seed: 0,
-            checkpoint_every: 100,
-            log_every: 10,
+        }
+    }
+}
+
+impl AdversarialOptions {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        let counts = [("steps", self.steps), ("batch", self.batch as u64), ("decay_every", self.decay_every)];
+        for (field, value) in counts {
+            OptionError::unless(value > 0, field, value, "1 or more")?;
+        }
+        let rate = self.learning_rate;
+        let fits = rate.is_finite() && rate > 0.0;
+        OptionError::unless(fits, "learning_rate", rate, "a finite number above 0")?;
+        OptionError::unless_weight("error", f64::from(self.error))?;
+        OptionError::unless_weight("reconstruction", f64::from(self.reconstruction))
+    }
+
+    fn schedule(&self) -> LearningRate {
+        LearningRate::StepDecay {
+            rate: self.learning_rate,
+            factor: 0.1,
+            at: (1..).map(|n| n * self.decay_every).take_while(|at| *at < self.steps).collect(),
         }
     }
 }
@@ -95,29 +114,82 @@ impl Generator for ResNet50Generator {
     }
 }
 
-/// What is trained, and what trains it.
-struct State<'a, G> {
-    generator: G,
+/// A generator in training, and its discriminator.
+pub struct AdversarialTraining<G> {
+    generator: Learner<G>,
     critic: Critic,
-    generator_optimiser: ModuleOptimizer,
-    pool: &'a [SymmetryMap],
-    /// Of the images, pixels.
-    side: usize,
-    options: &'a AdversarialOptions,
-    device: &'a Device,
+    pool: Vec<SymmetryMap>,
+    options: AdversarialOptions,
+    /// How often is logged and saved.
+    pub pace: Pace,
+    device: Device,
+}
+
+impl<G: Generator> AdversarialTraining<G> {
+    /// Of a generator on the autodiff `device` for one object; `pool` holds the object's symmetries, the identity first.
+    pub fn new(
+        generator: G,
+        mut pool: Vec<SymmetryMap>,
+        options: AdversarialOptions,
+        device: Device,
+    ) -> Self {
+        if !options.transformer_loss {
+            pool.truncate(1);
+        }
+        AdversarialTraining {
+            generator: Learner::adam("generator", generator),
+            critic: Critic::new("discriminator", options.seed, &device),
+            pool,
+            options,
+            pace: Pace { checkpoint_every: 100, log_every: 10, sample_threads: 2 },
+            device,
+        }
+    }
+
+    /// The trained generator.
+    pub fn into_network(self) -> G {
+        self.generator.into_network()
+    }
 }
 
 /// The samples of an iteration, and which it is.
-struct Batch {
+pub struct AdversarialBatch {
     samples: Vec<Sample>,
     step: u64,
 }
 
-impl<G: Generator> Trainee for State<'_, G> {
-    type Batch = Batch;
+impl<G: Generator> Training for AdversarialTraining<G> {
+    type Samples = SampleSource;
+    type Batch = AdversarialBatch;
 
-    fn step(&mut self, Batch { samples, step }: Batch, rate: f64) -> BTreeMap<String, f64> {
-        let Self { pool, side, options, device, .. } = *self;
+    fn plan(&self, source: &SampleSource) -> Result<Plan, TrainError> {
+        let options = &self.options;
+        options.check()?;
+        let one = source.objects() == 1 && !self.pool.is_empty();
+        let expected = "one: this network learns a single object";
+        OptionError::unless(one, "objects", source.objects(), expected)?;
+        let (side, target) = (source.options().size, source.options().target());
+        let expected = "128 pixels for images and targets";
+        OptionError::unless(side == 128 && target == 128, "size", format!("{side} and {target}"), expected)?;
+        Ok(Plan {
+            steps: options.steps,
+            schedule: options.schedule(),
+            samples_per_step: options.batch,
+            pace: self.pace,
+            settings: serde_json::to_value(options).map_err(TrainError::method)?,
+        })
+    }
+
+    fn batches<'a>(&self, source: &'a SampleSource) -> Batches<'a, AdversarialBatch> {
+        let (batch, seed) = (self.options.batch as u64, self.options.seed);
+        Box::new(move |step| {
+            let samples = (step * batch..(step + 1) * batch).map(|n| source.sample(0, seed, n));
+            AdversarialBatch { samples: samples.collect(), step }
+        })
+    }
+
+    fn step(&mut self, AdversarialBatch { samples, step }: AdversarialBatch, rate: f64) -> Losses {
+        let (options, device, side) = (&self.options, &self.device, SIDE);
         let count = samples.len();
         let gather =
             |part: fn(&Sample) -> &[f32]| samples.iter().flat_map(part).copied().collect::<Vec<f32>>();
@@ -126,14 +198,14 @@ impl<G: Generator> Trainee for State<'_, G> {
             device,
         );
         let coordinates = gather(|s| &s.coordinates);
-        let output = self.generator.generate(images);
-        let mut losses = BTreeMap::new();
+        let output = self.generator.network().generate(images);
+        let mut losses = Losses::new();
         if options.adversarial {
             let real =
                 Tensor::<4>::from_data(TensorData::new(coordinates.clone(), [count, 3, side, side]), device);
             let generated = output.coordinates.clone().detach();
-            let teaching = self.critic.teach(generated, real, step, rate, device);
-            losses.insert("discriminator".to_string(), teaching);
+            let loss = self.critic.step(generated, real, step, rate, device);
+            losses.insert("discriminator".to_string(), loss);
         }
         let joined = Tensor::cat(vec![output.coordinates.clone(), output.error], 1);
         let values = joined.clone().inner().into_data();
@@ -148,98 +220,22 @@ impl<G: Generator> Trainee for State<'_, G> {
             ..LossOptions::of(OutputKind::Paper)
         };
         let scale = options.reconstruction / count as f32;
-        let value = loss(values, &targets, side * side, pool, OutputKind::Paper, &weights, scale);
+        let value = loss(values, &targets, side * side, &self.pool, OutputKind::Paper, &weights, scale);
         losses.insert("coordinates".to_string(), value.coordinates);
         losses.insert("error".to_string(), value.error);
         let gradient = Tensor::<4>::from_data(TensorData::new(value.gradient, joined.dims()), device);
         let mut total = (joined * gradient).sum();
         if options.adversarial {
-            let doubt = self.critic.doubt(output.coordinates);
-            let known = doubt.clone().inner().into_scalar::<f32>();
-            losses.insert("adversarial".to_string(), f64::from(known));
-            total = total + doubt;
+            let loss = self.critic.generator_loss(output.coordinates);
+            let value = loss.clone().inner().into_scalar::<f32>();
+            losses.insert("adversarial".to_string(), f64::from(value));
+            total = total + loss;
         }
-        let gradients = GradientsParams::from_grads(total.backward(), &self.generator);
-        self.generator = self.generator_optimiser.step(rate, self.generator.clone(), gradients);
+        self.generator.descend(rate, total);
         losses
     }
 
-    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        let checkpoint = checkpoint
-            .module("generator", &self.generator)?
-            .optimiser("generator", &self.generator_optimiser)?;
-        self.critic.save(checkpoint)
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        vec![&mut self.generator, &mut self.critic.learner]
     }
-
-    fn restore(self, checkpoint: &Checkpoint) -> Result<Self, CheckpointError> {
-        Ok(State {
-            generator: checkpoint.module("generator", self.generator)?,
-            critic: self.critic.restore(checkpoint)?,
-            generator_optimiser: checkpoint.optimiser("generator", self.generator_optimiser)?,
-            ..self
-        })
-    }
-}
-
-/// Trains a generator for the one object of `source`; as [`crate::training::train`] otherwise.
-///
-/// # Errors
-/// [`TrainingError`]; the last checkpoints stay.
-#[allow(clippy::too_many_arguments)]
-pub fn train_adversarial<G: Generator>(
-    source: &SampleSource,
-    pool: &[SymmetryMap],
-    generator: G,
-    device: &Device,
-    folder: &Path,
-    options: &AdversarialOptions,
-    stop: &AtomicBool,
-    progress: impl FnMut(&TrainingRecord),
-) -> Result<TrainingOutcome<G>, TrainingError> {
-    let wrong = |field, expected, found: String| Err(TrainingError::Option { field, expected, found });
-    let side = source.options().size;
-    if source.objects() != 1 || pool.is_empty() {
-        return wrong("objects", "one: this network learns a single object", source.objects().to_string());
-    }
-    if side != 128 || source.options().target() != 128 {
-        return wrong(
-            "size",
-            "128 pixels for images and targets",
-            format!("{side} and {}", source.options().target()),
-        );
-    }
-    for (field, value) in [("batch", options.batch as u64), ("decay_every", options.decay_every)] {
-        if value == 0 {
-            return wrong(field, "at least 1", "0".to_string());
-        }
-    }
-    let state = State {
-        generator,
-        critic: Critic::new("discriminator", options.seed, device),
-        generator_optimiser: AdamConfig::new().init(),
-        pool: if options.transformer_loss { pool } else { &pool[..1] },
-        side,
-        options,
-        device,
-    };
-    let course = Course {
-        steps: options.steps,
-        schedule: LearningRate::StepDecay {
-            rate: options.learning_rate,
-            factor: 0.1,
-            at: (1..).map(|n| n * options.decay_every).take_while(|at| *at < options.steps).collect(),
-        },
-        samples_per_step: options.batch,
-        log_every: options.log_every,
-        checkpoint_every: options.checkpoint_every,
-        sample_threads: 2,
-    };
-    let decisive = AdversarialOptions { checkpoint_every: 0, log_every: 0, ..options.clone() };
-    let batch = |step| {
-        let first = step * options.batch as u64;
-        let samples = (first..first + options.batch as u64).map(|n| source.sample(0, options.seed, n));
-        Batch { samples: samples.collect(), step }
-    };
-    let ending = run(state, batch, &course, &decisive, folder, stop, progress)?;
-    Ok(ending.map(|state| state.generator.valid()))
 }

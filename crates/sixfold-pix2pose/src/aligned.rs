@@ -9,8 +9,6 @@ use crate::estimate::{EstimateError, EstimateOptions, Found, estimate};
 use crate::model::Pix2PoseModel;
 use crate::object::Correction;
 use crate::refine::{RefineOptions, refine};
-use crate::samples::RealCrop;
-use sixfold_geometry::stats::upper_median;
 use sixfold_data::PosedImage;
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};

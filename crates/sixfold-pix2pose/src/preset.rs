@@ -5,6 +5,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo};
+use sixfold_nn::choice::Choice;
 
 use crate::object::BOP_THRESHOLDS;
 
@@ -43,12 +44,10 @@ const TLESS_THRESHOLDS: [f32; 30] = [
     0.2, 0.2, 0.3, 0.1, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3,
 ];
 
-impl Preset {
-    /// All presets.
-    pub const ALL: [Preset; 4] = [Preset::Bop, Preset::Linemod, Preset::Lmo, Preset::Tless];
+impl Choice for Preset {
+    const ALL: &'static [Preset] = &[Preset::Bop, Preset::Linemod, Preset::Lmo, Preset::Tless];
 
-    /// As it is typed.
-    pub fn name(self) -> &'static str {
+    fn name(self) -> &'static str {
         match self {
             Preset::Bop => "bop",
             Preset::Linemod => "linemod",
@@ -57,11 +56,17 @@ impl Preset {
         }
     }
 
-    /// The preset of that name.
-    pub fn named(name: &str) -> Option<Preset> {
-        Preset::ALL.into_iter().find(|preset| preset.name() == name)
+    fn help(self) -> &'static str {
+        match self {
+            Preset::Bop => "The entries to the BOP challenges: three thresholds, symmetries of the dataset",
+            Preset::Linemod => "LineMOD",
+            Preset::Lmo => "LineMOD Occlusion",
+            Preset::Tless => "T-LESS",
+        }
     }
+}
 
+impl Preset {
     /// The objects of the experiment, for messages.
     pub fn objects(self) -> &'static str {
         match self {
@@ -173,7 +178,7 @@ mod tests {
             }
         }
         assert_eq!(Preset::Bop.thresholds(77), Some(vec![0.15, 0.25, 0.35]));
-        for preset in Preset::ALL {
+        for &preset in Preset::ALL {
             assert_eq!(Preset::named(preset.name()), Some(preset));
         }
     }

@@ -6,19 +6,19 @@ use burn::tensor::{Device, Tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_synth::augment::Backgrounds;
-use sixfold_data::TrainingObject;
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
+use sixfold_nn::options::Pace;
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Outcome, fit};
 use sixfold_nn::weights::{ModelCard, save_weights};
-use sixfold_pix2pose::adversarial::{AdversarialOptions, Generator, train_adversarial};
+use sixfold_pix2pose::adversarial::{AdversarialOptions, AdversarialTraining, Generator};
 use sixfold_pix2pose::networks::GeneratorOutput;
 use sixfold_pix2pose::object::SymmetryMap;
-use sixfold_pix2pose::samples::{SampleOptions, SampleSource};
-use sixfold_pix2pose::training::{TrainingError, TrainingOutcome};
+use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
 use sixfold_render::BoundingBoxScale;
-use sixfold_synth::augment::Backgrounds;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -58,7 +58,7 @@ fn source() -> (SampleSource, Vec<SymmetryMap>) {
 /// The losses of every step, and the weight file's bytes when it finished.
 type Run = (Vec<BTreeMap<String, f64>>, Option<Vec<u8>>);
 
-fn run(folder: &Path, options: &AdversarialOptions, stop_at: Option<u64>) -> Result<Run, TrainingError> {
+fn run(folder: &Path, options: &AdversarialOptions, stop_at: Option<u64>) -> Result<Run, TrainError> {
     let (source, pool) = source();
     let device = Device::flex().autodiff();
     let mut rng = ChaCha8Rng::seed_from_u64(3);
@@ -66,28 +66,22 @@ fn run(folder: &Path, options: &AdversarialOptions, stop_at: Option<u64>) -> Res
         Small { conv: ConvConfig::new([3, 4], 3, Activation::Linear).init(0.3, &mut rng, &device) };
     let stop = AtomicBool::new(false);
     let mut losses = vec![];
-    let outcome = train_adversarial(
-        &source,
-        &pool,
-        generator,
-        &device,
-        &folder.join("training"),
-        options,
-        &stop,
-        |record| {
-            losses.push(record.losses.clone());
-            if stop_at == Some(record.step) {
-                stop.store(true, Ordering::Relaxed);
-            }
-        },
-    )?;
+    let mut training = AdversarialTraining::new(generator, pool, options.clone(), device);
+    training.pace = Pace { log_every: 1, checkpoint_every: 2, ..training.pace };
+    let outcome = fit(&mut training, &source, &folder.join("training"), &stop, |record| {
+        losses.push(record.losses.clone());
+        if stop_at == Some(record.step) {
+            stop.store(true, Ordering::Relaxed);
+        }
+    })?;
     let bytes = match outcome {
-        TrainingOutcome::Finished(generator) => {
+        Outcome::Finished(()) => {
+            let generator = training.into_network();
             let file = folder.join("model.safetensors");
             save_weights(&generator, &ModelCard::new("test", "test"), &file).unwrap();
             Some(std::fs::read(file).unwrap())
         }
-        TrainingOutcome::Interrupted { step } => {
+        Outcome::Interrupted { step } => {
             assert_eq!(Some(step), stop_at);
             None
         }
@@ -96,14 +90,7 @@ fn run(folder: &Path, options: &AdversarialOptions, stop_at: Option<u64>) -> Res
 }
 
 fn options(steps: u64) -> AdversarialOptions {
-    AdversarialOptions {
-        steps,
-        batch: 2,
-        learning_rate: 1e-2,
-        log_every: 1,
-        checkpoint_every: 2,
-        ..AdversarialOptions::default()
-    }
+    AdversarialOptions { steps, batch: 2, learning_rate: 1e-2, ..AdversarialOptions::default() }
 }
 
 #[test]

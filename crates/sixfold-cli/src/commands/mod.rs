@@ -21,9 +21,3 @@ pub(crate) mod simulate;
 pub(crate) mod simulate_scenes;
 pub(crate) mod synthesize;
 pub(crate) mod train;
-pub(crate) mod train_detector;
-#[cfg(feature = "experience")]
-pub(crate) mod train_dgcm;
-#[cfg(feature = "physics")]
-pub(crate) mod train_mttm;
-pub(crate) mod train_nol;

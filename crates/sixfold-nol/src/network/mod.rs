@@ -13,6 +13,7 @@ mod weighting;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::choice::Choice;
 use sixfold_nn::weights::WeightsError;
 
 pub use compact::{Compact, CompactConfig};
@@ -43,6 +44,24 @@ pub enum IntegratorKind {
     Lstm,
     /// The mean over the sources that see a pixel: the dissertation's ablation without LSTM.
     Average,
+}
+
+impl Choice for IntegratorKind {
+    const ALL: &'static [IntegratorKind] = &[IntegratorKind::Lstm, IntegratorKind::Average];
+
+    fn name(self) -> &'static str {
+        match self {
+            IntegratorKind::Lstm => "lstm",
+            IntegratorKind::Average => "average",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            IntegratorKind::Lstm => "Convolutional LSTM over the sources",
+            IntegratorKind::Average => "Their mean, for comparison",
+        }
+    }
 }
 
 /// What of the network can be left out for comparison.

@@ -1,23 +1,16 @@
 //! The source of training samples: objects, photographs and backgrounds go in, samples come out.
 
 use std::collections::BTreeMap;
-
 use rand::RngExt;
-use sixfold_geometry::random::{Random, stream, uniform};
-use sixfold_geometry::{Camera, Mask, Pose, Vec2, Vec3};
-use sixfold_mesh::{Mesh, ModelInfo, simplify};
-use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Random, Window, stream, uniform};
-use sixfold_data::{DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors, default_distances, distances, is_textured, random_lights, random_material, randomly_colored};
-use sixfold_render::BoundingBoxScale;
 use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
-use sixfold_synth::randomly_colored;
-
+use sixfold_geometry::random::{Random, stream, uniform};
+use sixfold_data::{DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors, default_distances, distances, is_textured, random_lights, random_material, randomly_colored};
+use sixfold_geometry::{Camera, Mask, Pose, Vec2};
+use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_render::BoundingBoxScale;
 use super::composition::{Composition, Scenery, gain};
 use super::error::SampleError;
 use super::options::SampleOptions;
-use super::poses::PoseRange;
-use super::real::RealCrop;
-use super::rendering::{color_patch, colors, random_lights, random_material, targets};
 use super::second_stage;
 use super::symmetry::canonical;
 use super::targets::targets;

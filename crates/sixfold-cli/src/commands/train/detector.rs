@@ -1,0 +1,125 @@
+//! `sixfold train detector`: photographs with their ground truth, and models, in; a detector's file out.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+use sixfold_detect::recipe::{DetectorKind, DetectorRecipe, MIN_VISIBILITY};
+use sixfold_nn::choice::Choice;
+
+use super::options::{Degrees, choices};
+use super::{LearntFrom, Shown, Summary, checked, command_line, loss, summary, train_in};
+use crate::arguments::MaterialArguments;
+use crate::commands::material::material;
+
+fn default() -> DetectorRecipe {
+    DetectorRecipe::default()
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainDetectorArguments {
+    #[command(flatten)]
+    pub material: MaterialArguments,
+    /// Folder for checkpoints, learning curves and the finished model
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Which network learns
+    #[arg(long, value_parser = choices::<DetectorKind>(), default_value = default().network.name())]
+    pub network: DetectorKind,
+    /// Training steps
+    #[arg(long, value_name = "N", default_value_t = default().steps)]
+    pub steps: u64,
+    /// Images in a step
+    #[arg(long, value_name = "N", default_value_t = default().batch)]
+    pub batch: usize,
+    /// Highest learning rate
+    #[arg(long, value_name = "RATE", default_value_t = default().learning_rate)]
+    pub learning_rate: f64,
+    /// The pretrained encoder's share of the learning rate, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = default().encoder_share)]
+    pub encoder_share: f64,
+    /// Stages of the ImageNet encoder that stay as they are, of five
+    #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
+    pub frozen_stages: usize,
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random)
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
+    /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
+    #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
+    pub size: usize,
+    /// Share of training images that are parts of photographs, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = default().photograph_share)]
+    pub photograph_share: f32,
+    /// Share of renders among pasted objects that have photographs, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = default().render_share)]
+    pub render_share: f32,
+    /// Largest turn in the image plane, degrees
+    #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
+    pub rotation: Degrees,
+    /// Draw the meshes in random colours, as untextured CAD models
+    #[arg(long)]
+    pub no_mesh_colors: bool,
+    /// Larger images will be reduced to so many pixels along their longer side before detection
+    #[arg(long, value_name = "PIXELS", default_value_t = default().longest_side)]
+    pub longest_side: usize,
+    /// Score below which detections will be left out unless something else is asked for, 0 to 1
+    #[arg(long, value_name = "SCORE", default_value_t = default().threshold)]
+    pub threshold: f32,
+    /// Go on from the weights of another training of the same objects instead of ImageNet's
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Seed of weights and samples
+    #[arg(long, default_value_t = default().seed)]
+    pub seed: u64,
+}
+
+impl TrainDetectorArguments {
+    pub(super) fn recipe(&self) -> DetectorRecipe {
+        DetectorRecipe {
+            network: self.network,
+            steps: self.steps,
+            batch: self.batch,
+            learning_rate: self.learning_rate,
+            encoder_share: self.encoder_share,
+            frozen_stages: self.frozen_stages,
+            encoder: self.encoder.clone(),
+            size: self.size,
+            photograph_share: self.photograph_share,
+            render_share: self.render_share,
+            rotation: self.rotation.radians,
+            mesh_colors: !self.no_mesh_colors,
+            longest_side: self.longest_side,
+            threshold: self.threshold,
+            init: self.init.clone(),
+            backgrounds: self.material.backgrounds.clone(),
+            seed: self.seed,
+            command: command_line(),
+        }
+    }
+}
+
+/// Trains, or resumes a training, and writes the model.
+pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary<LearntFrom>> {
+    let recipe = checked(a.recipe())?;
+    let material = material(&a.material, MIN_VISIBILITY)?;
+    let objects = material.objects.iter().map(|o| o.id).collect();
+    let learnt_from = LearntFrom { objects, photographs: material.real.len() };
+    let shown = Shown {
+        preparing: "samples",
+        measuring: "model measured",
+        message: |record| {
+            format!(
+                "scores {:.3}, boxes {:.3}, masks {:.3}, {:.1} images/s",
+                loss(record, "scores"),
+                loss(record, "boxes"),
+                loss(record, "masks"),
+                record.samples_per_second
+            )
+        },
+    };
+    let trained = train_in(&recipe, material, &a.out, a.export, shown)?;
+    Ok(summary(trained, |()| learnt_from))
+}

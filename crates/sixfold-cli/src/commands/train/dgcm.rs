@@ -1,0 +1,108 @@
+//! `sixfold train dgcm`: nothing but a seed in, a network for grasps from experience out.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+use serde::Serialize;
+use sixfold_dgcm::recipe::{DgcmKind, DgcmRecipe};
+use sixfold_nn::choice::Choice;
+
+use super::options::{by_network, choices};
+use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
+
+fn default() -> DgcmRecipe {
+    DgcmRecipe::default()
+}
+
+/// Help with the defaults of both networks.
+fn help(what: &str, of: impl Fn(DgcmKind) -> String) -> String {
+    by_network(what, of(DgcmKind::Compact), of(DgcmKind::Paper))
+}
+
+fn pairs_help() -> String {
+    let (compact, paper) = (DgcmKind::Compact.options(), DgcmKind::Paper.options());
+    let default = format!("{}, with {} negative ones", compact.pairs, compact.negatives);
+    by_network("Positive pairs in a step", default, format!("{} of both", paper.pairs))
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainDgcmArguments {
+    /// Network
+    #[arg(long, value_parser = choices::<DgcmKind>(), default_value = default().network.name())]
+    pub network: DgcmKind,
+    /// ImageNet weights of ResNet-50 in torchvision's layout (.pth), for --network paper
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
+    #[arg(long, value_name = "N", help = help("Training steps", |k| k.options().common.steps.to_string()))]
+    pub steps: Option<u64>,
+    #[arg(long, value_name = "N", help = pairs_help())]
+    pub pairs: Option<usize>,
+    #[arg(
+        long,
+        value_name = "RATE",
+        help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
+    )]
+    pub learning_rate: Option<f64>,
+    #[arg(
+        long,
+        value_name = "WEIGHT",
+        help = help("Weight of the coordinates' loss beside the features'", |k| k.options().lambda.to_string())
+    )]
+    pub lambda: Option<f64>,
+    /// Simulated views to learn from, made at the start (about 35 kB of memory each)
+    #[arg(long, value_name = "N", default_value_t = default().views)]
+    pub views: usize,
+    /// Seed of weights, objects, views and pairs
+    #[arg(long, default_value_t = default().seed)]
+    pub seed: u64,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Folder for the model and the training's checkpoints, log and curves
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+impl TrainDgcmArguments {
+    pub(super) fn recipe(&self) -> DgcmRecipe {
+        DgcmRecipe {
+            network: self.network,
+            encoder: self.encoder.clone(),
+            steps: self.steps,
+            pairs: self.pairs,
+            learning_rate: self.learning_rate,
+            lambda: self.lambda,
+            views: self.views,
+            seed: self.seed,
+            command: command_line(),
+        }
+    }
+}
+
+/// How much was learnt from.
+#[derive(Serialize)]
+pub(super) struct Views {
+    views: usize,
+}
+
+/// Trains, or resumes a training, and writes the model.
+pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<Views>> {
+    let recipe = checked(a.recipe())?;
+    let shown = Shown {
+        preparing: "views",
+        measuring: "model measured",
+        message: |record| {
+            format!(
+                "metric {:.2}, distance {:.2} of similar and {:.2} of different pairs, coordinates off by {:.3}, {:.0} pairs/s",
+                loss(record, "metric"),
+                loss(record, "positive distance"),
+                loss(record, "negative distance"),
+                loss(record, "error on the object"),
+                record.samples_per_second
+            )
+        },
+    };
+    let trained = train_in(&recipe, (), &a.out, a.export, shown)?;
+    Ok(summary(trained, |()| Views { views: a.views }))
+}

@@ -1,0 +1,101 @@
+//! `sixfold train mttm`: made-up objects fall on a table, depth cameras look at them, and a network learns to match regions
+//! with templates. Nothing but a seed goes in.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+use sixfold_mttm::quality::Quality;
+use sixfold_mttm::recipe::{MttmKind, MttmRecipe};
+use sixfold_nn::choice::Choice;
+
+use super::options::{by_network, choices};
+use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
+
+fn default() -> MttmRecipe {
+    MttmRecipe::default()
+}
+
+/// Help with the defaults of both networks.
+fn help(what: &str, of: impl Fn(MttmKind) -> String) -> String {
+    by_network(what, of(MttmKind::Compact), of(MttmKind::Paper))
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainMttmArguments {
+    /// Network
+    #[arg(long, value_parser = choices::<MttmKind>(), default_value = default().network.name())]
+    pub network: MttmKind,
+    /// ImageNet weights of ResNet-50 in torchvision's layout (.pth), for --network paper
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
+    #[arg(long, value_name = "N", help = help("Training steps", |k| k.options().common.steps.to_string()))]
+    pub steps: Option<u64>,
+    #[arg(
+        long,
+        value_name = "N",
+        help = help("Regions with an object in a step", |k| k.options().batch.anchors.to_string())
+    )]
+    pub anchors: Option<usize>,
+    #[arg(
+        long,
+        value_name = "RATE",
+        help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
+    )]
+    pub learning_rate: Option<f64>,
+    /// Made-up objects: half of them household shapes, half of them toys
+    #[arg(long, value_name = "N", default_value_t = default().objects)]
+    pub objects: usize,
+    /// Scenes in which they fall on a table, made at the start; each is seen by five cameras
+    #[arg(long, value_name = "N", default_value_t = default().scenes)]
+    pub scenes: usize,
+    /// Seed of weights, objects, scenes and samples
+    #[arg(long, default_value_t = default().seed)]
+    pub seed: u64,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Folder for the model and the training's checkpoints, log and curves
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+impl TrainMttmArguments {
+    pub(super) fn recipe(&self) -> MttmRecipe {
+        MttmRecipe {
+            network: self.network,
+            encoder: self.encoder.clone(),
+            steps: self.steps,
+            anchors: self.anchors,
+            learning_rate: self.learning_rate,
+            objects: self.objects,
+            scenes: self.scenes,
+            seed: self.seed,
+            command: command_line(),
+        }
+    }
+}
+
+/// Trains, or resumes a training, and writes the model.
+pub(super) fn train_mttm(a: &TrainMttmArguments) -> Result<Summary<Measured<Quality>>> {
+    let recipe = checked(a.recipe())?;
+    // Scenes are made before the training and after it.
+    let shown = Shown {
+        preparing: "scenes",
+        measuring: "test scenes",
+        message: |record| {
+            format!(
+                "triplet {:.3}, other objects {:.3}, mask {:.3}, rotation {:.3}, offset {:.3}, matching {:.3}, {:.0} regions/s",
+                loss(record, "triplet"),
+                loss(record, "other objects"),
+                loss(record, "mask"),
+                loss(record, "rotation"),
+                loss(record, "offset"),
+                loss(record, "matching"),
+                record.samples_per_second
+            )
+        },
+    };
+    let trained = train_in(&recipe, (), &a.out, a.export, shown)?;
+    Ok(summary(trained, |quality| Measured { quality }))
+}

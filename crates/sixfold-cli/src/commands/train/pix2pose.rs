@@ -1,0 +1,157 @@
+//! `sixfold train pix2pose`: posed photographs and meshes in, a model file out.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+use sixfold_nn::choice::Choice;
+use sixfold_pix2pose::adversarial::AdversarialOptions;
+use sixfold_pix2pose::preset::Preset;
+use sixfold_pix2pose::recipe::{MIN_VISIBILITY, NetworkKind, Pix2PoseRecipe};
+use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
+
+use super::options::{Degrees, choices};
+use super::{LearntFrom, Shown, Summary, checked, command_line, loss, summary, train_in};
+use crate::arguments::MaterialArguments;
+use crate::commands::material::material;
+
+fn default() -> Pix2PoseRecipe {
+    Pix2PoseRecipe::default()
+}
+
+/// Of the compact network, and of the dissertation's.
+fn options() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
+    (default().compact_options(), default().dissertation_options())
+}
+
+fn steps_help() -> String {
+    let (compact, paper) = options();
+    format!(
+        "Training steps; each takes so many images of every object (default: {}; the dissertation's networks: {}). 0: the \
+         weights of --init as they are, with their alignment's constant error measured anew",
+        compact.common.steps, paper.steps
+    )
+}
+
+fn per_object_help() -> String {
+    let (compact, paper) = options();
+    let (compact, paper) = (compact.per_object, paper.batch);
+    format!("Images of every object in a step (default: {compact}; the dissertation's networks: {paper})")
+}
+
+fn learning_rate_help() -> String {
+    let (compact, paper) = options();
+    let (compact, paper) = (compact.common.learning_rate, paper.learning_rate);
+    format!("Highest learning rate (default: {compact}; the dissertation's networks: {paper})")
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainPix2PoseArguments {
+    #[command(flatten)]
+    pub material: MaterialArguments,
+    /// Folder for checkpoints, learning curves and the finished model
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Which network learns
+    #[arg(long, value_parser = choices::<NetworkKind>(), default_value = default().network.name())]
+    pub network: NetworkKind,
+    #[arg(long, value_name = "N", help = steps_help())]
+    pub steps: Option<u64>,
+    #[arg(long, value_name = "N", help = per_object_help())]
+    pub per_object: Option<usize>,
+    #[arg(long, value_name = "RATE", help = learning_rate_help())]
+    pub learning_rate: Option<f64>,
+    /// Train the compact network against discriminators, one an object, as the dissertation's are
+    #[arg(long, conflicts_with = "no_adversarial")]
+    pub adversarial: bool,
+    /// Train a network of the dissertation without its discriminator
+    #[arg(long)]
+    pub no_adversarial: bool,
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network resnet50 (default: random)
+    #[arg(long, value_name = "FILE")]
+    pub encoder: Option<PathBuf>,
+    /// Stages of the ImageNet encoder that stay as they are, of five
+    #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
+    pub frozen_stages: usize,
+    /// Share of renders among the images, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = default().render_share)]
+    pub render_share: f32,
+    /// Share of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
+    #[arg(long, value_name = "SHARE", default_value_t = default().near_photographs)]
+    pub near_photographs: f32,
+    /// Largest turn of photographs in the image plane, degrees
+    #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
+    pub rotation: Degrees,
+    /// Side of the network's input in pixels; the output has half of it
+    #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
+    pub size: usize,
+    /// Go on from the weights of another training instead of ImageNet's
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
+    /// Draw the meshes in random colours, as untextured CAD models
+    #[arg(long)]
+    pub no_mesh_colors: bool,
+    /// Learn the coordinates of the meshes' convex hulls, as if nothing better were known of the objects
+    #[arg(long)]
+    pub convex_hull: bool,
+    /// Plain L1 for symmetric objects instead of the transformer loss
+    #[arg(long)]
+    pub no_transformer_loss: bool,
+    /// Plain L1 with one side of a symmetric object standing for all, instead of the transformer loss
+    #[arg(long)]
+    pub view_limits: bool,
+    /// Symmetric poses, outlier thresholds and occlusion of an experiment of the dissertation (its appendix A) (default:
+    /// symmetries of the dataset, thresholds of the BOP entries)
+    #[arg(long, value_parser = choices::<Preset>())]
+    pub preset: Option<Preset>,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Seed of weights and samples
+    #[arg(long, default_value_t = default().seed)]
+    pub seed: u64,
+}
+
+impl TrainPix2PoseArguments {
+    pub(super) fn recipe(&self) -> Pix2PoseRecipe {
+        Pix2PoseRecipe {
+            network: self.network,
+            steps: self.steps,
+            per_object: self.per_object,
+            learning_rate: self.learning_rate,
+            adversarial: self.adversarial.then_some(true).or(self.no_adversarial.then_some(false)),
+            encoder: self.encoder.clone(),
+            frozen_stages: self.frozen_stages,
+            render_share: self.render_share,
+            near_photographs: self.near_photographs,
+            rotation: self.rotation.radians,
+            size: self.size,
+            init: self.init.clone(),
+            mesh_colors: !self.no_mesh_colors,
+            convex_hull: self.convex_hull,
+            transformer_loss: !self.no_transformer_loss,
+            view_limits: self.view_limits,
+            preset: self.preset,
+            backgrounds: self.material.backgrounds.clone(),
+            seed: self.seed,
+            command: command_line(),
+        }
+    }
+}
+
+/// Trains, or resumes a training, and writes the model.
+pub(crate) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary<LearntFrom>> {
+    let recipe = checked(a.recipe())?;
+    let material = material(&a.material, MIN_VISIBILITY)?;
+    let objects = material.objects.iter().map(|o| o.id).collect();
+    let learnt_from = LearntFrom { objects, photographs: material.real.len() };
+    let shown = Shown {
+        preparing: "samples",
+        measuring: "alignment measured on the photographs",
+        message: |record| {
+            format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
+        },
+    };
+    let trained = train_in(&recipe, material, &a.out, a.export, shown)?;
+    Ok(summary(trained, |()| learnt_from))
+}

@@ -1,0 +1,94 @@
+//! A network with its optimiser: one step of both, and their part of a checkpoint.
+
+use burn::grad_clipping::GradientClippingConfig;
+use burn::module::Module;
+use burn::optim::{AdamConfig, AdamWConfig, GradientsParams, ModuleOptimizer};
+use burn::tensor::Tensor;
+
+use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
+use crate::options::TrainingOptions;
+
+/// What a checkpoint holds and gives back.
+pub trait Checkpointed {
+    /// Adds it to a checkpoint.
+    ///
+    /// # Errors
+    /// [`CheckpointError`].
+    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError>;
+
+    /// Takes it from a checkpoint.
+    ///
+    /// # Errors
+    /// [`CheckpointError`].
+    fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError>;
+}
+
+/// A network in training, on an autodiff device, with the optimiser of all its parameters.
+pub struct Learner<N> {
+    name: String,
+    network: N,
+    optimiser: ModuleOptimizer,
+}
+
+impl<N: Module> Learner<N> {
+    /// With AdamW, as `options` say. `name` stands for both in checkpoints.
+    pub fn adam_w(name: impl Into<String>, network: N, options: &TrainingOptions) -> Self {
+        let clip = options.max_grad_norm.map(GradientClippingConfig::Norm);
+        let config = AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(clip);
+        Learner { name: name.into(), network, optimiser: config.init() }
+    }
+
+    /// With Adam (Kingma and Ba 2015), its published moments, no weight decay and no clip.
+    pub fn adam(name: impl Into<String>, network: N) -> Self {
+        Learner { name: name.into(), network, optimiser: AdamConfig::new().init() }
+    }
+
+    /// The network as it is now.
+    pub fn network(&self) -> &N {
+        &self.network
+    }
+
+    /// Changes the network in another way than by a step, such as by freezing parts of it.
+    pub fn change(&mut self, change: impl FnOnce(N) -> N) {
+        self.network = change(self.network.clone());
+    }
+
+    /// The trained network, off the autodiff device.
+    pub fn into_network(self) -> N {
+        self.network.valid()
+    }
+
+    /// One step down the gradients of `loss` (one number) at a learning rate.
+    pub fn descend(&mut self, rate: f64, loss: Tensor<1>) {
+        let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
+        self.step(rate, gradients);
+    }
+
+    /// One step of the whole network at a learning rate.
+    pub fn step(&mut self, rate: f64, gradients: GradientsParams) {
+        self.step_part(rate, gradients, |network| network);
+    }
+
+    /// One step of a part of the network, such as a pretrained encoder at a rate of its own.
+    pub fn step_part<P: Module>(
+        &mut self,
+        rate: f64,
+        gradients: GradientsParams,
+        part: impl FnOnce(&mut N) -> &mut P,
+    ) {
+        let part = part(&mut self.network);
+        *part = self.optimiser.step(rate, part.clone(), gradients);
+    }
+}
+
+impl<N: Module> Checkpointed for Learner<N> {
+    fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
+        checkpoint.module(&self.name, &self.network)?.optimiser(&self.name, &self.optimiser)
+    }
+
+    fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+        self.network = checkpoint.module(&self.name, self.network.clone())?;
+        self.optimiser = checkpoint.optimiser(&self.name, self.optimiser.clone())?;
+        Ok(())
+    }
+}

@@ -1,0 +1,167 @@
+//! What all trainings have in common: the optimiser's options, the pace, and the error of an option out of its range.
+
+use serde::{Deserialize, Serialize};
+
+use crate::schedule::LearningRate;
+
+/// An option is out of its range.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: found {found}, expected {expected}")]
+pub struct OptionError {
+    /// Its name.
+    pub field: &'static str,
+    /// What it held.
+    pub found: String,
+    /// What it should hold.
+    pub expected: &'static str,
+}
+
+impl OptionError {
+    /// An option that is out of its range.
+    pub fn new(field: &'static str, found: impl ToString, expected: &'static str) -> Self {
+        OptionError { field, found: found.to_string(), expected }
+    }
+
+    /// This error unless the option `fits`.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless(
+        fits: bool,
+        field: &'static str,
+        found: impl ToString,
+        expected: &'static str,
+    ) -> Result<(), OptionError> {
+        if fits { Ok(()) } else { Err(OptionError::new(field, found, expected)) }
+    }
+
+    /// This error unless `value` is a fraction, 0 to 1.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless_fraction(field: &'static str, value: impl Into<f64>) -> Result<(), OptionError> {
+        let value = value.into();
+        // Numbers of f32 are written as they were given.
+        OptionError::unless((0.0..=1.0).contains(&value), field, value as f32, "0 to 1")
+    }
+
+    /// This error unless `value` is the weight of a loss: finite, 0 or more.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless_weight(field: &'static str, value: f64) -> Result<(), OptionError> {
+        let fits = value >= 0.0 && value.is_finite();
+        OptionError::unless(fits, field, value, "a finite number, 0 or more")
+    }
+}
+
+/// How long and how strongly a network is trained: AdamW (Loshchilov and Hutter 2019) on a cosine schedule. All of it
+/// decides about the result. Methods flatten it into options of their own.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrainingOptions {
+    /// Optimiser steps, 1 or more.
+    pub steps: u64,
+    /// Highest learning rate, above 0; it falls to zero as a cosine.
+    pub learning_rate: f64,
+    /// Steps over which the rate rises at first, in a straight line. A shorter training rises until its last step.
+    pub warm_up: u64,
+    /// Decoupled weight decay, as a multiple of the learning rate, 0 or more.
+    pub weight_decay: f32,
+    /// Gradient-norm clip: a tensor's gradient of a larger Euclidean norm is scaled down to it. None: gradients as they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_grad_norm: Option<f32>,
+    /// Seed of weights and samples.
+    pub seed: u64,
+}
+
+impl TrainingOptions {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless(self.steps > 0, "steps", self.steps, "1 or more")?;
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        let above = "a finite number above 0";
+        OptionError::unless(positive(self.learning_rate), "learning_rate", self.learning_rate, above)?;
+        OptionError::unless_weight("weight_decay", f64::from(self.weight_decay))?;
+        let norm = self.max_grad_norm.unwrap_or(1.0);
+        OptionError::unless(positive(f64::from(norm)), "max_grad_norm", norm, above)
+    }
+
+    /// The learning rate of every step.
+    pub fn schedule(&self) -> LearningRate {
+        LearningRate::Cosine {
+            rate: self.learning_rate,
+            last: 0.0,
+            warm_up: self.warm_up.min(self.steps.saturating_sub(1)),
+            steps: self.steps,
+        }
+    }
+}
+
+/// How often a training is logged and saved, and by how many threads its samples are made. The result does not depend on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pace {
+    /// Steps between checkpoints, 1 or more.
+    pub checkpoint_every: u64,
+    /// Steps between records of the log, 1 or more.
+    pub log_every: u64,
+    /// Threads that make batches beside the training itself.
+    pub sample_threads: usize,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Pace { checkpoint_every: 250, log_every: 25, sample_threads: 1 }
+    }
+}
+
+impl Pace {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless(self.log_every > 0, "log_every", self.log_every, "1 or more")?;
+        OptionError::unless(self.checkpoint_every > 0, "checkpoint_every", self.checkpoint_every, "1 or more")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = TrainingOptions {
+            steps: 10,
+            learning_rate: 1e-3,
+            warm_up: 20,
+            weight_decay: 1e-4,
+            max_grad_norm: Some(5.0),
+            seed: 0,
+        };
+        assert_eq!(options.check(), Ok(()));
+        options.schedule().check().unwrap();
+        let wrong = [
+            (TrainingOptions { steps: 0, ..options.clone() }, "steps: found 0, expected 1 or more"),
+            (TrainingOptions { learning_rate: f64::NAN, ..options.clone() }, "learning_rate: found NaN"),
+            (TrainingOptions { weight_decay: -1.0, ..options.clone() }, "weight_decay: found -1"),
+            (TrainingOptions { max_grad_norm: Some(0.0), ..options.clone() }, "max_grad_norm: found 0"),
+        ];
+        for (options, message) in wrong {
+            let error = options.check().unwrap_err().to_string();
+            assert!(error.starts_with(message), "{error}");
+        }
+        assert_eq!(Pace { log_every: 0, ..Pace::default() }.check().unwrap_err().field, "log_every");
+    }
+
+    #[test]
+    fn gradients_that_are_not_clipped_are_not_mentioned() {
+        let text = r#"{"steps":10,"learning_rate":0.001,"warm_up":2,"weight_decay":0.5,"seed":7}"#;
+        let options: TrainingOptions = serde_json::from_str(text).unwrap();
+        assert_eq!((options.max_grad_norm, options.seed), (None, 7));
+        assert_eq!(serde_json::to_string(&options).unwrap(), text);
+    }
+}

@@ -1,0 +1,541 @@
+//! A whole training: objects and their photographs in, a model file out. Interrupted at any time, it is resumed.
+
+use std::collections::BTreeMap;
+use std::f32::consts::PI;
+use std::path::PathBuf;
+
+use burn::tensor::Device;
+use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_nn::choice::Choice;
+use sixfold_nn::learner::Checkpointed;
+use sixfold_nn::lite0::imagenet_encoder;
+use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_from};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::{Batches, Losses, Plan, Training};
+use sixfold_nn::weights::ModelCard;
+use sixfold_outline::outline_mesh;
+
+use crate::adversarial::{AdversarialBatch, AdversarialOptions, AdversarialTraining};
+use crate::aligned::measure_corrections;
+use sixfold_data::{TrainingSet, backgrounds};
+use crate::model::{ImageSizes, Network, Pix2PoseModel};
+use crate::networks::{Compact, CompactConfig, PaperGenerator, PaperGeneratorConfig, ResNet50Generator, ResNet50GeneratorConfig};
+use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
+use crate::preset::Preset;
+use crate::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
+use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
+
+/// Which network learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum NetworkKind {
+    /// ImageNet encoder shared by all objects, a small decoder for each; trains on two cores.
+    #[default]
+    Compact,
+    /// The dissertation's generator with its discriminator, one object.
+    Paper,
+    /// The same with a ResNet-50 encoder, as in the entry to BOP 2020.
+    ResNet50,
+}
+
+impl Choice for NetworkKind {
+    const ALL: &'static [NetworkKind] = &[NetworkKind::Compact, NetworkKind::Paper, NetworkKind::ResNet50];
+
+    fn name(self) -> &'static str {
+        match self {
+            NetworkKind::Compact => "compact",
+            NetworkKind::Paper => "paper",
+            NetworkKind::ResNet50 => "resnet50",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            NetworkKind::Compact => {
+                "ImageNet encoder shared by all objects, a small decoder for each; trains on two cores"
+            }
+            NetworkKind::Paper => {
+                "The dissertation's generator with its discriminator, one object; asks for a GPU or patience"
+            }
+            NetworkKind::ResNet50 => "The same with a ResNet-50 encoder, as in the entry to BOP 2020",
+        }
+    }
+}
+
+/// How a model is trained.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pix2PoseRecipe {
+    /// Which network learns.
+    pub network: NetworkKind,
+    /// Steps in all; `None`: those of [`Pix2PoseTrainingOptions`], the dissertation's networks those of
+    /// [`AdversarialOptions`], as for the next two. 0: the weights of `init` as they are, with their alignment's systematic error
+    /// measured again.
+    pub steps: Option<u64>,
+    /// Images of every object in a step.
+    pub per_object: Option<usize>,
+    /// Highest learning rate.
+    pub learning_rate: Option<f64>,
+    /// Train against a discriminator; `None`: the dissertation's networks with one, the compact one without.
+    pub adversarial: Option<bool>,
+    /// torchvision's ResNet-50 weights for [`NetworkKind::ResNet50`]; random ones without.
+    pub encoder: Option<PathBuf>,
+    /// Stages of the ImageNet encoder that stay as they are, of five.
+    pub frozen_stages: usize,
+    /// Share of renders among the images, 0 to 1.
+    pub render_share: f32,
+    /// Share of renders whose pose lies near one of a photograph, 0 to 1.
+    pub near_photographs: f32,
+    /// Largest turn of photographs in the image plane, radians.
+    pub rotation: f32,
+    /// Side of the network's input in pixels, a multiple of 32.
+    pub size: usize,
+    /// Go on from the weights of another training instead of ImageNet's.
+    pub init: Option<PathBuf>,
+    /// Draw the meshes in their own colours; otherwise in random ones.
+    pub mesh_colors: bool,
+    /// Learn the coordinates of the meshes' convex hulls.
+    pub convex_hull: bool,
+    /// The transformer loss for symmetric objects (equation 3.2); otherwise plain L1.
+    pub transformer_loss: bool,
+    /// Plain L1 with one side of a symmetric object standing for all.
+    pub view_limits: bool,
+    /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as they
+    /// are stated, the thresholds of its BOP entries.
+    pub preset: Option<Preset>,
+    /// Folder of photographs for backgrounds; made-up textures without.
+    pub backgrounds: Option<PathBuf>,
+    /// Seed of weights and samples.
+    pub seed: u64,
+    /// What was asked for, for the model's card.
+    pub command: String,
+}
+
+impl Default for Pix2PoseRecipe {
+    fn default() -> Self {
+        let samples = SampleOptions::default();
+        Pix2PoseRecipe {
+            network: NetworkKind::Compact,
+            steps: None,
+            per_object: None,
+            learning_rate: None,
+            adversarial: None,
+            encoder: None,
+            frozen_stages: Pix2PoseTrainingOptions::default().frozen_stages,
+            render_share: samples.render_share,
+            near_photographs: samples.near_real_share,
+            rotation: samples.rotation,
+            size: samples.size,
+            init: None,
+            mesh_colors: true,
+            convex_hull: false,
+            transformer_loss: true,
+            view_limits: false,
+            preset: None,
+            backgrounds: None,
+            seed: 0,
+            command: String::new(),
+        }
+    }
+}
+
+/// Instances below this visibility add label noise.
+pub const MIN_VISIBILITY: f64 = 0.25;
+
+/// Weight of the compact network's adversarial loss: the dissertation's lambda_1 is 100.
+const ADVERSARIAL: f32 = 0.01;
+
+/// What is known beside the network before the first step.
+pub struct Context {
+    objects: Vec<TrainingObject>,
+    real: Vec<RealCrop>,
+    entries: Vec<ObjectEntry>,
+    sizes: ImageSizes,
+    outlines: BTreeMap<u32, (Mesh, ModelInfo)>,
+}
+
+impl Pix2PoseRecipe {
+    /// How the compact network is trained.
+    pub fn compact_options(&self) -> Pix2PoseTrainingOptions {
+        let default = Pix2PoseTrainingOptions::default();
+        Pix2PoseTrainingOptions {
+            common: TrainingOptions {
+                steps: self.steps.unwrap_or(default.common.steps),
+                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
+                seed: self.seed,
+                ..default.common
+            },
+            per_object: self.per_object.unwrap_or(default.per_object),
+            frozen_stages: self.frozen_stages,
+            transformer_loss: self.transformer_loss && !self.view_limits,
+            adversarial: if self.adversarial == Some(true) { ADVERSARIAL } else { 0.0 },
+            ..default
+        }
+    }
+
+    /// How the dissertation's networks are trained.
+    pub fn dissertation_options(&self) -> AdversarialOptions {
+        let default = AdversarialOptions::default();
+        AdversarialOptions {
+            steps: self.steps.unwrap_or(default.steps),
+            batch: self.per_object.unwrap_or(default.batch),
+            learning_rate: self.learning_rate.unwrap_or(default.learning_rate),
+            adversarial: self.adversarial.unwrap_or(default.adversarial),
+            transformer_loss: self.transformer_loss && !self.view_limits,
+            seed: self.seed,
+            ..default
+        }
+    }
+
+    /// How samples are made.
+    fn sample_options(&self, sizes: ImageSizes) -> SampleOptions {
+        let default = SampleOptions::default();
+        SampleOptions {
+            size: sizes.input,
+            target_size: Some(sizes.output),
+            render_share: self.render_share,
+            near_real_share: self.near_photographs,
+            rotation: self.rotation,
+            random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
+            view_limits: self.view_limits,
+            occlusion: self.preset.map_or(default.occlusion, Preset::occlusion),
+            seed: self.seed,
+            ..default
+        }
+    }
+
+    /// Objects as the preset and `convex_hull` want them, and what they are in words.
+    fn objects(
+        &self,
+        mut objects: Vec<TrainingObject>,
+        mut description: String,
+        session: &mut Session<'_>,
+    ) -> Result<(Vec<TrainingObject>, String), TrainError> {
+        if let Some(preset) = self.preset {
+            for object in &mut objects {
+                apply(preset, object, session)?;
+            }
+            description += &format!("; the dissertation's parameters for {}", preset.name());
+        }
+        for object in &objects {
+            warn_of_symmetry(object, session);
+        }
+        if self.convex_hull {
+            for object in &mut objects {
+                let about = format!("object {}: its vertices have no convex hull", object.id);
+                object.mesh = object.mesh.convex_hull().map_err(TrainError::about(about))?;
+            }
+            description += "; convex hulls in place of the meshes";
+        }
+        Ok((objects, description))
+    }
+
+    fn entry(&self, object: &TrainingObject) -> ObjectEntry {
+        let mut entry = ObjectEntry::new(object.id, &object.info, &object.scale);
+        if let Some(thresholds) = self.preset.and_then(|preset| preset.thresholds(object.id)) {
+            entry.thresholds = thresholds;
+        }
+        entry
+    }
+
+    fn card(&self, description: String) -> Result<ModelCard, TrainError> {
+        if let (Some(file), Some(0)) = (&self.init, self.steps) {
+            let mut card = Pix2PoseModel::load(file).map_err(TrainError::method)?.card().clone();
+            card.extra["corrections"] = serde_json::json!({ "command": self.command, "data": description });
+            return Ok(card);
+        }
+        let mut card = ModelCard::new("", "Pix2Pose, compact network");
+        card.data = description;
+        card.extra = serde_json::json!({
+            "training": self.compact_options(), "continued_from": continued_from(self.init.as_deref())?
+        });
+        if self.network != NetworkKind::Compact {
+            card.title = format!("Pix2Pose, the dissertation's schedule, {} network", self.network.name());
+            card.extra = serde_json::json!({ "training": self.dissertation_options() });
+        }
+        Ok(card)
+    }
+
+    fn training(&self, objects: &[TrainingObject], device: Device) -> Result<Pix2PoseTraining, TrainError> {
+        let ids: Vec<u32> = objects.iter().map(|o| o.id).collect();
+        let mut pools: Vec<Vec<SymmetryMap>> =
+            objects.iter().map(|o| SymmetryMap::pool(&o.info, &o.scale)).collect();
+        Ok(match self.network {
+            NetworkKind::Compact => {
+                let network = self.compact(&ids, &device)?;
+                let options = self.compact_options();
+                Pix2PoseTraining::Compact(CompactTraining::new(network, pools, self.size, options, device))
+            }
+            NetworkKind::Paper => {
+                let generator = PaperGeneratorConfig { seed: self.seed }.init(&device);
+                let options = self.dissertation_options();
+                Pix2PoseTraining::Paper(AdversarialTraining::new(generator, pools.remove(0), options, device))
+            }
+            NetworkKind::ResNet50 => {
+                let config = ResNet50GeneratorConfig { seed: self.seed };
+                let generator = match &self.encoder {
+                    Some(file) => config.from_pytorch(file, &device).map_err(TrainError::method)?,
+                    None => config.init(&device),
+                };
+                let options = self.dissertation_options();
+                let training = AdversarialTraining::new(generator, pools.remove(0), options, device);
+                Pix2PoseTraining::ResNet50(training)
+            }
+        })
+    }
+
+    fn compact(&self, ids: &[u32], device: &Device) -> Result<Compact, TrainError> {
+        match &self.init {
+            Some(file) => Pix2PoseModel::network_for_training(file, ids, device).map_err(TrainError::method),
+            None => {
+                let config = CompactConfig { objects: ids.len() };
+                Ok(config.init(imagenet_encoder(device)?, self.seed, device))
+            }
+        }
+    }
+}
+
+impl Recipe for Pix2PoseRecipe {
+    type Data = TrainingSet;
+    type Samples = SampleSource;
+    type Training = Pix2PoseTraining;
+    type Context = Context;
+    type Report = ();
+
+    fn steps(&self) -> u64 {
+        match self.network {
+            NetworkKind::Compact => self.compact_options().common.steps,
+            _ => self.dissertation_options().steps,
+        }
+    }
+
+    fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    fn command(&self) -> &str {
+        &self.command
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        let fits = self.size.is_multiple_of(32) && (32..=512).contains(&self.size);
+        OptionError::unless(fits, "size", self.size, "a multiple of 32 from 32 to 512")?;
+        let fits = (0.0..=PI).contains(&self.rotation);
+        OptionError::unless(fits, "rotation", self.rotation, "radians from 0 to half a turn")?;
+        OptionError::unless_fraction("render_share", self.render_share)?;
+        OptionError::unless_fraction("near_photographs", self.near_photographs)?;
+        OptionError::unless(self.per_object != Some(0), "per_object", 0, "1 or more")?;
+        let expected = "1 or more, or weights to begin with, whose alignment is then measured anew";
+        OptionError::unless(self.steps != Some(0) || self.init.is_some(), "steps", 0, expected)?;
+        if self.network == NetworkKind::Compact {
+            let common = TrainingOptions { steps: self.steps().max(1), ..self.compact_options().common };
+            Pix2PoseTrainingOptions { common, ..self.compact_options() }.check()
+        } else {
+            let fits = self.size == 128 && self.init.is_none();
+            OptionError::unless(fits, "network", self.described(1), DISSERTATION)?;
+            self.dissertation_options().check()
+        }
+    }
+
+    fn prepare(
+        &self,
+        material: TrainingSet,
+        session: &mut Session<'_>,
+    ) -> Result<Prepared<Pix2PoseTraining, Context>, TrainError> {
+        let TrainingSet { objects, real, description, .. } = material;
+        let compact = self.network == NetworkKind::Compact;
+        let fits = compact || objects.len() == 1;
+        OptionError::unless(fits, "network", self.described(objects.len()), DISSERTATION)?;
+        let (objects, description) = self.objects(objects, description, session)?;
+        let training = self.training(&objects, Device::flex().autodiff())?;
+        let card = self.card(description)?;
+        let context = Context {
+            entries: objects.iter().map(|o| self.entry(o)).collect(),
+            sizes: ImageSizes { input: self.size, output: if compact { self.size / 2 } else { self.size } },
+            outlines: outlines(&objects, &real),
+            objects,
+            real,
+        };
+        Ok(Prepared { training, card, context })
+    }
+
+    fn samples(
+        &self,
+        context: &mut Context,
+        session: &mut Session<'_>,
+    ) -> Result<Option<SampleSource>, TrainError> {
+        let Context { objects, real, sizes, .. } = context;
+        let backgrounds =
+            backgrounds(self.backgrounds.as_deref(), real, objects).map_err(TrainError::method)?;
+        session.note(&format!(
+            "making {} objects and {} photographed instances ready",
+            objects.len(),
+            real.len()
+        ));
+        let objects = std::mem::take(objects);
+        SampleSource::new(objects, real.clone(), backgrounds, self.sample_options(*sizes))
+            .map(Some)
+            .map_err(TrainError::method)
+    }
+
+    /// Measures the systematic error of the model's aligned poses on the photographs that it learnt from.
+    fn finish(
+        &self,
+        Prepared { training, card, context }: Prepared<Pix2PoseTraining, Context>,
+        session: &mut Session<'_>,
+    ) -> Result<Option<()>, TrainError> {
+        let Context { real, entries, sizes, outlines, .. } = context;
+        let mut model = match (&self.init, self.steps) {
+            (Some(file), Some(0)) => Pix2PoseModel::load(file).map_err(TrainError::method)?.with_card(card),
+            _ => Pix2PoseModel::new(training.into_network(), entries, sizes, card),
+        };
+        let path = session.model();
+        model.save(&path).map_err(TrainError::method)?;
+        if real.is_empty() {
+            return Ok(Some(()));
+        }
+        let mut done = 0;
+        let corrections = measure_corrections(&model, &real, &outlines, || {
+            done += 1;
+            (session.events)(TrainingEvent::Measuring(done, real.len()));
+        })
+        .map_err(TrainError::method)?;
+        model.set_corrections(&corrections);
+        model.save(&path).map_err(TrainError::method)?;
+        Ok(Some(()))
+    }
+}
+
+/// What the dissertation's networks can be trained with.
+const DISSERTATION: &str =
+    "the compact network, or one object, images of 128 pixels and no weights to begin with";
+
+impl Pix2PoseRecipe {
+    fn described(&self, objects: usize) -> String {
+        format!("{} for {objects} objects, images of {} pixels", self.network.name(), self.size)
+    }
+}
+
+/// One of the networks in training.
+#[allow(clippy::large_enum_variant)]
+pub enum Pix2PoseTraining {
+    /// See [`NetworkKind::Compact`].
+    Compact(CompactTraining),
+    /// See [`NetworkKind::Paper`].
+    Paper(AdversarialTraining<PaperGenerator>),
+    /// See [`NetworkKind::ResNet50`].
+    ResNet50(AdversarialTraining<ResNet50Generator>),
+}
+
+/// What a step of one of the networks learns from.
+pub enum Pix2PoseBatch {
+    /// Images of all objects.
+    Compact(CompactBatch),
+    /// Images of one object.
+    Adversarial(AdversarialBatch),
+}
+
+impl Pix2PoseTraining {
+    /// The trained network.
+    pub fn into_network(self) -> Network {
+        match self {
+            Pix2PoseTraining::Compact(training) => Network::Compact(Box::new(training.into_network())),
+            Pix2PoseTraining::Paper(training) => Network::Paper(Box::new(training.into_network())),
+            Pix2PoseTraining::ResNet50(training) => Network::ResNet50(Box::new(training.into_network())),
+        }
+    }
+}
+
+impl Training for Pix2PoseTraining {
+    type Samples = SampleSource;
+    type Batch = Pix2PoseBatch;
+
+    fn plan(&self, source: &SampleSource) -> Result<Plan, TrainError> {
+        match self {
+            Pix2PoseTraining::Compact(training) => training.plan(source),
+            Pix2PoseTraining::Paper(training) => training.plan(source),
+            Pix2PoseTraining::ResNet50(training) => training.plan(source),
+        }
+    }
+
+    fn batches<'a>(&self, source: &'a SampleSource) -> Batches<'a, Pix2PoseBatch> {
+        let adversarial = match self {
+            Pix2PoseTraining::Compact(training) => {
+                let batches = training.batches(source);
+                return Box::new(move |step| Pix2PoseBatch::Compact(batches(step)));
+            }
+            Pix2PoseTraining::Paper(training) => training.batches(source),
+            Pix2PoseTraining::ResNet50(training) => training.batches(source),
+        };
+        Box::new(move |step| Pix2PoseBatch::Adversarial(adversarial(step)))
+    }
+
+    fn step(&mut self, batch: Pix2PoseBatch, rate: f64) -> Losses {
+        match (self, batch) {
+            (Pix2PoseTraining::Compact(t), Pix2PoseBatch::Compact(batch)) => t.step(batch, rate),
+            (Pix2PoseTraining::Paper(t), Pix2PoseBatch::Adversarial(batch)) => t.step(batch, rate),
+            (Pix2PoseTraining::ResNet50(t), Pix2PoseBatch::Adversarial(batch)) => t.step(batch, rate),
+            _ => unreachable!("batches are those of the network"),
+        }
+    }
+
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        match self {
+            Pix2PoseTraining::Compact(training) => training.learners(),
+            Pix2PoseTraining::Paper(training) => training.learners(),
+            Pix2PoseTraining::ResNet50(training) => training.learners(),
+        }
+    }
+
+    fn restored(&mut self) {
+        if let Pix2PoseTraining::Compact(training) = self {
+            training.restored();
+        }
+    }
+}
+
+/// What the alignment is measured with, where there are photographs to measure it on.
+fn outlines(objects: &[TrainingObject], photographs: &[RealCrop]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
+    if photographs.is_empty() {
+        return BTreeMap::new();
+    }
+    objects.iter().map(|o| (o.id, (outline_mesh(&o.mesh), o.info.clone()))).collect()
+}
+
+/// Gives an object the symmetries of a preset, which must have the object.
+fn apply(preset: Preset, object: &mut TrainingObject, session: &mut Session<'_>) -> Result<(), OptionError> {
+    if preset.thresholds(object.id).is_none() {
+        let found = format!("{} with object {}", preset.name(), object.id);
+        return Err(OptionError::new("preset", found, preset.objects()));
+    }
+    let pooled = preset.with_pool(object.id, &object.info);
+    let stated = std::mem::replace(&mut object.info, pooled);
+    let count = |info: &ModelInfo| (info.symmetries_discrete.len(), info.symmetries_continuous.len());
+    if count(&stated) != count(&object.info) {
+        session.note(&format!(
+            "object {}: {} discrete and {} continuous symmetries of appendix A in place of the dataset's {} and {}",
+            object.id,
+            object.info.symmetries_discrete.len(),
+            object.info.symmetries_continuous.len(),
+            stated.symmetries_discrete.len(),
+            stated.symmetries_continuous.len()
+        ));
+    }
+    Ok(())
+}
+
+/// A symmetry that the mesh does not have misleads the training: says how far the surface moves under it.
+fn warn_of_symmetry(object: &TrainingObject, session: &mut Session<'_>) {
+    for pose in object.info.symmetry_poses(0.1).iter().skip(1) {
+        let deviation = symmetry_deviation(&object.mesh, pose);
+        if deviation > 0.05 * object.info.diameter {
+            session.warn(&format!(
+                "object {}: under a declared symmetry its surface moves by {:.1} mm ({:.0} % of the diameter); \
+                 check symmetries in models_info.json",
+                object.id,
+                1000.0 * deviation,
+                100.0 * deviation / object.info.diameter
+            ));
+            return;
+        }
+    }
+}
