@@ -12,6 +12,7 @@
 
 pub mod crop;
 mod crop_turn;
+pub mod learner;
 pub mod loss;
 pub mod model;
 pub mod networks;

@@ -24,6 +24,7 @@ mod source;
 mod surface;
 pub mod synthesis;
 pub mod training;
+pub mod view_grid;
 
 pub use features::SourceFeatures;
 pub use maps::Maps;

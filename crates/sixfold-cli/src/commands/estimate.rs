@@ -8,12 +8,13 @@ use sixfold_bop::{CameraFile, read_depth, read_mask, read_rgb, write_rgb};
 use sixfold_geometry::{Camera, DepthImage, Mask, Rect, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_match::{Estimate, EstimateOptions, Scene, SceneOptions, VerificationScore, estimate};
 
-use crate::Outcome;
-use crate::arguments::EstimateArguments;
-use crate::objects;
-use crate::output::{pose_rows, report};
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use super::boxes::box_mask;
+use crate::commands::estimate_arguments::EstimateArguments;
+use sixfold_shell::Outcome;
+use sixfold_shell::objects;
+use sixfold_shell::output::{pose_rows, report};
+use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Least confidence of a pose in one image: on real frames most wrong poses lie below, most right ones above.
 const SURE_ENOUGH: f64 = 0.25;
@@ -121,7 +122,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let whole = Whole { poses: results, not_found: missing, overlay };
     if let Some(folder) = &a.out {
         let text = serde_json::to_string_pretty(&whole)?;
-        crate::output::write_atomically(&folder.join("poses.json"), text.as_bytes())?;
+        sixfold_shell::output::write_atomically(&folder.join("poses.json"), text.as_bytes())?;
     }
     report(&a.json, &whole, || print_table(&whole, a.out.as_deref()))?;
     Ok(if any { Outcome::Found } else { Outcome::NothingFound })
@@ -194,15 +195,6 @@ pub(super) fn estimate_options(a: &EstimateArguments, instances: usize) -> Estim
         min_score: a.min_score.unwrap_or(default.min_score),
         ..default
     }
-}
-
-/// The pixels of a box, grown a little: boxes are tight and depth shifts against colour.
-pub(super) fn box_mask(region: &Rect, camera: &Camera) -> Mask {
-    let r = region.scaled(1.1);
-    Mask::from_fn(camera.width, camera.height, |x, y| {
-        let (x, y) = (x as f64, y as f64);
-        x >= r.x && y >= r.y && x < r.x + r.width && y < r.y + r.height
-    })
 }
 
 /// `--box`, which has a size and shows something of the image.

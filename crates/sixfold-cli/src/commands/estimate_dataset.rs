@@ -18,12 +18,12 @@ use super::estimate::{estimate_options, scene_options};
 use super::frames::excepted;
 use super::mttm;
 use super::pix2pose::Pix2Pose;
-use crate::Outcome;
-use crate::arguments::{EstimateArguments, Method};
-use crate::objects::{self, Object};
-use crate::output::{report, write_atomically};
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use crate::commands::estimate_arguments::{EstimateArguments, Method};
+use sixfold_shell::Outcome;
+use sixfold_shell::objects::{self, Object};
+use sixfold_shell::output::{report, write_atomically};
+use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// What a result file was made with; kept beside it so that a later run goes on with the same.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -116,7 +116,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
                 "--method pix2pose needs boxes: give --detector FILE.safetensors, --boxes gt or a file of COCO detections"
             )
         }
-        Method::Pix2pose => Some(Pix2Pose::new(a)?),
+        Method::Pix2pose => Some(Pix2Pose::new(a.weights.as_deref(), a.seed, a.looks, a.refines())?),
         Method::Ppf if a.weights.is_some() || a.icp || a.looks.is_some() => {
             bail!(
                 "--weights, --icp and --looks belong to --method pix2pose; point pair features need none of them"
@@ -250,7 +250,7 @@ pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
             None => by_depth(a, scene, *im_id, targets, &known, &boxes),
         };
         match found {
-            Err(error) => skipped.push(format!("image {key}: {}", crate::describe(&error))),
+            Err(error) => skipped.push(format!("image {key}: {}", sixfold_shell::describe(&error))),
             Ok(found) => {
                 let time = start.elapsed().as_secs_f64();
                 seconds.push(time);
@@ -364,7 +364,7 @@ fn by_pix2pose(
                         "note: image {}/{im_id}, object {}: {}",
                         target.scene_id,
                         o.obj_id,
-                        crate::describe(&error)
+                        sixfold_shell::describe(&error)
                     );
                     continue;
                 }

@@ -17,11 +17,11 @@ use super::boxes::Region;
 use super::detect;
 use super::estimate::{depth_scale, given_box};
 use super::pix2pose::{Pix2Pose, view_picture};
-use crate::Outcome;
-use crate::arguments::EstimateArguments;
-use crate::objects;
-use crate::output::{pose_rows, report, write_atomically};
-use crate::overlay::{self, Drawn};
+use crate::commands::estimate_arguments::EstimateArguments;
+use sixfold_shell::Outcome;
+use sixfold_shell::objects;
+use sixfold_shell::output::{pose_rows, report, write_atomically};
+use sixfold_shell::overlay::{self, Drawn};
 
 #[derive(Serialize)]
 struct Found {
@@ -64,7 +64,7 @@ struct Whole {
 }
 
 pub(crate) fn run(a: &EstimateArguments) -> Result<Outcome> {
-    let pix2pose = Pix2Pose::new(a)?;
+    let pix2pose = Pix2Pose::new(a.weights.as_deref(), a.seed, a.looks, a.refines())?;
     let rgb_file = a.rgb.as_deref().ok_or_else(|| {
         anyhow!("--method pix2pose needs a colour image: give --rgb FILE (with --camera and --box) or --dataset DIR")
     })?;

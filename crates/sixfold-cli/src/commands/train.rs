@@ -6,10 +6,10 @@ use sixfold_pix2pose::recipe::{LEAST_VISIBLE, Recipe};
 
 use super::material::{Shown, Summary, command_line, interrupted_after, loss, material};
 use super::train_detector::train_detector;
-use crate::Outcome;
 use crate::arguments::{Preset, TrainArguments, TrainCommand, TrainPix2PoseArguments};
-use crate::output::report;
-use crate::progress::interrupted;
+use sixfold_shell::Outcome;
+use sixfold_shell::output::report;
+use sixfold_shell::progress::interrupted;
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
     match &a.command {

@@ -6,7 +6,7 @@ use sixfold_nn::training::Ending;
 
 use super::material::{Shown, Summary, command_line, interrupted_after, loss, material};
 use crate::arguments::{DetectorKind, TrainDetectorArguments};
-use crate::progress::interrupted;
+use sixfold_shell::progress::interrupted;
 
 /// Trains, or goes on with a training, and writes the model.
 pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary> {

@@ -10,7 +10,7 @@ use sixfold_nn::recipe::Trained;
 use sixfold_nn::training::Ending;
 
 use super::material::{Shown, command_line, interrupted_after, loss};
-use crate::progress::interrupted;
+use sixfold_shell::progress::interrupted;
 
 /// Which network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

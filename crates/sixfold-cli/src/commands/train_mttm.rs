@@ -12,7 +12,7 @@ use sixfold_nn::recipe::{News, Trained};
 use sixfold_nn::training::Ending;
 
 use super::material::{Shown, command_line, interrupted_after, loss};
-use crate::progress::{Progress, interrupted};
+use sixfold_shell::progress::{Progress, interrupted};
 
 /// Which network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

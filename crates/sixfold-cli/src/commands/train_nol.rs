@@ -13,7 +13,7 @@ use sixfold_nol::quality::Quality;
 use sixfold_nol::recipe::{self, Recipe};
 
 use super::material::{Shown, command_line, interrupted_after, loss};
-use crate::progress::interrupted;
+use sixfold_shell::progress::interrupted;
 
 /// Which network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

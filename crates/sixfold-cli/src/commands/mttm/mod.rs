@@ -3,7 +3,6 @@
 pub(crate) mod arguments;
 pub(crate) mod network;
 pub(crate) mod onboard;
-pub(crate) mod reproduce;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,12 +20,12 @@ use sixfold_mttm::{
 
 use self::network::{network, with_network};
 use super::estimate::Input;
-use crate::Outcome;
-use crate::arguments::EstimateArguments;
-use crate::objects::{self, Object, Store};
-use crate::output::{pose_rows, report, write_atomically};
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use crate::commands::estimate_arguments::EstimateArguments;
+use sixfold_shell::Outcome;
+use sixfold_shell::objects::{self, Object, Store};
+use sixfold_shell::output::{pose_rows, report, write_atomically};
+use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Least confidence of a pose in one image.
 const SURE_ENOUGH: f64 = 0.45;

@@ -6,7 +6,7 @@ use anyhow::Result;
 use sixfold_bop::{BopDataset, write_rgb};
 use sixfold_geometry::RgbImage;
 
-use crate::overlay;
+use sixfold_shell::overlay;
 
 /// Scenes and colour views shown.
 const SCENES: usize = 6;

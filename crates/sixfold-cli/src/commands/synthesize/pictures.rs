@@ -9,7 +9,7 @@ use sixfold_mesh::Mesh;
 use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
-use crate::overlay;
+use sixfold_shell::overlay;
 
 /// Side of a picture in a sheet.
 const SIDE: usize = 160;
