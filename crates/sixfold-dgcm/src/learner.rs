@@ -33,6 +33,9 @@ pub struct LearnerOptions {
     pub part: Option<String>,
 }
 
+/// The part that a grasp is on; none in particular, or one by name.
+pub type PartOf<'a> = dyn Fn(&Grasp) -> Option<&'static str> + 'a;
+
 /// An object in front of the robot.
 pub struct Lesson<'a> {
     /// What the camera sees of it.
@@ -44,7 +47,7 @@ pub struct Lesson<'a> {
     /// Where what is stored comes from.
     pub provenance: &'a str,
     /// The part that a grasp is on, where somebody knows the object's parts.
-    pub part_of: Option<&'a dyn Fn(&Grasp) -> Option<&'static str>>,
+    pub part_of: Option<&'a PartOf<'a>>,
     /// Seconds since 1970.
     pub now: fn() -> i64,
 }

@@ -19,7 +19,7 @@ pub(crate) enum GraspCommand {
     #[command(after_help = "Examples:\n  \
         sixfold grasp measure --object can.ply mug.ply --unit mm --trials 20\n  \
         sixfold grasp measure --list benches/grasp-objects.json --meshes DIR --out out/grasps")]
-    Measure(measure::MeasureArguments),
+    Measure(Box<measure::MeasureArguments>),
     /// Compare geometry, experience and both on the same simulated scenes
     #[command(after_help = "Example:\n  \
         sixfold grasp compare --experiences experience.db --list benches/grasp-objects.json --meshes DIR --hard --out out/compare\n\n\

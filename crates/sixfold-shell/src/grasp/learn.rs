@@ -8,7 +8,7 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::learner::{Learner, LearnerOptions, Lesson};
+use sixfold_dgcm::learner::{Learner, LearnerOptions, Lesson, PartOf};
 use sixfold_dgcm::store::StorePlace;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, middle_between_pads};
@@ -343,7 +343,7 @@ fn attempt(
         planner: AntipodalOptions { seed: scene.noise, ..setting.options.planner },
         object: &pupil.name,
         provenance: &format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, a.seed),
-        part_of: pupil.made.as_ref().map(|_| &part_of as &dyn Fn(&Grasp) -> Option<&'static str>),
+        part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
         now,
     };
     let learned = learner.learn(&lesson, &mut |grasp| {
