@@ -10,6 +10,7 @@
 // `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
+pub mod learner;
 pub mod loss;
 pub mod model;
 pub mod networks;

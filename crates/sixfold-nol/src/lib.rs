@@ -2,16 +2,16 @@
 //! mesh, and makes those poses better (K. Park, *6D Pose Estimation of Objects Using Limited Training Data*, TU Wien 2020,
 //! chapter 4).
 //!
-//! A [`PosedImage`](sixfold_data::PosedImage) is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
+//! A [`Photograph`] is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
 pub mod agreement;
-mod error;
 mod features;
 pub mod loss;
 mod maps;
 pub mod model;
 pub mod network;
+mod photograph;
 mod preview;
 mod projection;
 pub mod quality;
@@ -24,11 +24,10 @@ mod source;
 mod surface;
 pub mod synthesis;
 pub mod training;
-mod window;
+pub mod view_grid;
 
-pub use error::NolError;
 pub use features::SourceFeatures;
 pub use maps::Maps;
+pub use photograph::{NolError, Photograph, object_window};
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;
-pub use window::object_window;

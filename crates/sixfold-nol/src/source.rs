@@ -5,8 +5,6 @@ use sixfold_data::{PosedImage, PosedImageError};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
-use sixfold_synth::augment::{Coverage, Patch};
-
 use crate::error::NolError;
 use crate::projection::{Projection, TargetSurface};
 use crate::window::object_window;

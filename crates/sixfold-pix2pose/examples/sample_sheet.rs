@@ -10,16 +10,13 @@
 use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
-
-use sixfold_bop::{BopDataset, Models, write_rgb};
 use sixfold_synth::augment::{Backgrounds, ColorAugmentation, PhotographOptions};
+use sixfold_bop::{BopDataset, Models};
+use sixfold_io::write_rgb;
 use sixfold_data::{FrameId, TrainingObject, read_posed_images};
 use sixfold_geometry::RgbImage;
-use sixfold_io::write_rgb;
 use sixfold_mesh::ModelInfo;
-use sixfold_pix2pose::samples::{Sample, SampleOptions, SampleSource, TrainingObject, read_real_crops};
-use sixfold_render::BoundingBoxScale;
-use sixfold_synth::augment::{Backgrounds, ColorAugmentation, PhotographOptions};
+use sixfold_pix2pose::samples::{Sample, SampleOptions, SampleSource};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

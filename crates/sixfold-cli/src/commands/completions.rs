@@ -1,14 +1,20 @@
 //! `sixfold completions`.
 
 use anyhow::Result;
-use clap::CommandFactory;
+use clap::Args;
+use sixfold_shell::Outcome;
 
-use crate::Outcome;
-use crate::arguments::{Arguments, CompletionsArguments};
+#[derive(Debug, Args)]
+pub(crate) struct CompletionsArguments {
+    /// Which shell
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}
 
-pub(crate) fn run(a: &CompletionsArguments) -> Result<Outcome> {
+/// Prints completions for the program's command line.
+pub(crate) fn run(a: &CompletionsArguments, mut program: clap::Command) -> Result<Outcome> {
     let mut script = vec![];
-    clap_complete::generate(a.shell, &mut Arguments::command(), "sixfold", &mut script);
+    clap_complete::generate(a.shell, &mut program, "sixfold", &mut script);
     print!("{}", String::from_utf8_lossy(&script));
     Ok(Outcome::Found)
 }

@@ -12,57 +12,13 @@ use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
 use sixfold_io::{read_rgb, write_rgb};
 
-use super::frames::excepted;
-use crate::Outcome;
-use crate::arguments::DetectArguments;
-use crate::output::{report, write_atomically};
-use crate::overlay;
-use crate::progress::{Progress, check_interrupt};
-
-/// A detector with what is asked of it.
-pub(crate) struct Detector {
-    model: DetectorModel,
-    options: DetectOptions,
-}
-
-impl Detector {
-    /// The detector of a weight file with its default threshold.
-    pub fn load(weights: &Path) -> Result<Detector> {
-        let model = DetectorModel::load(weights)?;
-        let options = model.options();
-        Ok(Detector { model, options })
-    }
-
-    pub fn model(&self) -> &DetectorModel {
-        &self.model
-    }
-
-    /// Detections below `threshold` are left out.
-    pub fn with_threshold(self, threshold: f32) -> Detector {
-        Detector { options: DetectOptions { threshold, ..self.options }, ..self }
-    }
-
-    /// Detections of an image as COCO has them.
-    pub fn detections(&self, image: &RgbImage, scene_id: u32, image_id: u32) -> Result<Vec<Detection>> {
-        let start = Instant::now();
-        let found = self.model.detect(image, &self.options)?;
-        let time = start.elapsed().as_secs_f64();
-        found
-            .iter()
-            .map(|d| {
-                Ok(Detection {
-                    scene_id,
-                    image_id,
-                    category_id: self.model.id_of(d.class),
-                    score: f64::from(d.score),
-                    bbox: Some(d.bbox),
-                    segmentation: d.mask.as_ref().map(Rle::encode).transpose()?,
-                    time: Some(time),
-                })
-            })
-            .collect()
-    }
-}
+use super::detect_arguments::DetectArguments;
+use sixfold_shell::Outcome;
+use sixfold_shell::detector::Detector;
+use sixfold_shell::frames::excepted;
+use sixfold_shell::output::{report, write_atomically};
+use sixfold_shell::overlay;
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Serialize)]
 struct Found {
@@ -137,7 +93,7 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
-    let detector = Detector { model, options };
+    let detector = Detector::new(model, options);
     match (&a.dataset, &a.rgb[..]) {
         (Some(root), _) => in_dataset(a, &detector, root),
         (None, [file]) => in_image(a, &detector, file),
@@ -213,7 +169,7 @@ fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Res
                 images.push(OneOfMany { image: number, file: file.clone(), detections, seconds });
                 all.extend(found);
             }
-            Err(error) => skipped.push(format!("{}: {}", file.display(), crate::describe(&error))),
+            Err(error) => skipped.push(format!("{}: {}", file.display(), sixfold_shell::describe(&error))),
         }
         progress.step(file.display().to_string());
     }
@@ -269,7 +225,7 @@ fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<O
             let time = start.elapsed().as_secs_f64();
             found.retain(|d| wanted(a, d.category_id));
             if let Some(folder) = &a.overlays {
-                let sure = detector.model.usage().threshold;
+                let sure = detector.model().usage().threshold;
                 let shown: Vec<Detection> =
                     found.iter().filter(|d| d.score >= f64::from(sure)).cloned().collect();
                 write_rgb(&folder.join(format!("{scene_id:06}_{im_id:06}.png")), &picture(&image, &shown))?;
@@ -281,7 +237,9 @@ fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<O
                 all.extend(found);
                 seconds.push(time);
             }
-            Err(error) => skipped.push(format!("image {scene_id}/{im_id}: {}", crate::describe(&error))),
+            Err(error) => {
+                skipped.push(format!("image {scene_id}/{im_id}: {}", sixfold_shell::describe(&error)))
+            }
         }
         progress.step(format!("{scene_id}/{im_id}"));
     }

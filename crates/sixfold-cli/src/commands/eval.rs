@@ -1,20 +1,59 @@
 //! `sixfold eval`: scores on the screen, curves as a picture, JSON for scripts.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow};
+use clap::Args;
 use serde::Serialize;
-use sixfold_bop::{
-    Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType,
-    ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half,
-    read_detections, read_results, read_results_lenient, write_recall_curves,
-};
+use sixfold_bop::{Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType, ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half, read_detections, read_results, read_results_lenient, write_recall_curves};
 
-use super::frames::excepted;
-use crate::Outcome;
-use crate::arguments::EvalArguments;
-use crate::output::report;
-use crate::progress::Progress;
+use sixfold_shell::Outcome;
+use sixfold_shell::frames::excepted;
+use sixfold_shell::output::{JsonArguments, report};
+use sixfold_shell::progress::Progress;
+
+#[derive(Debug, Args)]
+pub(crate) struct EvalArguments {
+    /// BOP dataset folder
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file (default: the dataset's test_targets_bop19.json, or all ground truth)
+    #[arg(long, value_name = "FILE")]
+    pub targets: Option<PathBuf>,
+    /// Results in the BOP CSV format
+    #[arg(long, value_name = "FILE.csv", required_unless_present = "detections")]
+    pub results: Option<PathBuf>,
+    /// COCO detections to score by box AP (and mask AP where they have masks)
+    #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
+    pub detections: Option<PathBuf>,
+    /// Leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE")]
+    pub except: Option<PathBuf>,
+    /// With --detections: score from which on detections count for recall and false detections, 0 to 1
+    #[arg(long, value_name = "SCORE", default_value = "0.4")]
+    pub min_score: f64,
+    /// With --detections: write the ground truth that they were scored with as a COCO file
+    #[arg(long, value_name = "FILE.json", requires = "detections")]
+    pub write_truth: Option<PathBuf>,
+    /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)
+    #[arg(long)]
+    pub detection_ap: bool,
+    /// Skip broken rows of the result file, report them and score the rest (exit status 2)
+    #[arg(long)]
+    pub lenient: bool,
+    /// Leave out VSD, which renders every pose
+    #[arg(long)]
+    pub no_vsd: bool,
+    /// Picture of the recall curves
+    #[arg(long, value_name = "FILE.png")]
+    pub curves: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
 
 #[derive(Serialize)]
 struct Whole {

@@ -6,11 +6,11 @@ use sixfold_geometry::Vec3;
 use sixfold_io::write_rgb;
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo, ModelsInfo, read_mesh};
 
-use crate::Outcome;
-use crate::arguments::{Axis, ObjectArguments, ObjectCommand};
 use crate::commands::mttm::onboard;
-use crate::objects::{Record, Store, new_record, new_record_of_views};
-use crate::output::report;
+use crate::commands::object_arguments::{Axis, ObjectArguments, ObjectCommand};
+use sixfold_shell::Outcome;
+use sixfold_shell::objects::{Record, Store, new_record, new_record_of_views};
+use sixfold_shell::output::report;
 
 #[derive(Serialize)]
 struct Listed {

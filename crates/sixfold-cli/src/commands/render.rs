@@ -1,17 +1,44 @@
 //! `sixfold render`: what the renderer sees of one object, as pictures.
 
+use std::path::PathBuf;
+
 use anyhow::{Context, Result, bail};
+use clap::Args;
 use serde_json::json;
+use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
-use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, Unit};
 use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
 
-use crate::Outcome;
-use crate::arguments::RenderArguments;
-use crate::output::{pose_rows, report};
-use crate::{objects, overlay};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{JsonArguments, pose_rows, report};
+use sixfold_shell::{objects, overlay};
+
+#[derive(Debug, Args)]
+pub(crate) struct RenderArguments {
+    /// Mesh file or name of a stored object
+    #[arg(long, value_name = "NAME_OR_MESH")]
+    pub object: String,
+    /// Unit of the mesh file: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// Camera file (default: 640x480, 60 degrees wide)
+    #[arg(long, value_name = "FILE")]
+    pub camera: Option<PathBuf>,
+    /// Pose camera_from_object: tx,ty,tz,rx,ry,rz (metres, rotation vector in radians) or 16 numbers of a 4x4 matrix
+    /// row by row (default: fills the picture, seen from above)
+    #[arg(long, value_name = "NUMBERS", value_delimiter = ',', allow_hyphen_values = true)]
+    pub pose: Option<Vec<f64>>,
+    /// Folder for the pictures
+    #[arg(long, value_name = "DIR", default_value = "out/render")]
+    pub out: PathBuf,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
 
 pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
     let object = objects::find(&a.object, a.unit, &a.store)?;

@@ -1,24 +1,79 @@
 //! `sixfold simulate-depth`: what a depth camera would have measured in a dataset that has poses but no depth.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
 use serde_json::json;
-use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, VISIBILITY_DELTA, ground_truth_visibility,
-    write_camera, write_targets,
-};
-use sixfold_geometry::Pose;
+use sixfold_bop::{BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets};
 use sixfold_io::write_rgb;
+use sixfold_geometry::{Camera, DepthImage, Pose};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
+use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
 
-use crate::Outcome;
-use crate::arguments::SimulateArguments;
-use crate::output::report;
-use crate::overlay;
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{JsonArguments, report};
+use sixfold_shell::overlay;
+use sixfold_shell::progress::{Progress, check_interrupt};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Sensor {
+    /// Noise, quantisation and losses of a Kinect-class camera (Nguyen et al. 2012)
+    Kinect,
+    /// The same with the projector's shadow and the growth of the noise with the surface's angle
+    Xtion,
+    /// An active stereo camera of the RealSense D400 class
+    Realsense,
+    /// No noise
+    #[value(alias = "none")]
+    Ideal,
+}
+
+impl Sensor {
+    /// Its noise; none for an ideal camera.
+    pub fn model(self) -> Option<DepthSensor> {
+        match self {
+            Sensor::Ideal => None,
+            Sensor::Kinect => Some(DepthSensor::kinect()),
+            Sensor::Xtion => Some(DepthSensor::xtion()),
+            Sensor::Realsense => Some(DepthSensor::realsense()),
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SimulateArguments {
+    /// BOP dataset folder with ground truth
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// New dataset folder
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Depth camera
+    #[arg(long, value_enum, default_value = "kinect")]
+    pub sensor: Sensor,
+    /// Copy the colour images too
+    #[arg(long)]
+    pub rgb: bool,
+    /// Folder for pictures of ideal and simulated depth side by side
+    #[arg(long, value_name = "DIR")]
+    pub pictures: Option<PathBuf>,
+    /// Simulate only these image ids
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub images: Vec<u32>,
+    /// Leave out the table
+    #[arg(long)]
+    pub no_table: bool,
+    /// Seed of the noise
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
 
 /// Width of the simulated table in metres.
 const TABLE: f64 = 3.0;
@@ -49,31 +104,16 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             let camera = scene.camera(im_id)?;
             let posed: Vec<(&Mesh, Pose)> =
                 image.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
-            let mut objects: Vec<SceneObject<'_>> =
-                posed.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
-            let table = if a.no_table {
-                None
-            } else {
-                support_plane(&objects).and_then(|p| plane_mesh(&p, &camera, TABLE))
-            };
-            match &table {
-                Some(mesh) => objects.push(SceneObject { mesh, camera_from_object: Pose::identity() }),
-                None if !a.no_table => without_table.push(format!("{scene_id}/{im_id}")),
-                None => {}
-            }
-            let mut frame = Frame::new(&camera);
-            frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
-            let ideal = frame.depth();
             let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
-            let depth = match a.sensor.model() {
-                None => ideal.clone(),
-                Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), &sensor, seed),
-            };
+            let (ideal, depth, has_table) = measured(a, &posed, &camera, seed);
+            if !has_table && !a.no_table {
+                without_table.push(format!("{scene_id}/{im_id}"));
+            }
             if let Some(folder) = &a.pictures {
                 let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
                 write_rgb(&path, &overlay::side_by_side(&ideal, &depth))?;
             }
-            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), VISIBILITY_DELTA);
+            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
             let rgb = if a.rgb { scene.rgb(im_id)? } else { None };
             writer.add(&NewImage {
@@ -104,6 +144,31 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
     Ok(if images > 0 { Outcome::Found } else { Outcome::NothingFound })
+}
+
+/// The depth of posed objects on a table, if they may have one, as it is and as the camera measures it; whether there is a
+/// table.
+fn measured(
+    a: &SimulateArguments,
+    posed: &[(&Mesh, Pose)],
+    camera: &Camera,
+    seed: u64,
+) -> (DepthImage, DepthImage, bool) {
+    let mut objects: Vec<SceneObject<'_>> =
+        posed.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
+    let table =
+        if a.no_table { None } else { support_plane(&objects).and_then(|p| plane_mesh(&p, camera, TABLE)) };
+    if let Some(mesh) = &table {
+        objects.push(SceneObject { mesh, camera_from_object: Pose::identity() });
+    }
+    let mut frame = Frame::new(camera);
+    frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
+    let ideal = frame.depth();
+    let depth = match a.sensor.model() {
+        None => ideal.clone(),
+        Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), &sensor, seed),
+    };
+    (ideal, depth, table.is_some())
 }
 
 fn copy_files(from: &Path, to: &Path) -> Result<()> {

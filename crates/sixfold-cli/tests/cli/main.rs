@@ -6,10 +6,11 @@ mod detect;
 mod eval;
 #[cfg(all(feature = "experience", feature = "physics"))]
 mod experience;
+#[cfg(unix)]
+mod experiments;
 mod grasp;
 mod image;
 mod mttm;
-mod nol;
 mod objects;
 mod pix2pose;
 mod simulate;
@@ -17,3 +18,6 @@ mod simulate;
 mod simulate_scenes;
 mod support;
 mod synthesize;
+
+/// What is tested.
+const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold");

@@ -1,4 +1,4 @@
-//! Pix2Pose from the command line: training, weights, poses from colour, tables; on pictures that the tests render.
+//! Pix2Pose from the command line: training, weights, poses from colour; on pictures that the tests render.
 
 use std::path::Path;
 
@@ -283,74 +283,11 @@ fn bad_boxes_weights_and_objects() {
     let camera_file = tiny.path().join("tiny/camera.json");
     let camera: Value = json_of(&camera_file);
     let small = sixfold_geometry::RgbImage::filled(160, 120, [90; 3]);
-    sixfold_io::write_rgb(&tiny.path().join("small.png"), &small).unwrap();
+    sixfold_bop::write_rgb(&tiny.path().join("small.png"), &small).unwrap();
     fails(tiny.path(), &boxed.replace("tiny/test/000007/rgb/000004.png", "small.png"), &["160", "120"]);
     assert!(camera["fx"].is_number());
     // A dataset's target that the model does not know.
     let all =
         format!("estimate --method pix2pose --weights {WEIGHTS} --dataset tiny --boxes gt --out results.csv");
     fails(tiny.path(), &all, &["knows the objects 1", "object 2"]);
-}
-
-#[test]
-fn the_table_is_made_row_by_row() {
-    let tiny = Tiny::coloured();
-    std::fs::write(
-        tiny.path().join("frames.json"),
-        "[{\"scene_id\": 7, \"im_id\": 0}, {\"scene_id\": 7, \"im_id\": 11}]",
-    )
-    .unwrap();
-    sixfold(tiny.path(), &format!("{} --frames frames.json", train(3))).expect(0);
-    tiny.write_truth_as_results("perfect.csv");
-    let command = format!(
-        "reproduce pix2pose --dataset tiny --frames frames.json --weights {WEIGHTS} --published perfect.csv --out table"
-    );
-    let run = sixfold(tiny.path(), &format!("{command} --json"));
-    assert!(run.code == 0 || run.code == 1, "{}", run.stderr);
-    let json = run.json();
-    // Object 1 in the one frame that was not trained on; the model does not know object 2.
-    assert_eq!((&json["frames"], &json["targets"]), (&1.into(), &1.into()));
-    let rows = json["rows"].as_array().unwrap();
-    let keys: Vec<&str> = rows.iter().map(|r| r["key"].as_str().unwrap()).collect();
-    for key in
-        ["default", "no-refinement", "one-stage", "bug-recentring", "bugs-all", "noise-20", "published"]
-    {
-        assert!(keys.contains(&key), "{key} is not in {keys:?}");
-        assert!(tiny.path().join(format!("table/rows/{key}.json")).is_file());
-    }
-    let published = &rows[keys.iter().position(|k| *k == "published").unwrap()]["scores"];
-    for score in ["ar_mssd", "ar_mspd", "add_s"] {
-        assert!((published[score].as_f64().unwrap() - 1.0).abs() < 1e-9, "{score}: {published}");
-    }
-    let table = std::fs::read_to_string(tiny.path().join("table/table.md")).unwrap();
-    assert!(table.contains("| 1.000 | 1.000 | 1.000 |") && table.contains("0.320"), "{table}");
-
-    // What is there is not made again, what is missing is.
-    let edited = tiny.path().join("table/rows/one-stage.json");
-    replace(&edited, "\"one stage, PnP\"", "\"kept from before\"");
-    std::fs::remove_file(tiny.path().join("table/rows/noise-20.json")).unwrap();
-    let run = sixfold(tiny.path(), &command);
-    assert!(run.stdout.contains("kept from before"), "{}", run.stdout);
-    assert!(run.stderr.contains("row noise-20") && !run.stderr.contains("row default"), "{}", run.stderr);
-
-    fails(tiny.path(), &format!("{command} --quick"), &["table", "quick was false, is true"]);
-    // Frames that the network has seen are no test.
-    std::fs::write(tiny.path().join("wrong.json"), "[{\"scene_id\": 7, \"im_id\": 0}]").unwrap();
-    let wrong = command.replace("frames.json", "wrong.json").replace("--out table", "--out other");
-    fails(tiny.path(), &wrong, &["7/11", "wrong.json"]);
-    // A card that does not say which frames those are is no leave to test.
-    let mut bytes = std::fs::read(tiny.path().join(WEIGHTS)).unwrap();
-    let name = b"training_frames";
-    let at = bytes.windows(name.len()).position(|w| w == name).unwrap();
-    bytes[at..at + name.len()].copy_from_slice(b"another_setting");
-    std::fs::write(tiny.path().join("silent.safetensors"), bytes).unwrap();
-    let silent = command.replace(WEIGHTS, "silent.safetensors").replace("--out table", "--out other");
-    fails(tiny.path(), &silent, &["silent.safetensors", "no training_frames", "--export"]);
-    let all = serde_json::json!([0, 4, 11].map(|im| serde_json::json!({"scene_id": 7, "im_id": im})));
-    std::fs::write(tiny.path().join("all.json"), all.to_string()).unwrap();
-    fails(
-        tiny.path(),
-        &command.replace("frames.json", "all.json").replace("--out table", "--out other"),
-        &["no target"],
-    );
 }

@@ -35,9 +35,9 @@ impl Run {
     }
 }
 
-/// Runs `sixfold` in `dir` with arguments separated by spaces.
+/// Runs the tested program in `dir` with arguments separated by spaces.
 pub fn sixfold(dir: &Path, arguments: &str) -> Run {
-    let output = Command::new(env!("CARGO_BIN_EXE_sixfold"))
+    let output = Command::new(crate::PROGRAM)
         .args(arguments.split_whitespace())
         .current_dir(dir)
         .env_remove("SIXFOLD_STORE")

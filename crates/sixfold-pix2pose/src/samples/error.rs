@@ -1,6 +1,5 @@
 //! What can be wrong with training data.
 
-use sixfold_bop::DatasetError;
 use sixfold_synth::augment::AugmentError;
 use sixfold_data::PosedImageError;
 use thiserror::Error;

@@ -17,8 +17,4 @@ pub(crate) mod window;
 
 pub use error::SampleError;
 pub use options::SampleOptions;
-pub use poses::PoseRange;
-pub use real::{RealCrop, read_real_crops};
-pub use rendering::color_patch;
-pub use source::{Sample, SampleSource, TrainingObject};
 pub use source::{Sample, SampleSource};

@@ -1,12 +1,10 @@
 //! What samples look like.
 
 use rand::RngExt;
-use sixfold_synth::augment::{ColorAugmentation, Random};
+use sixfold_synth::augment::ColorAugmentation;
+use sixfold_geometry::random::Random;
 use sixfold_data::{PoseVariation, image_color_augmentation};
 use sixfold_geometry::Camera;
-use sixfold_geometry::random::Random;
-use sixfold_synth::augment::ColorAugmentation;
-
 use super::error::SampleError;
 
 /// Sizes, shares and ranges. The defaults are for few real images of objects on a table, with occlusion.

@@ -1,14 +1,11 @@
 //! Samples of a box whose colours are its coordinates: what is seen can be compared with what is to be learnt.
 
 use std::sync::Arc;
-
 use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
 use sixfold_data::{PosedImage, PosedImageError, TrainingObject, colors};
 use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo};
 use sixfold_render::{BoundingBoxScale, Light, Material};
-use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
-
 use super::targets::targets;
 use super::*;
 

@@ -7,17 +7,18 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Target, write_rgb};
+use sixfold_bop::{BopDataset, Target};
+use sixfold_io::write_rgb;
 use sixfold_io::write_rgb;
 use sixfold_data::FrameId;
 
-use super::super::boxes::Boxes;
-use super::super::material::was_trained_on;
-use super::super::pix2pose::Pix2Pose;
+use super::arguments::DemoArguments;
 use super::samples::{Known, add_s, found_upwards};
-use crate::arguments::DemoArguments;
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::boxes::Boxes;
+use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::pix2pose::Pix2Pose;
+use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::training::was_trained_on;
 
 #[derive(Serialize)]
 pub(super) struct Row {
@@ -76,8 +77,18 @@ pub(super) fn run(
         Ok(colour) => Ok(colour),
         // Those that were asked for have to be right.
         Err(error) if a.weights.is_some() => Err(error),
-        Err(error) => Ok(none(Some(weights), crate::describe(&error))),
+        Err(error) => Ok(none(Some(weights), sixfold_shell::describe(&error))),
     }
+}
+
+/// An error unless the model was trained on the meshes of the targets.
+fn check_meshes(pix2pose: &Pix2Pose, targets: &[Target], known: &BTreeMap<u32, Known>) -> Result<()> {
+    for (id, k) in known {
+        if targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id)) {
+            pix2pose.check_mesh(*id, &k.object.mesh, &format!("model {id}"))?;
+        }
+    }
+    Ok(())
 }
 
 fn with_model(
@@ -88,11 +99,7 @@ fn with_model(
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
-    for (id, k) in known {
-        if targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id)) {
-            pix2pose.check_mesh(*id, &k.object.mesh, &format!("model {id}"))?;
-        }
-    }
+    check_meshes(pix2pose, targets, known)?;
     let detector = a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR)));
     let boxes = match &detector {
         Some(file) => Boxes::of_detector(file, known.keys().copied())?,

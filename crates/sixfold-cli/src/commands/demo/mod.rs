@@ -1,6 +1,7 @@
 //! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures. Here poses from depth and the
 //! report; `colour.rs` adds poses from colour, `samples.rs` is what both know of the samples.
 
+pub(crate) mod arguments;
 mod colour;
 mod samples;
 
@@ -12,15 +13,16 @@ use anyhow::Result;
 use serde::Serialize;
 use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
 use sixfold_io::write_rgb;
+use sixfold_geometry::Pose;
 use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
 
+use self::arguments::DemoArguments;
 use self::colour::Colour;
 use self::samples::{Known, add_s, sample_folder};
-use crate::Outcome;
-use crate::arguments::DemoArguments;
-use crate::output::report;
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::report;
+use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Serialize)]
 struct Row {
@@ -85,7 +87,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                         e.confidence,
                         e.camera_from_object,
                     ));
-                    found.push((o.obj_id, e));
+                    found.push((o.obj_id, e.camera_from_object));
                     if let Some(truth) = truth {
                         let error = add_s(k, e.camera_from_object, truth);
                         rows.push(Row {
@@ -101,18 +103,8 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 }
             }
             let background = scene.rgb(im_id)?.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let drawn: Vec<Drawn<'_>> = found
-                .iter()
-                .filter_map(|(id, e)| {
-                    Some(Drawn {
-                        mesh: &known.get(id)?.object.mesh,
-                        camera_from_object: e.camera_from_object,
-                        color: overlay::color(*id as usize),
-                    })
-                })
-                .collect();
             let picture = a.out.join(format!("{scene_id:06}_{im_id:06}.png"));
-            write_rgb(&picture, &overlay::draw(&background, &camera, &drawn))?;
+            write_rgb(&picture, &overlay::draw(&background, &camera, &drawn(&found, &known)))?;
             pictures.push(picture);
         }
     }
@@ -134,6 +126,20 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     };
     report(&a.json, &whole, || print_table(&whole))?;
     Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+/// Poses by object, to be drawn.
+fn drawn<'a>(found: &[(u32, Pose)], known: &'a BTreeMap<u32, Known>) -> Vec<Drawn<'a>> {
+    found
+        .iter()
+        .filter_map(|(id, camera_from_object)| {
+            Some(Drawn {
+                mesh: &known.get(id)?.object.mesh,
+                camera_from_object: *camera_from_object,
+                color: overlay::color(*id as usize),
+            })
+        })
+        .collect()
 }
 
 /// Scenes of the sample data from this id on have simulated depth.

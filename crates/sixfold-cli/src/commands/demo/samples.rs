@@ -8,7 +8,7 @@ use sixfold_geometry::Pose;
 use sixfold_match::ObjectModel;
 use sixfold_mesh::{ModelInfo, ModelsInfo};
 
-use crate::objects::Object;
+use sixfold_shell::objects::Object;
 
 /// An object of the samples, described for point pair features.
 pub(super) struct Known {

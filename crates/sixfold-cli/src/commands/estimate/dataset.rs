@@ -11,7 +11,7 @@ use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunErr
 use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::report;
-use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::overlay::{Drawn, self};
 use sixfold_shell::progress::{Progress, interrupted};
 
 use super::arguments::{CommonArguments, EstimateArguments};

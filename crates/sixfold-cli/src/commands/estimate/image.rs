@@ -12,11 +12,11 @@ use sixfold_mttm::mask::to_image;
 use sixfold_runner::{FoundObject, ImageReport, ImageRun, pose_table};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{report, write_atomically};
-use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::overlay::{Drawn, self};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 use super::arguments::{CommonArguments, EstimateArguments};
-use super::region::{self, Where};
+use super::region::{Where, self};
 
 /// One image, without lens distortion.
 struct Input {

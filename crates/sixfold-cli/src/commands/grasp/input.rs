@@ -1,11 +1,32 @@
 //! A depth image from files, prepared for grasping.
 
+use std::path::PathBuf;
+
 use anyhow::{Context, Result, anyhow, bail};
+use clap::Args;
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_grasp::{GraspView, ViewOptions, find_objects};
-use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 
-use super::arguments::InputArguments;
+/// A depth image and what belongs to it.
+#[derive(Debug, Args)]
+pub(crate) struct InputArguments {
+    /// Depth image: PNG, one channel of 16 bits
+    #[arg(long, value_name = "FILE")]
+    pub depth: PathBuf,
+    /// Camera: a JSON file with fx fy cx cy or cam_K, and depth_scale (millimetres per unit of the depth image)
+    #[arg(long, value_name = "FILE")]
+    pub camera: PathBuf,
+    /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
+    #[arg(long, value_name = "MM")]
+    pub depth_scale: Option<f64>,
+    /// The object's mask: PNG, above zero inside (default: the largest thing on the table)
+    #[arg(long, value_name = "FILE")]
+    pub mask: Option<PathBuf>,
+    /// Colour image for the overlay
+    #[arg(long, value_name = "FILE")]
+    pub rgb: Option<PathBuf>,
+}
 
 /// What was read, without distortion.
 pub(super) struct Input {

@@ -1,28 +1,64 @@
 //! `sixfold grasp propose`: from a depth image to ranked grasps and a picture of them.
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::Result;
+use clap::Args;
 use serde::Serialize;
 use sixfold_geometry::Pose;
-use sixfold_grasp::{
-    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
-    antipodal_grasps, cluster_grasps, draw_grasps,
-};
+use sixfold_grasp::{AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper, antipodal_grasps, cluster_grasps, draw_grasps};
 use sixfold_io::write_rgb;
 
-use super::arguments::ProposeArguments;
-use super::input::{self, Input};
-use crate::Outcome;
-use crate::output::{pose_rows, report, write_atomically};
-use crate::overlay;
+use super::input::{Input, InputArguments, self};
+use sixfold_shell::Outcome;
+#[cfg(feature = "experience")]
+use sixfold_shell::grasp::experience::{NetworkArguments, self};
+use sixfold_shell::grasp::gripper::gripper;
+use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
+use sixfold_shell::overlay;
+
+#[derive(Debug, Args)]
+pub(crate) struct ProposeArguments {
+    #[command(flatten)]
+    pub input: InputArguments,
+    /// Gripper: jaws-140, jaws-85, or a file
+    #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
+    pub gripper: String,
+    /// Most grasps
+    #[arg(long, value_name = "N", default_value = "5")]
+    pub number: NonZeroUsize,
+    /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
+    /// postgres://user@host/database
+    #[cfg(feature = "experience")]
+    #[arg(long, value_name = "FILE")]
+    pub experiences: Option<sixfold_dgcm::store::StorePlace>,
+    #[cfg(feature = "experience")]
+    #[command(flatten)]
+    pub network: NetworkArguments,
+    /// Only experiences on parts of this name, such as handle, and only grasps that hold what they held
+    #[cfg(feature = "experience")]
+    #[arg(long, value_name = "NAME", requires = "experiences")]
+    pub part: Option<String>,
+    /// Take only what was seen: assume nothing of the object's far side
+    #[arg(long)]
+    pub seen_only: bool,
+    /// Folder for grasps.json and overlay.png
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Seed of everything random
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
 
 /// The best grasp's colour; the others are blue.
 const BEST: [u8; 3] = [60, 220, 80];
 const OTHER: [u8; 3] = [86, 150, 233];
 
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
-    let gripper = super::gripper(&a.gripper)?;
+    let gripper = gripper(&a.gripper)?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.seed)?;
     let proposed: Vec<Proposed> = match &view {
         None => vec![],
@@ -176,8 +212,8 @@ fn with_experience(
     use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank_by_outcome, rank_on_part};
     use sixfold_grasp::GraspFitter;
     let Some(file) = &a.experiences else { return Ok(vec![]) };
-    let model = super::experience::model(&a.network)?;
-    let mut memory = super::experience::memory(file, &model)?;
+    let model = experience::model(&a.network)?;
+    let mut memory = experience::memory(file, &model)?;
     let options = ProposeOptions { part: a.part.clone(), ..ProposeOptions::default() };
     let fitter = GraspFitter::new(view, gripper, planner)?;
     let found = propose(&fitter, &model, &mut memory, &options)?;

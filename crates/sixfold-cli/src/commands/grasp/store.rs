@@ -11,13 +11,12 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_grasp::{AntipodalQuality, Grasp};
 use sixfold_io::write_rgb;
 
-use super::arguments::InputArguments;
-use super::experience::{NetworkArguments, model, now};
-use super::input;
-use crate::Outcome;
-use crate::arguments::JsonArguments;
-use crate::output::{report, write_atomically};
-use crate::progress::{Progress, check_interrupt};
+use super::input::{InputArguments, self};
+use sixfold_shell::Outcome;
+use sixfold_shell::grasp::experience::{NetworkArguments, model, now};
+use sixfold_shell::grasp::gripper::gripper;
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Args)]
 pub(crate) struct StoreArguments {
@@ -190,7 +189,7 @@ struct Added {
 }
 
 fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
-    let gripper = super::gripper(&a.gripper)?;
+    let gripper = gripper(&a.gripper)?;
     let grasp = read_grasp(&a.grasp, a.number)?;
     let network = model(&a.network)?;
     let input = input::read(&a.input, 0)?;

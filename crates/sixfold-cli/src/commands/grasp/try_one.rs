@@ -1,30 +1,69 @@
 //! `sixfold grasp try`: one grasp in the physics engine.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
+use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{Gripper, gripper_pose};
-use sixfold_simulation::{
-    ConvexParts, Outcome as Trial, PartsOptions, TrialOptions, TrialReport, settle_in_middle, try_grasp,
-};
+use sixfold_grasp::gripper_pose;
+use sixfold_mesh::Unit;
+use sixfold_simulation::{ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_in_middle, try_grasp};
 
-use super::arguments::{PhysicsArguments, TryArguments};
-use crate::Outcome;
-use crate::objects;
-use crate::output::{pose_rows, report};
+use sixfold_shell::Outcome;
+use sixfold_shell::grasp::trial::{PhysicsArguments, physics};
+use sixfold_shell::objects;
+use sixfold_shell::output::{JsonArguments, pose_rows, report};
 
-/// Gripper and trial as the command line sets them, tested.
-pub(super) fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
-    let mut gripper = super::gripper(&a.gripper)?;
-    gripper.friction = a.friction.unwrap_or(gripper.friction);
-    gripper.force = a.force.unwrap_or(gripper.force);
-    gripper.check(&a.gripper).context("--friction and --force change the gripper")?;
-    let options = TrialOptions { mass: a.mass, ..TrialOptions::default() };
-    options.check()?;
-    Ok((gripper, options))
+#[derive(Debug, Args)]
+pub(crate) struct TryArguments {
+    /// Mesh file, or the name of a stored object
+    #[arg(long, value_name = "NAME_OR_MESH")]
+    pub object: String,
+    /// Unit of the mesh file: m, cm, mm, in
+    #[arg(long, value_name = "UNIT")]
+    pub unit: Option<Unit>,
+    /// Where the middle of the finger tips is when they close, metres
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        required_unless_present = "grasp"
+    )]
+    pub tip: Option<Vec<f64>>,
+    /// Approach direction
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        default_value = "0,0,-1"
+    )]
+    pub approach: Vec<f64>,
+    /// Closing direction
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        default_value = "1,0,0"
+    )]
+    pub closing: Vec<f64>,
+    /// Distance of the pads before they close, metres (default: as far as they go)
+    #[arg(long, value_name = "M")]
+    pub opening: Option<f64>,
+    /// A trial of `sixfold grasp measure` in place of --tip: JSON with world_from_object, world_from_gripper, opening
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["tip", "opening"])]
+    pub grasp: Option<PathBuf>,
+    #[command(flatten)]
+    pub physics: PhysicsArguments,
+    /// Folder of stored objects
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(flatten)]
+    pub json: JsonArguments,
 }
 
 pub(super) fn run(a: &TryArguments) -> Result<Outcome> {

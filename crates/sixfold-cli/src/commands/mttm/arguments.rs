@@ -64,29 +64,3 @@ pub(crate) struct DepthViewArguments {
     #[arg(long, value_name = "FILE", requires = "depth")]
     pub poses: Option<PathBuf>,
 }
-
-/// `sixfold reproduce mttm`.
-#[derive(Debug, Args)]
-pub(crate) struct ReproduceMttmArguments {
-    /// BOP dataset folder with depth, such as one that `sixfold simulate-depth` wrote
-    #[arg(long, value_name = "DIR")]
-    pub dataset: PathBuf,
-    /// Split of the dataset
-    #[arg(long, default_value = "test")]
-    pub split: String,
-    /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
-    #[arg(long, value_name = "FILE")]
-    pub targets: Option<PathBuf>,
-    /// Folder for the table, its JSON, and the images done so far
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
-    /// Take every N-th image
-    #[arg(long, value_name = "N", default_value = "1")]
-    pub every: std::num::NonZeroUsize,
-    /// Another network than that within the program: a file that `sixfold train mttm` wrote
-    #[arg(long, value_name = "FILE.safetensors")]
-    pub weights: Option<PathBuf>,
-    /// Leave out point pair features, for comparison on the same images
-    #[arg(long)]
-    pub no_ppf: bool,
-}

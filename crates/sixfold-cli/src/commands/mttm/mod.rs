@@ -3,7 +3,6 @@
 pub(crate) mod arguments;
 pub(crate) mod network;
 pub(crate) mod onboard;
-pub(crate) mod reproduce;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,18 +14,16 @@ use sixfold_match::{Scene, VerificationScore};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::mask::to_image;
 use sixfold_mttm::model::MttmModel;
-use sixfold_mttm::{
-    Estimate, EstimateOptions, KnownObject, ObjectTemplates, Search, Source, Stages, TemplateOptions,
-};
+use sixfold_mttm::{Estimate, EstimateOptions, KnownObject, ObjectTemplates, Search, Source, Stages, TemplateOptions};
 
 use self::network::{network, with_network};
 use super::estimate::Input;
-use crate::Outcome;
-use crate::arguments::EstimateArguments;
-use crate::objects::{self, Object, Store};
-use crate::output::{pose_rows, report, write_atomically};
-use crate::overlay::{self, Drawn};
-use crate::progress::{Progress, check_interrupt};
+use crate::commands::estimate_arguments::EstimateArguments;
+use sixfold_shell::Outcome;
+use sixfold_shell::objects::{Object, Store, self};
+use sixfold_shell::output::{pose_rows, report, write_atomically};
+use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Least confidence of a pose in one image.
 const SURE_ENOUGH: f64 = 0.45;

@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
-use sixfold_geometry::Camera;
 use sixfold_io::CameraFile;
+use sixfold_geometry::Camera;
 use sixfold_mesh::Unit;
-use sixfold_simulation::PileOptions;
 use sixfold_synth::shapes::Family;
+use sixfold_simulation::{PileOptions, TabletopOptions};
 
-use crate::arguments::{JsonArguments, Sensor};
+use crate::commands::simulate::Sensor;
+use sixfold_shell::output::JsonArguments;
 
 /// Shown under `sixfold simulate-scenes --help`.
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
@@ -158,6 +159,17 @@ impl SimulateScenesArguments {
             reach: (self.radius + 0.13).min(0.9),
             upright: self.upright,
             stacked: self.stacked,
+        }
+    }
+
+    /// What scenes are like.
+    pub fn tabletop(&self) -> TabletopOptions {
+        TabletopOptions {
+            objects: [self.objects_per_scene[0], self.objects_per_scene[1]],
+            pile: self.pile(),
+            distance: [self.distance[0], self.distance[1]],
+            elevation_degrees: [self.elevation[0], self.elevation[1]],
+            seed: self.seed,
         }
     }
 

@@ -16,9 +16,9 @@ use serde::Serialize;
 use sixfold_bop::{BopDataset, write_camera, write_targets};
 
 use self::arguments::SimulateScenesArguments;
-use crate::Outcome;
-use crate::output::{go_on_with, report};
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{go_on_with, report};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Serialize)]
 struct Summary {

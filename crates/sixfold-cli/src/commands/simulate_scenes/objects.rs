@@ -14,9 +14,9 @@ use sixfold_simulation::{ConvexParts, PartsOptions};
 use sixfold_synth::shapes::{Family, member, toy};
 
 use super::arguments::SimulateScenesArguments;
-use crate::objects::find;
-use crate::output::write_atomically;
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::objects::find;
+use sixfold_shell::output::write_atomically;
+use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// One of the objects that scenes are made of.
 pub(super) struct Thing {

@@ -7,7 +7,7 @@ use sixfold_bop::BopDataset;
 use sixfold_geometry::RgbImage;
 use sixfold_io::write_rgb;
 
-use crate::overlay;
+use sixfold_shell::overlay;
 
 /// Scenes and colour views shown.
 const SCENES: usize = 6;

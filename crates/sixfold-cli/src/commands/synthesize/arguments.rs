@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use crate::arguments::JsonArguments;
+use sixfold_shell::output::JsonArguments;
 
 /// How colours of several photographs become one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

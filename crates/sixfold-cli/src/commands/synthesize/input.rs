@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use sixfold_bop::{BopDataset, CameraFile, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility, read_mask, read_rgb};
+use sixfold_bop::{BopDataset, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility};
+use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_data::{FrameId, PosedImage};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
@@ -16,7 +17,7 @@ use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 
 use super::arguments::SynthesizeArguments;
-use crate::commands::detect::Detector;
+use sixfold_shell::detector::Detector;
 
 /// All that is given.
 pub(super) struct Input {
@@ -156,13 +157,8 @@ impl Disturber {
     }
 }
 
-fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
-    let dataset = BopDataset::open(root, &a.split)?;
-    let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
-    let ids: Vec<u32> = if a.ids.is_empty() { infos.0.keys().copied().collect() } else { a.ids.clone() };
-    if ids.is_empty() {
-        bail!("{}: no objects: its models have no models_info.json; name them with --ids", root.display());
-    }
+/// Scene and image of the photographs, sorted.
+fn frames(a: &SynthesizeArguments, dataset: &BopDataset) -> Result<Vec<(u32, u32)>> {
     let mut frames: Vec<(u32, u32)> = match &a.frames {
         Some(file) => dataset.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id)).collect(),
         None => {
@@ -177,6 +173,17 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
     };
     frames.sort_unstable();
     frames.dedup();
+    Ok(frames)
+}
+
+fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
+    let dataset = BopDataset::open(root, &a.split)?;
+    let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
+    let ids: Vec<u32> = if a.ids.is_empty() { infos.0.keys().copied().collect() } else { a.ids.clone() };
+    if ids.is_empty() {
+        bail!("{}: no objects: its models have no models_info.json; name them with --ids", root.display());
+    }
+    let frames = frames(a, &dataset)?;
     let mut disturber = Disturber::new(a)?;
     let detected = DetectedMasks::new(a, &ids)?;
     let mut subjects = BTreeMap::new();
@@ -193,10 +200,9 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
         if !truth.iter().any(|g| subjects.contains_key(&g.obj_id)) {
             continue;
         }
-        let Some(image) = scene.rgb(*im_id)? else {
-            bail!("{}: image {im_id} has no colour image; choose other --frames", scene.dir().display());
-        };
-        let image = Arc::new(image);
+        let image = Arc::new(scene.rgb(*im_id)?.ok_or_else(|| {
+            anyhow!("{}: image {im_id} has no colour image; choose other --frames", scene.dir().display())
+        })?);
         let camera = scene.camera(*im_id)?;
         for g in truth {
             if !subjects.contains_key(&g.obj_id) && !others.contains_key(&g.obj_id) {
@@ -235,7 +241,9 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
             });
         }
     }
-    for subject in subjects.values().filter(|s| s.photographs.is_empty()) {
+    let (subjects, without): (Vec<Subject>, Vec<Subject>) =
+        subjects.into_values().partition(|s| !s.photographs.is_empty());
+    for subject in &without {
         eprintln!(
             "note: object {}: none of the {} frames shows at least {:.0} % of it; left out",
             subject.id,
@@ -243,18 +251,21 @@ fn from_dataset(a: &SynthesizeArguments, root: &Path) -> Result<Input> {
             100.0 * a.least_visible
         );
     }
-    let (subjects, without): (Vec<Subject>, Vec<Subject>) =
-        subjects.into_values().partition(|s| !s.photographs.is_empty());
     others.extend(without.into_iter().map(|s| (s.id, s.mesh)));
     if detected.0.is_some() {
-        let all: usize = subjects.iter().map(|s| s.photographs.len()).sum();
-        let with = subjects.iter().flat_map(|s| s.photographs.iter().map(|p| (p.image, s.id)));
-        let with = with.filter(|key| kept.contains(key)).count();
-        eprintln!(
-            "note: masks of {with} of {all} objects in photographs by the detector or the dataset, the others drawn"
-        );
+        tell_masks(&subjects, &kept);
     }
     Ok(Input { subjects, others, drawn, kept })
+}
+
+/// Says how many masks were not drawn from poses.
+fn tell_masks(subjects: &[Subject], kept: &BTreeSet<(usize, u32)>) {
+    let all: usize = subjects.iter().map(|s| s.photographs.len()).sum();
+    let with = subjects.iter().flat_map(|s| s.photographs.iter().map(|p| (p.image, s.id)));
+    let with = with.filter(|key| kept.contains(key)).count();
+    eprintln!(
+        "note: masks of {with} of {all} objects in photographs by the detector or the dataset, the others drawn"
+    );
 }
 
 #[derive(Deserialize)]

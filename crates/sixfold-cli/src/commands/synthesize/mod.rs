@@ -25,9 +25,9 @@ use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use self::arguments::{SynthesizeArguments, WeightingKind};
 use self::input::{Input, Subject};
-use crate::Outcome;
-use crate::output::{go_on_with, report};
-use crate::progress::Progress;
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{go_on_with, report};
+use sixfold_shell::progress::Progress;
 
 /// Side of the crops that new views take their colours from, pixels.
 const CROP: usize = 256;
@@ -96,7 +96,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         None => Backgrounds::procedural(),
     };
     write_models(a, &input)?;
-    let per_object = views_per_object(a);
+    let per_object = views::grid(a).count();
     let mut progress = Progress::new("views", per_object * input.subjects.len());
     let (mut rows, mut objects) = (vec![], vec![]);
     for (subject, count) in input.subjects.iter().zip(&counts) {
@@ -129,12 +129,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     }
     progress.finish();
     pictures::sheet(&a.out.join("preview.png"), &rows)?;
-    let camera = Camera::new(1.0, 1.0, 0.0, 0.0, a.size, a.size)?;
-    if let Some(first) = input.subjects.iter().flat_map(|s| &s.photographs).next() {
-        // Every image has its own camera; this one gives the size.
-        let photograph = first.photograph.camera();
-        write_camera(&a.out, &Camera { fx: photograph.fx, fy: photograph.fy, ..camera }, 1e-3)?;
-    }
+    write_size(a, &input)?;
     let found = !objects.is_empty();
     let summary = Summary {
         out: a.out.display().to_string(),
@@ -148,6 +143,16 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     };
     report(&a.json, &summary, || table(a, &summary))?;
     Ok(if found { Outcome::Found } else { Outcome::NothingFound })
+}
+
+/// The dataset's camera file. Every image has its own camera; this one gives the size.
+fn write_size(a: &SynthesizeArguments, input: &Input) -> Result<()> {
+    let camera = Camera::new(1.0, 1.0, 0.0, 0.0, a.size, a.size)?;
+    if let Some(first) = input.subjects.iter().flat_map(|s| &s.photographs).next() {
+        let photograph = first.photograph.camera();
+        write_camera(&a.out, &Camera { fx: photograph.fx, fy: photograph.fy, ..camera }, 1e-3)?;
+    }
+    Ok(())
 }
 
 fn table(a: &SynthesizeArguments, summary: &Summary) {
@@ -184,12 +189,6 @@ fn table(a: &SynthesizeArguments, summary: &Summary) {
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     upper_median(&mut values).unwrap_or(0.0)
-}
-
-fn views_per_object(a: &SynthesizeArguments) -> usize {
-    let around = (360.0 / a.step).round().max(1.0) as usize;
-    let up = ((a.elevation[1] - a.elevation[0]) / a.step + 1e-9).floor() as usize + 1;
-    around * up * a.turns
 }
 
 fn check(a: &SynthesizeArguments) -> Result<()> {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Result;
-use sixfold_bop::write_rgb;
+use sixfold_io::write_rgb;
 use sixfold_data::PosedImage;
 use sixfold_geometry::{Camera, Pose, RgbImage};
 use sixfold_io::write_rgb;
@@ -11,7 +11,7 @@ use sixfold_mesh::Mesh;
 use sixfold_nol::SourceView;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
-use crate::overlay;
+use sixfold_shell::overlay;
 
 /// Side of a picture in a sheet.
 const SIDE: usize = 160;

@@ -11,8 +11,8 @@ use sixfold_nol::refine::{RefineOptions, SceneKind, SceneSource, refine_scene};
 
 use super::arguments::{SceneArgument, SynthesizeArguments};
 use super::input::{Input, Source};
-use crate::output::{pose_rows, write_atomically};
-use crate::progress::{Progress, interrupted};
+use sixfold_shell::output::{pose_rows, write_atomically};
+use sixfold_shell::progress::{Progress, interrupted};
 
 /// One photograph's poses, as they are written.
 #[derive(Debug, Clone, Serialize, Deserialize)]

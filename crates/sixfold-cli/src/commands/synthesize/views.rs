@@ -1,26 +1,22 @@
-//! Renders an object from everywhere on a part of the view sphere and writes the images of a BOP training set.
+//! Writes the views of an object as the images of a BOP training set.
 
-use std::f64::consts::{FRAC_PI_4, TAU};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use sixfold_synth::augment::Backgrounds;
+use sixfold_geometry::random::stream;
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
-use sixfold_data::PosedImage;
-use sixfold_geometry::nalgebra::UnitQuaternion;
-use sixfold_geometry::random::{stream, uniform};
-use sixfold_geometry::{Camera, Mask, Mat3, Pose, Rect, RgbImage, Vec3};
+use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;
-use sixfold_nol::{SourceView, object_window};
+use sixfold_nol::view_grid::{ViewGrid, over_background};
+use sixfold_nol::{Photograph, SourceView};
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
-use sixfold_synth::augment::{Backgrounds, Coverage, Patch};
 
 use super::arguments::SynthesizeArguments;
 use super::input::Subject;
-use crate::progress::{Progress, check_interrupt};
+use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Side of an image in units of the object's box.
-const ROOM: f64 = 1.6;
 /// Pictures of an object in the preview.
 const PREVIEWED: usize = 10;
 
@@ -32,62 +28,10 @@ pub(super) struct Written {
     pub preview: Vec<(RgbImage, String)>,
 }
 
-/// A pose to render, and its distance.
-struct Aim {
-    azimuth: f64,
-    elevation: f64,
-    turn: usize,
-}
-
-fn aims(a: &SynthesizeArguments) -> Vec<Aim> {
-    let step = a.step.to_radians();
-    let (low, high) = (a.elevation[0].to_radians(), a.elevation[1].to_radians());
-    let around = (TAU / step).round().max(1.0) as usize;
-    let up = ((high - low) / step + 1e-9).floor() as usize + 1;
-    let mut aims = Vec::with_capacity(around * up * a.turns);
-    for e in 0..up {
-        for z in 0..around {
-            for turn in 0..a.turns {
-                let (azimuth, elevation) = (TAU * z as f64 / around as f64, low + e as f64 * step);
-                aims.push(Aim { azimuth, elevation, turn });
-            }
-        }
-    }
-    aims
-}
-
-/// A camera that looks at `centre` from a direction given in the object's frame, upright but for a turn of the image.
-fn looking_at(centre: &Vec3, aim: &Aim, distance: f64, roll: f64) -> Pose {
-    let (sa, ca) = aim.azimuth.sin_cos();
-    let (se, ce) = aim.elevation.sin_cos();
-    let back = Vec3::new(ce * ca, ce * sa, se);
-    let z = -back;
-    // Straight from above, up is where the azimuth points.
-    let up = if se.abs() > 0.999 { Vec3::new(-ca, -sa, 0.0) * se.signum() } else { Vec3::z() };
-    let x = z.cross(&up).normalize();
-    let rotation = Mat3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
-    let upright = Pose::from_parts(&rotation, -rotation * (centre + back * distance)).unwrap_or_default();
-    Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), roll), Vec3::zeros()) * upright
-}
-
-/// Camera and pose of image `number`.
-fn placed(a: &SynthesizeArguments, subject: &Subject, aim: &Aim, number: u32) -> Option<(Camera, Pose)> {
-    let (low, high) = subject.mesh.bounding_box();
-    let centre = (low + high) * 0.5;
-    let mut random = stream(a.seed ^ u64::from(subject.id) << 40, u64::from(number));
-    let distances =
-        subject.photographs.iter().map(|s| s.photograph.camera_from_object().translation().norm());
-    let range = distances.fold([f64::INFINITY, 0.0f64], |[low, high], d| [low.min(d), high.max(d)]);
-    let distance = f64::from(uniform(&mut random, [range[0] as f32, range[1] as f32]));
-    // Turns of one view lie evenly between -45 and 45 degrees; a single one anywhere there.
-    let roll = if a.turns == 1 {
-        f64::from(uniform(&mut random, [-1.0, 1.0])) * FRAC_PI_4
-    } else {
-        (2.0 * aim.turn as f64 / (a.turns - 1) as f64 - 1.0) * FRAC_PI_4
-    };
-    let pose = looking_at(&centre, aim, distance, roll);
-    let camera = *subject.photographs.first()?.photograph.camera();
-    Some((object_window(&camera, &subject.mesh, &pose, ROOM)?.camera(&camera, a.size), pose))
+/// Where the views are taken from.
+pub(super) fn grid(a: &SynthesizeArguments) -> ViewGrid {
+    let (step, elevation) = (a.step, [a.elevation[0], a.elevation[1]]);
+    ViewGrid { step, elevation, turns: a.turns, size: a.size, seed: a.seed }
 }
 
 /// The folder of the object's scene.
@@ -103,18 +47,19 @@ pub(super) fn write(
     backgrounds: &Backgrounds,
     progress: &mut Progress,
 ) -> Result<Written> {
-    let aims = aims(a);
+    let photographs: Vec<&Photograph> = subject.photographs.iter().map(|s| &s.photograph).collect();
+    let places = grid(a).placed(&subject.mesh, &photographs, subject.id);
     let mut writer = SceneWriter::new(&a.out, &a.new_split, subject.id);
     let mut written = Written { images: 0, unseen: 0.0, preview: vec![] };
-    let every = aims.len().div_ceil(PREVIEWED).max(1);
+    let every = places.len().div_ceil(PREVIEWED).max(1);
     let scale = {
         let (low, high) = subject.mesh.bounding_box();
         BoundingBoxScale::of_corners(&low, &high)
     };
-    for (number, aim) in aims.iter().enumerate() {
+    for (number, place) in places.iter().enumerate() {
         check_interrupt("give the same command again to go on")?;
         let im_id = number as u32;
-        let Some((camera, pose)) = placed(a, subject, aim, im_id) else { continue };
+        let Some((camera, pose)) = *place else { continue };
         let image_file = folder(a, subject.id).join("rgb").join(format!("{im_id:06}.png"));
         let coordinates = folder(a, subject.id).join("coordinates").join(format!("{im_id:06}.png"));
         // The coordinates are written last: where they are, all is.
@@ -126,11 +71,7 @@ pub(super) fn write(
             let view = maker.render(&camera, &pose);
             written.unseen += view.unseen_share();
             let mut random = stream(a.seed ^ 0x6e6f_6c00 ^ u64::from(subject.id), u64::from(im_id));
-            let mut patch = backgrounds.patch(a.size, a.size, &mut random);
-            let mut soft = Coverage::from_fn(a.size, a.size, |x, y| f32::from(u8::from(view.mask[(x, y)])));
-            soft.blur(0.7);
-            patch.blend(&spread(&view.patch, &view.mask), &soft);
-            let image = patch.to_rgb();
+            let image = over_background(&view, backgrounds.patch(a.size, a.size, &mut random));
             if previewed {
                 let percent = (100.0 * view.unseen_share()).round();
                 let text = if percent >= 1.0 { format!("{percent:.0} % unseen") } else { String::new() };
@@ -147,13 +88,13 @@ pub(super) fn write(
     }
     if a.with_photographs {
         for (k, source) in subject.photographs.iter().enumerate() {
-            let im_id = (aims.len() + k) as u32;
+            let im_id = (places.len() + k) as u32;
             written.images +=
                 usize::from(add_photograph(a, &mut writer, subject, im_id, &source.photograph)?);
         }
     }
     writer.finish()?;
-    written.unseen /= aims.len().max(1) as f64;
+    written.unseen /= places.len().max(1) as f64;
     Ok(written)
 }
 
@@ -163,7 +104,7 @@ fn add_photograph(
     writer: &mut SceneWriter,
     subject: &Subject,
     im_id: u32,
-    photograph: &PosedImage,
+    photograph: &Photograph,
 ) -> Result<bool> {
     let pose = *photograph.camera_from_object();
     let view = SourceView::new(photograph, &subject.mesh, a.size)?;
@@ -176,35 +117,6 @@ fn add_photograph(
     }
     add(writer, subject, im_id, &view.camera, &pose, &mask, Some(&view.patch.to_rgb()))?;
     Ok(true)
-}
-
-/// Colours of the object carried a few pixels beyond its border, so that a soft border mixes no black.
-fn spread(patch: &Patch, mask: &Mask) -> Patch {
-    let (width, height) = mask.size();
-    let area = width * height;
-    let mut patch = patch.clone();
-    let mut known = mask.clone();
-    for _ in 0..3 {
-        let before = known.clone();
-        for y in 1..height.saturating_sub(1) {
-            for x in 1..width.saturating_sub(1) {
-                if before[(x, y)] {
-                    continue;
-                }
-                let near = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
-                let near: Vec<_> = near.into_iter().filter(|p| before[*p]).collect();
-                if near.is_empty() {
-                    continue;
-                }
-                for c in 0..3 {
-                    let sum: f32 = near.iter().map(|(x, y)| patch.data[c * area + y * width + x]).sum();
-                    patch.data[c * area + y * width + x] = sum / near.len() as f32;
-                }
-                known[(x, y)] = true;
-            }
-        }
-    }
-    patch
 }
 
 fn silhouette(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Mask {
@@ -296,31 +208,6 @@ fn write_coordinates(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_view_looks_at_the_centre_from_where_it_should() {
-        let centre = Vec3::new(0.01, -0.02, 0.03);
-        for (azimuth, elevation) in [(0.0, 0.0), (1.0, 0.5), (4.0, std::f64::consts::FRAC_PI_2), (2.0, -0.4)]
-        {
-            let aim = Aim { azimuth, elevation, turn: 0 };
-            let pose = looking_at(&centre, &aim, 0.7, 0.3);
-            assert!((pose.transform_point(&centre) - Vec3::new(0.0, 0.0, 0.7)).norm() < 1e-9);
-            let camera = pose.inverse().translation() - centre;
-            assert!((camera.z / camera.norm() - elevation.sin()).abs() < 1e-9);
-            if elevation.cos() > 1e-3 {
-                assert!(
-                    (camera.y.atan2(camera.x) - azimuth)
-                        .rem_euclid(TAU)
-                        .min((azimuth - camera.y.atan2(camera.x)).rem_euclid(TAU))
-                        < 1e-9
-                );
-            }
-        }
-        // Upright: the object's z axis points up in the image, turned by the roll.
-        let pose = looking_at(&centre, &Aim { azimuth: 0.4, elevation: 0.6, turn: 0 }, 0.7, 0.0);
-        let up = pose.transform_direction(&Vec3::z());
-        assert!(up.x.abs() < 1e-9 && up.y < 0.0);
-    }
 
     #[test]
     fn boxes_are_as_bop_writes_them() {

@@ -1,0 +1,55 @@
+//! What `sixfold detect` is told.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use sixfold_shell::output::JsonArguments;
+
+#[derive(Debug, Args)]
+pub(crate) struct DetectArguments {
+    /// Trained detector: a file that `sixfold train detector` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: PathBuf,
+    /// Colour images: PNG or JPEG of any size, grey or colour
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]
+    pub rgb: Vec<PathBuf>,
+    /// BOP dataset folder: detect in the images of its targets
+    #[arg(long, value_name = "DIR", requires = "out")]
+    pub dataset: Option<PathBuf>,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file that says which images (default: its test_targets_bop19.json, or all images)
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub targets: Option<PathBuf>,
+    /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    pub except: Option<PathBuf>,
+    /// Result: a JSON file of COCO detections for a dataset, a folder for images
+    #[arg(long, value_name = "PATH")]
+    pub out: Option<PathBuf>,
+    /// Folder for overlay pictures of a dataset's images
+    #[arg(long, value_name = "DIR", requires = "dataset")]
+    pub overlays: Option<PathBuf>,
+    /// Only these of the detector's objects (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub ids: Vec<u32>,
+    /// Leave out detections with a lower score, 0 to 1 (default: the model's; 0.02 with --dataset, as average precision
+    /// wants it)
+    #[arg(long, value_name = "SCORE")]
+    pub threshold: Option<f32>,
+    /// Of two boxes of an object that overlap more than this (intersection over union), leave the worse one out
+    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    pub overlap: f32,
+    /// Most detections of each object in an image, the best ones
+    #[arg(long, value_name = "N", default_value = "100")]
+    pub per_object: usize,
+    /// Most detections in an image, the best ones
+    #[arg(long, value_name = "N", default_value = "100")]
+    pub most: usize,
+    /// Boxes only
+    #[arg(long)]
+    pub no_masks: bool,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}

@@ -1,0 +1,60 @@
+//! `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`: run by the program `sixfold-experiments`, which is
+//! built and installed by itself, with the same arguments.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::process::Command;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use sixfold_shell::Outcome;
+
+/// The program that knows the command.
+const PROGRAM: &str = "sixfold-experiments";
+
+/// Whatever follows is for the other program.
+#[derive(Debug, Args)]
+pub(crate) struct Forwarded {
+    /// Arguments; --help shows them
+    #[arg(
+        value_name = "ARGUMENTS",
+        num_args = 0..,
+        trailing_var_arg = true,
+        allow_hyphen_values = true
+    )]
+    pub arguments: Vec<OsString>,
+}
+
+/// Runs the other program with this one's arguments; its exit status becomes this one's.
+pub(crate) fn run() -> Result<Outcome> {
+    let Some(program) = find() else {
+        bail!(
+            "this command is run by the program {PROGRAM}, which is neither beside this one nor on PATH: install it with \
+             `cargo install --path crates/{PROGRAM}`, or build it in a checkout with `cargo build --release -p {PROGRAM}`"
+        )
+    };
+    let mut command = Command::new(&program);
+    command.args(std::env::args_os().skip(1));
+    become_it(command).with_context(|| format!("cannot run {}", program.display()))
+}
+
+/// Beside this program, or on PATH.
+fn find() -> Option<PathBuf> {
+    let name = format!("{PROGRAM}{}", std::env::consts::EXE_SUFFIX);
+    let beside = std::env::current_exe().ok().and_then(|me| Some(me.parent()?.join(&name)));
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let on_path = std::env::split_paths(&path).map(|folder| folder.join(&name));
+    beside.into_iter().chain(on_path).find(|program| program.is_file())
+}
+
+#[cfg(unix)]
+fn become_it(mut command: Command) -> Result<Outcome> {
+    // Comes back only when it did not work.
+    Err(std::os::unix::process::CommandExt::exec(&mut command).into())
+}
+
+#[cfg(not(unix))]
+fn become_it(mut command: Command) -> Result<Outcome> {
+    let status = command.status()?;
+    std::process::exit(status.code().unwrap_or(2))
+}

@@ -1,0 +1,365 @@
+//! `sixfold grasp compare`: geometry, experience and both, on the same simulated scenes (table 6.2).
+//!
+//! Five ways to choose the grasp: the planner alone; experience alone (equation 6.6); the two as the dissertation joins them
+//! (section 6.3.2); the planner's grasps by what came of earlier attempts; and the grasps of both kinds by that.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use sixfold_io::write_rgb;
+use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::store::StorePlace;
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome};
+use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps};
+use sixfold_mesh::Mesh;
+use sixfold_simulation::{AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval_of_share};
+
+use sixfold_shell::Outcome;
+use sixfold_shell::grasp::experience::{NetworkArguments, memory, model};
+use sixfold_shell::grasp::journal::Journal;
+use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
+use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, ending_name, hardness};
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::overlay;
+use sixfold_shell::progress::{Progress, check_interrupt};
+
+/// Pictures of this many scenes of each object are kept.
+const PICTURES: u64 = 2;
+/// The methods, in the order of the table.
+pub(crate) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "outcomes", "both"];
+
+#[derive(Debug, Args)]
+pub(crate) struct CompareArguments {
+    /// The store of experiences, a file or postgres://user@host/database
+    #[arg(long, value_name = "FILE")]
+    pub experiences: StorePlace,
+    #[command(flatten)]
+    pub objects: ObjectsArguments,
+    /// Scenes of each object
+    #[arg(long, value_name = "N", default_value = "15")]
+    pub trials: u64,
+    /// A harder setting: twice the sensor's noise and lost edges, a hand that misses its place by 5 mm and 3 degrees (standard
+    /// deviations on each axis), pads with a friction of 0.25 where the planner believes the gripper's file, objects of 0.5 kg
+    #[arg(long)]
+    pub hard: bool,
+    /// Try each grasp so many times, each time with another error of the hand (with --hard; an exact hand does the same again):
+    /// the share that holds depends less on luck
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub tries: usize,
+    #[command(flatten)]
+    pub physics: PhysicsArguments,
+    #[command(flatten)]
+    pub network: NetworkArguments,
+    /// Folder for trials.jsonl (from which a stopped run goes on), table.json and pictures of the first scenes
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Seed of poses, view points, noise and the planner
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+/// One method on one scene.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Row {
+    class: String,
+    object: String,
+    number: u64,
+    method: String,
+    /// How the first try ended.
+    ending: String,
+    /// Tries that held.
+    held: usize,
+    /// Whether the object came to rest: else it was no attempt.
+    counts: bool,
+    /// Distance of the nearest experience's feature.
+    nearest: Option<f64>,
+    /// Candidates of geometry and of experience.
+    candidates: (usize, usize),
+    /// Whether the tried grasp was one transferred from experience.
+    transferred: bool,
+    seconds: f64,
+    trial_seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Recorded<'a> {
+    objects: Vec<&'a str>,
+    trials: u64,
+    tries: usize,
+    hard: bool,
+    seed: u64,
+    network: String,
+    experiences: usize,
+    outcomes: usize,
+    gripper: &'a Gripper,
+    mass: f64,
+}
+
+/// What came out.
+#[derive(Serialize)]
+pub(crate) struct Whole {
+    hard: bool,
+    /// Tries of each grasp.
+    tries: usize,
+    experiences: usize,
+    outcomes: usize,
+    friction: f64,
+    mass: f64,
+    pub classes: Vec<Class>,
+    pub median_seconds: [f64; METHODS.len()],
+}
+
+#[derive(Serialize)]
+pub(crate) struct Class {
+    pub class: String,
+    pub trials: usize,
+    /// In the order of the methods.
+    pub rates: [f64; METHODS.len()],
+    /// Wilson, 95 %.
+    pub intervals: [(f64, f64); METHODS.len()],
+}
+
+pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
+    let whole = compare(a)?;
+    report(&a.json, &whole, || print_table(&whole))?;
+    Ok(if whole.classes.iter().any(|c| c.rates.iter().any(|r| *r > 0.0)) {
+        Outcome::Found
+    } else {
+        Outcome::NothingFound
+    })
+}
+
+/// Compares, or goes on comparing.
+pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
+    if a.trials == 0 {
+        bail!("--trials: found 0, expected at least 1");
+    }
+    if a.tries == 0 || a.tries > 1 && !a.hard {
+        bail!(
+            "--tries: found {}, expected at least 1, and 1 without --hard: an exact hand does the same every time",
+            a.tries
+        );
+    }
+    let setting = hardness(&a.physics, a.hard)?;
+    let Hardness { gripper, real, options, .. } = &setting;
+    let network = model(&a.network)?;
+    let mut memory = memory(&a.experiences, &network)?;
+    let objects = named_objects(&a.objects)?;
+    let recorded = Recorded {
+        objects: objects.iter().map(|o| o.1.as_str()).collect(),
+        trials: a.trials,
+        tries: a.tries,
+        hard: a.hard,
+        seed: a.seed,
+        network: network.fingerprint(),
+        experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
+        gripper: real,
+        mass: options.trial.mass,
+    };
+    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("trials.jsonl"), &recorded)?;
+    let mut progress = Progress::new("scenes", objects.len() * a.trials as usize);
+    let scenes = Scenes { a, setting: &setting, gripper, options, network: &network };
+    for (class, name, mesh) in &objects {
+        // A scene whose rows are not all there is made again.
+        let done = |number: u64| {
+            rows.iter().filter(|r| r.object == *name && r.number == number).count() >= METHODS.len()
+        };
+        let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
+        (missing.len()..a.trials as usize).for_each(|_| progress.step(name.clone()));
+        if missing.is_empty() {
+            continue;
+        }
+        let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
+        for number in missing {
+            check_interrupt("finished scenes are kept; run the same command again to go on")?;
+            rows.retain(|r| r.object != *name || r.number != number);
+            for row in scenes.rows(class, name, mesh, &parts, number, &mut memory)? {
+                journal.row(&row)?;
+                rows.push(row);
+            }
+            progress.step(name.clone());
+        }
+    }
+    progress.finish();
+    let whole = Whole {
+        hard: a.hard,
+        tries: a.tries,
+        experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
+        friction: real.friction,
+        mass: options.trial.mass,
+        classes: classes(&rows, a.tries),
+        median_seconds: METHODS.map(|m| {
+            let mut seconds: Vec<f64> =
+                rows.iter().filter(|r| r.method == m && r.counts).map(|r| r.seconds).collect();
+            seconds.sort_by(f64::total_cmp);
+            seconds.get(seconds.len() / 2).copied().unwrap_or(0.0)
+        }),
+    };
+    write_atomically(&a.out.join("table.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    Ok(whole)
+}
+
+struct Scenes<'a> {
+    a: &'a CompareArguments,
+    setting: &'a Hardness,
+    gripper: &'a Gripper,
+    options: &'a AttemptOptions,
+    network: &'a DgcmModel,
+}
+
+impl Scenes<'_> {
+    /// All methods on one scene.
+    fn rows(
+        &self,
+        class: &str,
+        name: &str,
+        mesh: &Mesh,
+        parts: &ConvexParts,
+        number: u64,
+        memory: &mut Memory,
+    ) -> Result<Vec<Row>> {
+        let scene = scene(mesh, parts, self.options, self.a.seed, number);
+        let empty = Row {
+            class: class.to_owned(),
+            object: name.to_owned(),
+            number,
+            method: String::new(),
+            ending: ending_name(scene.ending),
+            held: 0,
+            counts: scene.ending != Ending::NoRest,
+            nearest: None,
+            candidates: (0, 0),
+            transferred: false,
+            seconds: scene.seconds,
+            trial_seconds: 0.0,
+        };
+        let rows = METHODS.map(|m| Row { method: m.to_owned(), ..empty.clone() });
+        let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows.to_vec()) };
+        let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
+        let began = Instant::now();
+        let geometry = antipodal_grasps(view, self.gripper, &planner)?;
+        let of_geometry = began.elapsed().as_secs_f64();
+        let began = Instant::now();
+        let fitter = GraspFitter::new(view, self.gripper, &planner)?;
+        let of_fitter = began.elapsed().as_secs_f64();
+        let found = propose(&fitter, self.network, memory, &ProposeOptions::default())?;
+        let of_experience = began.elapsed().as_secs_f64();
+        let clusters = ClusterOptions::default();
+        let began = Instant::now();
+        let outcomes = memory.outcomes(&self.gripper.name);
+        let by_outcome = |proposals| rank_by_outcome(&geometry, proposals, &clusters, &fitter, &outcomes);
+        let both = by_outcome(&found.proposals);
+        let of_outcomes = began.elapsed().as_secs_f64();
+        let ranked = [
+            rank(&geometry, &[], &clusters),
+            rank(&[], &found.proposals, &clusters),
+            rank_as_printed(&geometry, &found.proposals, &clusters),
+            by_outcome(&[]),
+            both,
+        ];
+        let seconds = [
+            of_geometry,
+            of_experience,
+            of_geometry + of_experience,
+            of_geometry + of_fitter + of_outcomes,
+            of_geometry + of_experience + of_outcomes,
+        ];
+        let mut out = vec![];
+        for ((mut row, ranked), seconds) in rows.into_iter().zip(&ranked).zip(seconds) {
+            row.nearest = found.nearest.first().map(|m| m.distance);
+            row.candidates = (geometry.len(), found.proposals.len());
+            row.seconds += seconds;
+            if let Some(best) = ranked.first() {
+                let began = Instant::now();
+                let sent = seen.world_from_camera * best.grasp.camera_from_gripper;
+                for k in 0..self.a.tries {
+                    let tried = try_grasp(
+                        parts,
+                        &scene.world_from_object,
+                        &self.setting.real,
+                        &self.setting.reached(&sent, scene.noise.wrapping_add(k as u64)),
+                        best.grasp.opening,
+                        &self.options.trial,
+                    )?;
+                    let ending = Ending::Tried(tried.outcome);
+                    row.held += usize::from(ending.is_success());
+                    if k == 0 {
+                        row.trial_seconds = began.elapsed().as_secs_f64();
+                        row.ending = ending_name(ending);
+                    }
+                }
+                row.transferred = best.proposal.is_some();
+                if number < PICTURES {
+                    self.picture(&row, seen, best)?;
+                }
+            }
+            out.push(row);
+        }
+        Ok(out)
+    }
+
+    /// The view with the gripper that was tried: green when it held more often than not, red when not.
+    fn picture(&self, row: &Row, seen: &sixfold_simulation::SimulatedView, best: &Ranked) -> Result<()> {
+        let color = if 2 * row.held > self.a.tries { [60, 220, 80] } else { [235, 70, 60] };
+        let grasp = &best.grasp;
+        let drawn =
+            [DrawnGrasp { camera_from_gripper: grasp.camera_from_gripper, opening: grasp.opening, color }];
+        let background = overlay::depth_picture(&seen.depth);
+        let image = draw_grasps(&background, Some(&seen.depth), &seen.camera, self.gripper, &drawn)?;
+        let name = format!("{}-{}-{}.png", file_name(&row.object), row.number, row.method);
+        Ok(write_rgb(&self.a.out.join(name), &image)?)
+    }
+}
+
+fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
+    let mut names: Vec<&str> = vec![];
+    for row in rows {
+        if !names.contains(&row.class.as_str()) {
+            names.push(&row.class);
+        }
+    }
+    let of = |name: &str, wanted: &dyn Fn(&Row) -> bool| {
+        let mut rates = [0.0; METHODS.len()];
+        let mut intervals = [(0.0, 0.0); METHODS.len()];
+        let mut trials = 0;
+        for (k, method) in METHODS.iter().enumerate() {
+            let mine: Vec<&Row> =
+                rows.iter().filter(|r| r.method == *method && r.counts && wanted(r)).collect();
+            let held: usize = mine.iter().map(|r| r.held).sum();
+            trials = mine.len();
+            rates[k] = held as f64 / (tries * trials).max(1) as f64;
+            intervals[k] = wilson_interval_of_share(rates[k], trials);
+        }
+        Class { class: name.to_owned(), trials, rates, intervals }
+    };
+    let mut classes: Vec<Class> = names.iter().map(|n| of(n, &|r: &Row| r.class == *n)).collect();
+    classes.push(of("all", &|_| true));
+    classes
+}
+
+fn print_table(whole: &Whole) {
+    let heads: Vec<String> = METHODS.iter().map(|m| format!("{m:>20}")).collect();
+    println!("{:>10} {:>7} {}", "", "scenes", heads.join(" "));
+    for c in &whole.classes {
+        let cells: Vec<String> = c
+            .rates
+            .iter()
+            .zip(&c.intervals)
+            .map(|(rate, (low, high))| format!("{:>20}", format!("{rate:.2} ({low:.2} to {high:.2})")))
+            .collect();
+        println!("{:>10} {:>7} {}", c.class, c.trials, cells.join(" "));
+    }
+    let seconds: Vec<String> = whole.median_seconds.iter().map(|s| format!("{s:.3}")).collect();
+    println!("median seconds from depth to ranked grasps: {}", seconds.join(", "));
+    println!(
+        "{} experiences, {} outcomes; friction {}, {} kg; each grasp tried {} times; 95 % intervals after Wilson, by scenes",
+        whole.experiences, whole.outcomes, whole.friction, whole.mass, whole.tries
+    );
+}

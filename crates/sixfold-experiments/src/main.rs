@@ -1,0 +1,51 @@
+//! The program `sixfold-experiments`: methods measured as their papers do, grasps tried in simulation many times. The program
+//! `sixfold` runs it for `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`.
+//!
+//! Exit status: 0 found, 1 nothing found, 2 error.
+
+mod grasp;
+mod reproduce;
+
+use std::num::NonZeroUsize;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use sixfold_shell::{end_with_the_reader, exit_code, progress, use_threads};
+
+/// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
+#[derive(Debug, Parser)]
+#[command(
+    name = "sixfold-experiments",
+    version,
+    after_help = "The program sixfold runs these commands too, where it finds this one.\n\n\
+        Exit status: 0 found, 1 nothing found, 2 error."
+)]
+struct Arguments {
+    /// Use this many threads (default: all cores); the results are the same for any number
+    #[arg(long, global = true, value_name = "N")]
+    threads: Option<NonZeroUsize>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Measure a method on a dataset as its paper does, with its ablations: one table from one command
+    #[command(
+        after_help = "Example:\n  sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --out out/reproduce"
+    )]
+    Reproduce(reproduce::ReproduceArguments),
+    /// Grasps of a parallel-jaw gripper, measured in simulation
+    Grasp(grasp::GraspArguments),
+}
+
+fn main() -> ExitCode {
+    end_with_the_reader();
+    let arguments = Arguments::parse();
+    progress::catch_interrupts();
+    use_threads(arguments.threads);
+    exit_code(&match &arguments.command {
+        Command::Reproduce(a) => reproduce::run(a),
+        Command::Grasp(a) => grasp::run(a),
+    })
+}

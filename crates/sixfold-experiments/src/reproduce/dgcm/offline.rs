@@ -1,0 +1,357 @@
+//! Figure 6.7: how near a transferred grasp comes to the wanted one, against the number of experiences, and from every
+//! object to every other; and from an object to itself at other sizes.
+//!
+//! As in section 6.3.1 the wanted grasp comes from above, on the object's upright axis, and a turn about the approach does
+//! not count. There the poses were annotated by hand on depth images; here they follow from the meshes, and the depth images
+//! are simulated. What is judged is the first grasp of the ranking by equation 6.6, whether it would hold or not.
+
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use serde::{Deserialize, Serialize};
+use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_experience::{Crop, Experience, SqliteStore};
+use sixfold_geometry::random::stream;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::{AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, gripper_pose};
+use sixfold_mesh::Mesh;
+use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
+
+use sixfold_shell::grasp::journal::Journal;
+use sixfold_shell::progress::{Progress, check_interrupt};
+
+/// Experiences of each object that a test may know, at most.
+const POOL: usize = 8;
+/// Numbers of experiences that are compared.
+pub(super) const COUNTS: [usize; 4] = [1, 2, 4, 8];
+/// An object wider than the open gripper has no grasp from above; so much is left for the fingers, metres.
+const ROOM: f64 = 0.01;
+
+/// An object with its wanted grasp.
+pub(super) struct Instance {
+    pub class: String,
+    pub name: String,
+    mesh: Mesh,
+    /// The wanted grasp, its width in metres.
+    grasp: (Pose, f64),
+}
+
+/// The objects of a list that can be grasped from above, in its order.
+pub(super) fn instances(objects: &[(String, String, Mesh)], gripper: &Gripper) -> Vec<Instance> {
+    objects
+        .iter()
+        .filter_map(|(class, name, mesh)| {
+            let grasp = from_above(mesh, gripper)?;
+            Some(Instance { class: class.clone(), name: name.clone(), mesh: mesh.clone(), grasp })
+        })
+        .collect()
+}
+
+/// The grasp from above on the axis through the middle of an object's top, closing along its narrower side.
+fn from_above(mesh: &Mesh, gripper: &Gripper) -> Option<(Pose, f64)> {
+    let (low, high) = mesh.bounding_box();
+    let height = high.z - low.z;
+    let depth = (0.4 * height).min(0.02);
+    let within = |from: f64| -> Option<(Vec3, Vec3)> {
+        let mut points = mesh.vertices().iter().filter(|p| p.z >= from).copied();
+        let first = points.next()?;
+        Some(points.fold((first, first), |(a, b), p| (a.inf(&p), b.sup(&p))))
+    };
+    let (a, b) = within(high.z - 0.05 * height)?;
+    let middle = (a + b) * 0.5;
+    let (a, b) = within(high.z - depth)?;
+    let size = b - a;
+    let (closing, width) = if size.x <= size.y { (Vec3::x(), size.x) } else { (Vec3::y(), size.y) };
+    if width > gripper.max_opening - ROOM {
+        return None;
+    }
+    let tip = Vec3::new(middle.x, middle.y, high.z - depth);
+    Some((gripper_pose(&tip, &-Vec3::z(), &closing)?, width))
+}
+
+/// One simulated view of an object.
+struct View {
+    instance: usize,
+    number: u64,
+    view: GraspView,
+    /// The wanted grasp in the camera's frame.
+    wanted: Grasp,
+}
+
+/// One question: which experiences were known, and how near the answer came.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Answer {
+    pub question: Question,
+    /// Distance of the tips' middles, metres, and angle of the approaches, radians; `None` without a proposal.
+    pub error: Option<(f64, f64)>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub(super) enum Question {
+    /// A number of experiences per object, of the tested object's class or of all.
+    Count { class: String, object: String, view: u64, count: usize, all: bool, round: u64 },
+    /// All experiences of one object.
+    Pair { from: String, to: String, view: u64 },
+    /// All experiences of the object as it is, tested on a stretched one.
+    Stretched { object: String, view: u64, factors: [i64; 3] },
+}
+
+impl Answer {
+    /// Whether it is near enough.
+    pub fn within(&self, distance: f64, degrees: f64) -> bool {
+        self.error.is_some_and(|(d, a)| d <= distance && a <= degrees.to_radians())
+    }
+}
+
+/// How much is asked.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(super) struct Size {
+    /// Tested views of each object.
+    pub views: u64,
+    /// Draws of experiences for each number.
+    pub rounds: u64,
+    /// Stretched copies of each object.
+    pub stretched: u64,
+}
+
+/// What the offline experiments need.
+pub(super) struct Offline<'a> {
+    pub instances: &'a [Instance],
+    pub network: &'a DgcmModel,
+    pub gripper: &'a Gripper,
+    pub options: &'a AttemptOptions,
+    pub size: Size,
+    pub seed: u64,
+}
+
+impl Offline<'_> {
+    /// All answers, those of an earlier run included.
+    pub fn run(&self, folder: &Path) -> Result<Vec<Answer>> {
+        let recorded = serde_json::json!({
+            "objects": self.instances.iter().map(|i| i.name.as_str()).collect::<Vec<_>>(),
+            "size": self.size, "seed": self.seed, "network": self.network.fingerprint(), "gripper": self.gripper,
+        });
+        let (mut journal, rows) = Journal::open::<Answer>(&folder.join("answers.jsonl"), &recorded)?;
+        let mut answers: BTreeMap<Question, Answer> =
+            rows.into_iter().map(|r| (r.question.clone(), r)).collect();
+        let store = SqliteStore::create(&folder.join("experience.db"))?;
+        let mut memory = Memory::new(Box::new(store), self.network)?;
+        let mut progress = Progress::new("views", self.instances.len());
+        let mut known: Vec<Vec<i64>> = vec![];
+        let mut tests: Vec<View> = vec![];
+        for (number, instance) in self.instances.iter().enumerate() {
+            check_interrupt("what was answered is kept; run the same command again to go on")?;
+            let (pool, views) = self.views(number, instance)?;
+            let ids: Result<Vec<i64>> = pool.iter().map(|v| self.remember(&mut memory, v)).collect();
+            known.push(ids?);
+            tests.extend(views);
+            progress.step(instance.name.clone());
+        }
+        progress.finish();
+        memory.refresh()?;
+        let questions = self.questions(&known, &tests);
+        let mut progress = Progress::new("questions", questions.len());
+        for (question, test, only) in questions {
+            if let Entry::Vacant(place) = answers.entry(question) {
+                check_interrupt("what was answered is kept; run the same command again to go on")?;
+                let error = self.ask(&mut memory, test, only)?;
+                let answer = Answer { question: place.key().clone(), error };
+                journal.row(&answer)?;
+                place.insert(answer);
+            }
+            progress.step(String::new());
+        }
+        progress.finish();
+        self.stretched(&known, &mut memory, &mut journal, &mut answers)?;
+        Ok(answers.into_values().collect())
+    }
+
+    /// The views that become experience, and those that are tested.
+    fn views(&self, number: usize, instance: &Instance) -> Result<(Vec<View>, Vec<View>)> {
+        let parts = ConvexParts::of_mesh(&instance.mesh, &PartsOptions::default())
+            .with_context(|| instance.name.clone())?;
+        let mut views = vec![];
+        let wanted = POOL + self.size.views as usize;
+        for k in 0..3 * wanted as u64 {
+            if views.len() == wanted {
+                break;
+            }
+            views.extend(self.view(number, &instance.mesh, &instance.grasp, &parts, k));
+        }
+        if views.len() < wanted {
+            bail!("{}: the object stood upright in {} of {} views", instance.name, views.len(), 3 * wanted);
+        }
+        let tests = views.split_off(POOL);
+        Ok((views, tests))
+    }
+
+    /// One view with its wanted grasp; `None` where the object did not stand upright, or was not seen.
+    fn view(
+        &self,
+        instance: usize,
+        mesh: &Mesh,
+        grasp: &(Pose, f64),
+        parts: &ConvexParts,
+        number: u64,
+    ) -> Option<View> {
+        let scene = scene(mesh, parts, self.options, self.seed.wrapping_add(1000 * instance as u64), number);
+        let upright = scene.world_from_object.transform_direction(&Vec3::z()).z > 0.99;
+        let (Some(view), Some(seen), true) = (scene.view, scene.seen, upright) else { return None };
+        let (pose, width) = grasp;
+        let camera_from_gripper = seen.world_from_camera.inverse() * scene.world_from_object * *pose;
+        let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 0.5 };
+        let opening = (width + 0.024).min(self.gripper.max_opening);
+        let wanted = Grasp { camera_from_gripper, opening, width: *width, quality };
+        Some(View { instance, number, view, wanted })
+    }
+
+    fn remember(&self, memory: &mut Memory, view: &View) -> Result<i64> {
+        let crop = Crop::of_view(&view.view, self.network.crop_options())?;
+        let instance = &self.instances[view.instance];
+        let provenance = format!("wanted grasp of view {}", view.number);
+        let experience = Experience::new(
+            self.network,
+            crop,
+            &view.wanted,
+            self.gripper,
+            &instance.name,
+            Some("top"),
+            0,
+            &provenance,
+        );
+        Ok(memory.store().add(&experience)?.0)
+    }
+
+    /// Every question with its view and the experiences that are known in it.
+    fn questions<'v>(
+        &self,
+        known: &[Vec<i64>],
+        tests: &'v [View],
+    ) -> Vec<(Question, &'v View, BTreeSet<i64>)> {
+        let mut questions = vec![];
+        for test in tests {
+            let instance = &self.instances[test.instance];
+            for count in COUNTS {
+                for round in 0..self.size.rounds {
+                    for all in [false, true] {
+                        let mut random = stream(self.seed, round * 64 + count as u64);
+                        let mut only = BTreeSet::new();
+                        for (other, ids) in self.instances.iter().zip(known) {
+                            let mut ids = ids.clone();
+                            ids.shuffle(&mut random);
+                            if all || other.class == instance.class {
+                                only.extend(ids.into_iter().take(count));
+                            }
+                        }
+                        let question = Question::Count {
+                            class: instance.class.clone(),
+                            object: instance.name.clone(),
+                            view: test.number,
+                            count,
+                            all,
+                            round,
+                        };
+                        questions.push((question, test, only));
+                    }
+                }
+            }
+            for (from, ids) in self.instances.iter().zip(known) {
+                let question =
+                    Question::Pair { from: from.name.clone(), to: instance.name.clone(), view: test.number };
+                questions.push((question, test, ids.iter().copied().collect()));
+            }
+        }
+        questions
+    }
+
+    /// The error of the first grasp that these experiences propose.
+    fn ask(&self, memory: &mut Memory, test: &View, only: BTreeSet<i64>) -> Result<Option<(f64, f64)>> {
+        let options = AntipodalOptions::default();
+        let fitter = GraspFitter::new(&test.view, self.gripper, &options)?;
+        let options = ProposeOptions { only: Some(only), ..ProposeOptions::default() };
+        let found = propose(&fitter, self.network, memory, &options)?;
+        Ok(rank(&[], &found.proposals, &ClusterOptions::default()).first().map(|best| {
+            let wanted = &test.wanted;
+            let distance = best.grasp.camera_from_gripper.distance_to(&wanted.camera_from_gripper);
+            (distance, best.grasp.approach().angle(&wanted.approach()))
+        }))
+    }
+
+    /// Objects stretched by 0.5 to 2 along each of their axes.
+    fn stretched(
+        &self,
+        known: &[Vec<i64>],
+        memory: &mut Memory,
+        journal: &mut Journal,
+        answers: &mut BTreeMap<Question, Answer>,
+    ) -> Result<()> {
+        let mut progress = Progress::new("stretched", self.instances.len() * self.size.stretched as usize);
+        for (number, instance) in self.instances.iter().enumerate() {
+            for view in 0..self.size.stretched {
+                check_interrupt("what was answered is kept; run the same command again to go on")?;
+                progress.step(instance.name.clone());
+                let mut random = stream(self.seed ^ 0x73_7472, view);
+                // As many times smaller as larger; in hundredths, to be a key.
+                let factors: [i64; 3] = std::array::from_fn(|_| {
+                    (100.0 * 2f64.powf(random.random_range(-1.0..1.0))).round() as i64
+                });
+                let question = Question::Stretched { object: instance.name.clone(), view, factors };
+                if answers.contains_key(&question) {
+                    continue;
+                }
+                let stretch = Vec3::from(factors.map(|f| f as f64 / 100.0));
+                let vertices = instance.mesh.vertices();
+                let vertices = vertices.iter().map(|p| p.component_mul(&stretch)).collect();
+                let mesh = Mesh::new(vertices, instance.mesh.faces().to_vec())?;
+                let Some(grasp) = from_above(&mesh, self.gripper) else { continue };
+                let Ok(parts) = ConvexParts::of_mesh(&mesh, &PartsOptions::default()) else { continue };
+                let Some(test) = self.view(number, &mesh, &grasp, &parts, 500 + view) else { continue };
+                let only = known[number].iter().copied().collect();
+                let answer = Answer { question: question.clone(), error: self.ask(memory, &test, only)? };
+                journal.row(&answer)?;
+                answers.insert(question, answer);
+            }
+        }
+        progress.finish();
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_wanted_grasp_is_on_top_and_across() {
+        // A box of 6 x 10 x 12 cm that stands on z = 0.
+        let corner = |i: usize| {
+            let at = |bit: usize, size: f64| if i >> bit & 1 == 1 { size } else { 0.0 };
+            Vec3::new(at(0, 0.06), at(1, 0.10), at(2, 0.12))
+        };
+        let faces = vec![[0, 1, 2], [4, 5, 6], [0, 1, 4], [3, 7, 1]];
+        let mesh = Mesh::new((0..8).map(corner).collect(), faces).unwrap();
+        let gripper = Gripper::built_in("jaws-85").unwrap();
+        let (pose, width) = from_above(&mesh, &gripper).unwrap();
+        assert!((pose.translation() - Vec3::new(0.03, 0.05, 0.10)).norm() < 1e-9);
+        assert!((pose.transform_direction(&Vec3::z()) + Vec3::z()).norm() < 1e-9);
+        assert!((width - 0.06).abs() < 1e-9 && pose.transform_direction(&Vec3::x()).x.abs() > 0.999);
+        // Too wide for the hand.
+        let wide = mesh.vertices().iter().map(|p| p * 2.0).collect();
+        assert!(from_above(&Mesh::new(wide, mesh.faces().to_vec()).unwrap(), &gripper).is_none());
+    }
+
+    #[test]
+    fn near_enough_needs_both_distance_and_angle() {
+        let question = Question::Pair { from: "a".into(), to: "b".into(), view: 0 };
+        let answer = |error| Answer { question: question.clone(), error };
+        assert!(answer(Some((0.02, 0.1))).within(0.05, 15.0));
+        assert!(!answer(Some((0.02, 0.3))).within(0.05, 15.0));
+        assert!(!answer(Some((0.02, 0.1))).within(0.01, 15.0));
+        assert!(!answer(None).within(1.0, 180.0));
+    }
+}

@@ -1,0 +1,66 @@
+//! What long measurements keep in their folder: rows as they are made, and what they were made from.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use sixfold_shell::output::write_atomically;
+
+/// The row of an earlier run, or a new one, which is kept.
+pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
+    folder: &Path,
+    key: &str,
+    make: impl FnOnce() -> Result<T>,
+) -> Result<T> {
+    let path = folder.join("rows").join(format!("{key}.json"));
+    if let Ok(text) = std::fs::read_to_string(&path) {
+        return serde_json::from_str(&text).with_context(|| {
+            format!("{}: not a row of this version; remove it to have it made again", path.display())
+        });
+    }
+    eprintln!("row {key}");
+    let text = serde_json::to_string_pretty(&make()?)?;
+    write_atomically(&path, text.as_bytes())?;
+    // As a later run will read it: numbers as text may lose their last digit.
+    serde_json::from_str(&text).with_context(|| format!("row {key}"))
+}
+
+/// An error if the folder holds rows of something else.
+pub(super) fn same_inputs(folder: &Path, inputs: &impl Serialize) -> Result<()> {
+    let path = folder.join("inputs.json");
+    let now = serde_json::to_value(inputs)?;
+    if let Ok(text) = std::fs::read_to_string(&path) {
+        let before: serde_json::Value = serde_json::from_str(&text)
+            .with_context(|| format!("{}: not JSON; remove the folder", path.display()))?;
+        if let (Some(before), Some(now)) = (before.as_object(), now.as_object())
+            && let Some((field, was)) = before.iter().find(|(field, was)| now.get(*field) != Some(*was))
+        {
+            bail!(
+                "{}: holds rows with other inputs ({field} was {was}, is {}); choose another --out, or remove it",
+                folder.display(),
+                now.get(field).cloned().unwrap_or_default()
+            );
+        }
+        return Ok(());
+    }
+    write_atomically(&path, serde_json::to_string_pretty(&now)?.as_bytes())
+}
+
+/// 64-bit FNV-1a: tells files apart, nothing more.
+pub(super) fn fnv(bytes: &[u8]) -> u64 {
+    bytes
+        .iter()
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_hash_is_fnv_1a() {
+        assert_eq!(fnv(b""), 0xcbf2_9ce4_8422_2325);
+        assert_eq!(fnv(b"foobar"), 0x8594_4171_f739_67e8);
+    }
+}

@@ -1,0 +1,465 @@
+//! `sixfold reproduce mttm`: masks and poses of template matching per object, next to its ablations and to point pair features
+//! on the same images (dissertation, tables 5.1 and 5.2).
+//!
+//! Every image's outcomes are kept in `images/`, so an interrupted run goes on where it was.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use sixfold_bop::{BopDataset, Models};
+use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, Vec3};
+use sixfold_match::{Scene, SceneOptions, VerificationOptions};
+use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::{EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions};
+use sixfold_render::render_depth;
+
+use sixfold_shell::Outcome;
+use sixfold_shell::objects::{Object, description_beside};
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::progress::{Progress, check_interrupt};
+
+/// `sixfold reproduce mttm`.
+#[derive(Debug, Args)]
+pub(crate) struct ReproduceMttmArguments {
+    /// BOP dataset folder with depth, such as one that `sixfold simulate-depth` wrote
+    #[arg(long, value_name = "DIR")]
+    pub dataset: PathBuf,
+    /// Split of the dataset
+    #[arg(long, default_value = "test")]
+    pub split: String,
+    /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
+    #[arg(long, value_name = "FILE")]
+    pub targets: Option<PathBuf>,
+    /// Folder for the table, its JSON, and the images done so far
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Take every N-th image
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub every: std::num::NonZeroUsize,
+    /// Another network than that within the program: a file that `sixfold train mttm` wrote
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub weights: Option<PathBuf>,
+    /// Leave out point pair features, for comparison on the same images
+    #[arg(long)]
+    pub no_ppf: bool,
+}
+
+/// Pixels whose depth lies this near to the drawn truth are the object's, metres (dissertation, section 5.3.2).
+const TRUTH_DEPTH: f32 = 0.02;
+
+/// A row of the table.
+struct Way {
+    key: &'static str,
+    title: &'static str,
+    by: MatchedBy,
+    predicted_pose: bool,
+    align: bool,
+    mesh: bool,
+    occluders_have_edges: bool,
+}
+
+const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
+    Way { key, title, by, predicted_pose: true, align: true, mesh: true, occluders_have_edges: true }
+}
+
+/// Ways of template matching, the default first.
+const WAYS: [Way; 10] = [
+    way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
+    Way {
+        predicted_pose: false,
+        ..way("both-template-pose", "the same without the predicted rotation and place", MatchedBy::Both)
+    },
+    Way { mesh: false, ..way("both-templates", "the same judged by the templates alone", MatchedBy::Both) },
+    Way {
+        occluders_have_edges: false,
+        ..way(
+            "both-printed-score",
+            "the same with the printed score, which forgives whatever is hidden",
+            MatchedBy::Both,
+        )
+    },
+    way("network", "network alone, aligned, verified with the mesh", MatchedBy::Network),
+    Way {
+        predicted_pose: false,
+        ..way(
+            "network-template-pose",
+            "the same without the predicted rotation and place",
+            MatchedBy::Network,
+        )
+    },
+    Way {
+        predicted_pose: false,
+        align: false,
+        mesh: false,
+        ..way("network-nearest", "the network's nearest template as it was matched", MatchedBy::Network)
+    },
+    way("points", "points alone (no network), aligned, verified with the mesh", MatchedBy::Points),
+    Way {
+        mesh: false,
+        ..way("points-templates", "the same judged by the templates alone", MatchedBy::Points)
+    },
+    Way {
+        align: false,
+        mesh: false,
+        ..way("points-nearest", "the nearest template by points as it was matched", MatchedBy::Points)
+    },
+];
+/// The row of another method.
+const PPF: (&str, &str) = ("ppf", "point pair features (`sixfold estimate`'s default)");
+
+/// What was measured of one target in one way.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct Outcomes {
+    object: u32,
+    /// Intersection over union of the mask and the visible truth, where there is a mask.
+    iou: Option<f64>,
+    /// ADD (ADI for symmetric objects) as a share of the diameter; none when nothing was found.
+    error: Option<f64>,
+    confidence: Option<f64>,
+    /// Seconds until hypotheses, and in verification.
+    seconds: [f64; 2],
+}
+
+/// One image: outcomes by row.
+type Measured = BTreeMap<String, Vec<Outcomes>>;
+
+#[derive(Debug, Clone, Serialize)]
+struct Score {
+    targets: usize,
+    /// Share of the targets whose mask overlaps the truth by more than half.
+    iou: Option<f64>,
+    /// Share of the targets within a tenth of the diameter.
+    add_s: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Row {
+    key: &'static str,
+    title: &'static str,
+    all: Score,
+    objects: BTreeMap<u32, Score>,
+    /// Mean seconds an image, all of its objects: until hypotheses, and of verification.
+    seconds: [f64; 2],
+}
+
+#[derive(Debug, Serialize)]
+struct Whole {
+    dataset: String,
+    images: usize,
+    rows: Vec<Row>,
+    /// What the dissertation reports, trained on these objects, real depth; not measured here.
+    literature: BTreeMap<&'static str, f64>,
+}
+
+/// What outcomes depend on.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Inputs {
+    version: String,
+    dataset: String,
+    split: String,
+    ppf: bool,
+    /// Fingerprint of the network.
+    network: String,
+}
+
+struct Known {
+    mesh: Mesh,
+    info: ModelInfo,
+    with_mesh: KnownObject,
+    alone: KnownObject,
+    ppf: sixfold_match::ObjectModel,
+}
+
+pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Outcome> {
+    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
+    let model = match &a.weights {
+        Some(file) => MttmModel::load(file).context("--weights")?,
+        None => MttmModel::shipped().context("the network within the program")?,
+    };
+    let model = Arc::new(model);
+    let inputs = Inputs {
+        version: env!("CARGO_PKG_VERSION").into(),
+        dataset: a.dataset.display().to_string(),
+        split: a.split.clone(),
+        ppf: !a.no_ppf,
+        network: format!("{:016x}", model.fingerprint()),
+    };
+    same_inputs(&a.out, &inputs)?;
+    let mut images: BTreeMap<(u32, u32), Vec<u32>> = BTreeMap::new();
+    for (t, o) in targets.iter().filter_map(|t| t.object.map(|o| (t, o))) {
+        images.entry((t.scene_id, t.im_id)).or_default().push(o.obj_id);
+    }
+    let images: Vec<_> = images.into_iter().step_by(a.every.get()).collect();
+    let mut known: BTreeMap<u32, Known> = BTreeMap::new();
+    let mut progress = Progress::new("images", images.len());
+    let mut measured: Vec<Measured> = vec![];
+    for ((scene_id, im_id), ids) in &images {
+        check_interrupt("the images done so far are kept; run the same command again to go on")?;
+        let kept = a.out.join("images").join(format!("{scene_id:06}_{im_id:06}.json"));
+        if let Ok(text) = std::fs::read_to_string(&kept) {
+            measured.push(serde_json::from_str(&text).with_context(|| {
+                format!("{}: not an image of this version; remove it to have it made again", kept.display())
+            })?);
+            progress.step(format!("{scene_id}/{im_id} was done"));
+            continue;
+        }
+        for id in ids {
+            if let std::collections::btree_map::Entry::Vacant(place) = known.entry(*id) {
+                place.insert(know(&dataset, *id, &model)?);
+            }
+        }
+        let scene = dataset.scene(*scene_id)?;
+        let Some(depth) = scene.depth(*im_id)? else {
+            bail!(
+                "image {scene_id}/{im_id} has no depth image, which templates need (simulate it with `sixfold simulate-depth`)"
+            )
+        };
+        let truths: BTreeMap<u32, Pose> =
+            scene.image(*im_id)?.ground_truth.iter().map(|g| (g.obj_id, g.camera_from_object)).collect();
+        let one = measure(a, &depth, &scene.camera(*im_id)?, ids, &truths, &known)?;
+        write_atomically(&kept, serde_json::to_string(&one)?.as_bytes())?;
+        measured.push(one);
+        progress.step(format!("{scene_id}/{im_id}"));
+    }
+    progress.finish();
+    let rows: Vec<Row> = WAYS
+        .iter()
+        .map(|w| (w.key, w.title))
+        .chain([PPF])
+        .filter(|(key, _)| measured.iter().any(|m| m.contains_key(*key)))
+        .map(|(key, title)| row(key, title, &measured))
+        .collect();
+    let whole = Whole {
+        dataset: inputs.dataset,
+        images: images.len(),
+        rows,
+        literature: BTreeMap::from([
+            ("dissertation, table 5.1: masks with IoU above 0.5", 0.788),
+            ("dissertation, table 5.2: ADD(-S) below a tenth of the diameter, mean of the objects", 0.529),
+        ]),
+    };
+    let text = markdown(&whole);
+    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
+    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    report(json, &whole, || {
+        println!("{text}");
+        println!("table.md, reproduce.json and the images' outcomes are in {}", a.out.display());
+    })?;
+    let any = whole.rows.iter().any(|r| r.all.add_s > 0.0);
+    Ok(if any { Outcome::Found } else { Outcome::NothingFound })
+}
+
+/// An error if the folder holds images measured with something else.
+fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
+    let path = folder.join("inputs.json");
+    if let Ok(text) = std::fs::read_to_string(&path) {
+        let before: Option<Inputs> = serde_json::from_str(&text).ok();
+        if before.as_ref() != Some(inputs) {
+            bail!(
+                "{} was made with other inputs (see {}): remove it or choose another --out",
+                folder.display(),
+                path.display()
+            );
+        }
+        return Ok(());
+    }
+    write_atomically(&path, serde_json::to_string_pretty(inputs)?.as_bytes())
+}
+
+fn know(dataset: &BopDataset, id: u32, model: &Arc<MttmModel>) -> Result<Known> {
+    let mesh = dataset.model(id, Models::Rendering)?;
+    let info = dataset
+        .models_info(Models::Rendering)?
+        .and_then(|all| all.0.get(&id).cloned())
+        .unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
+    let folder = dataset.models_dir(Models::Rendering).unwrap_or_default();
+    let file = folder.join(format!("obj_{id:06}.ply"));
+    // Where `sixfold estimate --method mttm` keeps what it learns of a mesh, too.
+    let kept = file.with_extension("sixfold-templates");
+    let (templates, _) = ObjectTemplates::cached(&kept, &mesh, &TemplateOptions::default())
+        .with_context(|| format!("object {id}"))?;
+    let object = Object { name: format!("object {id}"), mesh, info, description: description_beside(&file) };
+    let ppf = object.ppf_model()?;
+    let with_mesh = KnownObject::new(templates, Some(ppf.clone()));
+    let descriptors = kept.with_extension("sixfold-descriptors");
+    let (with_mesh, note) = with_mesh.with_network_cached(model.clone(), &descriptors);
+    if let Some(note) = note {
+        eprintln!("note: descriptors of {} not kept or renewed: {note}", object.name);
+    }
+    let alone = with_mesh.clone().without_mesh();
+    Ok(Known { mesh: object.mesh, info: object.info, with_mesh, alone, ppf })
+}
+
+fn measure(
+    a: &ReproduceMttmArguments,
+    depth: &DepthImage,
+    camera: &Camera,
+    ids: &[u32],
+    truths: &BTreeMap<u32, Pose>,
+    known: &BTreeMap<u32, Known>,
+) -> Result<Measured> {
+    let scene = Scene::new(depth, camera, None, &SceneOptions::default())?;
+    let mut measured = Measured::new();
+    // Each way by itself, so that times are its own.
+    let searches: Vec<Search<'_>> = WAYS.iter().map(|_| Search::new(&scene)).collect();
+    for id in ids {
+        let (Some(k), Some(truth)) = (known.get(id), truths.get(id)) else { continue };
+        let drawn = render_depth(&k.mesh, truth, camera);
+        let visible = |i: usize| {
+            let (z, seen) = (drawn.as_slice()[i], depth.as_slice()[i]);
+            z > 0.0 && seen > 0.0 && (z - seen).abs() < TRUTH_DEPTH
+        };
+        let of_truth = (0..drawn.as_slice().len()).filter(|&i| visible(i)).count();
+        let error = |pose: &Pose| pose_error(&k.mesh, &k.info, truth, pose);
+        let plain = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
+        for (way, search) in WAYS.iter().zip(&searches) {
+            let object = if way.mesh { &k.with_mesh } else { &k.alone };
+            let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
+            let verification = VerificationOptions {
+                occluders_have_edges: way.occluders_have_edges,
+                ..VerificationOptions::default()
+            };
+            let options = EstimateOptions { matched_by, predicted_pose, align, verification, ..plain };
+            let (found, stages) = search.estimate(object, &options);
+            let best = found.first();
+            let iou = best.map(|e| {
+                let common = e.mask.iter().filter(|&&p| visible(p as usize)).count();
+                common as f64 / (of_truth + e.mask.len() - common).max(1) as f64
+            });
+            measured.entry(way.key.into()).or_default().push(Outcomes {
+                object: *id,
+                iou,
+                error: best.map(|e| error(&e.camera_from_object)),
+                confidence: best.map(|e| e.confidence),
+                seconds: [stages.hypotheses(), stages.verification],
+            });
+        }
+        if !a.no_ppf {
+            let start = Instant::now();
+            let options = sixfold_match::EstimateOptions { min_score: 0.0, ..Default::default() };
+            let found = sixfold_match::estimate(&scene, &k.ppf, &options);
+            let best = found.first();
+            measured.entry(PPF.0.into()).or_default().push(Outcomes {
+                object: *id,
+                iou: None,
+                error: best.map(|e| error(&e.camera_from_object)),
+                confidence: best.map(|e| e.confidence),
+                seconds: [start.elapsed().as_secs_f64(), 0.0],
+            });
+        }
+    }
+    Ok(measured)
+}
+
+/// ADD, or ADI for symmetric objects, over at most 1000 vertices, as a share of the diameter.
+fn pose_error(mesh: &Mesh, info: &ModelInfo, truth: &Pose, found: &Pose) -> f64 {
+    let vertices = mesh.vertices();
+    let points: Vec<Vec3> = vertices.iter().step_by(vertices.len().div_ceil(1000).max(1)).copied().collect();
+    let sum: f64 = if info.is_symmetric() {
+        let there: Vec<Vec3> = vertices.iter().map(|p| found.transform_point(p)).collect();
+        let tree = KdTree::new(&there);
+        points.iter().filter_map(|p| tree.nearest(&truth.transform_point(p))).map(|n| n.distance).sum()
+    } else {
+        points.iter().map(|p| (truth.transform_point(p) - found.transform_point(p)).norm()).sum()
+    };
+    sum / points.len().max(1) as f64 / info.diameter
+}
+
+fn row(key: &'static str, title: &'static str, measured: &[Measured]) -> Row {
+    let outcomes: Vec<&Outcomes> = measured.iter().filter_map(|m| m.get(key)).flatten().collect();
+    let score = |of: &[&Outcomes]| {
+        let share = |count: usize| count as f64 / of.len().max(1) as f64;
+        Score {
+            targets: of.len(),
+            iou: (key != PPF.0).then(|| share(of.iter().filter(|o| o.iou.is_some_and(|v| v > 0.5)).count())),
+            add_s: share(of.iter().filter(|o| o.error.is_some_and(|e| e < 0.1)).count()),
+        }
+    };
+    let mut by_object: BTreeMap<u32, Vec<&Outcomes>> = BTreeMap::new();
+    for o in &outcomes {
+        by_object.entry(o.object).or_default().push(o);
+    }
+    let mean = |k: usize| outcomes.iter().map(|o| o.seconds[k]).sum::<f64>() / measured.len().max(1) as f64;
+    Row {
+        key,
+        title,
+        all: score(&outcomes),
+        objects: by_object.iter().map(|(id, of)| (*id, score(of))).collect(),
+        seconds: [mean(0), mean(1)],
+    }
+}
+
+fn markdown(whole: &Whole) -> String {
+    let percent = |v: Option<f64>| v.map_or("-".to_string(), |v| format!("{:.1}", 100.0 * v));
+    let mut text = format!(
+        "# Template matching: {} images of {}\n\nPer cent of the targets whose mask overlaps the visible truth by more than half / \
+         whose pose is right within a tenth of the diameter (ADD, ADI for symmetric objects).\n\n| |",
+        whole.images, whole.dataset
+    );
+    let ids: Vec<u32> = whole.rows.first().map(|r| r.objects.keys().copied().collect()).unwrap_or_default();
+    for id in &ids {
+        text += &format!(" {id} |");
+    }
+    text += " all | s an image, hypotheses + verification |\n|---|";
+    text += &"---|".repeat(ids.len() + 2);
+    text += "\n";
+    for r in &whole.rows {
+        text += &format!("| {} |", r.title);
+        for id in &ids {
+            match r.objects.get(id) {
+                Some(s) => text += &format!(" {} / {} |", percent(s.iou), percent(Some(s.add_s))),
+                None => text += " - |",
+            }
+        }
+        text += &format!(
+            " {} / {} | {:.2} + {:.2} |\n",
+            percent(r.all.iou),
+            percent(Some(r.all.add_s)),
+            r.seconds[0],
+            r.seconds[1]
+        );
+    }
+    let targets = whole.rows.first().map_or(0, |r| r.all.targets);
+    text += &format!("\n{targets} targets. Not measured here, real depth, trained on these objects:\n\n");
+    for (what, value) in &whole.literature {
+        text += &format!("* {what}: {value:.3}\n");
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_counts_what_was_not_found_as_wrong() {
+        let outcome =
+            |object, iou, error| Outcomes { object, iou, error, confidence: None, seconds: [1.0, 0.5] };
+        let image = |all: Vec<Outcomes>| Measured::from([("both".to_string(), all)]);
+        let measured = [
+            image(vec![outcome(1, Some(0.8), Some(0.05)), outcome(2, None, None)]),
+            image(vec![outcome(1, Some(0.4), Some(0.2))]),
+        ];
+        let r = row("both", "", &measured);
+        assert_eq!((r.all.targets, r.all.iou, r.all.add_s), (3, Some(1.0 / 3.0), 1.0 / 3.0));
+        assert_eq!((r.objects[&1].add_s, r.objects[&2].add_s), (0.5, 0.0));
+        assert_eq!(r.seconds, [1.5, 0.75]);
+    }
+
+    #[test]
+    fn the_error_is_a_share_of_the_diameter() {
+        let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
+        let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();
+        let info = ModelInfo::of_mesh(&mesh);
+        let moved = Pose::from_translation(Vec3::new(0.0, 0.01, 0.0));
+        let error = pose_error(&mesh, &info, &Pose::identity(), &moved);
+        assert!((error - 0.01 / info.diameter).abs() < 1e-9, "{error}");
+    }
+}

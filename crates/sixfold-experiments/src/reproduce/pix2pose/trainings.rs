@@ -1,0 +1,182 @@
+//! Networks trained for a comparison: symmetric objects with the transformer loss, with L1 and view limits, and with
+//! plain L1 (table 3.1), and two others with their convex hulls in place of the meshes, from photographs alone, and with a
+//! discriminator and without (figure 3.12), on whole boxes and on boxes of which half is black.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+use sixfold_bop::{Models, Target};
+use sixfold_nn::training::Ending;
+use sixfold_pix2pose::recipe::{LEAST_VISIBLE, Recipe};
+
+use super::super::kept::kept_or_made;
+use super::row::{Row, Setting};
+use super::{Bench, Regions, ReproducePix2PoseArguments, fourfold};
+use sixfold_shell::pix2pose::Pix2Pose;
+use sixfold_shell::progress::interrupted;
+use sixfold_shell::training::{MaterialArguments, Shown, command_line, interrupted_after, loss, material};
+
+/// What a training of the comparison learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Of {
+    /// The dataset's objects with discrete symmetries.
+    Symmetric,
+    /// The first two without.
+    Others,
+    /// A made-up object with four equal sides, from renders.
+    Fourfold,
+}
+
+/// One training of the comparison.
+struct Training {
+    key: &'static str,
+    title: &'static str,
+    of: Of,
+    /// What differs from the defaults.
+    vary: fn(&mut Recipe),
+}
+
+const fn training(key: &'static str, title: &'static str, of: Of, vary: fn(&mut Recipe)) -> Training {
+    Training { key, title, of, vary }
+}
+
+const TRAININGS: [Training; 9] = [
+    training("trained-transformer-loss", "transformer loss", Of::Symmetric, |_| ()),
+    training("trained-view-limits", "L1 with view limits", Of::Symmetric, |r| r.view_limits = true),
+    training("trained-plain-l1", "L1", Of::Symmetric, |r| r.transformer_loss = false),
+    training("fourfold-transformer-loss", "transformer loss", Of::Fourfold, |_| ()),
+    training("fourfold-view-limits", "L1 with view limits", Of::Fourfold, |r| r.view_limits = true),
+    training("fourfold-plain-l1", "L1", Of::Fourfold, |r| r.transformer_loss = false),
+    training("trained-mesh", "meshes, photographs only", Of::Others, |r| r.render_share = 0.0),
+    training("trained-discriminator", "meshes, photographs only, with discriminators", Of::Others, |r| {
+        (r.render_share, r.adversarial) = (0.0, Some(true))
+    }),
+    training("trained-convex-hull", "convex hulls, photographs only", Of::Others, |r| {
+        (r.render_share, r.convex_hull) = (0.0, true)
+    }),
+];
+
+/// Trains, or goes on with the trainings, and measures what they came to.
+pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<Row>> {
+    let infos = bench.dataset.models_info(Models::Rendering)?.unwrap_or_default();
+    let symmetric = |id: &u32| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty());
+    let (turning, others): (Vec<u32>, Vec<u32>) = bench.meshes.keys().copied().partition(symmetric);
+    let others: Vec<u32> = others.into_iter().take(2).collect();
+    let fourfold_folder = a.out.join("fourfold");
+    let mut fourfold_bench = None;
+    let mut rows = vec![];
+    for training in TRAININGS {
+        let ids = match training.of {
+            Of::Symmetric => turning.clone(),
+            Of::Others => others.clone(),
+            Of::Fourfold => vec![fourfold::OBJECT],
+        };
+        let key = format!("{}-{}", training.key, a.steps);
+        if ids.is_empty() {
+            eprintln!("note: {key}: the model has no such object, nothing to train for the comparison");
+            continue;
+        }
+        let names: Vec<String> = ids.iter().map(u32::to_string).collect();
+        let folder = a.out.join("trainings").join(&key);
+        let made = training.of == Of::Fourfold;
+        if made && fourfold_bench.is_none() {
+            fourfold::write(&fourfold_folder, a.seed)?;
+            fourfold_bench = Some(Bench::of_dataset(&fourfold_folder, a.seed)?);
+        }
+        let what = if made {
+            "object with four equal sides".into()
+        } else {
+            format!("objects {}", names.join(" and "))
+        };
+        let title = format!("{what}, {} steps, two stages, PnP: {}", a.steps, training.title);
+        let mut settings = vec![Setting::plain(&key, &title)];
+        if training.of == Of::Others {
+            let plain =
+                Setting::plain(&format!("{key}-half-black"), &format!("{title}; half of every box black"));
+            settings.push(Setting { half_black: true, ..plain });
+        }
+        for setting in settings {
+            rows.push(kept_or_made(&a.out, &setting.key, || {
+                let dataset = if made { &fourfold_folder } else { &a.dataset };
+                let model = training.train(a, dataset, &ids, &folder)?;
+                let trained = setting.of(&Pix2Pose::load(&model)?, a.seed);
+                match &fourfold_bench {
+                    Some(bench) if made => bench.measure(&trained, &setting, &a.out),
+                    _ => bench.of_objects(&ids).measure(&trained, &setting, &a.out),
+                }
+            })?);
+        }
+    }
+    Ok(rows)
+}
+
+impl Bench {
+    /// The same for a few objects.
+    fn of_objects(&self, ids: &[u32]) -> Bench {
+        let mine = |regions: &Regions| {
+            regions.iter().filter(|(key, _)| ids.contains(&key.2)).map(|(k, v)| (*k, v.clone())).collect()
+        };
+        let of_them = |t: &&Target| t.object.is_some_and(|o| ids.contains(&o.obj_id));
+        Bench {
+            dataset: self.dataset.clone(),
+            targets: self.targets.iter().filter(of_them).copied().collect(),
+            meshes: self
+                .meshes
+                .iter()
+                .filter(|(id, _)| ids.contains(id))
+                .map(|(id, m)| (*id, m.clone()))
+                .collect(),
+            truth: mine(&self.truth),
+            detections: vec![],
+            seed: self.seed,
+        }
+    }
+}
+
+impl Training {
+    /// Trains, or goes on, and says where the model is.
+    fn train(
+        &self,
+        a: &ReproducePix2PoseArguments,
+        dataset: &Path,
+        ids: &[u32],
+        folder: &Path,
+    ) -> Result<PathBuf> {
+        if !a.size.is_multiple_of(32) || !(32..=512).contains(&a.size) {
+            bail!("--size: found {}, expected a multiple of 32 from 32 to 512", a.size);
+        }
+        let renders_only = self.of == Of::Fourfold;
+        let material = material(
+            &MaterialArguments {
+                dataset: Some(dataset.to_owned()),
+                split: a.split.clone(),
+                frames: (!renders_only).then(|| a.frames.clone()),
+                renders_only,
+                ids: ids.to_vec(),
+                objects: vec![],
+                unit: None,
+                backgrounds: a.backgrounds.clone(),
+                store: PathBuf::new(),
+            },
+            LEAST_VISIBLE,
+        )?;
+        let mut recipe = Recipe {
+            steps: Some(a.steps),
+            size: a.size,
+            backgrounds: a.backgrounds.clone(),
+            seed: a.seed,
+            command: command_line(),
+            ..Recipe::default()
+        };
+        (self.vary)(&mut recipe);
+        let mut shown = Shown::new(|record| {
+            format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
+        });
+        let ending = recipe.train(material, folder, interrupted(), &mut |news| shown.hear(news))?;
+        shown.finish();
+        match ending {
+            Ending::Finished(trained) => Ok(trained.model),
+            Ending::Interrupted { step } => Err(interrupted_after(step)),
+        }
+    }
+}

@@ -1,0 +1,13 @@
+//! The program as a user runs it: the real binary, in a temporary folder, on inputs made by the tests themselves.
+
+mod grasp;
+mod mttm;
+mod nol;
+mod pix2pose;
+// The same small scenes as for the program `sixfold`.
+#[allow(dead_code)]
+#[path = "../../../sixfold-cli/tests/cli/support.rs"]
+mod support;
+
+/// What is tested.
+const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold-experiments");

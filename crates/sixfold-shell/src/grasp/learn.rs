@@ -1,0 +1,427 @@
+//! `sixfold grasp learn`: the incremental loop of section 6.2.1 with a simulated hand. Propose from experience when some is
+//! near enough, else by geometry; execute; store what worked; go on.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use sixfold_dgcm::learner::{Learner, LearnerOptions, Lesson, PartOf};
+use sixfold_dgcm::store::StorePlace;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, middle_between_pads};
+use sixfold_mesh::Mesh;
+use sixfold_synth::shapes::{Family, Member, Rest, member};
+use sixfold_simulation::{ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval};
+
+use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
+use super::journal::Journal;
+use super::object_list::{ObjectsArguments, named_objects};
+use super::trial::{Hardness, PhysicsArguments, ending_name, hardness};
+use crate::output::JsonArguments;
+use crate::progress::{Progress, check_interrupt};
+
+/// What `sixfold grasp learn` is told.
+#[derive(Debug, Args)]
+pub struct LearnArguments {
+    /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
+    #[arg(long, value_name = "FILE")]
+    pub experiences: StorePlace,
+    /// Where experiences wait for a server.
+    #[command(flatten)]
+    pub outbox: OutboxArguments,
+    /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
+    pub families: Vec<String>,
+    /// Made-up objects of each family
+    #[arg(long, value_name = "N", default_value = "4", requires = "families")]
+    pub members: u64,
+    /// The objects to learn on, where they are not made up.
+    #[command(flatten)]
+    pub objects: ObjectsArguments,
+    /// Scenes of each object
+    #[arg(long, value_name = "N", default_value = "4")]
+    pub attempts: u64,
+    /// Grasps tried in a scene until one holds, the best first
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub tries: usize,
+    /// Further grasps tried in every scene, spread over the ranked ones: what fails teaches how much to trust a grasp
+    #[arg(long, value_name = "N", default_value = "0")]
+    pub explore: usize,
+    /// Feature distance of the nearest experience from which on it proposes: 0 for never (dissertation: 0.9)
+    #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
+    pub near: f64,
+    /// Try and store only grasps on parts of this name (made-up objects: handle of mug and drill)
+    #[arg(long, value_name = "NAME")]
+    pub part: Option<String>,
+    /// Stronger sensor noise, an imprecise hand, less friction and a heavier object, see `sixfold grasp compare --help`
+    #[arg(long)]
+    pub hard: bool,
+    /// The simulated trials.
+    #[command(flatten)]
+    pub physics: PhysicsArguments,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArguments,
+    /// Folder for attempts.jsonl, from which a stopped run goes on
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Seed of objects, poses, view points, noise and the planner
+    #[arg(long, default_value = "0")]
+    pub seed: u64,
+    /// Where the result goes.
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+/// What is learned on.
+pub struct Pupil {
+    /// Class, as the provenance says it.
+    pub class: String,
+    /// Name, as rows and the store have it.
+    pub name: String,
+    /// Metres, as it lies.
+    pub mesh: Mesh,
+    /// A made-up object, which knows its parts, and how it lies.
+    pub made: Option<(Member, Rest)>,
+}
+
+impl Pupil {
+    /// The part that a grasp is on: that of the surface nearest to the middle between the pads, a centimetre behind the
+    /// tips, if most of what was seen between the pads belongs to it too; `None` for no part in particular. A hand over the body of a
+    /// drill whose tips reach the handle is not on the handle.
+    fn part(
+        &self,
+        camera_from_object: &Pose,
+        grasp: &Grasp,
+        view: &GraspView,
+        gripper: &Gripper,
+    ) -> Option<&'static str> {
+        let (member, rest) = self.made.as_ref()?;
+        let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
+        let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
+        let middle = part_at(&middle_between_pads(&grasp.camera_from_gripper));
+        let gripper_from_camera = grasp.camera_from_gripper.inverse();
+        let held: Vec<&Vec3> = view
+            .object
+            .points
+            .iter()
+            .filter(|p| gripper.is_between_pads(&gripper_from_camera.transform_point(p), grasp.opening))
+            .collect();
+        let same = held.iter().filter(|p| part_at(p) == middle).count();
+        (10 * same >= 7 * held.len()).then_some(middle)
+    }
+}
+
+/// Made-up objects, the same for the same seed.
+pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<Pupil>> {
+    let mut pupils = vec![];
+    let families: Vec<Family> = if names.iter().any(|n| n == "all") {
+        Family::ALL.to_vec()
+    } else {
+        names
+            .iter()
+            .map(|name| {
+                let known = || Family::ALL.map(Family::name).join(", ");
+                Family::ALL
+                    .into_iter()
+                    .find(|f| f.name() == name)
+                    .with_context(|| format!("--families: found {name}, expected all or some of {}", known()))
+            })
+            .collect::<Result<_>>()?
+    };
+    for family in families {
+        for number in 0..members {
+            let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x6465_6d6f);
+            random.set_stream(number * 64 + family as u64);
+            let made = member(family, &mut random)?;
+            let rest = family.rests()[number as usize % family.rests().len()];
+            pupils.push(Pupil {
+                class: family.name().to_owned(),
+                name: format!("{}-{number}", family.name()),
+                mesh: made.mesh.transformed(&rest.rotation()),
+                made: Some((made, rest)),
+            });
+        }
+    }
+    Ok(pupils)
+}
+
+/// One grasp that was tried.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Row {
+    object: String,
+    class: String,
+    attempt: u64,
+    /// Whether experience proposed it; else geometry did.
+    from_experience: bool,
+    /// Distance of the nearest experience's feature.
+    nearest: Option<f64>,
+    ending: String,
+    held: bool,
+    /// Which of the proposals it was, from 0.
+    rank: usize,
+    /// Number of the experience that came of it.
+    stored: Option<i64>,
+}
+
+#[derive(Serialize)]
+struct Recorded<'a> {
+    experiences: &'a StorePlace,
+    objects: Vec<&'a str>,
+    attempts: u64,
+    tries: usize,
+    explore: usize,
+    near: f64,
+    part: &'a Option<String>,
+    hard: bool,
+    seed: u64,
+    network: String,
+    gripper: &'a Gripper,
+}
+
+/// What was learned.
+#[derive(Serialize)]
+pub struct Whole {
+    /// Scenes.
+    pub attempts: usize,
+    /// Those in which a grasp held.
+    pub held: usize,
+    /// Their fraction.
+    pub rate: f64,
+    /// Wilson, 95 %.
+    pub interval: (f64, f64),
+    /// Scenes in which experience proposed.
+    pub from_experience: usize,
+    /// In the store.
+    pub experiences: usize,
+    /// Grasps whose outcome is known for this gripper.
+    pub outcomes: usize,
+    /// The objects, one after another.
+    pub objects: Vec<Curve>,
+}
+
+/// How it went with one object, attempt by attempt.
+#[derive(Serialize)]
+pub struct Curve {
+    /// Its name.
+    pub object: String,
+    /// Whether a grasp held.
+    pub held: Vec<bool>,
+    /// Distance of the nearest experience's feature.
+    pub nearest: Vec<Option<f64>>,
+    /// Whether experience proposed the grasp; else geometry did.
+    pub from_experience: Vec<bool>,
+}
+
+/// The objects that the arguments name.
+fn pupils(a: &LearnArguments) -> Result<Vec<Pupil>> {
+    if !a.families.is_empty() {
+        return made_up(&a.families, a.members, a.seed);
+    }
+    let named = named_objects(&a.objects)?.into_iter();
+    Ok(named.map(|(class, name, mesh)| Pupil { class, name, mesh, made: None }).collect())
+}
+
+/// Learns, or goes on learning.
+///
+/// # Errors
+/// When the arguments, the store or the folder of an earlier run do not fit, and when the user asks to stop.
+pub fn learn(a: &LearnArguments) -> Result<Whole> {
+    if a.near.is_nan() || a.near < 0.0 {
+        bail!("--near: found {}, expected 0 or more", a.near);
+    }
+    if a.tries == 0 || a.attempts == 0 {
+        bail!("--tries and --attempts: expected at least 1");
+    }
+    let setting = hardness(&a.physics, a.hard)?;
+    let gripper = &setting.gripper;
+    let network = model(&a.network)?;
+    let pupils = pupils(a)?;
+    let recorded = Recorded {
+        experiences: &a.experiences,
+        objects: pupils.iter().map(|p| p.name.as_str()).collect(),
+        attempts: a.attempts,
+        tries: a.tries,
+        explore: a.explore,
+        near: a.near,
+        part: &a.part,
+        hard: a.hard,
+        seed: a.seed,
+        network: network.fingerprint(),
+        gripper: &setting.real,
+    };
+    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
+    let mut memory = new_memory(&a.experiences, &a.outbox, &a.out, &network)?;
+    let options = LearnerOptions { tries: a.tries, explore: a.explore, near: a.near, part: a.part.clone() };
+    let mut learner = Learner { network: &network, memory: &mut memory, gripper, options: &options };
+    let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
+    for pupil in &pupils {
+        let done =
+            |rows: &[Row], attempt| rows.iter().any(|r| r.object == pupil.name && r.attempt == attempt);
+        if (0..a.attempts).all(|n| done(&rows, n)) {
+            (0..a.attempts).for_each(|_| progress.step(pupil.name.clone()));
+            continue;
+        }
+        let parts = ConvexParts::of_mesh(&pupil.mesh, &PartsOptions::default())
+            .with_context(|| pupil.name.clone())?;
+        for attempt in 0..a.attempts {
+            if !done(&rows, attempt) {
+                check_interrupt("what was learned is kept; run the same command again to go on")?;
+                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt)?;
+                journal.row(&row)?;
+                rows.push(row);
+            }
+            progress.step(pupil.name.clone());
+        }
+    }
+    progress.finish();
+    memory.refresh()?;
+    let held = rows.iter().filter(|r| r.held).count();
+    Ok(Whole {
+        attempts: rows.len(),
+        held,
+        rate: held as f64 / rows.len().max(1) as f64,
+        interval: wilson_interval(held, rows.len()),
+        from_experience: rows.iter().filter(|r| r.from_experience).count(),
+        experiences: memory.len(),
+        outcomes: memory.outcomes(&gripper.name).attempts,
+        objects: pupils
+            .iter()
+            .map(|p| {
+                let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
+                Curve {
+                    object: p.name.clone(),
+                    held: mine.iter().map(|r| r.held).collect(),
+                    nearest: mine.iter().map(|r| r.nearest).collect(),
+                    from_experience: mine.iter().map(|r| r.from_experience).collect(),
+                }
+            })
+            .collect(),
+    })
+}
+
+/// One letter an attempt: G geometry, E experience; capitals held.
+pub fn marks(curve: &Curve) -> String {
+    let letter = |(held, e): (&bool, &bool)| match (held, e) {
+        (true, true) => 'E',
+        (true, false) => 'G',
+        (false, true) => 'e',
+        (false, false) => 'g',
+    };
+    curve.held.iter().zip(&curve.from_experience).map(letter).collect()
+}
+
+/// One scene with an object, and what was learned of it.
+fn attempt(
+    a: &LearnArguments,
+    setting: &Hardness,
+    learner: &mut Learner<'_>,
+    pupil: &Pupil,
+    parts: &ConvexParts,
+    attempt: u64,
+) -> Result<Row> {
+    let scene = scene(&pupil.mesh, parts, &setting.options, a.seed, attempt);
+    let mut row = Row {
+        object: pupil.name.clone(),
+        class: pupil.class.clone(),
+        attempt,
+        from_experience: false,
+        nearest: None,
+        ending: ending_name(scene.ending),
+        held: false,
+        rank: 0,
+        stored: None,
+    };
+    let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
+    let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
+    let part_of = |grasp: &Grasp| pupil.part(&camera_from_object, grasp, view, &setting.gripper);
+    let lesson = Lesson {
+        view,
+        planner: AntipodalOptions { seed: scene.noise, ..setting.options.planner },
+        object: &pupil.name,
+        provenance: &format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, a.seed),
+        part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
+        now,
+    };
+    let learned = learner.learn(&lesson, &mut |grasp| {
+        let sent = seen.world_from_camera * grasp.camera_from_gripper;
+        let tried = try_grasp(
+            parts,
+            &scene.world_from_object,
+            &setting.real,
+            &setting.reached(&sent, scene.noise),
+            grasp.opening,
+            &setting.options.trial,
+        )?;
+        let ending = Ending::Tried(tried.outcome);
+        Ok((ending.is_success(), ending))
+    })?;
+    row.nearest = learned.nearest;
+    row.from_experience = learned.from_experience;
+    row.held = learned.held;
+    row.stored = learned.stored;
+    if let Some((rank, ending)) = learned.last {
+        row.rank = rank;
+        row.ending = ending_name(ending);
+    }
+    Ok(row)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::{Camera, DepthImage, Mask, PointCloud};
+    use sixfold_grasp::{AntipodalQuality, gripper_pose};
+
+    #[test]
+    fn a_hand_over_the_body_is_not_on_the_handle() {
+        let pupil = made_up(&["drill".to_owned()], 4, 0)
+            .unwrap()
+            .into_iter()
+            .find(|p| {
+                p.made
+                    .as_ref()
+                    .is_some_and(|(_, rest)| rest.rotation().rotation_angle_to(&Pose::identity()) < 0.1)
+            })
+            .expect("a drill that stands");
+        let points = pupil.mesh.sample_surface(4000, 0).points;
+        let (member, _) = pupil.made.as_ref().unwrap();
+        let on = |part: &str| -> Vec<Vec3> {
+            points.iter().copied().filter(|p| member.part_at(p) == part).collect()
+        };
+        let handle = on("handle");
+        let middle = handle.iter().sum::<Vec3>() / handle.len() as f64;
+        let top = handle.iter().map(|p| p.z).fold(f64::MIN, f64::max);
+        // The camera's frame is the object's.
+        let view = GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: None,
+            object: PointCloud { normals: vec![Vec3::z(); points.len()], points: points.clone() },
+            obstacles: PointCloud::default(),
+            step: 0.0025,
+            cut_by_edge: false,
+        };
+        let gripper = Gripper::built_in("jaws-140").unwrap();
+        let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
+        let part = |tips: Vec3, approach: Vec3| {
+            let pose = gripper_pose(&tips, &approach, &Vec3::y()).unwrap();
+            let grasp = Grasp { camera_from_gripper: pose, opening: 0.08, width: 0.03, quality };
+            pupil.part(&Pose::identity(), &grasp, &view, &gripper)
+        };
+        // From behind across the handle, the tips a centimetre past its middle.
+        assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
+        // From above, the tips at the upper end of the handle, the body between the fingers.
+        let above = Vec3::new(middle.x, middle.y, top - 0.025);
+        assert_eq!(part(above, -Vec3::z()), None);
+        // Across the body before the handle.
+        let body = on("body");
+        let front = body.iter().map(|p| p.x).fold(f64::MIN, f64::max);
+        let height = body.iter().map(|p| p.z).sum::<f64>() / body.len() as f64;
+        assert_eq!(part(Vec3::new(0.6 * front, 0.0, height - 0.01), -Vec3::z()), Some("body"));
+    }
+}

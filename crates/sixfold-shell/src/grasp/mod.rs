@@ -1,0 +1,14 @@
+//! What commands on grasps share: the gripper, simulated trials, the objects they are made with, experience, learning by
+//! doing.
+
+#[cfg(feature = "experience")]
+pub mod experience;
+pub mod gripper;
+#[cfg(all(feature = "physics", feature = "experience"))]
+pub mod journal;
+#[cfg(all(feature = "physics", feature = "experience"))]
+pub mod learn;
+#[cfg(feature = "physics")]
+pub mod object_list;
+#[cfg(feature = "physics")]
+pub mod trial;

@@ -1,0 +1,109 @@
+//! Simulated trials of grasps as the command line sets them: gripper, mass and friction, the usual setting and a hard one.
+
+use anyhow::{Context, Result};
+use clap::Args;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use sixfold_geometry::Pose;
+use sixfold_grasp::Gripper;
+use sixfold_nn::layers::normal;
+use sixfold_render::DepthSensor;
+use sixfold_simulation::{AttemptOptions, Ending, TrialOptions};
+
+use super::gripper::gripper;
+
+/// Numbers of the simulated trial.
+#[derive(Debug, Args)]
+pub struct PhysicsArguments {
+    /// Gripper: jaws-140, jaws-85, or a file
+    #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
+    pub gripper: String,
+    /// Mass of the objects, kg
+    #[arg(long, value_name = "KG", default_value = "0.2")]
+    pub mass: f64,
+    /// Friction coefficient of the pads (default: the gripper's)
+    #[arg(long, value_name = "MU")]
+    pub friction: Option<f64>,
+    /// Force of each finger, newtons (default: the gripper's)
+    #[arg(long, value_name = "N")]
+    pub force: Option<f64>,
+}
+
+/// Gripper and trial as the command line sets them, tested.
+///
+/// # Errors
+/// When the gripper is not known, or a number makes no trial.
+pub fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
+    let mut gripper = gripper(&a.gripper)?;
+    gripper.friction = a.friction.unwrap_or(gripper.friction);
+    gripper.force = a.force.unwrap_or(gripper.force);
+    gripper.check(&a.gripper).context("--friction and --force change the gripper")?;
+    let options = TrialOptions { mass: a.mass, ..TrialOptions::default() };
+    options.check()?;
+    Ok((gripper, options))
+}
+
+/// With what scenes are made and grasps are tried.
+pub struct Hardness {
+    /// The gripper as whoever proposes knows it.
+    pub gripper: Gripper,
+    /// The gripper as it is.
+    pub real: Gripper,
+    /// Sensor, planner and trial.
+    pub options: AttemptOptions,
+    /// Standard deviations of the hand's position (metres) and orientation (radians) from where it was sent.
+    pub error: Option<(f64, f64)>,
+}
+
+impl Hardness {
+    /// Where the hand goes when it is sent somewhere; the same deviation for the same seed.
+    pub fn reached(&self, world_from_gripper: &Pose, seed: u64) -> Pose {
+        let Some((position, orientation)) = self.error else { return *world_from_gripper };
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(u64::from(u32::MAX));
+        let mut draw = |deviation: f64| deviation * f64::from(normal(&mut random));
+        let shift = [draw(position), draw(position), draw(position)];
+        let turn = [draw(orientation), draw(orientation), draw(orientation)];
+        // In the hand's own frame, about its tips.
+        *world_from_gripper * Pose::exp(&[shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]].into())
+    }
+}
+
+/// The usual setting, or the hard one.
+///
+/// # Errors
+/// As [`physics`].
+pub fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
+    let (gripper, mut trial) = physics(a)?;
+    let mut options = AttemptOptions::default();
+    let mut real = gripper.clone();
+    let mut error = None;
+    if hard {
+        // A --friction that was asked for is known to both.
+        real.friction = a.friction.unwrap_or(0.25);
+        // The command line's default is the easy setting's mass.
+        trial.mass = if a.mass == 0.2 { 0.5 } else { a.mass };
+        error = Some((0.005, 3f64.to_radians()));
+        let kinect = DepthSensor::kinect();
+        options.sensor = Some(DepthSensor {
+            axial_base: 2.0 * kinect.axial_base,
+            axial_growth: 2.0 * kinect.axial_growth,
+            lateral: 1.5 * kinect.lateral,
+            edge_loss: 0.8,
+            ..kinect
+        });
+    }
+    options.trial = trial;
+    Ok(Hardness { gripper, real, options, error })
+}
+
+/// The word for an ending in files and tables.
+pub fn ending_name(ending: Ending) -> String {
+    match serde_json::to_value(ending) {
+        Ok(serde_json::Value::String(word)) => word,
+        Ok(serde_json::Value::Object(map)) => {
+            map.values().next().and_then(|v| v.as_str()).unwrap_or("tried").to_owned()
+        }
+        _ => format!("{ending:?}"),
+    }
+}

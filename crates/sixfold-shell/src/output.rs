@@ -1,0 +1,81 @@
+//! What a command prints: a table for people, JSON for scripts.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::Serialize;
+use serde_json::Value;
+use sixfold_geometry::Pose;
+
+/// `--json`: to the screen, or to a file.
+#[derive(Debug, Default, Args, Clone)]
+pub struct JsonArguments {
+    /// Print the result as JSON, or write it to FILE and keep the table
+    #[arg(long, global = true, value_name = "FILE", num_args = 0..=1)]
+    json: Option<Option<PathBuf>>,
+}
+
+impl JsonArguments {
+    /// Whether JSON replaces the table on the screen.
+    pub fn on_screen(&self) -> bool {
+        matches!(self.json, Some(None))
+    }
+
+    /// The file JSON goes to.
+    pub fn file(&self) -> Option<&PathBuf> {
+        self.json.as_ref().and_then(Option::as_ref)
+    }
+}
+
+/// A pose as four rows of four numbers, translation in metres.
+pub fn pose_rows(pose: &Pose) -> [[f64; 4]; 4] {
+    let m = pose.to_matrix();
+    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+}
+
+/// Prints JSON or calls `table`, and writes the JSON file if one was asked for.
+pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).context("cannot write the result as JSON")?;
+    if let Some(path) = json.file() {
+        write_atomically(path, text.as_bytes())?;
+    }
+    if json.on_screen() {
+        println!("{text}");
+    } else {
+        table();
+    }
+    Ok(())
+}
+
+/// Writes a file under another name first, so that no reader sees half of it.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(parent).with_context(|| format!("folder {}", parent.display()))?;
+    }
+    let mut name = path.as_os_str().to_owned();
+    name.push(format!(".{}.tmp", std::process::id()));
+    std::fs::write(&name, bytes)
+        .and_then(|()| std::fs::rename(&name, path))
+        .with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Keeps the options that decide about a folder's content in `file`, an object of them. Where the file is there already, a
+/// folder made with others is refused.
+pub fn go_on_with(file: &Path, options: &Value) -> Result<()> {
+    if !file.exists() {
+        return write_atomically(file, format!("{options:#}\n").as_bytes());
+    }
+    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+    let before: Value = serde_json::from_str(&text).with_context(|| file.display().to_string())?;
+    let differs = |key: &&String| before.get(key.as_str()) != options.get(key.as_str());
+    if let Some(key) = options.as_object().into_iter().flat_map(|o| o.keys()).find(differs) {
+        bail!(
+            "{}: made with another {key} (there {}, now {}); give the same options to go on, or another --out",
+            file.display(),
+            before[key],
+            options[key]
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,86 @@
+//! Progress on standard error, and a clean stop on interrupt.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// The first interrupt asks for a stop at the next whole step, the second ends the program.
+pub fn catch_interrupts() {
+    // Without a handler an interrupt ends the program at once, which loses nothing that is on disk.
+    let _ = ctrlc::set_handler(|| {
+        if INTERRUPTED.swap(true, Ordering::SeqCst) {
+            std::process::exit(2);
+        }
+        eprintln!("stopping after this step (interrupt again to stop at once)");
+    });
+}
+
+/// Set once the user has asked to stop, for jobs that look at it themselves.
+pub fn interrupted() -> &'static AtomicBool {
+    &INTERRUPTED
+}
+
+/// An error once the user has asked to stop; `how` says how to go on.
+pub fn check_interrupt(how: &str) -> Result<()> {
+    if INTERRUPTED.load(Ordering::SeqCst) {
+        bail!("interrupted; {how}");
+    }
+    Ok(())
+}
+
+/// A bar on a terminal, a line every ten seconds elsewhere.
+pub struct Progress {
+    bar: ProgressBar,
+    plain: Option<(Instant, &'static str)>,
+}
+
+impl Progress {
+    /// A bar of `total` steps.
+    pub fn new(what: &'static str, total: usize) -> Progress {
+        let bar = ProgressBar::new(total as u64);
+        if let Ok(style) =
+            ProgressStyle::with_template("{prefix} {bar:32} {pos}/{len}, {elapsed} of about {duration} {msg}")
+        {
+            bar.set_style(style);
+        }
+        bar.set_prefix(what);
+        let plain = bar.is_hidden().then(|| (Instant::now(), what));
+        Progress { bar, plain }
+    }
+
+    /// One step is done.
+    pub fn step(&mut self, message: String) {
+        self.set(self.bar.position() as usize + 1);
+        self.bar.set_message(message);
+    }
+
+    /// What is shown behind the bar.
+    pub fn message(&mut self, message: String) {
+        if let Some((last, _)) = &self.plain
+            && last.elapsed() < Duration::from_millis(100)
+        {
+            eprintln!("  {message}");
+        }
+        self.bar.set_message(message);
+    }
+
+    /// `done` steps are done.
+    pub fn set(&mut self, done: usize) {
+        self.bar.set_position(done as u64);
+        if let Some((last, what)) = &mut self.plain
+            && last.elapsed() > Duration::from_secs(10)
+        {
+            *last = Instant::now();
+            eprintln!("{what} {done}/{}", self.bar.length().unwrap_or_default());
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(self) {
+        self.bar.finish_and_clear();
+    }
+}
