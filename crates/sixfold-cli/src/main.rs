@@ -12,7 +12,6 @@ use sixfold_shell::progress;
 use sixfold_shell::{end_with_the_reader, exit_code, use_threads};
 
 use crate::arguments::{Arguments, Command};
-use crate::commands::estimate_arguments::Method;
 
 fn main() -> ExitCode {
     end_with_the_reader();
@@ -21,9 +20,6 @@ fn main() -> ExitCode {
     use_threads(arguments.threads);
     exit_code(&match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
-        Command::Estimate(a) if a.dataset.is_some() => commands::estimate_dataset::run(a),
-        Command::Estimate(a) if a.method == Method::Pix2pose => commands::estimate_rgb::run(a),
-        Command::Estimate(a) if a.method == Method::Mttm => commands::mttm::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Detect(a) => commands::detect::run(a),
         Command::Eval(a) => commands::eval::run(a),

@@ -21,7 +21,7 @@ pub use posed_image::{LEAST_PIXELS, PosedImage};
 pub use poses::{DEFAULT_CAMERA, PoseRange, PoseVariation, default_distances, distances};
 pub use prepared_mesh::{PreparedMesh, is_textured};
 pub use reading::read_posed_images;
-pub use rendering::{color_patch, colors, random_lights, random_material, randomly_colored};
+pub use rendering::{color_patch, colors, random_lights, random_material};
 pub use sixfold_geometry::FrameId;
 pub use training_set::{FrameSelection, TrainingObject, TrainingSet};
 pub use visible_mask::VisibleMask;

@@ -11,13 +11,12 @@ use sixfold_nn::options::{OptionError, TrainingOptions};
 use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::train_error::TrainError;
-use sixfold_nn::weights::ModelCard;
-use sixfold_data::{TrainingSet, plain_backgrounds};
-use sixfold_pix2pose::samples::read_real_crops;
+use sixfold_nn::weights::{ModelCard, training_frames};
+use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};
-use crate::samples::{SceneObject, SceneOptions, SceneSource};
+use crate::samples::{SceneOptions, SceneSource};
 use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Which network learns.
@@ -222,6 +221,8 @@ impl Recipe for DetectorRecipe {
         let options = self.options();
         let mut card = ModelCard::new("", &format!("Detector, {} network", self.network.name()));
         card.data.clone_from(&material.description);
+        card.training_frames =
+            training_frames(self.init.as_deref(), &material.frames).map_err(TrainError::method)?;
         card.extra = serde_json::json!({
             "training": options, "continued_from": continued_from(self.init.as_deref())?
         });
@@ -236,22 +237,15 @@ impl Recipe for DetectorRecipe {
         session: &mut Session<'_>,
     ) -> Result<Option<SceneSource>, TrainError> {
         let ids: Vec<u32> = classes.iter().map(|c| c.id).collect();
-        let photographs = material.real.len();
+        let photographs = material.images.len();
         session.note(&format!("making {} objects and {photographs} photographed instances ready", ids.len()));
-        let cut = match &material.frames {
-            Some((dataset, frames)) => {
-                read_real_crops(dataset, frames, &ids, CUT_VISIBLE).map_err(TrainError::method)?
-            }
-            None => vec![],
-        };
-        let objects = std::mem::take(&mut material.objects)
-            .into_iter()
-            .map(|o| SceneObject { id: o.id, mesh: o.mesh, diameter: o.info.diameter })
-            .collect();
+        let complete = |image: &&PosedImage| image.visible_fraction().is_some_and(|f| f >= CUT_VISIBLE);
+        let cut: Vec<PosedImage> = material.images.iter().filter(complete).cloned().collect();
+        let objects = std::mem::take(&mut material.objects);
         let (backgrounds, fraction) =
             plain_backgrounds(self.backgrounds.as_deref()).map_err(TrainError::method)?;
         let backgrounds = backgrounds.with_procedural_share(fraction);
-        SceneSource::new(objects, &material.real, &cut, backgrounds, self.scenes())
+        SceneSource::new(objects, &material.images, &cut, backgrounds, self.scenes())
             .map(Some)
             .map_err(TrainError::method)
     }

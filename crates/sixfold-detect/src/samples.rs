@@ -12,7 +12,8 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sixfold_synth::augment::{AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape, procedural_texture};
 use sixfold_geometry::random::{Random, stream, uniform};
-use sixfold_data::{DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject, color_patch, default_distances, distances, image_color_augmentation, is_textured, randomly_colored};
+use sixfold_data::{DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject, color_patch, default_distances, distances, image_color_augmentation, is_textured};
+use sixfold_synth::randomly_colored;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
 use crate::targets::{Annotation, IGNORED, Instance};
 

@@ -6,13 +6,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use sixfold_synth::augment::Backgrounds;
+use sixfold_data::TrainingObject;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneObject, SceneOptions, SceneSource};
+use sixfold_detect::samples::{SceneOptions, SceneSource};
 use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::{Image, RgbImage, Vec3};
-use sixfold_mesh::Mesh;
+use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::{Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
@@ -20,7 +21,7 @@ use sixfold_nn::training::{Outcome, fit};
 use sixfold_nn::weights::ModelCard;
 
 /// A pyramid or a flat box of one colour.
-fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {
+fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {
     let (vertices, faces): (Vec<[f64; 3]>, Vec<[u32; 3]>) = if pyramid {
         let corners = [[-0.05, -0.05, 0.0], [0.05, -0.05, 0.0], [0.05, 0.05, 0.0], [-0.05, 0.05, 0.0]];
         let tip = [[0.0, 0.0, 0.09]];
@@ -37,7 +38,9 @@ fn object(id: u32, pyramid: bool, color: [u8; 3]) -> SceneObject {
     };
     let colors = vec![color; vertices.len()];
     let mesh = Mesh::new(vertices.into_iter().map(Vec3::from).collect(), faces).unwrap();
-    SceneObject { id, mesh: mesh.with_colors(colors).unwrap(), diameter: 0.14 }
+    let mesh = mesh.with_colors(colors).unwrap();
+    let info = ModelInfo { diameter: 0.14, ..ModelInfo::of_mesh(&mesh) };
+    TrainingObject::new(id, mesh, info)
 }
 
 fn source(size: usize) -> SceneSource {

@@ -44,7 +44,9 @@ pub struct Query<'a> {
     pub diagnostics: bool,
     /// What methods keep between objects.
     pub memo: Memo,
-    depth_region: OnceLock<Result<DepthRegion, PreparedDepthError>>,
+    /// What [`Query::depth_region`] returns.
+    #[doc(hidden)]
+    pub depth_region: OnceLock<Result<DepthRegion, PreparedDepthError>>,
 }
 
 impl<'a> Query<'a> {

@@ -40,7 +40,7 @@ mod views;
 
 pub use error::{StoreError, TemplateError};
 pub use estimate::{MttmEstimate, MttmOptions, KnownObject, MatchedBy, Search, Stages, estimate};
-pub use estimator::{MttmEstimator, MttmObject};
+pub use estimator::{MttmEstimator, MttmObject, TEMPLATES_FILE};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
 pub use views::{Coverage, view_directions, view_rotation};

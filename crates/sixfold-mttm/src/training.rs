@@ -252,7 +252,7 @@ mod tests {
     use sixfold_geometry::{Pose, Vec3};
     use sixfold_mesh::Mesh;
     use sixfold_nn::training::{Outcome, fit};
-    use sixfold_shapes::{Family, member};
+    use sixfold_synth::shapes::{Family, member};
     use std::path::Path;
     use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -2,16 +2,16 @@
 //! mesh, and makes those poses better (K. Park, *6D Pose Estimation of Objects Using Limited Training Data*, TU Wien 2020,
 //! chapter 4).
 //!
-//! A [`Photograph`] is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
+//! A [`PosedImage`](sixfold_data::PosedImage) is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
 pub mod agreement;
+mod error;
 mod features;
 pub mod loss;
 mod maps;
 pub mod model;
 pub mod network;
-mod photograph;
 mod preview;
 mod projection;
 pub mod quality;
@@ -25,9 +25,11 @@ mod surface;
 pub mod synthesis;
 pub mod training;
 pub mod view_grid;
+mod window;
 
+pub use error::NolError;
 pub use features::SourceFeatures;
 pub use maps::Maps;
-pub use photograph::{NolError, Photograph, object_window};
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;
+pub use window::object_window;

@@ -8,9 +8,10 @@ use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
+use sixfold_data::PosedImage;
 
-use crate::photograph::{Photograph, object_window};
 use crate::synthesis::NewView;
+use crate::window::object_window;
 
 /// Side of an image in units of the object's box.
 const ROOM: f64 = 1.6;
@@ -43,7 +44,7 @@ impl ViewGrid {
     pub fn placed(
         &self,
         mesh: &Mesh,
-        photographs: &[&Photograph],
+        photographs: &[&PosedImage],
         object: u32,
     ) -> Vec<Option<(Camera, Pose)>> {
         let aims = self.aims();
@@ -76,7 +77,7 @@ impl ViewGrid {
     fn place(
         &self,
         mesh: &Mesh,
-        photographs: &[&Photograph],
+        photographs: &[&PosedImage],
         object: u32,
         aim: &Aim,
         number: u32,

@@ -10,6 +10,7 @@ use crate::model::Pix2PoseModel;
 use crate::object::Correction;
 use crate::refine::{RefineOptions, refine};
 use sixfold_data::PosedImage;
+use sixfold_geometry::stats::upper_median;
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;

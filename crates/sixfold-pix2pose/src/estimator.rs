@@ -8,9 +8,9 @@ use sixfold_align::outline::outline_mesh;
 use sixfold_align::DepthOptions;
 use sixfold_estimator::{
     Diagnostic, EstimatorError, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
-    Region, downcast,
+    downcast,
 };
-use sixfold_geometry::{Image, NormalOptions, Pose, RgbImage, Vec3};
+use sixfold_geometry::{Camera, Image, NormalOptions, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::aligned::{AlignOptions, estimate_aligned};
@@ -66,40 +66,78 @@ impl Pix2PoseEstimator {
         }
     }
 
-    fn found(
+    /// An object as the model knows it, with its mesh where it has one.
+    ///
+    /// # Errors
+    /// [`EstimatorError`] where the model does not know it, or its mesh is another's.
+    pub fn object(&self, object: &Object) -> Result<Pix2PoseObject, EstimatorError> {
+        let entry = self.entry(object.id.or(self.object_id))?;
+        let mut notes = vec![];
+        match &object.mesh {
+            Some(mesh) => entry.check_mesh(mesh).map_err(|e| EstimatorError::Object {
+                object: object.name.clone(),
+                source: Box::new(e),
+            })?,
+            None => notes.push(
+                "without --object NAME_OR_MESH the outline is not aligned, and the overlay shows a box".to_owned(),
+            ),
+        }
+        let name = if object.name.is_empty() { format!("object {}", entry.id) } else { object.name.clone() };
+        Ok(Pix2PoseObject {
+            name,
+            id: entry.id,
+            diameter: entry.diameter,
+            mesh: object.mesh.clone(),
+            solid: if object.mesh.is_none() { box_of(entry) } else { None },
+            outline: OnceLock::new(),
+            notes,
+        })
+    }
+
+    /// The best pose of an object in a box of a pinhole image, before ICP; `None` if it is not seen there. Without a mesh the
+    /// outline is not aligned.
+    ///
+    /// # Errors
+    /// [`EstimateError`].
+    pub fn pose_in_box(
         &self,
+        image: &RgbImage,
+        camera: &Camera,
         object: &Pix2PoseObject,
-        query: &Query<'_>,
-        region: &Region,
-    ) -> Result<Option<Posed>, EstimateError> {
-        let (Some(image), id, camera) = (query.rgb, object.id, query.camera) else { return Ok(None) };
+        bbox: &Rect,
+    ) -> Result<Option<Pix2PosePose>, EstimateError> {
+        let id = object.id;
         if let (true, Some(mesh)) = (self.refine, &object.mesh) {
             let outline = object.outline.get_or_init(|| outline_mesh(mesh));
             let (model, options) = (&self.model, &self.options);
-            let aligned = estimate_aligned(model, image, camera, id, &region.bbox, outline, options)?;
-            return Ok(aligned.map(|a| Posed {
+            let aligned = estimate_aligned(model, image, camera, id, bbox, outline, options)?;
+            return Ok(aligned.map(|a| Pix2PosePose {
                 camera_from_object: a.camera_from_object,
                 score: a.score,
                 refined: a.improved,
                 found: a.found,
             }));
         }
-        let found = estimate(&self.model, image, camera, id, &region.bbox, &self.options.estimate)?;
+        let found = estimate(&self.model, image, camera, id, bbox, &self.options.estimate)?;
         Ok(found.and_then(|found| {
             let best = found.hypotheses.first()?;
             let (score, camera_from_object) = (best.score, best.camera_from_object);
-            Some(Posed { camera_from_object, score, refined: false, found })
+            Some(Pix2PosePose { camera_from_object, score, refined: false, found })
         }))
     }
 }
 
 /// A pose before ICP.
-struct Posed {
-    camera_from_object: Pose,
-    score: f64,
+#[derive(Debug, Clone)]
+pub struct Pix2PosePose {
+    /// The pose.
+    pub camera_from_object: Pose,
+    /// Correspondences that fit over the object's pixels, 0 to 1.
+    pub score: f64,
     /// Whether the outline was aligned with the image.
-    refined: bool,
-    found: Found,
+    pub refined: bool,
+    /// What both passes found.
+    pub found: Found,
 }
 
 /// An object as a trained network knows it.
@@ -144,25 +182,7 @@ impl PoseEstimator for Pix2PoseEstimator {
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
-        let entry = self.entry(object.id.or(self.object_id))?;
-        let mut notes = vec![];
-        match &object.mesh {
-            Some(mesh) => entry.check_mesh(mesh).map_err(|e| EstimatorError::Object {
-                object: object.name.clone(),
-                source: Box::new(e),
-            })?,
-            None => notes.push("without a mesh the outline is not aligned, and the overlay shows a box".to_owned()),
-        }
-        let name = if object.name.is_empty() { format!("object {}", entry.id) } else { object.name.clone() };
-        Ok(Box::new(Pix2PoseObject {
-            name,
-            id: entry.id,
-            diameter: entry.diameter,
-            mesh: object.mesh.clone(),
-            solid: if object.mesh.is_none() { box_of(entry) } else { None },
-            outline: OnceLock::new(),
-            notes,
-        }))
+        Ok(Box::new(self.object(object)?))
     }
 
     fn estimate(
@@ -171,13 +191,13 @@ impl PoseEstimator for Pix2PoseEstimator {
         query: &Query<'_>,
     ) -> Result<Vec<PoseEstimate>, EstimatorError> {
         let object: &Pix2PoseObject = downcast(object, METHOD)?;
-        query.rgb(METHOD)?;
+        let image = query.rgb(METHOD)?;
         let region = query.region.ok_or(EstimatorError::Input {
             what: "region that says where the object is",
             method: METHOD,
             advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
         })?;
-        let posed = match self.found(object, query, region) {
+        let posed = match self.pose_in_box(image, query.camera, object, &region.bbox) {
             Ok(Some(posed)) => posed,
             Ok(None) => return Ok(vec![]),
             // Only the box is to blame.
@@ -221,7 +241,7 @@ impl PoseEstimator for Pix2PoseEstimator {
 
 /// What is said of an estimate besides: whether the outline was aligned, ICP, the square of the image that the last pass saw (x, y,
 /// side), and all hypotheses as PnP left them, best first.
-fn details(id: u32, posed: &Posed, icp: Value) -> Map<String, Value> {
+fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
     let rows = |pose: &Pose| -> [[f64; 4]; 4] {
         let m = pose.to_matrix();
         std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))

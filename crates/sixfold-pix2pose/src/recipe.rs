@@ -13,17 +13,17 @@ use sixfold_nn::options::{OptionError, TrainingOptions};
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_from};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
-use sixfold_nn::weights::ModelCard;
-use sixfold_outline::outline_mesh;
+use sixfold_nn::weights::{ModelCard, training_frames};
+use sixfold_align::outline::outline_mesh;
 
 use crate::adversarial::{AdversarialBatch, AdversarialOptions, AdversarialTraining};
 use crate::aligned::measure_corrections;
-use sixfold_data::{TrainingSet, backgrounds};
+use sixfold_data::{FrameId, PosedImage, TrainingObject, TrainingSet, backgrounds_with_images};
 use crate::model::{ImageSizes, Network, Pix2PoseModel};
 use crate::networks::{Compact, CompactConfig, PaperGenerator, PaperGeneratorConfig, ResNet50Generator, ResNet50GeneratorConfig};
 use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
 use crate::preset::Preset;
-use crate::samples::{RealCrop, SampleOptions, SampleSource, TrainingObject};
+use crate::samples::{SampleOptions, SampleSource};
 use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
 
 /// Which network learns.
@@ -147,7 +147,7 @@ const ADVERSARIAL: f32 = 0.01;
 /// What is known beside the network before the first step.
 pub struct Context {
     objects: Vec<TrainingObject>,
-    real: Vec<RealCrop>,
+    real: Vec<PosedImage>,
     entries: Vec<ObjectEntry>,
     sizes: ImageSizes,
     outlines: BTreeMap<u32, (Mesh, ModelInfo)>,
@@ -237,13 +237,17 @@ impl Pix2PoseRecipe {
         entry
     }
 
-    fn card(&self, description: String) -> Result<ModelCard, TrainError> {
+    fn card(&self, description: String, frames: &[FrameId]) -> Result<ModelCard, TrainError> {
+        // With weights to begin with, their frames count too; so do those that corrections are measured on.
+        let frames = training_frames(self.init.as_deref(), frames).map_err(TrainError::method)?;
         if let (Some(file), Some(0)) = (&self.init, self.steps) {
             let mut card = Pix2PoseModel::load(file).map_err(TrainError::method)?.card().clone();
             card.extra["corrections"] = serde_json::json!({ "command": self.command, "data": description });
+            card.training_frames = frames;
             return Ok(card);
         }
         let mut card = ModelCard::new("", "Pix2Pose, compact network");
+        card.training_frames = frames;
         card.data = description;
         card.extra = serde_json::json!({
             "training": self.compact_options(), "continued_from": continued_from(self.init.as_deref())?
@@ -341,13 +345,13 @@ impl Recipe for Pix2PoseRecipe {
         material: TrainingSet,
         session: &mut Session<'_>,
     ) -> Result<Prepared<Pix2PoseTraining, Context>, TrainError> {
-        let TrainingSet { objects, real, description, .. } = material;
+        let TrainingSet { objects, images: real, frames, description } = material;
         let compact = self.network == NetworkKind::Compact;
         let fits = compact || objects.len() == 1;
         OptionError::unless(fits, "network", self.described(objects.len()), DISSERTATION)?;
         let (objects, description) = self.objects(objects, description, session)?;
         let training = self.training(&objects, Device::flex().autodiff())?;
-        let card = self.card(description)?;
+        let card = self.card(description, &frames)?;
         let context = Context {
             entries: objects.iter().map(|o| self.entry(o)).collect(),
             sizes: ImageSizes { input: self.size, output: if compact { self.size / 2 } else { self.size } },
@@ -365,7 +369,7 @@ impl Recipe for Pix2PoseRecipe {
     ) -> Result<Option<SampleSource>, TrainError> {
         let Context { objects, real, sizes, .. } = context;
         let backgrounds =
-            backgrounds(self.backgrounds.as_deref(), real, objects).map_err(TrainError::method)?;
+            backgrounds_with_images(self.backgrounds.as_deref(), real, objects).map_err(TrainError::method)?;
         session.note(&format!(
             "making {} objects and {} photographed instances ready",
             objects.len(),
@@ -494,7 +498,7 @@ impl Training for Pix2PoseTraining {
 }
 
 /// What the alignment is measured with, where there are photographs to measure it on.
-fn outlines(objects: &[TrainingObject], photographs: &[RealCrop]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
+fn outlines(objects: &[TrainingObject], photographs: &[PosedImage]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
     if photographs.is_empty() {
         return BTreeMap::new();
     }

@@ -2,6 +2,7 @@
 
 use burn::tensor::Device;
 use sixfold_synth::augment::Backgrounds;
+use sixfold_data::TrainingObject;
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::options::{Pace, TrainingOptions};
@@ -10,7 +11,7 @@ use sixfold_nn::training::{Outcome, fit};
 use sixfold_nn::weights::{ModelCard, save_weights};
 use sixfold_pix2pose::networks::CompactConfig;
 use sixfold_pix2pose::object::SymmetryMap;
-use sixfold_pix2pose::samples::{SampleOptions, SampleSource, TrainingObject};
+use sixfold_pix2pose::samples::{SampleOptions, SampleSource};
 use sixfold_pix2pose::training::{CompactTraining, Pix2PoseTrainingOptions};
 use sixfold_render::BoundingBoxScale;
 use std::path::Path;

@@ -1,14 +1,12 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, pictures, and the
 //! arguments, stores and scenes that both take.
 
-pub mod boxes;
 pub mod detector;
 pub mod frames;
 pub mod grasp;
 pub mod objects;
 pub mod output;
 pub mod overlay;
-pub mod pix2pose;
 pub mod progress;
 pub mod training;
 

@@ -1,44 +1,22 @@
-//! What trainings have in common: what they learn from, what they tell on their way, and what they say in the end.
+//! What trainings on the command line have in common: what they learn from, how their progress is shown, and what they report.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
+use sixfold_data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
 use sixfold_mesh::Unit;
-use sixfold_nn::recipe::{News, Trained};
+use sixfold_nn::options::OptionError;
+use sixfold_nn::recipe::{Recipe, Session, Trained, TrainingEvent, export, train};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::training::Outcome;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
-use sixfold_data::{FrameSelection, TrainingSet, TrainingSetError};
 
 use crate::objects;
-use crate::progress::Progress;
-
-/// What a training came to.
-#[derive(Serialize)]
-pub struct Summary {
-    /// File of the model.
-    pub model: String,
-    /// Ids of the objects that were learnt.
-    pub objects: Vec<u32>,
-    /// Photographed instances that were learnt from.
-    pub photographs: usize,
-    /// Of the training.
-    pub steps: u64,
-    /// Of training; `None` where a model was only exported.
-    pub seconds: Option<f64>,
-    /// Of the last record, by name.
-    pub losses: BTreeMap<String, f64>,
-}
-
-impl Summary {
-    /// Of a training that went through.
-    pub fn new(trained: Trained, objects: Vec<u32>, photographs: usize) -> Summary {
-        let Trained { model, steps, seconds, losses } = trained;
-        Summary { model: model.display().to_string(), objects, photographs, steps, seconds, losses }
-    }
-}
+use crate::progress::{Progress, interrupted};
 
 /// What a training learns from.
 #[derive(Debug, Args)]
@@ -72,15 +50,19 @@ pub struct MaterialArguments {
     pub store: PathBuf,
 }
 
-/// What `a` names: all its objects, and the photographed instances of which at least the share `least_visible` is seen.
-pub fn material(a: &MaterialArguments, least_visible: f64) -> Result<Material> {
+/// The training set that `a` names: all its objects, and the posed instances of which at least the fraction `min_visibility` is
+/// seen.
+///
+/// # Errors
+/// When nothing is named, or it cannot be read.
+pub fn training_set(a: &MaterialArguments, min_visibility: f64) -> Result<TrainingSet> {
     if let Some(root) = &a.dataset {
         let frames = match &a.frames {
-            Some(file) => Frames::File(file.clone()),
-            None if a.renders_only => Frames::RendersOnly,
-            None => Frames::All,
+            Some(file) => FrameSelection::File(file.clone()),
+            None if a.renders_only => FrameSelection::RendersOnly,
+            None => FrameSelection::All,
         };
-        return Material::of_dataset(root, &a.split, &a.ids, &frames, least_visible).map_err(in_words);
+        return TrainingSet::of_dataset(root, &a.split, &a.ids, &frames, min_visibility).map_err(in_words);
     }
     if a.objects.is_empty() {
         bail!("what is to be learnt? Give --dataset DIR, or --object NAME_OR_MESH for training on renders");
@@ -90,64 +72,151 @@ pub fn material(a: &MaterialArguments, least_visible: f64) -> Result<Material> {
         let object = objects::find(name, a.unit, &a.store)?;
         meshes.push((index as u32 + 1, object.mesh, object.info));
     }
-    Ok(Material::of_meshes(meshes, &a.objects.join(", ")))
+    Ok(TrainingSet::of_meshes(meshes, &a.objects.join(", ")))
 }
 
 /// With the options that help.
-fn in_words(error: MaterialError) -> anyhow::Error {
+fn in_words(error: TrainingSetError) -> anyhow::Error {
     match &error {
-        MaterialError::NoObjects { .. } => anyhow!("{error} with --ids"),
-        MaterialError::NoImages { .. } => {
+        TrainingSetError::NoObjects { .. } => anyhow!("{error} with --ids"),
+        TrainingSetError::NoImages { .. } => {
             anyhow!("{error}; give another --split, or train with --renders-only")
         }
-        MaterialError::NothingVisible { .. } => {
+        TrainingSetError::NothingVisible { .. } => {
             anyhow!("{error} with --frames, or train with --renders-only")
         }
         _ => error.into(),
     }
 }
 
-/// Shows what a training tells: a bar of its steps with `message` behind it, and notes. The last record is kept.
-pub struct Shown<M: Fn(&TrainingRecord) -> String> {
-    message: M,
-    bar: Option<Progress>,
-    measuring: bool,
+/// Whether the model in `file` was trained on a frame: scores there are worth nothing.
+///
+/// # Errors
+/// For a card that does not say: no frame can be tested on then.
+pub fn was_trained_on(card: &ModelCard, file: &Path, frame: FrameId) -> Result<bool> {
+    card.was_trained_on(frame).with_context(|| {
+        format!(
+            "{}: its card has no training_frames, so whether it was trained on frame {frame} is not known; train it again, or \
+             write its last checkpoint again with --export",
+            file.display()
+        )
+    })
 }
 
-impl<M: Fn(&TrainingRecord) -> String> Shown<M> {
-    /// Shows `message` of every record behind the bar.
-    pub fn new(message: M) -> Self {
-        Shown { message, bar: None, measuring: false }
-    }
+/// What a training came to; `M`: what only some of them say.
+#[derive(Serialize)]
+pub struct Summary<M> {
+    /// The model's file.
+    pub model: String,
+    /// Steps of the training.
+    pub steps: u64,
+    /// Of training; `None` where a model was only exported.
+    pub seconds: Option<f64>,
+    /// Losses of the last record, by name.
+    pub losses: BTreeMap<String, f64>,
+    /// What only some trainings say.
+    #[serde(flatten)]
+    pub more: M,
+}
 
-    /// Shows what a training tells.
-    pub fn hear(&mut self, news: News<'_>) {
-        match news {
-            News::Note(text) => eprintln!("{text}"),
-            News::Warning(text) => eprintln!("warning: {text}"),
-            News::Preparing(done, all) => {
-                if done % 1000 < 4 {
-                    eprintln!("  {done} of {all}");
-                }
+/// What was learnt from.
+#[derive(Serialize)]
+pub struct LearntFrom {
+    /// Ids of the objects.
+    pub objects: Vec<u32>,
+    /// Posed instances in photographs.
+    pub photographs: usize,
+}
+
+/// How good the model is on objects that it was not trained on.
+#[derive(Serialize)]
+pub struct Measured<Q> {
+    /// Its scores.
+    pub quality: Q,
+}
+
+/// What is reported of a training.
+pub fn summary<R, M>(trained: Trained<R>, more: impl FnOnce(R) -> M) -> Summary<M> {
+    let Trained { model, steps, seconds, losses, report } = trained;
+    Summary { model: model.display().to_string(), steps, seconds, losses, more: more(report) }
+}
+
+/// How a training is shown.
+pub struct Shown {
+    /// What is made ready before the first step.
+    pub preparing: &'static str,
+    /// What is measured after the last.
+    pub measuring: &'static str,
+    /// Behind the bar of the steps.
+    pub message: fn(&TrainingRecord) -> String,
+}
+
+/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint. `by_flag` says an option out of
+/// its range in the caller's words.
+///
+/// # Errors
+/// As the recipe, and when the user interrupts.
+pub fn train_in<R: Recipe>(
+    recipe: &R,
+    data: R::Data,
+    out: &Path,
+    export_only: bool,
+    shown: Shown,
+    by_flag: impl Fn(&OptionError) -> anyhow::Error,
+) -> Result<Trained<R::Report>> {
+    let mut bars = Bars { shown, bar: None };
+    let mut receive = |event: TrainingEvent<'_>| bars.receive(event);
+    let mut session = Session::new(out, interrupted(), &mut receive);
+    let ended =
+        if export_only { export(recipe, data, &mut session) } else { train(recipe, data, &mut session) };
+    bars.finish();
+    match ended {
+        Ok(Outcome::Finished(trained)) => Ok(trained),
+        Ok(Outcome::Interrupted { step: 0 }) => {
+            bail!("interrupted; nothing was trained yet; run the same command again")
+        }
+        Ok(Outcome::Interrupted { step }) => {
+            bail!("interrupted after step {step}, which is kept; run the same command again to go on")
+        }
+        Err(TrainError::Option(error)) => Err(by_flag(&error)),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// A bar of what is done at the moment, and notes.
+struct Bars {
+    shown: Shown,
+    bar: Option<(&'static str, Progress)>,
+}
+
+impl Bars {
+    fn receive(&mut self, event: TrainingEvent<'_>) {
+        match event {
+            TrainingEvent::Note(text) => {
+                self.finish();
+                eprintln!("{text}");
             }
-            News::Steps(record, steps) => {
-                let bar = self.bar.get_or_insert_with(|| Progress::new("steps", steps as usize));
+            TrainingEvent::Warning(text) => eprintln!("warning: {text}"),
+            TrainingEvent::Preparing(done, all) => self.bar(self.shown.preparing, all).set(done),
+            TrainingEvent::Steps(record, steps) => {
+                let message = (self.shown.message)(record);
+                let bar = self.bar("steps", steps as usize);
                 bar.set(record.step as usize);
-                bar.message((self.message)(record));
+                bar.message(message);
             }
-            News::Measuring(done, all) => {
-                if !std::mem::replace(&mut self.measuring, true) {
-                    self.finish();
-                }
-                let what = "alignment measured on the photographs";
-                self.bar.get_or_insert_with(|| Progress::new(what, all)).set(done);
-            }
+            TrainingEvent::Measuring(done, all) => self.bar(self.shown.measuring, all).set(done),
         }
     }
 
-    /// Takes the bar away.
-    pub fn finish(&mut self) {
-        if let Some(bar) = self.bar.take() {
+    fn bar(&mut self, what: &'static str, all: usize) -> &mut Progress {
+        if self.bar.as_ref().is_some_and(|(before, _)| *before != what) {
+            self.finish();
+        }
+        &mut self.bar.get_or_insert_with(|| (what, Progress::new(what, all))).1
+    }
+
+    fn finish(&mut self) {
+        if let Some((_, bar)) = self.bar.take() {
             bar.finish();
         }
     }
@@ -158,19 +227,8 @@ pub fn loss(record: &TrainingRecord, name: &str) -> f64 {
     record.losses.get(name).copied().unwrap_or(f64::NAN)
 }
 
-/// A training that was asked to stop.
-pub fn interrupted_after(step: u64) -> anyhow::Error {
-    anyhow!("interrupted after step {step}, which is kept; run the same command again to go on")
-}
-
 /// What the user typed, for the card.
 pub fn command_line() -> String {
     let words = std::env::args().skip(1).filter(|word| word != "--export");
     std::iter::once("sixfold".to_string()).chain(words).collect::<Vec<_>>().join(" ")
-}
-
-/// Whether a model's card names a frame (`scene/image`) among those of its training.
-pub fn was_trained_on(card: &ModelCard, scene_id: u32, im_id: u32) -> bool {
-    let name = format!("{scene_id}/{im_id}");
-    card.data.split(|c: char| !(c.is_ascii_digit() || c == '/')).any(|word| word == name)
 }

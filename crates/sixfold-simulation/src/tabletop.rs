@@ -5,9 +5,9 @@
 use std::f64::consts::TAU;
 
 use rand::seq::SliceRandom;
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::{Rng, RngExt};
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::{Random, stream};
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_render::{DepthSensor, Frame, Light, Material, RenderOptions, SceneObject, shade, simulate_depth};
@@ -46,7 +46,7 @@ pub struct Tabletop {
     options: TabletopOptions,
     table: Mesh,
     lights: Lights,
-    random: ChaCha8Rng,
+    random: Random,
 }
 
 /// What a camera saw.
@@ -69,8 +69,7 @@ impl Tabletop {
         options: &TabletopOptions,
         number: u32,
     ) -> Result<Tabletop, MeshError> {
-        let mut random = ChaCha8Rng::seed_from_u64(options.seed);
-        random.set_stream(3 << 40 | u64::from(number));
+        let mut random = stream(options.seed, 3 << 40 | u64::from(number));
         let (resting, dropped) = settle(objects, options, number, &mut random);
         let (table, lights) = (table(&mut random)?, Lights::random(&mut random));
         Ok(Tabletop { resting, dropped, options: *options, table, lights, random })
@@ -135,7 +134,7 @@ fn settle(
     objects: &[&ConvexParts],
     options: &TabletopOptions,
     number: u32,
-    random: &mut ChaCha8Rng,
+    random: &mut Random,
 ) -> (Vec<(usize, Pose)>, usize) {
     let count = random.random_range(options.objects[0]..=options.objects[1]);
     let mut chosen: Vec<usize> = vec![];

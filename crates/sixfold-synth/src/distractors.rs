@@ -9,10 +9,9 @@ use rand::RngExt;
 use sixfold_geometry::random::Random;
 use sixfold_geometry::{Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
+
 use crate::augment::{Backgrounds, procedural_texture};
 use crate::{profiles, randomly_colored};
-use sixfold_synth::augment::{Backgrounds, Random, procedural_texture};
-use sixfold_data::randomly_colored;
 
 /// Corners around a turned solid.
 const AROUND: u32 = 24;

@@ -313,8 +313,3 @@ fn picture(image: &RgbImage, found: &[Detection]) -> RgbImage {
     }
     out
 }
-
-/// The best detection of an object in an image that the detector is sure enough of.
-pub(super) fn best(found: &[Detected], model: &DetectorModel, id: u32) -> Option<Detected> {
-    found.iter().find(|d| model.id_of(d.class) == id).cloned()
-}

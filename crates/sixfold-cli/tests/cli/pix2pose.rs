@@ -283,7 +283,7 @@ fn bad_boxes_weights_and_objects() {
     let camera_file = tiny.path().join("tiny/camera.json");
     let camera: Value = json_of(&camera_file);
     let small = sixfold_geometry::RgbImage::filled(160, 120, [90; 3]);
-    sixfold_bop::write_rgb(&tiny.path().join("small.png"), &small).unwrap();
+    sixfold_io::write_rgb(&tiny.path().join("small.png"), &small).unwrap();
     fails(tiny.path(), &boxed.replace("tiny/test/000007/rgb/000004.png", "small.png"), &["160", "120"]);
     assert!(camera["fx"].is_number());
     // A dataset's target that the model does not know.

@@ -11,7 +11,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_io::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::store::StorePlace;
+use sixfold_experience::StorePlace;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome};
 use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps};
 use sixfold_mesh::Mesh;

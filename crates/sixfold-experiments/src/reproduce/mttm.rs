@@ -11,16 +11,17 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
+use sixfold_align::{DepthOptions, DepthRegion, VerificationOptions};
 use sixfold_bop::{BopDataset, Models};
+use sixfold_estimator::{Cache, Object, PoseEstimator, downcast};
 use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, Vec3};
-use sixfold_match::{Scene, SceneOptions, VerificationOptions};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_mttm::model::MttmModel;
-use sixfold_mttm::{EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions};
+use sixfold_mttm::{KnownObject, MatchedBy, MttmEstimator, MttmObject, MttmOptions, Search};
+use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject, PpfOptions};
 use sixfold_render::render_depth;
 
 use sixfold_shell::Outcome;
-use sixfold_shell::objects::{Object, description_beside};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
@@ -173,7 +174,7 @@ struct Known {
     info: ModelInfo,
     with_mesh: KnownObject,
     alone: KnownObject,
-    ppf: sixfold_match::ObjectModel,
+    ppf: ObjectModel,
 }
 
 pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Outcome> {
@@ -279,22 +280,19 @@ fn know(dataset: &BopDataset, id: u32, model: &Arc<MttmModel>) -> Result<Known> 
         .models_info(Models::Rendering)?
         .and_then(|all| all.0.get(&id).cloned())
         .unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-    let folder = dataset.models_dir(Models::Rendering).unwrap_or_default();
-    let file = folder.join(format!("obj_{id:06}.ply"));
-    // Where `sixfold estimate --method mttm` keeps what it learns of a mesh, too.
-    let kept = file.with_extension("sixfold-templates");
-    let (templates, _) = ObjectTemplates::cached(&kept, &mesh, &TemplateOptions::default())
-        .with_context(|| format!("object {id}"))?;
-    let object = Object { name: format!("object {id}"), mesh, info, description: description_beside(&file) };
-    let ppf = object.ppf_model()?;
-    let with_mesh = KnownObject::new(templates, Some(ppf.clone()));
-    let descriptors = kept.with_extension("sixfold-descriptors");
-    let (with_mesh, note) = with_mesh.with_network_cached(model.clone(), &descriptors);
-    if let Some(note) = note {
-        eprintln!("note: descriptors of {} not kept or renewed: {note}", object.name);
+    // Where `sixfold estimate` keeps what it derives from a mesh, too.
+    let folder = Cache::of_user().of_mesh(&mesh, &info)?;
+    let object = Object { folder, ..Object::of_mesh(format!("object {id}"), mesh.clone(), info.clone()) };
+    let templates = MttmEstimator { network: Some(model.clone()), ..MttmEstimator::default() };
+    let templates = templates.prepare(&object)?;
+    let features = PpfEstimator::default().prepare(&object)?;
+    for note in templates.notes().iter().chain(features.notes()) {
+        eprintln!("note: {note}");
     }
+    let with_mesh = downcast::<MttmObject>(templates.as_ref(), "mttm")?.known().clone();
+    let ppf = downcast::<PpfObject>(features.as_ref(), "ppf")?.model().clone();
     let alone = with_mesh.clone().without_mesh();
-    Ok(Known { mesh: object.mesh, info: object.info, with_mesh, alone, ppf })
+    Ok(Known { mesh, info, with_mesh, alone, ppf })
 }
 
 fn measure(
@@ -305,7 +303,7 @@ fn measure(
     truths: &BTreeMap<u32, Pose>,
     known: &BTreeMap<u32, Known>,
 ) -> Result<Measured> {
-    let scene = Scene::new(depth, camera, None, &SceneOptions::default())?;
+    let scene = DepthRegion::from_depth(depth, camera, None, &DepthOptions::default())?;
     let mut measured = Measured::new();
     // Each way by itself, so that times are its own.
     let searches: Vec<Search<'_>> = WAYS.iter().map(|_| Search::new(&scene)).collect();
@@ -318,7 +316,7 @@ fn measure(
         };
         let of_truth = (0..drawn.as_slice().len()).filter(|&i| visible(i)).count();
         let error = |pose: &Pose| pose_error(&k.mesh, &k.info, truth, pose);
-        let plain = EstimateOptions { min_score: 0.0, ..EstimateOptions::default() };
+        let plain = MttmOptions { min_score: 0.0, ..MttmOptions::default() };
         for (way, search) in WAYS.iter().zip(&searches) {
             let object = if way.mesh { &k.with_mesh } else { &k.alone };
             let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
@@ -326,7 +324,7 @@ fn measure(
                 occluders_have_edges: way.occluders_have_edges,
                 ..VerificationOptions::default()
             };
-            let options = EstimateOptions { matched_by, predicted_pose, align, verification, ..plain };
+            let options = MttmOptions { matched_by, predicted_pose, align, verification, ..plain };
             let (found, stages) = search.estimate(object, &options);
             let best = found.first();
             let iou = best.map(|e| {
@@ -343,8 +341,8 @@ fn measure(
         }
         if !a.no_ppf {
             let start = Instant::now();
-            let options = sixfold_match::EstimateOptions { min_score: 0.0, ..Default::default() };
-            let found = sixfold_match::estimate(&scene, &k.ppf, &options);
+            let options = PpfOptions { min_score: 0.0, ..Default::default() };
+            let found = sixfold_ppf::estimate(&scene, &k.ppf, &options);
             let best = found.first();
             measured.entry(PPF.0.into()).or_default().push(Outcomes {
                 object: *id,

@@ -3,7 +3,8 @@
 use std::sync::atomic::AtomicBool;
 
 use sixfold_data::{FrameSelection, TrainingSet};
-use sixfold_pix2pose::recipe::{LEAST_VISIBLE, Recipe};
+use sixfold_nn::recipe::{Session, train as train_recipe};
+use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
 
 use crate::support::*;
 
@@ -11,17 +12,19 @@ const WEIGHTS: &str = "trained/model.safetensors";
 
 /// Trains object 1 on the pictures of frames.json, a small network for three steps.
 fn train(tiny: &Tiny) {
-    let frames = Frames::File(tiny.path().join("frames.json"));
-    let material = Material::of_dataset(&tiny.file(""), "test", &[1], &frames, LEAST_VISIBLE).unwrap();
-    let recipe = Recipe {
+    let frames = FrameSelection::File(tiny.path().join("frames.json"));
+    let material = TrainingSet::of_dataset(&tiny.file(""), "test", &[1], &frames, MIN_VISIBILITY).unwrap();
+    let recipe = Pix2PoseRecipe {
         steps: Some(3),
         per_object: Some(4),
         rotation: 0.0,
         render_share: 0.0,
         size: 64,
-        ..Recipe::default()
+        ..Pix2PoseRecipe::default()
     };
-    recipe.train(material, &tiny.path().join("trained"), &AtomicBool::new(false), &mut |_| ()).unwrap();
+    let (out, stop) = (tiny.path().join("trained"), AtomicBool::new(false));
+    let mut events = |_: sixfold_nn::recipe::TrainingEvent<'_>| ();
+    train_recipe(&recipe, material, &mut Session::new(&out, &stop, &mut events)).unwrap();
 }
 
 #[test]

@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::learner::{Learner, LearnerOptions, Lesson, PartOf};
-use sixfold_dgcm::store::StorePlace;
+use sixfold_experience::StorePlace;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, middle_between_pads};
 use sixfold_mesh::Mesh;

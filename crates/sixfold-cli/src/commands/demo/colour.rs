@@ -9,14 +9,14 @@ use anyhow::{Result, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Target};
 use sixfold_io::write_rgb;
-use sixfold_io::write_rgb;
 use sixfold_data::FrameId;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
+use sixfold_runner::RegionSource;
 
 use super::arguments::DemoArguments;
 use super::samples::{Known, add_s, found_upwards};
-use sixfold_shell::boxes::Boxes;
 use sixfold_shell::overlay::{Drawn, self};
-use sixfold_shell::pix2pose::Pix2Pose;
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::training::was_trained_on;
 
@@ -49,6 +49,8 @@ pub(super) struct Colour {
 const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
 /// The detector of the sample objects.
 const DETECTOR: &str = "weights/detector-lmo.safetensors";
+/// Detections this sure are passed on, as `sixfold estimate --dataset` does.
+const MIN_DETECTION: f32 = 0.1;
 
 pub(super) fn run(
     a: &DemoArguments,
@@ -71,7 +73,8 @@ pub(super) fn run(
             format!("no {WEIGHTS}; `sixfold train pix2pose` makes weights, --weights FILE takes them"),
         ));
     };
-    let result = Pix2Pose::load(&weights)
+    let result = Pix2PoseEstimator::load(&weights)
+        .map_err(anyhow::Error::from)
         .and_then(|pix2pose| with_model(a, &pix2pose, &weights, dataset, targets, known));
     match result {
         Ok(colour) => Ok(colour),
@@ -81,30 +84,33 @@ pub(super) fn run(
     }
 }
 
-/// An error unless the model was trained on the meshes of the targets.
-fn check_meshes(pix2pose: &Pix2Pose, targets: &[Target], known: &BTreeMap<u32, Known>) -> Result<()> {
-    for (id, k) in known {
-        if targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id)) {
-            pix2pose.check_mesh(*id, &k.object.mesh, &format!("model {id}"))?;
-        }
-    }
-    Ok(())
+/// The targets' objects as the model knows them; an error unless it was trained on their meshes.
+fn objects(
+    pix2pose: &Pix2PoseEstimator,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<BTreeMap<u32, Pix2PoseObject>> {
+    let wanted = |id: &u32| targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id));
+    let wanted = known.iter().filter(|(id, _)| wanted(id));
+    wanted.map(|(id, k)| Ok((*id, pix2pose.object(&k.object)?))).collect()
 }
 
 fn with_model(
     a: &DemoArguments,
-    pix2pose: &Pix2Pose,
+    pix2pose: &Pix2PoseEstimator,
     weights: &Path,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
-    check_meshes(pix2pose, targets, known)?;
+    let objects = objects(pix2pose, targets, known)?;
     let detector = a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR)));
-    let boxes = match &detector {
-        Some(file) => Boxes::of_detector(file, known.keys().copied())?,
-        None => Boxes::GroundTruth,
-    };
+    let (mut regions, mut detector_card) = (RegionSource::GroundTruth, None);
+    if let Some(file) = &detector {
+        let trained = TrainedDetector::load(file)?.with_threshold(MIN_DETECTION);
+        detector_card = Some(trained.model().card().clone());
+        regions = RegionSource::of_detector(Box::new(trained), known.keys().copied())?;
+    }
     let mut colour = Colour {
         weights: Some(weights.to_owned()),
         detector,
@@ -120,8 +126,8 @@ fn with_model(
         for im_id in scene.image_ids() {
             check_interrupt("run it again")?;
             let Some(image) = scene.rgb(im_id)? else { continue };
-            let detector = boxes.detector_card().zip(colour.detector.as_deref());
-            for (card, file) in [(pix2pose.model().card(), weights)].into_iter().chain(detector) {
+            let detector = detector_card.as_ref().zip(colour.detector.as_deref());
+            for (card, file) in [(pix2pose.model.card(), weights)].into_iter().chain(detector) {
                 if was_trained_on(card, file, FrameId { scene_id, im_id })? {
                     bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", file.display());
                 }
@@ -132,26 +138,23 @@ fn with_model(
                 let Some((o, k)) = t.object.and_then(|o| Some((o, known.get(&o.obj_id)?))) else { continue };
                 colour.targets += 1;
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
-                let regions = boxes.of_target(&scene, t, &o, |id| known.get(&id).map(|k| &k.object.mesh))?;
+                let found = regions.of_target(&scene, t, &o, |id| known.get(&id).map(|k| k.mesh.as_ref()))?;
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
-                let (Some(region), Some(truth)) = (regions.first(), truth) else { continue };
+                let (Some(region), Some(truth)) = (found.first(), truth) else { continue };
                 let start = Instant::now();
-                let Some(posed) =
-                    pix2pose.estimate(&image, &camera, o.obj_id, &region.bbox, Some(&k.object.mesh))?
-                else {
-                    continue;
-                };
+                let Some(object) = objects.get(&o.obj_id) else { continue };
+                let Some(posed) = pix2pose.pose_in_box(&image, &camera, object, &region.bbox)? else { continue };
                 let error = add_s(k, posed.camera_from_object, truth);
                 colour.poses.push(Row {
                     image: format!("{scene_id}/{im_id}"),
                     object: o.obj_id,
                     add_s_mm: 1000.0 * error,
-                    add_s_of_diameter: error / k.object.info.diameter,
+                    add_s_of_diameter: error / k.info.diameter,
                     confidence: posed.score,
                     seconds: start.elapsed().as_secs_f64(),
                 });
                 drawn.push(Drawn {
-                    mesh: &k.object.mesh,
+                    mesh: &k.mesh,
                     camera_from_object: posed.camera_from_object,
                     color: overlay::color(o.obj_id as usize),
                 });

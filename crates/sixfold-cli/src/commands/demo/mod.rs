@@ -14,7 +14,8 @@ use serde::Serialize;
 use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
 use sixfold_io::write_rgb;
 use sixfold_geometry::Pose;
-use sixfold_match::{EstimateOptions, Scene, SceneOptions, estimate};
+use sixfold_align::{DepthOptions, DepthRegion};
+use sixfold_ppf::{PpfOptions, estimate};
 
 use self::arguments::DemoArguments;
 use self::colour::Colour;
@@ -66,7 +67,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
             check_interrupt("run it again")?;
             let camera = scene.camera(im_id)?;
             let Some(depth) = scene.depth(im_id)? else { continue };
-            let prepared = Scene::new(&depth, &camera, None, &SceneOptions::default())?;
+            let prepared = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default())?;
             let mut found = vec![];
             for t in targets.iter().filter(|t| (t.scene_id, t.im_id) == (scene_id, im_id)) {
                 let Some(o) = t.object else { continue };
@@ -75,7 +76,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                     place.insert(Known::new(&dataset, &infos, o.obj_id, &a.out.join("objects"))?);
                 }
                 let Some(k) = known.get(&o.obj_id) else { continue };
-                let estimates = estimate(&prepared, &k.model, &EstimateOptions::default());
+                let estimates = estimate(&prepared, &k.model, &PpfOptions::default());
                 let seconds = began.elapsed().as_secs_f64();
                 progress.step(format!("image {im_id}, object {}", o.obj_id));
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
@@ -134,7 +135,7 @@ fn drawn<'a>(found: &[(u32, Pose)], known: &'a BTreeMap<u32, Known>) -> Vec<Draw
         .iter()
         .filter_map(|(id, camera_from_object)| {
             Some(Drawn {
-                mesh: &known.get(id)?.object.mesh,
+                mesh: &known.get(id)?.mesh,
                 camera_from_object: *camera_from_object,
                 color: overlay::color(*id as usize),
             })

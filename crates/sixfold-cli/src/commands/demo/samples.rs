@@ -1,18 +1,21 @@
 //! The samples: where they are, and what is known of their objects.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models, Placement, adi};
 use sixfold_geometry::Pose;
-use sixfold_match::ObjectModel;
-use sixfold_mesh::{ModelInfo, ModelsInfo};
+use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
 
-use sixfold_shell::objects::Object;
+use sixfold_estimator::{Object, PoseEstimator, downcast};
+use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject};
 
 /// An object of the samples, described for point pair features.
 pub(super) struct Known {
     pub object: Object,
+    pub mesh: Arc<Mesh>,
+    pub info: ModelInfo,
     pub model: ObjectModel,
     points: ModelPoints,
 }
@@ -25,10 +28,14 @@ impl Known {
             .ok_or_else(|| anyhow!("object {id}: the model has no vertices"))?;
         let info = infos.0.get(&id).cloned();
         let info = info.unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-        let description = folder.join(format!("{id:06}.sixfold-ppf"));
-        let object = Object { name: id.to_string(), mesh, info, description };
-        let model = object.ppf_model()?;
-        Ok(Known { object, model, points })
+        let folder = folder.join(format!("{id:06}"));
+        let object = Object::of_mesh(format!("object {id}"), mesh, info.clone());
+        let object = Object { id: Some(id), folder: Some(folder), ..object };
+        let prepared = PpfEstimator::default().prepare(&object)?;
+        prepared.notes().iter().for_each(|note| eprintln!("note: {note}"));
+        let model = downcast::<PpfObject>(prepared.as_ref(), "ppf")?.model().clone();
+        let mesh = object.needed_mesh("ppf")?.clone();
+        Ok(Known { object, mesh, info, model, points })
     }
 }
 
@@ -52,7 +59,7 @@ pub(super) fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
 /// ADD, or ADI for symmetric objects, in metres.
 pub(super) fn add_s(known: &Known, camera_from_object: Pose, truth: &GroundTruth) -> f64 {
     let estimated = Placement::from(camera_from_object);
-    if known.object.info.is_symmetric() {
+    if known.info.is_symmetric() {
         adi(&known.points, estimated, truth.placement())
     } else {
         sixfold_bop::add(&known.points, estimated, truth.placement())

@@ -183,7 +183,7 @@ impl Args for EstimateArguments {
                 let users: Vec<&str> = METHODS.iter().filter(|m| m.has(argument.get_id())).map(|m| m.name).collect();
                 if users.first() == Some(&method.name) {
                     let heading = format!("Options of --method {}", users.join(" and "));
-                    command = command.arg(argument.help_heading(heading));
+                    command = command.arg(argument.help_heading(clap::builder::Str::from(heading)));
                 }
             }
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_align::PreparedDepth;
-use sixfold_estimator::{Need, Object, PoseEstimator, Query, Region};
+use sixfold_estimator::{Need, Object, PoseEstimator, Query};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_io::{CameraFile, read_depth, read_rgb, write_mask, write_rgb};
 use sixfold_mttm::mask::to_image;

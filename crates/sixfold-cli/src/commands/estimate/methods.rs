@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, anyhow};
-use clap::{ArgMatches, Args, Command, FromArgMatches, Id, ValueEnum};
+use clap::{ArgMatches, Args, Command, Id, ValueEnum};
 use sixfold_align::DepthOptions;
 use sixfold_estimator::PoseEstimator;
 use sixfold_mttm::model::MttmModel;

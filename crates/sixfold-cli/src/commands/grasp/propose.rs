@@ -32,7 +32,7 @@ pub(crate) struct ProposeArguments {
     /// postgres://user@host/database
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "FILE")]
-    pub experiences: Option<sixfold_dgcm::store::StorePlace>,
+    pub experiences: Option<sixfold_experience::StorePlace>,
     #[cfg(feature = "experience")]
     #[command(flatten)]
     pub network: NetworkArguments,

@@ -9,7 +9,6 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 use sixfold_bop::{BopDataset, Detection, MaskKind, Models, Rle, VISIBILITY_DELTA, ground_truth_visibility};
-use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_data::{FrameId, PosedImage};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};

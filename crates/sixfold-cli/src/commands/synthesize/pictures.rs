@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use anyhow::Result;
-use sixfold_io::write_rgb;
 use sixfold_data::PosedImage;
 use sixfold_geometry::{Camera, Pose, RgbImage};
 use sixfold_io::write_rgb;

@@ -10,7 +10,8 @@ use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_nol::synthesis::ViewMaker;
 use sixfold_nol::view_grid::{ViewGrid, over_background};
-use sixfold_nol::{Photograph, SourceView};
+use sixfold_data::PosedImage;
+use sixfold_nol::SourceView;
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
 
 use super::arguments::SynthesizeArguments;
@@ -47,7 +48,7 @@ pub(super) fn write(
     backgrounds: &Backgrounds,
     progress: &mut Progress,
 ) -> Result<Written> {
-    let photographs: Vec<&Photograph> = subject.photographs.iter().map(|s| &s.photograph).collect();
+    let photographs: Vec<&PosedImage> = subject.photographs.iter().map(|s| &s.photograph).collect();
     let places = grid(a).placed(&subject.mesh, &photographs, subject.id);
     let mut writer = SceneWriter::new(&a.out, &a.new_split, subject.id);
     let mut written = Written { images: 0, unseen: 0.0, preview: vec![] };
@@ -104,7 +105,7 @@ fn add_photograph(
     writer: &mut SceneWriter,
     subject: &Subject,
     im_id: u32,
-    photograph: &Photograph,
+    photograph: &PosedImage,
 ) -> Result<bool> {
     let pose = *photograph.camera_from_object();
     let view = SourceView::new(photograph, &subject.mesh, a.size)?;

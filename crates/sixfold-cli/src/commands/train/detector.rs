@@ -8,9 +8,7 @@ use sixfold_detect::recipe::{DetectorKind, DetectorRecipe, MIN_VISIBILITY};
 use sixfold_nn::choice::Choice;
 
 use super::options::{Degrees, choices};
-use super::{LearntFrom, Shown, Summary, checked, command_line, loss, summary, train_in};
-use crate::arguments::MaterialArguments;
-use crate::commands::material::material;
+use super::{LearntFrom, MaterialArguments, training_set, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> DetectorRecipe {
     DetectorRecipe::default()
@@ -104,9 +102,9 @@ impl TrainDetectorArguments {
 /// Trains, or resumes a training, and writes the model.
 pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary<LearntFrom>> {
     let recipe = checked(a.recipe())?;
-    let material = material(&a.material, MIN_VISIBILITY)?;
+    let material = training_set(&a.material, MIN_VISIBILITY)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
-    let learnt_from = LearntFrom { objects, photographs: material.real.len() };
+    let learnt_from = LearntFrom { objects, photographs: material.images.len() };
     let shown = Shown {
         preparing: "samples",
         measuring: "model measured",

@@ -12,17 +12,18 @@ mod pix2pose;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::{Result, anyhow, bail};
-use clap::CommandFactory;
+use anyhow::{Result, anyhow};
+use clap::{Args, CommandFactory, Subcommand};
 use serde::Serialize;
 use sixfold_nn::options::OptionError;
-use sixfold_nn::recipe::{Recipe, Session, Trained, TrainingEvent, export, train};
-use sixfold_nn::train_error::TrainError;
-use sixfold_nn::training::Outcome as Ended;
-use sixfold_nn::training_log::TrainingRecord;
+use sixfold_nn::recipe::{Recipe, Trained};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{JsonArguments, report};
+use sixfold_shell::training::{
+    self, LearntFrom, MaterialArguments, Measured, Shown, Summary, command_line, loss, summary, training_set,
+};
 
 pub(crate) use self::detector::TrainDetectorArguments;
 #[cfg(feature = "experience")]
@@ -31,10 +32,45 @@ pub(crate) use self::dgcm::TrainDgcmArguments;
 pub(crate) use self::mttm::TrainMttmArguments;
 pub(crate) use self::nol::TrainNolArguments;
 pub(crate) use self::pix2pose::{TrainPix2PoseArguments, train_pix2pose};
-use crate::Outcome;
-use crate::arguments::{Arguments, JsonArguments, TrainArguments, TrainCommand};
-use crate::output::report;
-use crate::progress::{Progress, interrupted};
+use crate::arguments::Arguments;
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainArguments {
+    #[command(subcommand)]
+    pub command: TrainCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum TrainCommand {
+    /// Per-pixel object coordinates from RGB: poses with `sixfold estimate --method pix2pose`
+    #[command(after_help = "Examples:\n  \
+        sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo\n  \
+        sixfold train pix2pose --object mug.ply --unit mm --out out/mug\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Pix2pose(Box<TrainPix2PoseArguments>),
+    /// Boxes and masks of objects in colour images: `sixfold detect`, `sixfold estimate --detector`
+    #[command(after_help = "Examples:\n  \
+        sixfold train detector --dataset lmo --frames frames.json --backgrounds photographs --out out/detector\n  \
+        sixfold train detector --object mug.ply --unit mm --out out/mug-detector\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Detector(Box<TrainDetectorArguments>),
+    /// Train the network that transfers grasps from experience, on procedural objects
+    #[cfg(feature = "experience")]
+    #[command(after_help = "Example:\n  sixfold train dgcm --out out/dgcm\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Dgcm(Box<TrainDgcmArguments>),
+    /// Train the network that finds objects by their templates in depth, on procedural objects
+    #[cfg(feature = "physics")]
+    #[command(after_help = "Example:\n  sixfold train mttm --out out/mttm\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Mttm(Box<TrainMttmArguments>),
+    /// Train the network that renders new views of an object from few photographs, on procedural objects
+    #[command(after_help = "Example:\n  sixfold train nol --backgrounds photographs --out out/nol\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Nol(Box<TrainNolArguments>),
+}
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
     match &a.command {
@@ -65,36 +101,6 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
     }
 }
 
-/// What a training came to; `M`: what only some of them say.
-#[derive(Serialize)]
-pub(crate) struct Summary<M> {
-    pub model: String,
-    pub steps: u64,
-    /// Of training; `None` where a model was only exported.
-    pub seconds: Option<f64>,
-    pub losses: BTreeMap<String, f64>,
-    #[serde(flatten)]
-    pub more: M,
-}
-
-/// What was learnt from.
-#[derive(Serialize)]
-pub(crate) struct LearntFrom {
-    pub objects: Vec<u32>,
-    pub photographs: usize,
-}
-
-/// How good the model is on objects that it was not trained on.
-#[derive(Serialize)]
-struct Measured<Q> {
-    quality: Q,
-}
-
-fn summary<R, M>(trained: Trained<R>, more: impl FnOnce(R) -> M) -> Summary<M> {
-    let Trained { model, steps, seconds, losses, report } = trained;
-    Summary { model: model.display().to_string(), steps, seconds, losses, more: more(report) }
-}
-
 fn show<M: Serialize>(
     json: &JsonArguments,
     out: &Path,
@@ -114,23 +120,13 @@ fn show<M: Serialize>(
     Ok(Outcome::Found)
 }
 
-/// How a training is shown.
-struct Shown {
-    /// What is made ready before the first step.
-    preparing: &'static str,
-    /// What is measured after the last.
-    measuring: &'static str,
-    /// Behind the bar of the steps.
-    message: fn(&TrainingRecord) -> String,
-}
-
 /// A recipe whose options are in their ranges, before its data are read.
 fn checked<R: Recipe>(recipe: R) -> Result<R> {
     recipe.check().map_err(|error| by_flag(&error))?;
     Ok(recipe)
 }
 
-/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint.
+/// As the library's, with options named by their flags.
 fn train_in<R: Recipe>(
     recipe: &R,
     data: R::Data,
@@ -138,23 +134,7 @@ fn train_in<R: Recipe>(
     export_only: bool,
     shown: Shown,
 ) -> Result<Trained<R::Report>> {
-    let mut bars = Bars { shown, bar: None };
-    let mut receive = |event: TrainingEvent<'_>| bars.receive(event);
-    let mut session = Session::new(out, interrupted(), &mut receive);
-    let ended =
-        if export_only { export(recipe, data, &mut session) } else { train(recipe, data, &mut session) };
-    bars.finish();
-    match ended {
-        Ok(Ended::Finished(trained)) => Ok(trained),
-        Ok(Ended::Interrupted { step: 0 }) => {
-            bail!("interrupted; nothing was trained yet; run the same command again")
-        }
-        Ok(Ended::Interrupted { step }) => {
-            bail!("interrupted after step {step}, which is kept; run the same command again to go on")
-        }
-        Err(TrainError::Option(error)) => Err(by_flag(&error)),
-        Err(error) => Err(error.into()),
-    }
+    training::train_in(recipe, data, out, export_only, shown, by_flag)
 }
 
 /// An option out of its range, by the flag that sets it where there is one.
@@ -167,54 +147,4 @@ fn by_flag(error: &OptionError) -> anyhow::Error {
         return anyhow!("--{flag}: found {}, expected {}", error.found, error.expected);
     }
     anyhow!("{error}")
-}
-
-/// A bar of what is done at the moment, and notes.
-struct Bars {
-    shown: Shown,
-    bar: Option<(&'static str, Progress)>,
-}
-
-impl Bars {
-    fn receive(&mut self, event: TrainingEvent<'_>) {
-        match event {
-            TrainingEvent::Note(text) => {
-                self.finish();
-                eprintln!("{text}");
-            }
-            TrainingEvent::Warning(text) => eprintln!("warning: {text}"),
-            TrainingEvent::Preparing(done, all) => self.bar(self.shown.preparing, all).set(done),
-            TrainingEvent::Steps(record, steps) => {
-                let message = (self.shown.message)(record);
-                let bar = self.bar("steps", steps as usize);
-                bar.set(record.step as usize);
-                bar.message(message);
-            }
-            TrainingEvent::Measuring(done, all) => self.bar(self.shown.measuring, all).set(done),
-        }
-    }
-
-    fn bar(&mut self, what: &'static str, all: usize) -> &mut Progress {
-        if self.bar.as_ref().is_some_and(|(before, _)| *before != what) {
-            self.finish();
-        }
-        &mut self.bar.get_or_insert_with(|| (what, Progress::new(what, all))).1
-    }
-
-    fn finish(&mut self) {
-        if let Some((_, bar)) = self.bar.take() {
-            bar.finish();
-        }
-    }
-}
-
-/// The value of a loss, where the record has it.
-fn loss(record: &TrainingRecord, name: &str) -> f64 {
-    record.losses.get(name).copied().unwrap_or(f64::NAN)
-}
-
-/// What the user typed, for the card.
-fn command_line() -> String {
-    let words = std::env::args().skip(1).filter(|word| word != "--export");
-    std::iter::once("sixfold".to_string()).chain(words).collect::<Vec<_>>().join(" ")
 }

@@ -11,9 +11,7 @@ use sixfold_pix2pose::recipe::{MIN_VISIBILITY, NetworkKind, Pix2PoseRecipe};
 use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
 
 use super::options::{Degrees, choices};
-use super::{LearntFrom, Shown, Summary, checked, command_line, loss, summary, train_in};
-use crate::arguments::MaterialArguments;
-use crate::commands::material::material;
+use super::{LearntFrom, MaterialArguments, training_set, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> Pix2PoseRecipe {
     Pix2PoseRecipe::default()
@@ -142,9 +140,9 @@ impl TrainPix2PoseArguments {
 /// Trains, or resumes a training, and writes the model.
 pub(crate) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary<LearntFrom>> {
     let recipe = checked(a.recipe())?;
-    let material = material(&a.material, MIN_VISIBILITY)?;
+    let material = training_set(&a.material, MIN_VISIBILITY)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
-    let learnt_from = LearntFrom { objects, photographs: material.real.len() };
+    let learnt_from = LearntFrom { objects, photographs: material.images.len() };
     let shown = Shown {
         preparing: "samples",
         measuring: "alignment measured on the photographs",

@@ -1,5 +1,6 @@
 //! The defaults of trainings stand once, in the recipes: command line, help and Python's stub show those.
 
+use std::collections::BTreeMap;
 use std::fmt::Debug;
 
 use clap::Parser;

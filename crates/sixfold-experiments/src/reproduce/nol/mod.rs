@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use sixfold_mesh::Mesh;
-use sixfold_nol::Photograph;
+use sixfold_data::PosedImage;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::similarity::Judge;
 
@@ -227,7 +227,7 @@ impl Bench<'_> {
         let mut ways: Vec<Way<'_>> = vec![];
         // Encoding takes its time; with all rows there it is not needed.
         if !keys.iter().all(kept) {
-            let of = |sources: &[Source]| -> Vec<Photograph> {
+            let of = |sources: &[Source]| -> Vec<PosedImage> {
                 sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect()
             };
             for (set, sources) in sets {

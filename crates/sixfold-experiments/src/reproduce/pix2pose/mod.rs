@@ -5,6 +5,7 @@
 //! computed again.
 
 mod fourfold;
+mod model;
 mod row;
 mod table;
 mod trainings;
@@ -16,16 +17,16 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Models, Target, read_results};
-use sixfold_geometry::Rect;
+use sixfold_geometry::{FrameId, Rect};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::estimate::Quirks;
 
 use self::row::{Row, Setting};
 use super::kept::{fnv, kept_or_made, same_inputs};
 use sixfold_shell::Outcome;
-use sixfold_shell::boxes::Boxes;
+use sixfold_runner::RegionSource;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
-use sixfold_shell::pix2pose::Pix2Pose;
+use self::model::Pix2Pose;
 use sixfold_shell::progress::check_interrupt;
 use sixfold_shell::training::was_trained_on;
 
@@ -126,7 +127,7 @@ fn regions(
     dataset: &BopDataset,
     targets: &[Target],
     meshes: &BTreeMap<u32, Mesh>,
-    boxes: &Boxes,
+    boxes: &RegionSource,
 ) -> Result<Regions> {
     let mut all = Regions::new();
     let mut scenes = BTreeMap::new();
@@ -285,22 +286,25 @@ fn test_targets(
 ) -> Result<Vec<Target>> {
     let mut targets = dataset.object_targets(&dataset.targets(None)?)?;
     targets.retain(|t| !trained_on.contains(&(t.scene_id, t.im_id)));
-    let known = |t: &Target| t.object.is_some_and(|o| pix2pose.entry(Some(o.obj_id)).is_ok());
+    let known = |t: &Target| t.object.is_some_and(|o| pix2pose.model().object(o.obj_id).is_ok());
     let others = targets.iter().filter(|t| !known(t)).count();
     if others > 0 {
         eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
         targets.retain(known);
     }
     // The model's card says what it was trained on: scores on those frames would be worth nothing.
-    let card = &pix2pose.model().card().data;
-    if let Some(t) = targets.iter().find(|t| was_trained_on(pix2pose.model().card(), t.scene_id, t.im_id)) {
-        bail!(
-            "{}: the model was trained on frame {}/{}, which {} does not list; give the frames of its training (its card says: {card})",
-            a.weights.display(),
-            t.scene_id,
-            t.im_id,
-            a.frames.display()
-        );
+    let card = pix2pose.model().card();
+    for t in &targets {
+        let frame = FrameId::new(t.scene_id, t.im_id);
+        if was_trained_on(card, &a.weights, frame)? {
+            let all: Vec<String> = card.training_frames.iter().flatten().map(FrameId::to_string).collect();
+            bail!(
+                "{}: the model was trained on frame {frame}, which {} does not list; give the frames of its training (its card says: {})",
+                a.weights.display(),
+                a.frames.display(),
+                all.join(" ")
+            );
+        }
     }
     if a.quick {
         let frames: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
@@ -326,7 +330,7 @@ impl Bench {
         for id in targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect::<BTreeSet<_>>() {
             meshes.insert(id, dataset.model(id, Models::Rendering)?);
         }
-        let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
+        let truth = regions(&dataset, &targets, &meshes, &RegionSource::GroundTruth)?;
         Ok(Bench { dataset, targets, meshes, truth, detections: vec![], seed })
     }
 
@@ -342,10 +346,11 @@ impl Bench {
             pix2pose.check_mesh(id, &mesh, &format!("{}: model {id}", a.dataset.display()))?;
             meshes.insert(id, mesh);
         }
-        let truth = regions(&dataset, &targets, &meshes, &Boxes::GroundTruth)?;
+        let truth = regions(&dataset, &targets, &meshes, &RegionSource::GroundTruth)?;
         let mut detections = vec![];
         for file in &a.detections {
-            let (boxes, skipped) = Boxes::read(&dataset, file)?;
+            let (boxes, changed, skipped) = RegionSource::read(&dataset, file)?;
+            changed.iter().for_each(|note| eprintln!("note: {note}"));
             for s in skipped {
                 eprintln!("skipped {s}");
             }

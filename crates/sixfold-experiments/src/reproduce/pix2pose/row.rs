@@ -13,8 +13,8 @@ use sixfold_geometry::{Image, Rect, RgbImage};
 use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::estimate::EstimateOptions;
 
+use super::model::Pix2Pose;
 use super::{Bench, Regions};
-use sixfold_shell::pix2pose::Pix2Pose;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// A way of using the model.
@@ -170,8 +170,8 @@ impl Bench {
                     let image = covered.as_ref().unwrap_or(&image);
                     regions += 1;
                     let start = Instant::now();
-                    let posed =
-                        pix2pose.estimate(image, &camera, o.obj_id, &region, self.meshes.get(&o.obj_id));
+                    let Some(mesh) = self.meshes.get(&o.obj_id) else { continue };
+                    let posed = pix2pose.estimate(image, &camera, o.obj_id, &region, mesh);
                     times.push(start.elapsed().as_secs_f64());
                     match posed {
                         Ok(Some(p)) => estimates.push(Estimate::new(

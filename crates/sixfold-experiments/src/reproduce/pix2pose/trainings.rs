@@ -6,15 +6,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 use sixfold_bop::{Models, Target};
-use sixfold_nn::training::Ending;
-use sixfold_pix2pose::recipe::{LEAST_VISIBLE, Recipe};
+use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
 
 use super::super::kept::kept_or_made;
 use super::row::{Row, Setting};
 use super::{Bench, Regions, ReproducePix2PoseArguments, fourfold};
-use sixfold_shell::pix2pose::Pix2Pose;
-use sixfold_shell::progress::interrupted;
-use sixfold_shell::training::{MaterialArguments, Shown, command_line, interrupted_after, loss, material};
+use super::model::Pix2Pose;
+use sixfold_shell::training::{MaterialArguments, Shown, command_line, loss, train_in, training_set};
 
 /// What a training of the comparison learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,10 +31,10 @@ struct Training {
     title: &'static str,
     of: Of,
     /// What differs from the defaults.
-    vary: fn(&mut Recipe),
+    vary: fn(&mut Pix2PoseRecipe),
 }
 
-const fn training(key: &'static str, title: &'static str, of: Of, vary: fn(&mut Recipe)) -> Training {
+const fn training(key: &'static str, title: &'static str, of: Of, vary: fn(&mut Pix2PoseRecipe)) -> Training {
     Training { key, title, of, vary }
 }
 
@@ -146,7 +144,7 @@ impl Training {
             bail!("--size: found {}, expected a multiple of 32 from 32 to 512", a.size);
         }
         let renders_only = self.of == Of::Fourfold;
-        let material = material(
+        let material = training_set(
             &MaterialArguments {
                 dataset: Some(dataset.to_owned()),
                 split: a.split.clone(),
@@ -158,25 +156,25 @@ impl Training {
                 backgrounds: a.backgrounds.clone(),
                 store: PathBuf::new(),
             },
-            LEAST_VISIBLE,
+            MIN_VISIBILITY,
         )?;
-        let mut recipe = Recipe {
+        let mut recipe = Pix2PoseRecipe {
             steps: Some(a.steps),
             size: a.size,
             backgrounds: a.backgrounds.clone(),
             seed: a.seed,
             command: command_line(),
-            ..Recipe::default()
+            ..Pix2PoseRecipe::default()
         };
         (self.vary)(&mut recipe);
-        let mut shown = Shown::new(|record| {
-            format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
-        });
-        let ending = recipe.train(material, folder, interrupted(), &mut |news| shown.hear(news))?;
-        shown.finish();
-        match ending {
-            Ending::Finished(trained) => Ok(trained.model),
-            Ending::Interrupted { step } => Err(interrupted_after(step)),
-        }
+        let shown = Shown {
+            preparing: "samples",
+            measuring: "alignment measured on the photographs",
+            message: |record| {
+                format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
+            },
+        };
+        let by_flag = |error: &sixfold_nn::options::OptionError| anyhow::anyhow!("{error}");
+        Ok(train_in(&recipe, material, folder, false, shown, by_flag)?.model)
     }
 }

@@ -1,4 +1,4 @@
-//! `sixfold object add --templates`, and objects added from depth images alone.
+//! Objects added from depth images alone: `sixfold object add --depth`.
 
 use std::path::Path;
 
@@ -6,16 +6,9 @@ use anyhow::{Context, Result, anyhow, bail};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
 use sixfold_io::{CameraFile, read_depth, read_mask};
-use sixfold_mesh::Mesh;
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 
-use super::arguments::{DepthViewArguments, TemplateViews};
-
-/// The templates of a mesh.
-pub(crate) fn of_mesh(mesh: &Mesh, views: TemplateViews) -> Result<ObjectTemplates> {
-    let options = TemplateOptions { coverage: views.coverage(), ..TemplateOptions::default() };
-    Ok(ObjectTemplates::from_mesh(mesh, &options)?)
-}
+use super::arguments::DepthViewArguments;
 
 struct Read {
     depth: DepthImage,

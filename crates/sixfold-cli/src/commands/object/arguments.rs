@@ -1,0 +1,124 @@
+//! What `sixfold object` is told.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand, ValueEnum};
+use sixfold_mesh::Unit;
+use sixfold_mttm::Coverage;
+use sixfold_shell::output::JsonArguments;
+
+
+#[derive(Debug, Args)]
+pub(crate) struct ObjectArguments {
+    /// Folder of stored objects
+    #[arg(long, global = true, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
+    pub store: PathBuf,
+    #[command(subcommand)]
+    pub command: ObjectCommand,
+    #[command(flatten)]
+    pub json: JsonArguments,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ObjectCommand {
+    /// Store a mesh under a name, or an object seen in depth images
+    #[command(after_help = "Examples:\n  \
+        sixfold object add mug mug.ply --unit mm --turns-about z --templates\n  \
+        sixfold object add mug --depth d.png --mask mask.png --camera camera.json")]
+    Add(Box<AddArguments>),
+    /// List the stored objects
+    #[command(after_help = "Example:\n  sixfold object list")]
+    List,
+    /// Show one object, and draw it
+    #[command(after_help = "Example:\n  sixfold object show mug --picture mug.png")]
+    Show {
+        /// Its name
+        name: String,
+        /// Picture to write
+        #[arg(long, value_name = "FILE.png")]
+        picture: Option<PathBuf>,
+    },
+    /// Remove one object
+    #[command(after_help = "Example:\n  sixfold object remove mug")]
+    Remove {
+        /// Its name
+        name: String,
+    },
+}
+
+/// `sixfold object add`.
+#[derive(Debug, Args)]
+pub(crate) struct AddArguments {
+    /// Name: letters, digits, - and _
+    pub name: String,
+    /// Mesh file: PLY, OBJ, STL, glTF, GLB
+    #[arg(required_unless_present = "depth")]
+    pub mesh: Option<PathBuf>,
+    /// Unit of the mesh file: m, cm, mm, in
+    #[arg(long, value_name = "UNIT", required_unless_present = "depth")]
+    pub unit: Option<Unit>,
+    /// Also make the mesh's templates for `estimate --method mttm`, from these sides
+    #[arg(long, value_enum, value_name = "VIEWS", num_args = 0..=1, default_missing_value = "above", conflicts_with = "depth")]
+    pub templates: Option<TemplateViews>,
+    #[command(flatten)]
+    pub views: DepthViewArguments,
+    /// BOP models_info.json to take the symmetries from
+    #[arg(long, value_name = "FILE", requires = "model_id")]
+    pub models_info: Option<PathBuf>,
+    /// Object id in models_info.json
+    #[arg(long, value_name = "ID")]
+    pub model_id: Option<u32>,
+    /// The object may turn freely about this axis of its own frame: x, y or z
+    #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
+    pub turns_about: Option<Axis>,
+    /// Replace an object of the same name
+    #[arg(long)]
+    pub replace: bool,
+}
+
+/// An axis of an object's own frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Axis {
+    X,
+    Y,
+    Z,
+}
+
+/// From which sides templates are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TemplateViews {
+    /// From above, the camera held upright: 305 views with 7 turns, for what stands on a table, z axis up
+    Above,
+    /// From everywhere and however the camera is held: 642 views with 24 turns
+    Around,
+}
+
+impl TemplateViews {
+    pub fn coverage(self) -> Coverage {
+        match self {
+            TemplateViews::Above => Coverage::Above,
+            TemplateViews::Around => Coverage::Around,
+        }
+    }
+}
+
+/// An object known from depth images, for `sixfold object add`.
+#[derive(Debug, Args)]
+pub(crate) struct DepthViewArguments {
+    /// Depth images of an object that has no mesh: its templates for `estimate --method mttm`
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
+    pub depth: Vec<PathBuf>,
+    /// Where the object is in each of them (PNG, above zero inside), in the same order
+    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth")]
+    pub masks: Vec<PathBuf>,
+    /// Camera of the depth images: a JSON file with fx fy cx cy or cam_K, and depth_scale
+    #[arg(long, value_name = "FILE", requires = "depth")]
+    pub camera: Option<PathBuf>,
+    /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
+    #[arg(long, value_name = "MM", requires = "depth")]
+    pub depth_scale: Option<f64>,
+    /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
+    /// metres (default: every view has a frame of its own)
+    #[arg(long, value_name = "FILE", requires = "depth")]
+    pub poses: Option<PathBuf>,
+}

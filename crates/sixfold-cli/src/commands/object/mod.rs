@@ -1,0 +1,174 @@
+//! `sixfold object add|list|show|remove`.
+
+pub(crate) mod arguments;
+mod templates;
+
+use std::path::Path;
+
+use anyhow::{Result, anyhow};
+use serde::Serialize;
+use sixfold_estimator::{NewObject, ObjectRecord, ObjectStore, PoseEstimator};
+use sixfold_geometry::Vec3;
+use sixfold_io::write_rgb;
+use sixfold_mesh::{ContinuousSymmetry, ModelInfo, ModelsInfo, read_mesh};
+use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
+use sixfold_ppf::PpfEstimator;
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{JsonArguments, report};
+
+use self::arguments::{AddArguments, Axis, ObjectArguments, ObjectCommand};
+
+#[derive(Serialize)]
+struct Listed {
+    name: String,
+    #[serde(flatten)]
+    record: ObjectRecord,
+}
+
+pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
+    let store = ObjectStore::new(&a.store);
+    match &a.command {
+        ObjectCommand::Add(add) => match &add.mesh {
+            None => add_views(&store, add, &a.json),
+            Some(mesh) => add_mesh(&store, add, mesh, &a.json),
+        },
+        ObjectCommand::List => list(&store, &a.store, &a.json),
+        ObjectCommand::Show { name, picture } => show(&store, name, picture.as_deref(), &a.json),
+        ObjectCommand::Remove { name } => {
+            store.remove(name)?;
+            report(&a.json, &serde_json::json!({ "removed": name }), || println!("removed {name}"))?;
+            Ok(Outcome::Found)
+        }
+    }
+}
+
+/// Stores an object that is known from depth images.
+fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
+    let templates = templates::of_depth(&a.views)?;
+    let record = ObjectRecord::of_views(&a.views.depth, templates.diameter);
+    let new = NewObject { mesh: None, record: &record, replace: a.replace };
+    store.add(&a.name, new, |object| keep(&templates, object.file(TEMPLATES_FILE)))?;
+    let listed = Listed { name: a.name.clone(), record };
+    report(json, &listed, || {
+        println!(
+            "added {}: {} template(s), {:.1} mm across as seen",
+            listed.name,
+            templates.templates.len(),
+            1000.0 * templates.diameter
+        );
+    })?;
+    Ok(Outcome::Found)
+}
+
+/// Stores a mesh, and what methods derive from it: now, not at the first estimate.
+fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArguments) -> Result<Outcome> {
+    let unit = a.unit.as_ref().ok_or_else(|| anyhow!("--unit UNIT is missing"))?;
+    let loaded = read_mesh(mesh, *unit)?;
+    let record = ObjectRecord::of_mesh(mesh, *unit, &loaded, &info(a, ModelInfo::of_mesh(&loaded))?);
+    let new = NewObject { mesh: Some(&loaded), record: &record, replace: a.replace };
+    let mut views = None;
+    store.add(&a.name, new, |object| {
+        PpfEstimator::default().prepare(object)?;
+        if let (Some(sides), Some(mesh)) = (a.templates, &object.mesh) {
+            let options = TemplateOptions { coverage: sides.coverage(), ..TemplateOptions::default() };
+            let templates = ObjectTemplates::from_mesh(mesh, &options)?;
+            keep(&templates, object.file(TEMPLATES_FILE))?;
+            MttmEstimator::default().prepare(object)?;
+            views = Some((templates.templates.len(), templates.turns().len()));
+        }
+        Ok(())
+    })?;
+    let listed = Listed { name: a.name.clone(), record };
+    report(json, &listed, || {
+        println!(
+            "added {}: diameter {:.1} mm, {} faces",
+            listed.name,
+            1000.0 * listed.record.diameter,
+            listed.record.faces
+        );
+        if let Some((views, turns)) = views {
+            println!("{views} views with {turns} turns each");
+        }
+    })?;
+    Ok(Outcome::Found)
+}
+
+/// Writes templates into an object's folder.
+fn keep(
+    templates: &ObjectTemplates,
+    file: Option<std::path::PathBuf>,
+) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    if let Some(file) = file {
+        templates.write(&file)?;
+    }
+    Ok(())
+}
+
+/// Diameter and box of the mesh with the symmetries that the options name.
+fn info(a: &AddArguments, mut info: ModelInfo) -> Result<ModelInfo> {
+    if let (Some(file), Some(id)) = (&a.models_info, &a.model_id) {
+        let all = ModelsInfo::read(file)?;
+        let found = all.0.get(id).ok_or_else(|| anyhow!("{}: no object {id}", file.display()))?;
+        info.symmetries_discrete = found.symmetries_discrete.clone();
+        info.symmetries_continuous = found.symmetries_continuous.clone();
+    }
+    if let Some(axis) = a.turns_about {
+        let axis = match axis {
+            Axis::X => Vec3::x(),
+            Axis::Y => Vec3::y(),
+            Axis::Z => Vec3::z(),
+        };
+        // The axis runs through the centre of the bounding box: a file's origin may be anywhere.
+        let offset = info.min + info.size * 0.5;
+        info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
+    }
+    Ok(info)
+}
+
+fn list(store: &ObjectStore, folder: &Path, json: &JsonArguments) -> Result<Outcome> {
+    let listed = store
+        .names()?
+        .into_iter()
+        .map(|name| Ok(Listed { record: store.record(&name)?, name }))
+        .collect::<Result<Vec<_>>>()?;
+    report(json, &listed, || {
+        if listed.is_empty() {
+            println!("no objects in {}", folder.display());
+        }
+        for l in &listed {
+            println!(
+                "{:<24} {:>8.1} mm {:>8} faces  {}",
+                l.name,
+                1000.0 * l.record.diameter,
+                l.record.faces,
+                l.record.source
+            );
+        }
+    })?;
+    Ok(if listed.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+}
+
+fn show(store: &ObjectStore, name: &str, picture: Option<&Path>, json: &JsonArguments) -> Result<Outcome> {
+    let listed = Listed { name: name.to_owned(), record: store.record(name)? };
+    if let Some(file) = picture {
+        let object = store.load(name)?;
+        write_rgb(file, &super::render::portrait(object.needed_mesh("ppf")?))?;
+    }
+    report(json, &listed, || {
+        let r = &listed.record;
+        println!("{name}");
+        println!("  diameter    {:.2} mm", 1000.0 * r.diameter);
+        if r.without_mesh {
+            println!("  mesh        none: known from depth images");
+        } else {
+            println!("  mesh        {} vertices, {} faces", r.vertices, r.faces);
+        }
+        println!(
+            "  symmetries  {} discrete, {} continuous",
+            r.symmetries_discrete.len(),
+            r.symmetries_continuous.len()
+        );
+        println!("  source      {} ({})", r.source, r.source_unit);
+    })?;
+    Ok(Outcome::Found)
+}
