@@ -7,7 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Detection, Rle, write_detections};
-use sixfold_detect::detect::{DetectOptions, Detected};
+use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
 use sixfold_io::{read_rgb, write_rgb};
