@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
 use sixfold_nn::lite0::imagenet_encoder;
-use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::train_error::TrainError;
@@ -132,13 +132,9 @@ pub struct Context {
 impl DetectorRecipe {
     /// How the network is trained.
     pub fn options(&self) -> DetectorTrainingOptions {
+        let default = DetectorTrainingOptions::default().common;
         DetectorTrainingOptions {
-            common: TrainingOptions {
-                steps: self.steps,
-                learning_rate: self.learning_rate,
-                seed: self.seed,
-                ..DetectorTrainingOptions::default().common
-            },
+            common: default.with(Some(self.steps), Some(self.learning_rate), self.seed),
             batch: self.batch,
             encoder_share: self.encoder_share,
             frozen_stages: self.frozen_stages,

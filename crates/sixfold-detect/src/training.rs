@@ -164,13 +164,7 @@ impl Training for DetectorTraining {
             samples: source.options(),
             photographs: source.photographs(),
         };
-        Ok(Plan {
-            steps: options.common.steps,
-            schedule: options.common.schedule(),
-            samples_per_step: options.batch,
-            pace: self.pace,
-            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
-        })
+        Plan::new(&options.common, options.batch, self.pace, &settings)
     }
 
     fn batches<'a>(&self, source: &'a SceneSource) -> Batches<'a, Self::Batch> {

@@ -5,7 +5,7 @@ use std::sync::Mutex;
 
 use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
-use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
@@ -105,12 +105,7 @@ impl DgcmRecipe {
     pub fn options(&self) -> DgcmTrainingOptions {
         let default = self.network.options();
         DgcmTrainingOptions {
-            common: TrainingOptions {
-                steps: self.steps.unwrap_or(default.common.steps),
-                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
-                seed: self.seed,
-                ..default.common
-            },
+            common: default.common.with(self.steps, self.learning_rate, self.seed),
             pairs: self.pairs.unwrap_or(default.pairs),
             lambda: self.lambda.unwrap_or(default.lambda),
             ..default

@@ -155,13 +155,7 @@ impl Training for DgcmTraining {
             architecture: self.learner.network().architecture(),
             margin: MARGIN,
         };
-        Ok(Plan {
-            steps: options.common.steps,
-            schedule: options.common.schedule(),
-            samples_per_step: options.pairs + options.negatives,
-            pace: self.pace,
-            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
-        })
+        Plan::new(&options.common, options.pairs + options.negatives, self.pace, &settings)
     }
 
     fn batches<'a>(&self, pool: &'a Pool) -> Batches<'a, Batch> {

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::choice::Choice;
-use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
@@ -119,12 +119,7 @@ impl MttmRecipe {
     pub fn options(&self) -> MttmTrainingOptions {
         let default = self.network.options();
         MttmTrainingOptions {
-            common: TrainingOptions {
-                steps: self.steps.unwrap_or(default.common.steps),
-                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
-                seed: self.seed,
-                ..default.common
-            },
+            common: default.common.with(self.steps, self.learning_rate, self.seed),
             batch: BatchOptions { anchors: self.anchors.unwrap_or(default.batch.anchors), ..default.batch },
             ..default
         }

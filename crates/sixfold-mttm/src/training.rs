@@ -130,13 +130,7 @@ impl Training for MttmTraining {
             architecture: self.learner.network().architecture(),
             gamma: GAMMA,
         };
-        Ok(Plan {
-            steps: options.common.steps,
-            schedule: options.common.schedule(),
-            samples_per_step: options.batch.anchors,
-            pace: self.pace,
-            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
-        })
+        Plan::new(&options.common, options.batch.anchors, self.pace, &settings)
     }
 
     fn batches<'a>(&self, pool: &'a Pool) -> Batches<'a, Batch> {

@@ -89,6 +89,16 @@ impl TrainingOptions {
         OptionError::unless(positive(f64::from(norm)), "max_grad_norm", norm, above)
     }
 
+    /// The same with what a user asks for, where it is given.
+    pub fn with(self, steps: Option<u64>, learning_rate: Option<f64>, seed: u64) -> Self {
+        TrainingOptions {
+            steps: steps.unwrap_or(self.steps),
+            learning_rate: learning_rate.unwrap_or(self.learning_rate),
+            seed,
+            ..self
+        }
+    }
+
     /// The learning rate of every step.
     pub fn schedule(&self) -> LearningRate {
         LearningRate::Cosine {

@@ -3,10 +3,11 @@
 
 use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use crate::learner::Checkpointed;
-use crate::options::Pace;
+use crate::options::{Pace, TrainingOptions};
 use crate::schedule::LearningRate;
 use crate::train_error::TrainError;
 use crate::training_log::{TrainingLog, TrainingRecord, draw_curves, read_training_log};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -61,6 +62,22 @@ pub struct Plan {
     pub pace: Pace,
     /// All that the result depends on, an object: a training with other settings is not resumed.
     pub settings: serde_json::Value,
+}
+
+impl Plan {
+    /// With the steps and the schedule of `options`.
+    ///
+    /// # Errors
+    /// [`TrainError::Method`] for settings that are no JSON.
+    pub fn new(
+        options: &TrainingOptions,
+        samples_per_step: usize,
+        pace: Pace,
+        settings: &impl Serialize,
+    ) -> Result<Plan, TrainError> {
+        let settings = serde_json::to_value(settings).map_err(TrainError::method)?;
+        Ok(Plan { steps: options.steps, schedule: options.schedule(), samples_per_step, pace, settings })
+    }
 }
 
 /// How a training ended.

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use burn::tensor::Device;
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 use sixfold_nn::choice::Choice;
-use sixfold_nn::options::{OptionError, TrainingOptions};
+use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
@@ -84,12 +84,7 @@ impl NolRecipe {
     pub fn options(&self) -> NolTrainingOptions {
         let default = self.network.options();
         NolTrainingOptions {
-            common: TrainingOptions {
-                steps: self.steps.unwrap_or(default.common.steps),
-                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
-                seed: self.seed,
-                ..default.common
-            },
+            common: default.common.with(self.steps, self.learning_rate, self.seed),
             ..default
         }
     }

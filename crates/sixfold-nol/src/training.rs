@@ -167,13 +167,7 @@ impl Training for NolTraining {
             parts: self.parts,
             textures: textures.images(),
         };
-        Ok(Plan {
-            steps: options.common.steps,
-            schedule: options.common.schedule(),
-            samples_per_step: 1,
-            pace: self.pace,
-            settings: serde_json::to_value(settings).map_err(TrainError::method)?,
-        })
+        Plan::new(&options.common, 1, self.pace, &settings)
     }
 
     fn batches<'a>(&self, textures: &'a Backgrounds) -> Batches<'a, Batch> {

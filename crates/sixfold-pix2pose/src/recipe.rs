@@ -158,12 +158,7 @@ impl Pix2PoseRecipe {
     pub fn compact_options(&self) -> Pix2PoseTrainingOptions {
         let default = Pix2PoseTrainingOptions::default();
         Pix2PoseTrainingOptions {
-            common: TrainingOptions {
-                steps: self.steps.unwrap_or(default.common.steps),
-                learning_rate: self.learning_rate.unwrap_or(default.common.learning_rate),
-                seed: self.seed,
-                ..default.common
-            },
+            common: default.common.with(self.steps, self.learning_rate, self.seed),
             per_object: self.per_object.unwrap_or(default.per_object),
             frozen_stages: self.frozen_stages,
             transformer_loss: self.transformer_loss && !self.view_limits,

@@ -152,13 +152,8 @@ impl Training for CompactTraining {
 
     fn plan(&self, source: &SampleSource) -> Result<Plan, TrainError> {
         self.check(source)?;
-        Ok(Plan {
-            steps: self.options.common.steps,
-            schedule: self.options.common.schedule(),
-            samples_per_step: self.options.per_object * self.pools.len(),
-            pace: self.pace,
-            settings: serde_json::to_value(&self.options).map_err(TrainError::method)?,
-        })
+        let images = self.options.per_object * self.pools.len();
+        Plan::new(&self.options.common, images, self.pace, &self.options)
     }
 
     fn batches<'a>(&self, source: &'a SampleSource) -> Batches<'a, CompactBatch> {
