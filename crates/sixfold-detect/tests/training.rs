@@ -174,9 +174,9 @@ fn samples_are_a_function_of_their_number() {
     }
     assert!(a.sample(4, 0) != a.sample(5, 0));
     // Without a mesh to render and a photograph there is nothing to see.
-    let bare = SceneObject { mesh: object(3, true, [0; 3]).mesh, ..object(3, true, [0; 3]) };
+    let bare = object(3, true, [0; 3]);
     let plain = Mesh::new(bare.mesh.vertices().to_vec(), bare.mesh.faces().to_vec()).unwrap();
-    let grey = SceneObject { mesh: plain, ..bare };
+    let grey = TrainingObject { mesh: plain, ..bare };
     let options = SceneOptions { size: 64, ..SceneOptions::default() };
     let error =
         SceneSource::new(vec![grey], &[], &[], Backgrounds::procedural(), options.clone()).unwrap_err();
