@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::{Device, Tensor};
 use sixfold_augment::Backgrounds;
+use sixfold_nn::checkpoint::CheckpointError;
 
 use crate::network::{COLOURS, Network};
 use crate::samples::{Batch, SampleOptions, make_sample};
@@ -28,9 +29,11 @@ impl Preview {
         Preview { batch: Batch::of_samples(&samples), file: folder.join("preview.png") }
     }
 
-    /// Draws sources, the true target, the sources' average, X^D and X^phi. A picture that cannot be written is no reason to stop
-    /// a training.
-    pub fn draw(&self, network: &Network) {
+    /// Draws sources, the true target, the sources' average, X^D and X^phi.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Write`]: a folder that cannot take the picture cannot take the checkpoint after it either.
+    pub fn draw(&self, network: &Network) -> Result<(), CheckpointError> {
         let passed = pass(network, self.batch.clone(), &Device::flex());
         let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
         let (average, _) = self.batch.average();
@@ -66,8 +69,13 @@ impl Preview {
         let saved = folder.map_err(image::ImageError::IoError).and_then(|()| {
             image::save_buffer(&self.file, &picture, width, height, image::ExtendedColorType::Rgb8)
         });
-        if let Err(error) = saved {
-            eprintln!("{}: cannot be written: {error}", self.file.display());
-        }
+        saved.map_err(|error| CheckpointError::Write { file: self.file.clone(), source: io_error(error) })
+    }
+}
+
+fn io_error(error: image::ImageError) -> std::io::Error {
+    match error {
+        image::ImageError::IoError(error) => error,
+        error => std::io::Error::other(error),
     }
 }

@@ -166,7 +166,7 @@ impl Trainee for State<'_> {
     }
 
     fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError> {
-        self.preview.draw(&self.network.valid());
+        self.preview.draw(&self.network.valid())?;
         checkpoint.module("network", &self.network)?.optimiser("optimiser", &self.optimiser)
     }
 
