@@ -5,6 +5,8 @@
 //! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
 //! another (`solids.rs`). Real objects are thereby all held out. [`toy`] draws what belongs to no family.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod solids;
 mod sweep;
 mod toy;
