@@ -3,6 +3,8 @@
 //! Millimetres exist in the files only; everything here is in metres, radians and pixels. The short way from a result
 //! file to scores: [`BopDataset::open`], [`read_results`], [`BopDataset::targets`], [`evaluate`].
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod coco;
 mod coco_score;
 mod coco_truth;

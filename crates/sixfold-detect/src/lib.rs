@@ -2,6 +2,8 @@
 //!
 //! The short way: [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod detect;
 pub mod detector;
 pub mod loss;

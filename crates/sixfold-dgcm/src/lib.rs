@@ -7,8 +7,7 @@
 //!
 //! Metres and radians, in the camera's frame unless a name says otherwise.
 
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod learner;
 pub mod loss;

@@ -4,8 +4,7 @@
 //! their spaces (`camera_from_object`), the OpenCV camera frame (x right, y down, z forward), pixel
 //! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
 
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod camera;
 mod cloud;

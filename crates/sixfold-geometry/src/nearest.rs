@@ -1,15 +1,53 @@
-//! Nearest neighbours in three dimensions: a k-d tree over a cloud (crate kiddo).
+//! Nearest neighbours in three dimensions: a k-d tree over a cloud.
+//!
+//! Bentley 1975 ("Multidimensional binary search trees used for associative searching"), with points in buckets at the
+//! leaves and cuts at the median of the longest side (Friedman, Bentley and Finkel 1977), and with the distance to a
+//! cell kept per axis on the way down (Arya and Mount 1993). The tree is complete, so children and buckets are found
+//! by arithmetic.
+//!
+//! Searches are exact to the last bit: the distance to a cell is added up in the same order as that to a point, and
+//! rounding is monotone, so no cell with a nearer point in it is passed over.
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use std::ops::Range;
 
 use crate::Vec3;
 
+/// The most points in a bucket. Fewer make the tree deeper, more make a search look at more points in vain.
+const BUCKET: usize = 32;
+
 /// A k-d tree over points in metres.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct KdTree {
-    tree: Option<ImmutableKdTree<f64, 3>>,
-    /// Index in the caller's list per point in the tree; empty when they are the same.
+    /// The inner nodes of a complete binary tree: the children of `i` are `2 i + 1` and `2 i + 2`.
+    nodes: Vec<Node>,
+    /// Levels of inner nodes; there are `2^depth` buckets.
+    depth: u32,
+    /// The points in the order of the buckets, per axis.
+    points: [Vec<f64>; 3],
+    /// Their indices in the caller's list.
     original: Vec<usize>,
+    /// The smallest box around all points.
+    bounds: Bounds,
+}
+
+/// An axis-aligned box: its lowest and its highest coordinates.
+#[derive(Debug, Clone, Copy)]
+struct Bounds {
+    low: [f64; 3],
+    high: [f64; 3],
+}
+
+/// A point and its index in the caller's list.
+type Entry = ([f64; 3], usize);
+
+/// Where a cell is cut in two.
+#[derive(Debug, Clone, Copy)]
+struct Node {
+    axis: usize,
+    /// No point of the first child has a larger coordinate, none of the second a smaller one.
+    cut: f64,
+    /// The lowest index among the points of the first and of the second child; it decides between equal distances.
+    lowest: [usize; 2],
 }
 
 /// A neighbour: its index in the list the tree was built from, and how far it is.
@@ -24,54 +62,176 @@ pub struct Neighbour {
 impl KdTree {
     /// A tree over the points; those with a coordinate that is not finite are left out.
     pub fn new(points: &[Vec3]) -> KdTree {
-        let finite = |p: &&Vec3| p.iter().all(|c| c.is_finite());
-        let entries: Vec<[f64; 3]> = points.iter().filter(finite).map(|p| [p.x, p.y, p.z]).collect();
-        let original = if entries.len() == points.len() {
-            vec![]
-        } else {
-            (0..points.len()).filter(|&i| finite(&&points[i])).collect()
+        let mut entries: Vec<Entry> =
+            points.iter().enumerate().filter_map(|(i, p)| Some((finite(p)?, i))).collect();
+        let depth = entries.len().div_ceil(BUCKET).next_power_of_two().trailing_zeros();
+        let mut bounds = Bounds { low: [f64::INFINITY; 3], high: [f64::NEG_INFINITY; 3] };
+        for (p, _) in &entries {
+            bounds.low = std::array::from_fn(|axis| bounds.low[axis].min(p[axis]));
+            bounds.high = std::array::from_fn(|axis| bounds.high[axis].max(p[axis]));
+        }
+        let mut tree = KdTree {
+            nodes: vec![Node { axis: 0, cut: 0.0, lowest: [0; 2] }; (1 << depth) - 1],
+            depth,
+            points: [vec![], vec![], vec![]],
+            original: vec![0; entries.len()],
+            bounds,
         };
-        let tree = if entries.is_empty() { None } else { ImmutableKdTree::new_from_slice(&entries).ok() };
-        KdTree { tree, original }
+        tree.build(0, 0..1 << depth, bounds, &mut entries);
+        tree.points = std::array::from_fn(|axis| entries.iter().map(|(p, _)| p[axis]).collect());
+        tree.original = entries.into_iter().map(|(_, index)| index).collect();
+        tree
     }
 
-    /// The nearest point, `None` when the tree is empty or `p` is not finite.
-    pub fn nearest(&self, p: &Vec3) -> Option<Neighbour> {
-        if !p.iter().all(|c| c.is_finite()) {
-            return None;
+    /// Sorts `entries`, which lie in the cell `bounds`, into `buckets` and fills the nodes above them; the lowest index
+    /// among the entries.
+    fn build(&mut self, node: usize, buckets: Range<usize>, bounds: Bounds, entries: &mut [Entry]) -> usize {
+        if buckets.len() == 1 {
+            return entries.iter().map(|e| e.1).min().unwrap_or(usize::MAX);
         }
-        let tree = self.tree.as_ref()?;
-        let hit = tree.query(&[p.x, p.y, p.z]).nearest_one::<SquaredEuclidean<f64>>().execute();
-        Some(Neighbour { index: self.original_index(hit.item), distance: hit.distance.sqrt() })
+        let side = |axis: usize| bounds.high[axis] - bounds.low[axis];
+        let axis = (1..3).fold(0, |longest, axis| if side(axis) > side(longest) { axis } else { longest });
+        let middle = buckets.start + buckets.len() / 2;
+        let first = self.start(middle) - self.start(buckets.start);
+        // Equal coordinates go by index: equal points then make a tree over their indices, which is quick to search.
+        let order = |a: &Entry, b: &Entry| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1));
+        let cut = entries.select_nth_unstable_by(first, order).1.0[axis];
+        let (left, right) = entries.split_at_mut(first);
+        let (mut below, mut above) = (bounds, bounds);
+        below.high[axis] = cut;
+        above.low[axis] = cut;
+        let lowest = [
+            self.build(2 * node + 1, buckets.start..middle, below, left),
+            self.build(2 * node + 2, middle..buckets.end, above, right),
+        ];
+        self.nodes[node] = Node { axis, cut, lowest };
+        lowest[0].min(lowest[1])
+    }
+
+    /// Position of a bucket's first point: the points are spread evenly.
+    fn start(&self, bucket: usize) -> usize {
+        (bucket * self.original.len()) >> self.depth
+    }
+
+    /// The nearest point, of equally near ones that of the lowest index; `None` when the tree is empty or `p` is not
+    /// finite.
+    pub fn nearest(&self, p: &Vec3) -> Option<Neighbour> {
+        let p = finite(p).filter(|_| !self.original.is_empty())?;
+        let mut search = Nearest { squared: f64::INFINITY, index: usize::MAX };
+        self.search(&p, &mut search, 0, self.bounds.off(&p));
+        Some(Neighbour { index: search.index, distance: search.squared.sqrt() })
     }
 
     /// All points within `radius` metres, in the order of their indices.
     pub fn within(&self, p: &Vec3, radius: f64) -> Vec<Neighbour> {
-        let Some(tree) = self.tree.as_ref().filter(|_| p.iter().all(|c| c.is_finite())) else {
+        let Some(p) = finite(p) else {
             return vec![];
         };
-        let hits = tree
-            .query(&[p.x, p.y, p.z])
-            .within::<SquaredEuclidean<f64>>(radius * radius)
-            .unsorted()
-            .execute();
-        let mut found: Vec<_> = hits
-            .iter()
-            .map(|h| Neighbour { index: self.original_index(h.item), distance: h.distance.sqrt() })
-            .collect();
-        found.sort_unstable_by_key(|n| n.index);
-        found
+        let mut search = Within { squared: radius * radius, found: vec![] };
+        self.search(&p, &mut search, 0, self.bounds.off(&p));
+        search.found.sort_unstable_by_key(|n| n.index);
+        search.found
     }
 
-    fn original_index(&self, item: u32) -> usize {
-        self.original.get(item as usize).copied().unwrap_or(item as usize)
+    /// Shows `search` the points of the cells under `node` that it wants to look into, the nearer child first. `off` is
+    /// the distance from `p` to the cell along each axis, 0 where `p` is within its bounds.
+    fn search(&self, p: &[f64; 3], search: &mut impl Search, node: usize, off: [f64; 3]) {
+        let Some(inner) = self.nodes.get(node) else {
+            let bucket = node - self.nodes.len();
+            let range = self.start(bucket)..self.start(bucket + 1);
+            let [x, y, z] = [0, 1, 2].map(|axis| &self.points[axis][range.clone()]);
+            let mut squared = [0.0; BUCKET];
+            for (((s, x), y), z) in squared.iter_mut().zip(x).zip(y).zip(z) {
+                *s = squared_length(&[x - p[0], y - p[1], z - p[2]]);
+            }
+            for (&squared, &index) in squared.iter().zip(&self.original[range]) {
+                search.point(squared, index);
+            }
+            return;
+        };
+        let difference = p[inner.axis] - inner.cut;
+        let near = usize::from(!(difference < 0.0));
+        self.search(p, search, 2 * node + 1 + near, off);
+        let mut beyond = off;
+        beyond[inner.axis] = difference;
+        if search.reaches(squared_length(&beyond), inner.lowest[1 - near]) {
+            self.search(p, search, 2 * node + 2 - near, beyond);
+        }
     }
+}
+
+impl Bounds {
+    /// How far `p` is from the box along each axis, 0 where it is within its bounds.
+    fn off(&self, p: &[f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|axis| (self.low[axis] - p[axis]).max(p[axis] - self.high[axis]).max(0.0))
+    }
+}
+
+/// What a search wants to see and does with it; distances are squared.
+trait Search {
+    /// Whether to look into a cell as far away as this, with no index lower than this.
+    fn reaches(&self, squared: f64, lowest: usize) -> bool;
+    /// Takes a point.
+    fn point(&mut self, squared: f64, index: usize);
+}
+
+struct Nearest {
+    squared: f64,
+    index: usize,
+}
+
+impl Search for Nearest {
+    fn reaches(&self, squared: f64, lowest: usize) -> bool {
+        squared < self.squared || (squared == self.squared && lowest < self.index)
+    }
+
+    fn point(&mut self, squared: f64, index: usize) {
+        if self.reaches(squared, index) {
+            *self = Nearest { squared, index };
+        }
+    }
+}
+
+struct Within {
+    squared: f64,
+    found: Vec<Neighbour>,
+}
+
+impl Search for Within {
+    fn reaches(&self, squared: f64, _lowest: usize) -> bool {
+        squared <= self.squared
+    }
+
+    fn point(&mut self, squared: f64, index: usize) {
+        if squared <= self.squared {
+            self.found.push(Neighbour { index, distance: squared.sqrt() });
+        }
+    }
+}
+
+fn finite(p: &Vec3) -> Option<[f64; 3]> {
+    p.iter().all(|c| c.is_finite()).then_some([p.x, p.y, p.z])
+}
+
+/// The one order of additions that all comparisons of distances rest on.
+fn squared_length(v: &[f64; 3]) -> f64 {
+    v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    /// The nearest of all points, the first of equally near ones.
+    fn full_search(points: &[Vec3], p: &Vec3) -> Neighbour {
+        let squared = |q: &Vec3| squared_length(&[q.x - p.x, q.y - p.y, q.z - p.z]);
+        // Squares are compared, as in the tree: two of them may have one root.
+        let index = (0..points.len())
+            .reduce(|best, i| if squared(&points[i]) < squared(&points[best]) { i } else { best });
+        let index = index.unwrap();
+        Neighbour { index, distance: squared(&points[index]).sqrt() }
+    }
 
     proptest! {
         #[test]
@@ -87,6 +247,22 @@ mod tests {
             let inside = points.iter().filter(|p| (*p - query).norm() <= radius).count();
             prop_assert_eq!(tree.within(&query, radius).len(), inside);
         }
+
+        /// On a lattice most distances are equal: index and distance are still those of a full search, to the last bit.
+        #[test]
+        fn of_equally_near_points_the_lowest_index_wins(
+            points in prop::collection::vec(prop::array::uniform3(-3..=3i8), 1..400),
+            query in prop::array::uniform3(-8..=8i8), radius in 0..6u8
+        ) {
+            let points: Vec<Vec3> = points.iter().map(|p| Vec3::from(p.map(|c| 0.1 * f64::from(c)))).collect();
+            let query = Vec3::from(query.map(|c| 0.05 * f64::from(c)));
+            let tree = KdTree::new(&points);
+            prop_assert_eq!(tree.nearest(&query), Some(full_search(&points, &query)));
+            let radius = 0.1 * f64::from(radius);
+            let near = |q: &Vec3| squared_length(&[q.x - query.x, q.y - query.y, q.z - query.z]) <= radius * radius;
+            let inside: Vec<usize> = (0..points.len()).filter(|&i| near(&points[i])).collect();
+            prop_assert_eq!(tree.within(&query, radius).iter().map(|n| n.index).collect::<Vec<_>>(), inside);
+        }
     }
 
     #[test]
@@ -94,8 +270,12 @@ mod tests {
         let tree = KdTree::new(&[Vec3::from_element(f64::NAN), Vec3::x(), Vec3::y()]);
         assert_eq!(tree.nearest(&Vec3::new(0.9, 0.1, 0.0)).unwrap().index, 1);
         assert!(KdTree::new(&[]).nearest(&Vec3::x()).is_none());
+        assert!(KdTree::new(&[]).within(&Vec3::x(), 1.0).is_empty());
         // Thousands of equal points are no trouble.
         let same = KdTree::new(&vec![Vec3::x(); 5000]);
-        assert_eq!(same.nearest(&Vec3::zeros()).unwrap().distance, 1.0);
+        assert_eq!(same.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: 1.0 }));
+        // Nor are distances whose squares overflow.
+        let far = KdTree::new(&[Vec3::x() * 1e300, Vec3::y() * 1e300]);
+        assert_eq!(far.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: f64::INFINITY }));
     }
 }

@@ -16,8 +16,7 @@
 //! assert!(gripper.check("jaws-85").is_ok());
 //! ```
 
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod antipodal;
 mod cluster;

@@ -12,6 +12,8 @@
 //! # Ok::<(), sixfold_mesh::MeshFileError>(())
 //! ```
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod convex_hull;
 mod diameter;
 mod error;

@@ -1,8 +1,6 @@
 //! From a prepared scene and an object's templates to poses: sample regions, match, mask, merge, match again, align, verify
 //! (dissertation, sections 5.2.4 and 5.2.5).
 
-use std::path::Path;
-use std::sync::Arc;
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -12,16 +10,17 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::align::{align, camera_from_view};
-use crate::by_network;
-use crate::error::StoreError;
 use crate::judge::{Surface, judge};
-use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
 use crate::matching::{Match, MatchOptions, Matcher};
-use crate::model::MttmModel;
-use crate::regions::RegionCache;
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::ObjectTemplates;
+#[cfg(not(feature = "network"))]
+use crate::without_network::{self as by_network, Learned, RegionCache};
+#[cfg(feature = "network")]
+use crate::{by_network, error::StoreError, learned::Learned, model::MttmModel, regions::RegionCache};
+#[cfg(feature = "network")]
+use std::{path::Path, sync::Arc};
 
 /// Who matches regions with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -106,6 +105,7 @@ impl KnownObject {
     }
 
     /// The same object as a network knows it too.
+    #[cfg(feature = "network")]
     pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
         self.learned = Some(Learned::new(model, &self.templates, self.matcher.entries()));
         self
@@ -113,6 +113,7 @@ impl KnownObject {
 
     /// The same, with the network's descriptors kept in a file. The second value tells why a file that was there could not be
     /// used, or that the new one could not be written.
+    #[cfg(feature = "network")]
     pub fn with_network_cached(
         mut self,
         model: Arc<MttmModel>,

@@ -6,12 +6,15 @@
 //! masks ([`mask`]), masks of one object are merged, matched again without their background, and the nearest
 //! templates become poses by their geometry ([`align`]); [`mod@estimate`] puts it together, and [`judge`] says how well a pose
 //! agrees with the image when there is no mesh.
+//!
+//! Without the feature `network` (default) there is matching point by point only, and nothing of Burn is compiled.
 
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod align;
+#[cfg(feature = "network")]
 mod by_network;
+#[cfg(feature = "network")]
 mod descriptor_file;
 mod error;
 pub mod estimate;
@@ -19,24 +22,34 @@ mod estimator;
 pub mod from_depth;
 pub mod from_mesh;
 pub mod judge;
+#[cfg(feature = "network")]
 pub mod learned;
+#[cfg(feature = "network")]
 pub mod loss;
 pub mod mask;
 pub mod matching;
+#[cfg(feature = "network")]
 pub mod model;
+#[cfg(feature = "network")]
 pub mod network;
 pub mod patch;
 pub mod pose_distance;
+#[cfg(feature = "network")]
 pub mod quality;
-#[cfg(feature = "recipe")]
+#[cfg(all(feature = "network", feature = "recipe"))]
 pub mod recipe;
+#[cfg(feature = "network")]
 mod regions;
 pub mod roi;
+#[cfg(feature = "network")]
 pub mod samples;
 mod store;
 mod template;
+#[cfg(feature = "network")]
 pub mod training;
 mod views;
+#[cfg(not(feature = "network"))]
+mod without_network;
 
 pub use error::{StoreError, TemplateError};
 pub use estimate::{MttmEstimate, MttmOptions, KnownObject, MatchedBy, Search, Stages, estimate};

@@ -1,5 +1,7 @@
 //! Backbones, fast convolutions, weight files and the training loop on Burn.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod kernels;
 pub mod layers;
 pub mod lite0;

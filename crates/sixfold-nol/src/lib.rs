@@ -5,6 +5,8 @@
 //! A [`PosedImage`](sixfold_data::PosedImage) is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod agreement;
 mod error;
 mod features;

@@ -1,6 +1,8 @@
 //! Pix2Pose (Park, Patten, Vincze 2019; dissertation chapter 3): per-pixel object coordinates and their expected error
 //! from an RGB crop, and poses from them.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod adversarial;
 pub mod aligned;
 mod critic;

@@ -3,6 +3,8 @@
 //! [`Canvas`] draws at three times the size and averages down, so lines are smooth. Coordinates are picture pixels, x to
 //! the right and y down from the top left corner.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod font;
 mod ticks;
 

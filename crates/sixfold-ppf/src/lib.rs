@@ -5,6 +5,8 @@
 //! ([`model`], [`voting`]), similar poses are joined ([`clustering`]), the best are refined by ICP and
 //! judged by rendering ([`mod@sixfold_align::verify`]); [`estimate()`] puts it together.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod clustering;
 pub mod estimate;
 mod estimator;

@@ -6,6 +6,8 @@
 //! pixel and never leave a gap. Depth is where the pixel's ray meets the triangle's plane, not an interpolation
 //! between rounded corners. One thread or many: same bytes.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod outputs;
 mod raster;
 mod sensor;

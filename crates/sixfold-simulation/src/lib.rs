@@ -20,8 +20,7 @@
 //! # Ok::<(), sixfold_simulation::SimulationError>(())
 //! ```
 
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
+#![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod attempt;
 mod error;

@@ -4,6 +4,8 @@
 //! [`log_odds`] says where the object is, [`Outline::lines`] where its border lies across the rendered outline,
 //! [`add_lines`] what that says about the pose.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod lines;
 mod odds;
 

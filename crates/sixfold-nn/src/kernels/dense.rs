@@ -1,7 +1,7 @@
 //! Dense convolutions as matrix products: pointwise ones directly on the image, others through patches laid out as
 //! columns (im2col), a band of rows at a time so that the patches stay in the cache.
 
-use super::shared::{Shared, View, activate, before_activation, multiply, sum, unwritten};
+use super::shared::{Shared, View, activate, before_activation, multiply, sum, unwritten, written, zeroed};
 use super::{ConvGradients, ConvShape, ConvSpec};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -176,7 +176,9 @@ pub(super) fn dense_forward(
         #[allow(unsafe_code)]
         let line = |channel: usize| unsafe { shared.slice(begin + channel * pixels, n) };
         for (channel, bias) in bias.iter().enumerate() {
-            line(channel).fill(*bias);
+            line(channel).iter_mut().for_each(|v| {
+                v.write(*bias);
+            });
         }
         COLUMNS.with_borrow_mut(|[patches, ..]| {
             let left = View { data: weight, strides: [plan.patch, 1] };
@@ -193,9 +195,17 @@ pub(super) fn dense_forward(
                 multiply([shape.outputs, n, plan.patch], (shared, begin, pixels), true, left, right)
             };
         });
-        (0..shape.outputs).for_each(|channel| activate(line(channel), spec.activation));
+        for channel in 0..shape.outputs {
+            // SAFETY: the biases were written first.
+            #[allow(unsafe_code)]
+            activate(unsafe { line(channel).assume_init_mut() }, spec.activation);
+        }
     });
-    y
+    // SAFETY: the bands of all images are all of the output.
+    #[allow(unsafe_code)]
+    unsafe {
+        written(y)
+    }
 }
 
 pub(super) fn dense_backward(
@@ -213,7 +223,7 @@ pub(super) fn dense_backward(
     let mut dx = match (want_x, plan.pointwise) {
         (false, _) => Vec::new(),
         (true, true) => unwritten(x.len()),
-        (true, false) => vec![0.0; x.len()],
+        (true, false) => zeroed(x.len()),
     };
     let shared = Shared::new(&mut dx);
     let group_size = shape.batch.div_ceil(GROUPS).max(1);
@@ -245,7 +255,7 @@ pub(super) fn dense_backward(
                                 View { data: patches, strides: [1, n] }
                             };
                             let left = View { data: gradient, strides: [n, 1] };
-                            let out = (Shared::new(&mut dweight), 0, plan.patch);
+                            let out = (Shared::of_numbers(&mut dweight), 0, plan.patch);
                             // SAFETY: these sums belong to this group alone.
                             #[allow(unsafe_code)]
                             unsafe {
@@ -256,7 +266,8 @@ pub(super) fn dense_backward(
                             let left = View { data: weight, strides: [1, plan.patch] };
                             let right = View { data: gradient, strides: [n, 1] };
                             let size = [plan.patch, n, shape.outputs];
-                            // SAFETY: every image belongs to one group, every band to one turn of its loop.
+                            // SAFETY: every image belongs to one group, every band to one turn of its loop; what is
+                            // added to was zeroed.
                             #[allow(unsafe_code)]
                             if plan.pointwise {
                                 unsafe {
@@ -264,8 +275,9 @@ pub(super) fn dense_backward(
                                 };
                             } else {
                                 let dpatches = sized(dpatches, plan.patch * n);
-                                unsafe { multiply(size, (Shared::new(dpatches), 0, n), false, left, right) };
-                                let dx = unsafe { shared.slice(b * image, image) };
+                                let out = (Shared::of_numbers(dpatches), 0, n);
+                                unsafe { multiply(size, out, false, left, right) };
+                                let dx = unsafe { shared.slice(b * image, image).assume_init_mut() };
                                 add_columns(dpatches, shape, spec, &plan, band, dx);
                             }
                         }
@@ -281,5 +293,8 @@ pub(super) fn dense_backward(
         dweight.iter_mut().zip(&w).for_each(|(t, v)| *t += v);
         dbias.iter_mut().zip(&b).for_each(|(t, v)| *t += v);
     }
+    // SAFETY: zeroed, or written by the products of all bands of all images.
+    #[allow(unsafe_code)]
+    let dx = unsafe { written(dx) };
     ConvGradients { x: dx, weight: dweight, bias: dbias }
 }

@@ -3,9 +3,10 @@
 //! Each channel is copied into a padded buffer; with a stride of two its even and odd columns are kept apart, so that
 //! every inner loop runs over neighbouring numbers.
 
-use super::shared::{Shared, activate, before_activation, sum, unwritten, vectorised};
+use super::shared::{Shared, activate, before_activation, sum, unwritten, vectorised, written};
 use super::{ConvGradients, ConvShape, ConvSpec};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
 /// The padded channel: `stride` phases of columns, each `rows x columns`.
 struct Padded {
@@ -52,16 +53,18 @@ impl Padded {
         }
     }
 
-    fn unfill(&self, buffer: &[f32], image: &mut [f32], width: usize, spec: &ConvSpec) {
+    fn unfill(&self, buffer: &[f32], image: &mut [MaybeUninit<f32>], width: usize, spec: &ConvSpec) {
         for (y, line) in image.chunks_exact_mut(width).enumerate() {
             let row = y + spec.padding[0];
             if self.stride == 1 {
-                line.copy_from_slice(&buffer[self.start(row, 0) + spec.padding[0]..][..width]);
+                line.write_copy_of_slice(&buffer[self.start(row, 0) + spec.padding[0]..][..width]);
             } else {
                 for phase in 0..self.stride {
                     let (first, start) = self.phase(row, phase, spec);
                     let target = line[first.min(width)..].iter_mut().step_by(self.stride);
-                    target.zip(&buffer[start..]).for_each(|(v, b)| *v = *b);
+                    target.zip(&buffer[start..]).for_each(|(v, b)| {
+                        v.write(*b);
+                    });
                 }
             }
         }
@@ -70,7 +73,7 @@ impl Padded {
 
 vectorised! {
     /// One output row: the sum over the taps of `weight * source[start..]`, in blocks of sixteen columns.
-    fn row(out: &mut [f32], source: &[f32], starts: &[usize], weights: &[f32], bias: f32) {
+    fn row(out: &mut [MaybeUninit<f32>], source: &[f32], starts: &[usize], weights: &[f32], bias: f32) {
         let width = out.len();
         let mut x = 0;
         while x < width {
@@ -82,7 +85,7 @@ vectorised! {
                 }
             }
             let n = 16.min(width - x);
-            out[x..x + n].copy_from_slice(&lanes[..n]);
+            out[x..x + n].write_copy_of_slice(&lanes[..n]);
             x += 16;
         }
     }
@@ -160,10 +163,16 @@ pub(super) fn depthwise_forward(
                 for (out, starts) in out.chunks_exact_mut(columns).zip(starts.chunks_exact(area)) {
                     row(out, buffer, starts, &weight[channel * area..][..area], bias[channel]);
                 }
-                activate(out, spec.activation);
+                // SAFETY: all of its rows were written just now.
+                #[allow(unsafe_code)]
+                activate(unsafe { out.assume_init_mut() }, spec.activation);
             },
         );
-    y
+    // SAFETY: every plane of every image was written.
+    #[allow(unsafe_code)]
+    unsafe {
+        written(y)
+    }
 }
 
 pub(super) fn depthwise_backward(
@@ -247,6 +256,9 @@ pub(super) fn depthwise_backward(
         )
         .collect();
     let (weight, bias): (Vec<Vec<f32>>, Vec<f32>) = gradients.into_iter().unzip();
+    // SAFETY: empty, or written channel by channel, each whole.
+    #[allow(unsafe_code)]
+    let dx = unsafe { written(dx) };
     if want_weight {
         ConvGradients { x: dx, weight: weight.concat(), bias }
     } else {

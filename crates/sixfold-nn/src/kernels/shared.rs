@@ -1,6 +1,9 @@
 //! What all convolution kernels share: their options, the activation, vector code for several processors, and
 //! writing to disjoint parts of one output from several threads.
 
+use std::marker::PhantomData;
+use std::mem::{ManuallyDrop, MaybeUninit};
+
 /// Non-linearity applied to the output of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Activation {
@@ -123,41 +126,72 @@ vectorised! {
 
 /// A mutable buffer that several threads write to, each its own part.
 #[derive(Clone, Copy)]
-pub(super) struct Shared(*mut f32, usize);
+pub(super) struct Shared<'a> {
+    start: *mut MaybeUninit<f32>,
+    length: usize,
+    buffer: PhantomData<&'a mut [MaybeUninit<f32>]>,
+}
 
-// SAFETY: the pointer is only used through `slice` and `pointer`, whose callers keep to disjoint parts.
+// SAFETY: the pointer is only used through `slice` and `multiply`, whose callers keep to disjoint parts.
 #[allow(unsafe_code)]
-unsafe impl Send for Shared {}
+unsafe impl Send for Shared<'_> {}
 // SAFETY: as above.
 #[allow(unsafe_code)]
-unsafe impl Sync for Shared {}
+unsafe impl Sync for Shared<'_> {}
 
-impl Shared {
-    pub(super) fn new(buffer: &mut [f32]) -> Self {
-        Self(buffer.as_mut_ptr(), buffer.len())
+impl<'a> Shared<'a> {
+    pub(super) fn new(buffer: &'a mut [MaybeUninit<f32>]) -> Self {
+        Self { start: buffer.as_mut_ptr(), length: buffer.len(), buffer: PhantomData }
+    }
+
+    /// A buffer of numbers; [`Shared::slice`]'s callers leave numbers in it.
+    pub(super) fn of_numbers(buffer: &'a mut [f32]) -> Self {
+        Self { start: buffer.as_mut_ptr().cast(), length: buffer.len(), buffer: PhantomData }
     }
 
     /// Part of the buffer.
     ///
     /// # Safety
-    /// No other thread may use this range while the slice lives.
-    #[allow(unsafe_code, clippy::mut_from_ref)]
-    pub(super) unsafe fn slice(&self, start: usize, length: usize) -> &mut [f32] {
-        assert!(start + length <= self.1);
+    /// Nothing else may use this range while the slice lives, and what was a number there stays one.
+    #[allow(unsafe_code)]
+    pub(super) unsafe fn slice(self, start: usize, length: usize) -> &'a mut [MaybeUninit<f32>] {
+        assert!(start + length <= self.length);
         // SAFETY: within the buffer by the assertion; disjoint by the caller's promise.
-        unsafe { std::slice::from_raw_parts_mut(self.0.add(start), length) }
+        unsafe { std::slice::from_raw_parts_mut(self.start.add(start), length) }
     }
 }
 
 /// A buffer whose every number is written before it is read: zeroing large outputs first takes as long as a layer.
-pub(super) fn unwritten(length: usize) -> Vec<f32> {
+pub(super) fn unwritten(length: usize) -> Vec<MaybeUninit<f32>> {
     let mut buffer = Vec::with_capacity(length);
-    // SAFETY: the capacity is there, any bits are an `f32`, and the kernels write each element before anyone reads it.
-    #[allow(unsafe_code, clippy::uninit_vec)]
+    // SAFETY: the capacity is there, and a `MaybeUninit` needs no value.
+    #[allow(unsafe_code)]
     unsafe {
         buffer.set_len(length)
     };
     buffer
+}
+
+/// The same, with zeros in it.
+pub(super) fn zeroed(length: usize) -> Vec<MaybeUninit<f32>> {
+    // Zeroed as numbers: the system gives pages of zeros for nothing.
+    let mut buffer = ManuallyDrop::new(vec![0.0f32; length]);
+    // SAFETY: the parts of a vector that nobody drops; `MaybeUninit<f32>` has the layout of `f32`.
+    #[allow(unsafe_code)]
+    unsafe {
+        Vec::from_raw_parts(buffer.as_mut_ptr().cast(), buffer.len(), buffer.capacity())
+    }
+}
+
+/// The numbers of a buffer.
+///
+/// # Safety
+/// All of them were written.
+#[allow(unsafe_code)]
+pub(super) unsafe fn written(buffer: Vec<MaybeUninit<f32>>) -> Vec<f32> {
+    let mut buffer = ManuallyDrop::new(buffer);
+    // SAFETY: the parts of a vector that nobody drops, in the layout of `f32`; written, as the caller promises.
+    unsafe { Vec::from_raw_parts(buffer.as_mut_ptr().cast(), buffer.len(), buffer.capacity()) }
 }
 
 /// A matrix in a slice: start, row stride and column stride.
@@ -171,11 +205,11 @@ pub(super) struct View<'a> {
 /// `out_stride`, beginning at `start` of the shared buffer; `left` is `m x k`, `right` is `k x n`.
 ///
 /// # Safety
-/// No other thread may use these `n` columns of `out` meanwhile.
+/// Nothing else may use these `n` columns of `out` meanwhile; with `add` they are written already.
 #[allow(unsafe_code)]
 pub(super) unsafe fn multiply(
     [m, n, k]: [usize; 3],
-    (out, start, out_stride): (Shared, usize, usize),
+    (out, start, out_stride): (Shared<'_>, usize, usize),
     add: bool,
     left: View<'_>,
     right: View<'_>,
@@ -184,7 +218,7 @@ pub(super) unsafe fn multiply(
         (rows - 1) * strides[0] + (columns - 1) * strides[1]
     };
     assert!(m > 0 && n > 0 && k > 0);
-    assert!(start + last(m, n, [out_stride, 1]) < out.1);
+    assert!(start + last(m, n, [out_stride, 1]) < out.length);
     assert!(last(m, k, left.strides) < left.data.len());
     assert!(last(k, n, right.strides) < right.data.len());
     // SAFETY: the assertions keep every element inside its buffer; nobody else uses the output, as the caller promises.
@@ -193,7 +227,7 @@ pub(super) unsafe fn multiply(
             m,
             n,
             k,
-            out.0.add(start),
+            out.start.add(start).cast::<f32>(),
             1,
             out_stride as isize,
             add,

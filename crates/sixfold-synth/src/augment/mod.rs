@@ -7,6 +7,8 @@
 //!
 //! Colour augmentation after K. Park, dissertation, table 3.2; occluders after table 3.3.
 
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod backgrounds;
 mod blur;
 mod color;
