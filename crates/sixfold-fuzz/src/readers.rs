@@ -1,0 +1,48 @@
+//! The list of readers: a new one is a line here, a check in `checks.rs` and its seeds in `seeds.rs`.
+
+use crate::{checks, seeds};
+
+/// A reader of files under test.
+#[derive(Debug, Clone, Copy)]
+pub struct Reader {
+    /// What `--reader` calls it.
+    pub name: &'static str,
+    /// Files that it can read, to be mutated.
+    pub seeds: fn() -> Vec<Vec<u8>>,
+    /// Reads the bytes and asserts what holds of the content.
+    ///
+    /// # Panics
+    /// When something does not hold: that is a finding.
+    pub check: fn(&[u8]),
+    /// How many inputs of a fast reader one input here takes as long as.
+    pub cost: usize,
+    /// Whether the file ends in a checksum, which half of the inputs then carry correctly.
+    pub checksum: bool,
+}
+
+/// Every reader of files from outside.
+pub fn readers() -> Vec<Reader> {
+    let fast = |name, seeds, check| Reader { name, seeds, check, cost: 1, checksum: false };
+    let slow = |cost, reader: Reader| Reader { cost, ..reader };
+    let summed = |reader: Reader| Reader { checksum: true, ..reader };
+    vec![
+        fast("ply", seeds::ply, checks::ply),
+        fast("obj", seeds::obj, checks::obj),
+        fast("stl", seeds::stl, checks::stl),
+        fast("gltf", seeds::gltf, checks::gltf),
+        fast("xyz", seeds::xyz, checks::xyz),
+        fast("models-info", seeds::models_info, checks::models_info),
+        fast("scene-files", seeds::scene_files, checks::scene_files),
+        fast("coco", seeds::coco, checks::coco),
+        fast("rle", seeds::rle, checks::rle),
+        fast("results", seeds::results, checks::results),
+        fast("camera", seeds::camera, checks::camera),
+        slow(2, fast("images", seeds::images, checks::images)),
+        fast("weights", seeds::weights, checks::weights),
+        slow(4, summed(fast("ppf", seeds::ppf, checks::ppf))),
+        slow(2, summed(fast("templates", seeds::templates, checks::templates))),
+        fast("gripper", seeds::gripper, checks::gripper),
+        fast("training-log", seeds::training_log, checks::training_log),
+        slow(10, fast("experience", seeds::experience, checks::experience)),
+    ]
+}
