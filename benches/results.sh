@@ -13,7 +13,7 @@
 #   --work DIR       folder for what the commands write (OUT in the commands; default: out/results)
 #   --commit NAME    what to write as the commit (default: git's HEAD); a work folder belongs to one commit
 #
-# Needs bash, python3, and about 20 minutes of one core.
+# Needs bash, python3, paths without spaces, and about 20 minutes of one core.
 set -euo pipefail
 
 PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows pix2pose detector grasp nol dgcm)
@@ -66,7 +66,7 @@ for name in names:
     lines = [f"  {k}: {a.get(k, 'nothing')} -> {b.get(k, 'nothing')}" for k in a | b if a.get(k, a) != b.get(k, b)]
     if not lines:
         print(f"{name}: {len(a)} values, the same")
-    elif list(a.values()) == list(b.values()):
+    elif sorted(map(repr, a.values())) == sorted(map(repr, b.values())):
         print(f"{name}: {len(a)} values, the same under other names")
     else:
         different += 1
