@@ -46,3 +46,27 @@ pub fn readers() -> Vec<Reader> {
         slow(10, fast("experience", seeds::experience, checks::experience)),
     ]
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::mutated;
+
+    #[test]
+    fn every_reader_has_a_name_of_its_own_and_seeds_and_holds_for_a_few_mutations() {
+        let all = readers();
+        assert_eq!(all.iter().map(|r| r.name).collect::<BTreeSet<_>>().len(), all.len());
+        for reader in all {
+            let seeds = (reader.seeds)();
+            assert!(!seeds.is_empty(), "{}", reader.name);
+            seeds.iter().for_each(|s| (reader.check)(s));
+            let mut random = ChaCha8Rng::seed_from_u64(1);
+            (0..20usize.div_ceil(reader.cost)).for_each(|_| (reader.check)(&mutated(&seeds, &mut random)));
+        }
+    }
+}
