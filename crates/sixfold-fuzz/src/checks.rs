@@ -7,6 +7,7 @@ use sixfold_bop::{
     parse_results, parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets, read_depth,
     read_mask, read_rgb,
 };
+#[cfg(feature = "networks")]
 use sixfold_dgcm::store::{ExperienceStore, Position, SqliteStore};
 use sixfold_geometry::Pose;
 use sixfold_grasp::parse_gripper;
@@ -14,9 +15,13 @@ use sixfold_match::ObjectModel;
 use sixfold_mesh::{
     Mesh, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
 };
+#[cfg(feature = "networks")]
 use sixfold_mttm::ObjectTemplates;
+#[cfg(feature = "networks")]
 use sixfold_nn::pretrained::PretrainedFile;
+#[cfg(feature = "networks")]
 use sixfold_nn::training_log::read_training_log;
+#[cfg(feature = "networks")]
 use sixfold_nn::weights::read_card;
 
 use crate::seeds;
@@ -182,6 +187,7 @@ pub(crate) fn images(bytes: &[u8]) {
     });
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn weights(bytes: &[u8]) {
     with_file("model.safetensors", bytes, |path| {
         let _ = read_card(path);
@@ -205,6 +211,7 @@ pub(crate) fn ppf(bytes: &[u8]) {
     });
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn templates(bytes: &[u8]) {
     let path = Path::new("fuzz.sixfold-templates");
     if let Ok(read) = ObjectTemplates::parse(bytes, path) {
@@ -221,6 +228,7 @@ pub(crate) fn gripper(bytes: &[u8]) {
     }
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn training_log(bytes: &[u8]) {
     with_file("log.jsonl", bytes, |path| {
         let lines = bytes.iter().filter(|b| **b == b'\n').count() + 1;
@@ -229,6 +237,7 @@ pub(crate) fn training_log(bytes: &[u8]) {
 }
 
 /// A store is a database file: whatever it holds, each experience is read or refused.
+#[cfg(feature = "networks")]
 pub(crate) fn experience(bytes: &[u8]) {
     with_file("experience.db", bytes, |path| {
         let Ok(store) = SqliteStore::open(path) else { return };

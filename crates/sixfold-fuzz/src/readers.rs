@@ -25,7 +25,7 @@ pub fn readers() -> Vec<Reader> {
     let fast = |name, seeds, check| Reader { name, seeds, check, cost: 1, checksum: false };
     let slow = |cost, reader: Reader| Reader { cost, ..reader };
     let summed = |reader: Reader| Reader { checksum: true, ..reader };
-    vec![
+    let mut all = vec![
         fast("ply", seeds::ply, checks::ply),
         fast("obj", seeds::obj, checks::obj),
         fast("stl", seeds::stl, checks::stl),
@@ -38,13 +38,17 @@ pub fn readers() -> Vec<Reader> {
         fast("results", seeds::results, checks::results),
         fast("camera", seeds::camera, checks::camera),
         slow(2, fast("images", seeds::images, checks::images)),
-        fast("weights", seeds::weights, checks::weights),
         slow(4, summed(fast("ppf", seeds::ppf, checks::ppf))),
-        slow(2, summed(fast("templates", seeds::templates, checks::templates))),
         fast("gripper", seeds::gripper, checks::gripper),
+    ];
+    #[cfg(feature = "networks")]
+    all.extend([
+        fast("weights", seeds::weights, checks::weights),
+        slow(2, summed(fast("templates", seeds::templates, checks::templates))),
         fast("training-log", seeds::training_log, checks::training_log),
         slow(10, fast("experience", seeds::experience, checks::experience)),
-    ]
+    ]);
+    all
 }
 
 #[cfg(test)]

@@ -1,12 +1,18 @@
 //! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
 
 use sixfold_bop::{Rle, write_depth, write_mask, write_rgb};
+#[cfg(feature = "networks")]
 use sixfold_dgcm::crop::{Crop, CropOptions};
+#[cfg(feature = "networks")]
 use sixfold_dgcm::store::{Copy, Experience, ExperienceStore, SqliteStore};
-use sixfold_geometry::{Camera, Image, Mask, Pose, Vec3};
+#[cfg(feature = "networks")]
+use sixfold_geometry::{Camera, Pose};
+use sixfold_geometry::{Image, Mask, Vec3};
+#[cfg(feature = "networks")]
 use sixfold_grasp::Gripper;
 use sixfold_match::{ModelOptions, ObjectModel};
 use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes};
+#[cfg(feature = "networks")]
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 
 fn texts(all: &[&str]) -> Vec<Vec<u8>> {
@@ -180,6 +186,7 @@ pub(crate) fn images() -> Vec<Vec<u8>> {
     ]
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn weights() -> Vec<Vec<u8>> {
     let file = |header: &str, data: usize| {
         let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
@@ -206,6 +213,7 @@ pub(crate) fn ppf() -> Vec<Vec<u8>> {
     vec![description]
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn templates() -> Vec<Vec<u8>> {
     let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).expect("a camera");
     let mask = Mask::from_fn(320, 240, |x, y| (120..180).contains(&x) && (90..150).contains(&y));
@@ -227,6 +235,7 @@ pub(crate) fn gripper() -> Vec<Vec<u8>> {
 "force": 30.0, "friction": 0.5}"#])
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn training_log() -> Vec<Vec<u8>> {
     let line = |step| {
         format!(
@@ -236,6 +245,7 @@ pub(crate) fn training_log() -> Vec<Vec<u8>> {
     texts(&[&format!("{}\n{}\n{}\n", line(10), line(20), line(30))])
 }
 
+#[cfg(feature = "networks")]
 pub(crate) fn experience() -> Vec<Vec<u8>> {
     let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).expect("a camera");
     let inside = |x: usize, y: usize| (120..180).contains(&x) && (90..150).contains(&y);
