@@ -25,6 +25,7 @@ pub fn readers() -> Vec<Reader> {
     let fast = |name, seeds, check| Reader { name, seeds, check, cost: 1, checksum: false };
     let slow = |cost, reader: Reader| Reader { cost, ..reader };
     let summed = |reader: Reader| Reader { checksum: true, ..reader };
+    #[cfg_attr(not(feature = "networks"), allow(unused_mut))]
     let mut all = vec![
         fast("ply", seeds::ply, checks::ply),
         fast("obj", seeds::obj, checks::obj),
@@ -38,7 +39,7 @@ pub fn readers() -> Vec<Reader> {
         fast("results", seeds::results, checks::results),
         fast("camera", seeds::camera, checks::camera),
         slow(2, fast("images", seeds::images, checks::images)),
-        slow(4, summed(fast("ppf", seeds::ppf, checks::ppf))),
+        slow(20, summed(fast("ppf", seeds::ppf, checks::ppf))),
         fast("gripper", seeds::gripper, checks::gripper),
     ];
     #[cfg(feature = "networks")]

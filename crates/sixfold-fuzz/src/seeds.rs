@@ -35,7 +35,7 @@ pub(crate) fn tetrahedron() -> Mesh {
 
 /// Coarse descriptions: quick to make anew.
 pub(crate) fn coarse() -> ModelOptions {
-    ModelOptions { sampling_step: 0.3, ..ModelOptions::default() }
+    ModelOptions { sampling_step: 0.2, ..ModelOptions::default() }
 }
 
 pub(crate) fn ply() -> Vec<Vec<u8>> {
