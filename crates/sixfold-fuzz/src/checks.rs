@@ -1,0 +1,253 @@
+//! What holds behind each reader, whatever the bytes: finite, within bounds, consistent. All imports of readers are here.
+
+use std::path::{Path, PathBuf};
+
+use sixfold_bop::{
+    CameraFile, CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections,
+    parse_results, parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets, read_depth,
+    read_mask, read_rgb,
+};
+#[cfg(feature = "networks")]
+use sixfold_dgcm::store::{ExperienceStore, Position, SqliteStore};
+use sixfold_geometry::Pose;
+use sixfold_grasp::parse_gripper;
+use sixfold_match::ObjectModel;
+use sixfold_mesh::{
+    Mesh, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
+};
+#[cfg(feature = "networks")]
+use sixfold_mttm::ObjectTemplates;
+#[cfg(feature = "networks")]
+use sixfold_nn::pretrained::PretrainedFile;
+#[cfg(feature = "networks")]
+use sixfold_nn::training_log::read_training_log;
+#[cfg(feature = "networks")]
+use sixfold_nn::weights::read_card;
+
+use crate::seeds;
+
+/// Runs a reader of paths on bytes, in a file of its own with this name.
+fn with_file<T>(name: &str, bytes: &[u8], read: impl FnOnce(&Path) -> T) -> T {
+    let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let path: PathBuf = folder.path().join(name);
+    std::fs::write(&path, bytes).expect("a temporary file can be written");
+    read(&path)
+}
+
+fn finite(pose: &Pose) -> bool {
+    pose.to_matrix().iter().all(|v| v.is_finite())
+        && (pose.rotation_matrix().determinant() - 1.0).abs() < 1e-6
+}
+
+fn mesh(mesh: &Mesh) {
+    let count = mesh.vertices().len();
+    assert!(mesh.vertices().iter().all(|v| v.iter().all(|c| c.is_finite())), "vertices are finite");
+    assert!(mesh.faces().iter().flatten().all(|&i| (i as usize) < count), "faces name vertices");
+    assert!(mesh.diameter() >= 0.0, "a diameter is no negative number and not NaN");
+    assert_eq!(mesh.vertex_normals().len(), count, "a normal for each vertex");
+    assert!(mesh.colors().is_none_or(|c| c.len() == count), "a colour for each vertex");
+    assert!(mesh.texcoords().is_none_or(|t| t.len() == count), "texture coordinates for each vertex");
+    assert!(mesh.sample_surface(3, 0).points.len() <= 3, "no more samples than asked for");
+}
+
+pub(crate) fn ply(bytes: &[u8]) {
+    if let Ok(read) = parse_ply(bytes, "fuzz.ply", Unit::Millimetre, &no_resources) {
+        mesh(&read);
+    }
+}
+
+pub(crate) fn obj(bytes: &[u8]) {
+    // The same bytes serve as the material file and as the texture.
+    let resources = |_: &str| Ok(bytes.to_vec());
+    if let Ok(read) = parse_obj(bytes, "fuzz.obj", Unit::Millimetre, &resources) {
+        mesh(&read);
+    }
+}
+
+pub(crate) fn stl(bytes: &[u8]) {
+    if let Ok(read) = parse_stl(bytes, "fuzz.stl", Unit::Millimetre, &no_resources) {
+        mesh(&read);
+    }
+}
+
+pub(crate) fn gltf(bytes: &[u8]) {
+    if let Ok(read) = parse_gltf(bytes, "fuzz.gltf", Unit::Millimetre, &no_resources) {
+        mesh(&read);
+    }
+}
+
+pub(crate) fn xyz(bytes: &[u8]) {
+    if let Ok(read) = parse_xyz(bytes, "fuzz.xyz", Unit::Millimetre, &no_resources) {
+        assert!(read.faces().is_empty(), "points have no faces");
+        mesh(&read);
+    }
+}
+
+pub(crate) fn models_info(bytes: &[u8]) {
+    if let Ok(infos) = ModelsInfo::parse(bytes, "fuzz.json") {
+        for info in infos.0.values() {
+            assert!(info.diameter.is_finite() && info.diameter > 0.0, "a diameter is a length");
+            let symmetries = info.symmetry_poses(1.0);
+            assert!(!symmetries.is_empty(), "the identity at least");
+            assert!(symmetries.iter().all(finite), "symmetries are rigid");
+        }
+    }
+}
+
+pub(crate) fn scene_files(bytes: &[u8]) {
+    let path = Path::new("fuzz.json");
+    for camera in parse_scene_camera(bytes, path).unwrap_or_default().values() {
+        assert!(camera.fx > 0.0 && camera.fy > 0.0, "focal lengths are positive");
+        assert!([camera.fx, camera.fy, camera.cx, camera.cy].iter().all(|v| v.is_finite()), "{camera:?}");
+        assert!(camera.depth_scale.is_none_or(|s| s.is_finite() && s > 0.0), "{camera:?}");
+        assert!(camera.camera_from_world.iter().all(finite), "{camera:?}");
+    }
+    for truth in parse_scene_gt(bytes, path).unwrap_or_default().values().flatten() {
+        assert!(finite(&truth.camera_from_object), "{truth:?}");
+    }
+    for info in parse_scene_gt_info(bytes, path).unwrap_or_default().values().flatten() {
+        assert!((0.0..=1.0).contains(&info.visib_fract), "{info:?}");
+        for b in [info.bbox_obj, info.bbox_visib].into_iter().flatten() {
+            assert!(b.width >= 0.0 && b.height >= 0.0, "{info:?}");
+        }
+    }
+    let _ = parse_targets(bytes, path);
+}
+
+pub(crate) fn coco(bytes: &[u8]) {
+    let path = Path::new("fuzz.json");
+    let (width, height) = (640, 480);
+    let options = ReadDetections { lenient: true, image_size: Some((width, height)) };
+    let found = parse_detections(bytes, path, &options).unwrap_or_default();
+    for d in &found.detections {
+        assert!(d.score.is_finite(), "{d:?}");
+        if let Some(b) = d.bbox {
+            assert!(b.width > 0.0 && b.height > 0.0, "{d:?}");
+            assert!(b.x >= 0.0 && b.x + b.width <= width as f64 + 1e-6, "{d:?}");
+            assert!(b.y >= 0.0 && b.y + b.height <= height as f64 + 1e-6, "{d:?}");
+        }
+    }
+    let mut truth = CocoGroundTruth::default();
+    let _ = truth.add_scene(0, bytes, path);
+    for kind in [IouType::Box, IouType::Mask] {
+        let scores = evaluate_coco(&truth, &found.detections, kind);
+        for score in [scores.ap, scores.ap50, scores.ap75, scores.ar100].into_iter().flatten() {
+            assert!((0.0..=1.0).contains(&score), "{scores:?}");
+        }
+    }
+}
+
+/// The first two bytes are the mask's size.
+pub(crate) fn rle(bytes: &[u8]) {
+    let [width, height, text @ ..] = bytes else { return };
+    let Ok(text) = std::str::from_utf8(text) else { return };
+    if let Ok(rle) = Rle::from_compressed((*width).into(), (*height).into(), text) {
+        let again = Rle::from_compressed((*width).into(), (*height).into(), &rle.to_compressed());
+        assert_eq!(again.as_ref(), Ok(&rle), "what decodes encodes to itself");
+        let mask = rle.decode();
+        let area = mask.as_slice().iter().filter(|p| **p).count();
+        assert_eq!(area as u64, rle.area());
+        assert_eq!(rle.intersection(&rle), Some(rle.area()));
+    }
+}
+
+pub(crate) fn results(bytes: &[u8]) {
+    let (estimates, bad) = parse_results(&String::from_utf8_lossy(bytes));
+    for e in &estimates {
+        assert!(e.score.is_finite() && finite(&e.camera_from_object), "{e:?}");
+        assert!(e.time.is_none_or(f64::is_finite), "{e:?}");
+    }
+    let lines = bytes.iter().filter(|b| matches!(b, b'\n' | b'\r')).count() + 1;
+    assert!(estimates.len() + bad.len() <= lines, "no more rows than lines");
+}
+
+pub(crate) fn camera(bytes: &[u8]) {
+    with_file("camera.json", bytes, |path| {
+        let Ok(file) = CameraFile::read(path) else { return };
+        assert!(file.depth_scale.is_none_or(|s| s.is_finite() && s > 0.0), "{file:?}");
+        file.camera.check().expect("a camera that was read is a camera");
+        if let Ok(camera) = file.for_image(640, 480, path) {
+            camera.check().expect("a camera of an image is a camera");
+            assert_eq!((camera.width, camera.height), (640, 480));
+        }
+    });
+}
+
+pub(crate) fn images(bytes: &[u8]) {
+    with_file("image.png", bytes, |path| {
+        if let Ok(image) = read_rgb(path) {
+            assert!(image.width() > 0 && image.height() > 0, "an image has pixels");
+        }
+        if let Ok(depth) = read_depth(path, 0.001) {
+            assert!(depth.as_slice().iter().all(|d| d.is_finite() && *d >= 0.0), "depth is a length");
+        }
+        if let Ok(mask) = read_mask(path) {
+            assert_eq!(mask.as_slice().len(), mask.width() * mask.height());
+        }
+    });
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn weights(bytes: &[u8]) {
+    with_file("model.safetensors", bytes, |path| {
+        let _ = read_card(path);
+        if let Ok(file) = PretrainedFile::open(path) {
+            for (name, shape) in file.tensors() {
+                let size = shape.iter().try_fold(1usize, |product, side| product.checked_mul(*side));
+                assert!(size.is_some_and(|s| s <= bytes.len()), "{name} {shape:?} fits into its file");
+            }
+        }
+    });
+}
+
+/// A damaged description is made anew: the object is described all the same.
+pub(crate) fn ppf(bytes: &[u8]) {
+    with_file("object.sixfold-ppf", bytes, |path| {
+        let described = ObjectModel::cached(path, &seeds::tetrahedron(), &[], &seeds::coarse());
+        let (model, _) =
+            described.expect("a file of any content does not keep an object from being described");
+        assert!(model.diameter() >= 0.0);
+        assert_eq!(model.samples().points.len(), model.samples().normals.len());
+    });
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn templates(bytes: &[u8]) {
+    let path = Path::new("fuzz.sixfold-templates");
+    if let Ok(read) = ObjectTemplates::parse(bytes, path) {
+        let again = ObjectTemplates::parse(&read.to_bytes(), path);
+        again.expect("what was read can be written and read again");
+    }
+}
+
+pub(crate) fn gripper(bytes: &[u8]) {
+    if let Ok(g) = parse_gripper(&String::from_utf8_lossy(bytes), "fuzz.json") {
+        let lengths = [g.max_opening, g.finger_length, g.finger_width, g.finger_thickness, g.palm_width];
+        let others = [g.palm_depth, g.palm_height, g.force, g.friction];
+        assert!(lengths.iter().chain(&others).all(|v| v.is_finite() && *v > 0.0), "{g:?}");
+    }
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn training_log(bytes: &[u8]) {
+    with_file("log.jsonl", bytes, |path| {
+        let lines = bytes.iter().filter(|b| **b == b'\n').count() + 1;
+        assert!(read_training_log(path).unwrap_or_default().len() <= lines, "no more records than lines");
+    });
+}
+
+/// A store is a database file: whatever it holds, each experience is read or refused.
+#[cfg(feature = "networks")]
+pub(crate) fn experience(bytes: &[u8]) {
+    with_file("experience.db", bytes, |path| {
+        let Ok(store) = SqliteStore::open(path) else { return };
+        let _ = store.check_integrity();
+        let _ = store.changes(Position::default());
+        let _ = store.attempts(0);
+        for summary in store.list().unwrap_or_default() {
+            if let Ok(Some(stored)) = store.get(summary.id) {
+                stored.experience.check().expect("an experience that was read is one");
+            }
+        }
+    });
+}

@@ -1,0 +1,275 @@
+//! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
+
+use sixfold_bop::{Rle, write_depth, write_mask, write_rgb};
+#[cfg(feature = "networks")]
+use sixfold_dgcm::crop::{Crop, CropOptions};
+#[cfg(feature = "networks")]
+use sixfold_dgcm::store::{Copy, Experience, ExperienceStore, SqliteStore};
+#[cfg(feature = "networks")]
+use sixfold_geometry::{Camera, Pose};
+use sixfold_geometry::{Image, Mask, Vec3};
+#[cfg(feature = "networks")]
+use sixfold_grasp::Gripper;
+use sixfold_match::{ModelOptions, ObjectModel};
+use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes};
+#[cfg(feature = "networks")]
+use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
+
+fn texts(all: &[&str]) -> Vec<Vec<u8>> {
+    all.iter().map(|text| text.as_bytes().to_vec()).collect()
+}
+
+/// The file that `write` makes.
+fn made(name: &str, write: impl FnOnce(&std::path::Path)) -> Vec<u8> {
+    let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let path = folder.path().join(name);
+    write(&path);
+    std::fs::read(&path).expect("the seed was written")
+}
+
+/// A tetrahedron with edges of 5 to 7 cm.
+pub(crate) fn tetrahedron() -> Mesh {
+    let corners = vec![Vec3::zeros(), Vec3::x() * 0.05, Vec3::y() * 0.05, Vec3::z() * 0.05];
+    Mesh::new(corners, vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).expect("a tetrahedron is a mesh")
+}
+
+/// Coarse descriptions: quick to make anew.
+pub(crate) fn coarse() -> ModelOptions {
+    ModelOptions { sampling_step: 0.2, ..ModelOptions::default() }
+}
+
+pub(crate) fn ply() -> Vec<Vec<u8>> {
+    let colored = tetrahedron().with_colors(vec![[10, 200, 30]; 4]).expect("a colour for each vertex");
+    let square = "ply\nformat ascii 1.0\ncomment x\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
+        property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n\
+        element face 1\nproperty list uchar int vertex_indices\nend_header\n\
+        0 0 0 0 0 1 255 0 0\n10 0 0 0 0 1 0 255 0\n10 10 0 0 0 1 0 0 255\n0 10 0 0 0 1 9 9 9\n4 0 1 2 3\n";
+    let big = b"ply\nformat binary_big_endian 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n\
+        element face 1\nproperty list uint8 uint32 vertex_index\nend_header\n";
+    let mut big = big.to_vec();
+    [0.0f64, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0].iter().for_each(|v| big.extend(v.to_be_bytes()));
+    big.push(3);
+    [0u32, 1, 2].iter().for_each(|v| big.extend(v.to_be_bytes()));
+    vec![
+        ply_bytes(&tetrahedron(), Unit::Millimetre, PlyFormat::Ascii, None),
+        ply_bytes(&colored, Unit::Millimetre, PlyFormat::BinaryLittleEndian, None),
+        square.as_bytes().to_vec(),
+        big,
+    ]
+}
+
+pub(crate) fn obj() -> Vec<Vec<u8>> {
+    texts(&[
+        "# a square\nv 0 0 0\nv 10 0 0\nv 10 10 0\nv 0 10 0\nf 1 2 3 4\n",
+        "v 0 0 0 1 0 0\nv 10 0 0 0 1 0\nv 10 10 0 0 0 1\nvn 0 0 1\nf 1//1 2//1 -1//-1\n",
+        "mtllib a.mtl\nnewmtl red\nKd 0.8 0.1 0.1\nmap_Kd a.png\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n\
+         usemtl red\nf 1/1 2/2 3/3\n",
+    ])
+}
+
+pub(crate) fn stl() -> Vec<Vec<u8>> {
+    let mut binary = vec![b' '; 80];
+    binary.extend(2u32.to_le_bytes());
+    for corners in
+        [[0.0f32, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 9.0, 0.0], [9.0, 0.0, 0.0, 9.0, 9.0, 0.0, 0.0, 9.0, 0.0]]
+    {
+        [0.0f32, 0.0, 1.0].iter().chain(&corners).for_each(|v| binary.extend(v.to_le_bytes()));
+        binary.extend(0u16.to_le_bytes());
+    }
+    let ascii = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 10 0 0\nvertex 0 10 0\nendloop\nendfacet\nendsolid a\n";
+    vec![binary, ascii.as_bytes().to_vec()]
+}
+
+pub(crate) fn gltf() -> Vec<Vec<u8>> {
+    let mut bin = Vec::new();
+    for v in [0.0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0] {
+        bin.extend(v.to_le_bytes());
+    }
+    for index in [0u16, 1, 2, 0, 2, 3] {
+        bin.extend(index.to_le_bytes());
+    }
+    let document = |buffer: &str| {
+        format!(
+            r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0,"scale":[-1,1,1]}}],
+"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1,"material":0}}]}}],
+"materials":[{{"pbrMetallicRoughness":{{"baseColorFactor":[1,0.5,0,1]}}}}],
+"accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}},
+{{"bufferView":1,"componentType":5123,"count":6,"type":"SCALAR"}}],
+"bufferViews":[{{"buffer":0,"byteOffset":0,"byteLength":48}},{{"buffer":0,"byteOffset":48,"byteLength":12}}],
+"buffers":[{{"byteLength":60{buffer}}}]}}"#
+        )
+    };
+    let mut json = document("").into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let mut glb = b"glTF".to_vec();
+    for part in [2, (12 + 8 + json.len() + 8 + bin.len()) as u32, json.len() as u32] {
+        glb.extend(part.to_le_bytes());
+    }
+    glb.extend(b"JSON");
+    glb.extend(json);
+    glb.extend((bin.len() as u32).to_le_bytes());
+    glb.extend(b"BIN\0");
+    glb.extend(bin);
+    let inside = document(
+        r#","uri":"data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAACAPwAAgD8AAAAAAAAAAAAAgD8AAAAAAAABAAIAAAACAAMA""#,
+    );
+    vec![glb, inside.into_bytes()]
+}
+
+pub(crate) fn xyz() -> Vec<Vec<u8>> {
+    texts(&["# points\n0 0 0\n10 0 0\n0,10,0\n", "0 0 0 0 0 1\n10 0 0 0 0 1\n0 10 0 0 0 1\n"])
+}
+
+pub(crate) fn models_info() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"{"1": {"diameter": 102.1, "min_x": -38, "min_y": -39, "min_z": -46, "size_x": 76, "size_y": 78, "size_z": 92}}"#,
+        r#"{"10": {"diameter": 164.6, "min_x": -50, "min_y": -90, "min_z": -34, "size_x": 100, "size_y": 181, "size_z": 68,
+"symmetries_discrete": [[-1,0,0,0, 0,-1,0,0, 0,0,1,0, 0,0,0,1]],
+"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}}"#,
+    ])
+}
+
+pub(crate) fn scene_files() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"{"3": {"cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1], "depth_scale": 1.0,
+"cam_R_w2c": [1,0,0,0,1,0,0,0,1], "cam_t_w2c": [0, 0, 700]}}"#,
+        r#"{"3": [{"cam_R_m2c": [1,0,0,0,0,-1,0,1,0], "cam_t_m2c": [10, -20, 700], "obj_id": 5}], "4": []}"#,
+        r#"{"3": [{"bbox_obj": [10, 20, 30, 40], "bbox_visib": [10, 20, 15, 40], "px_count_all": 900, "px_count_valid": 800,
+"px_count_visib": 400, "visib_fract": 0.44}]}"#,
+        r#"[{"im_id": 3, "inst_count": 1, "obj_id": 1, "scene_id": 2}, {"im_id": 4, "scene_id": 2}]"#,
+    ])
+}
+
+pub(crate) fn coco() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"[{"scene_id": 0, "image_id": 1, "category_id": 1, "score": 0.375, "bbox": [24, 1, 55, 8],
+"segmentation": {"size": [480, 640], "counts": [2309, 5, 300000, 4886]}, "time": 0.1}]"#,
+        r#"[{"image_id": 1, "category_id": 2, "score": 0.9, "bbox": [600, 400, 100, 100]}]"#,
+        r#"{"images": [{"id": 1, "width": 640, "height": 480}], "categories": [{"id": 1}], "annotations": [{"id": 1, "image_id": 1,
+"category_id": 1, "bbox": [20, 0, 60, 10], "area": 600, "iscrowd": 0, "ignore": false,
+"segmentation": {"size": [480, 640], "counts": [2309, 5, 300000, 4886]}}]}"#,
+    ])
+}
+
+pub(crate) fn rle() -> Vec<Vec<u8>> {
+    let mask = Mask::from_fn(20, 12, |x, y| (3..9).contains(&x) && (2..7).contains(&y) && (x + y) % 5 > 0);
+    let mut some = vec![20, 12];
+    some.extend(Rle::encode(&mask).expect("a mask can be encoded").to_compressed().bytes());
+    vec![some, vec![0, 0], b"\x05\x05`0".to_vec()]
+}
+
+pub(crate) fn results() -> Vec<Vec<u8>> {
+    texts(&[
+        "scene_id,im_id,obj_id,score,R,t,time\n2,3,1,0.9,1 0 0 0 1 0 0 0 1,10 -20 700,0.5\n2,4,5,-1,0 -1 0 1 0 0 0 0 1,1 2 3,-1\n",
+        "2,3,1,0.9,1 0 0 0 1 0 0 0 1,10 -20 700,0.5\r\n",
+    ])
+}
+
+pub(crate) fn camera() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"{"width": 640, "height": 480, "fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "depth_scale": 1.0}"#,
+        r#"{"cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1], "distortion": [0.1, -0.2, 0.001, 0.0, 0.05]}"#,
+        r#"{"3": {"cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1], "depth_scale": 0.1}}"#,
+    ])
+}
+
+pub(crate) fn images() -> Vec<Vec<u8>> {
+    let written = "a small image can be written";
+    vec![
+        made("a.png", |p| {
+            write_rgb(p, &Image::from_fn(9, 7, |x, y| [x as u8 * 9, y as u8, 7])).expect(written)
+        }),
+        made("a.png", |p| {
+            write_depth(p, &Image::from_fn(9, 7, |x, _| x as f32 * 0.1), 0.001).expect(written)
+        }),
+        made("a.png", |p| write_mask(p, &Mask::from_fn(9, 7, |x, y| x > y)).expect(written)),
+    ]
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn weights() -> Vec<Vec<u8>> {
+    let file = |header: &str, data: usize| {
+        let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+        bytes.extend(header.bytes());
+        bytes.extend((0..data).map(|k| k as u8));
+        bytes
+    };
+    vec![
+        file(
+            r#"{"__metadata__":{"sixfold_card":"{\"architecture\":\"a\",\"format_version\":1,\"steps\":12,\"scores\":{\"x\":0.5}}"},"a.weight":{"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}}"#,
+            24,
+        ),
+        file(
+            r#"{"b":{"dtype":"F16","shape":[4],"data_offsets":[0,8]},"c":{"dtype":"I64","shape":[],"data_offsets":[8,16]}}"#,
+            16,
+        ),
+    ]
+}
+
+pub(crate) fn ppf() -> Vec<Vec<u8>> {
+    let description = made("object.sixfold-ppf", |path| {
+        ObjectModel::cached(path, &tetrahedron(), &[], &coarse()).expect("a tetrahedron can be described");
+    });
+    vec![description]
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn templates() -> Vec<Vec<u8>> {
+    let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).expect("a camera");
+    let mask = Mask::from_fn(320, 240, |x, y| (120..180).contains(&x) && (90..150).contains(&y));
+    let depth = Image::from_fn(320, 240, |x, y| {
+        let inside = (120..180).contains(&x) && (90..150).contains(&y);
+        if inside { 0.7 + 0.0003 * x as f32 } else { 0.9 }
+    });
+    let made = |camera_from_object| {
+        let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object };
+        let templates = ObjectTemplates::from_depth(&[view], &TemplateOptions::default());
+        templates.expect("a box in sight gives a template").to_bytes()
+    };
+    vec![made(None), made(Some(Pose::from_translation(Vec3::new(0.0, 0.0, 0.75))))]
+}
+
+pub(crate) fn gripper() -> Vec<Vec<u8>> {
+    texts(&[r#"{"kind": "parallel-jaws", "name": "jaws-85", "max_opening": 0.085, "finger_length": 0.045,
+"finger_width": 0.022, "finger_thickness": 0.010, "palm_width": 0.11, "palm_depth": 0.07, "palm_height": 0.10,
+"force": 30.0, "friction": 0.5}"#])
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn training_log() -> Vec<Vec<u8>> {
+    let line = |step| {
+        format!(
+            r#"{{"step":{step},"seconds":1.5,"learning_rate":0.001,"samples_per_second":12.0,"losses":{{"total":0.5,"other":null}}}}"#
+        )
+    };
+    texts(&[&format!("{}\n{}\n{}\n", line(10), line(20), line(30))])
+}
+
+#[cfg(feature = "networks")]
+pub(crate) fn experience() -> Vec<Vec<u8>> {
+    let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).expect("a camera");
+    let inside = |x: usize, y: usize| (120..180).contains(&x) && (90..150).contains(&y);
+    let depth = Image::from_fn(320, 240, |x, y| if inside(x, y) { 0.7 + 0.0003 * x as f32 } else { 0.0 });
+    let mask = Mask::from_fn(320, 240, inside);
+    let crop =
+        Crop::new(&depth, &camera, &mask, &CropOptions::compact()).expect("a box in sight gives a crop");
+    let experience = Experience {
+        region: crop.mask.clone(),
+        crop,
+        camera_from_gripper: Pose::exp(&[0.0, 0.01, 0.7, 0.1, 3.0, 0.0].into()),
+        opening: 0.07,
+        width: 0.05,
+        copies: vec![Copy { angle: 0.0, feature: vec![0.1; sixfold_dgcm::networks::FEATURE] }],
+        network: "seed".to_owned(),
+        gripper: Gripper::built_in("jaws-85").expect("a built-in gripper"),
+        object: "box".to_owned(),
+        part: None,
+        time: 1_700_000_000,
+        provenance: "a seed".to_owned(),
+    };
+    let store = made("experience.db", |path| {
+        let mut store = SqliteStore::create(path).expect("a store can be made");
+        store.add(&experience).expect("the experience is one");
+    });
+    vec![store]
+}
