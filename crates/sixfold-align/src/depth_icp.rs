@@ -68,7 +68,11 @@ pub fn align_to_depth(
         let source = PointCloud::from_depth(&seen, Some(&normals), camera).transformed(&pose.inverse());
         let stride = (source.len() / POINTS).max(1);
         let options = IcpOptions {
-            levels: vec![IcpLevel { rejection_distance: fraction * diameter, iterations: ITERATIONS, stride }],
+            levels: vec![IcpLevel {
+                rejection_distance: fraction * diameter,
+                iterations: ITERATIONS,
+                stride,
+            }],
             max_angle: MAX_ANGLE.to_radians(),
             convergence: CONVERGENCE,
             min_correspondences: MIN_PIXELS,

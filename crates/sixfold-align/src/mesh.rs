@@ -171,7 +171,9 @@ mod tests {
         let kept = std::fs::read(&file).unwrap();
         assert!(decode(&kept, fingerprint(&mesh)).is_some());
         assert!(same(&VerificationMesh::cached(Some(&file), &mesh).unwrap()));
-        for broken in [&kept[..kept.len() / 2], &kept[..5], b"something else, longer than a head of such a file"] {
+        for broken in
+            [&kept[..kept.len() / 2], &kept[..5], b"something else, longer than a head of such a file"]
+        {
             std::fs::write(&file, broken).unwrap();
             let again = VerificationMesh::cached(Some(&file), &mesh).unwrap();
             assert!(same(&again) && again.note.is_some());

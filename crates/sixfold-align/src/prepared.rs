@@ -256,7 +256,8 @@ impl DepthRegion {
                 height: image.depth.height(),
             });
         }
-        let bounds = mask.bounding_box().map_or([0; 4], |[x, y, width, height]| [x, y, x + width, y + height]);
+        let bounds =
+            mask.bounding_box().map_or([0; 4], |[x, y, width, height]| [x, y, x + width, y + height]);
         Ok(DepthRegion::of(image, image.points(bounds, |x, y| mask[(x, y)])))
     }
 

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 use sixfold_geometry::{Rect, Vec3};
+use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 
 use crate::posed_image::PosedImage;
 use crate::training_set::TrainingObject;

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use sixfold_synth::augment::AugmentError;
 use sixfold_bop::DatasetError;
 use sixfold_geometry::{CameraError, FrameId};
+use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
 /// What is wrong with one posed image.

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 use sixfold_geometry::{Camera, FrameId, Mask, Pose, Rect, RgbImage, Vec2};
+use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 
 use crate::error::PosedImageError;
 use crate::visible_mask::VisibleMask;

@@ -6,15 +6,15 @@ use std::error::Error;
 use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
-use sixfold_synth::augment::Backgrounds;
-use sixfold_detect::network::{DetectorConfig, Encoder};
 use sixfold_data::TrainingObject;
+use sixfold_detect::network::{DetectorConfig, Encoder};
 use sixfold_detect::samples::{SceneOptions, SceneSource};
 use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::training::fit;
+use sixfold_synth::augment::Backgrounds;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let steps = std::env::args().nth(1).map_or(Ok(60), |text| text.parse())?;
@@ -22,7 +22,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         .map(Vec3::from)
         .to_vec();
     let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])?;
-    let objects = vec![TrainingObject::new(1, mesh.clone(), ModelInfo { diameter: 0.12, ..ModelInfo::of_mesh(&mesh) })];
+    let objects =
+        vec![TrainingObject::new(1, mesh.clone(), ModelInfo { diameter: 0.12, ..ModelInfo::of_mesh(&mesh) })];
     let options = SceneOptions { random_color_chance: 1.0, ..SceneOptions::default() };
     let source = SceneSource::new(objects, &[], &[], Backgrounds::procedural(), options)?;
     let device = Device::flex().autodiff();

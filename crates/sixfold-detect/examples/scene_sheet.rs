@@ -2,15 +2,15 @@
 //!
 //!     cargo run --release -p sixfold-detect --example scene_sheet -- DATASET FRAMES.json BACKGROUNDS OUT.png
 
-use std::error::Error;
-use std::path::Path;
-use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 use sixfold_bop::{BopDataset, Models};
-use sixfold_io::write_rgb;
 use sixfold_data::{FrameId, TrainingObject, read_posed_images};
 use sixfold_detect::samples::{SceneOptions, SceneSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
+use sixfold_io::write_rgb;
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
+use std::error::Error;
+use std::path::Path;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();

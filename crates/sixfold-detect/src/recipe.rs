@@ -5,6 +5,7 @@ use std::f32::consts::PI;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
+use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::OptionError;
@@ -12,7 +13,6 @@ use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::{ModelCard, training_frames};
-use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};

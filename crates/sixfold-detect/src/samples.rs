@@ -5,17 +5,23 @@
 //! A photograph shows objects wherever it shows them: it is never a mere background, its annotations stay. Each sample is
 //! a function of seed and number alone.
 
-use std::collections::BTreeMap;
-use std::sync::Arc;
-use sixfold_synth::distractors::{random_solid, random_turn};
+use crate::targets::{Annotation, IGNORED, Instance};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sixfold_synth::augment::{AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape, procedural_texture};
+use sixfold_data::{
+    DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject,
+    color_patch, default_distances, distances, image_color_augmentation, is_textured,
+};
 use sixfold_geometry::random::{Random, stream, uniform};
-use sixfold_data::{DEFAULT_CAMERA, PoseRange, PoseVariation, PosedImage, PosedImageError, PreparedMesh, TrainingObject, color_patch, default_distances, distances, image_color_augmentation, is_textured};
-use sixfold_synth::randomly_colored;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
-use crate::targets::{Annotation, IGNORED, Instance};
+use sixfold_synth::augment::{
+    AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape,
+    procedural_texture,
+};
+use sixfold_synth::distractors::{random_solid, random_turn};
+use sixfold_synth::randomly_colored;
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Objects with fewer visible pixels in a training image are not learnt.
 const LEAST_PIXELS: usize = 64;

@@ -5,7 +5,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use sixfold_synth::augment::Backgrounds;
 use sixfold_data::TrainingObject;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
@@ -19,6 +18,7 @@ use sixfold_nn::options::{Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Outcome, fit};
 use sixfold_nn::weights::ModelCard;
+use sixfold_synth::augment::Backgrounds;
 
 /// A pyramid or a flat box of one colour.
 fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {

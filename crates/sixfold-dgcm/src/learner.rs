@@ -7,11 +7,15 @@
 use std::error::Error as StdError;
 
 use sixfold_experience::{Attempt, Crop, Experience, StoreError};
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps,
+};
 use thiserror::Error;
 
 use crate::model::DgcmModel;
-use crate::transfer::{Kind, Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
+use crate::transfer::{
+    Kind, Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
+};
 
 /// How much is tried, and when experience is asked.
 #[derive(Debug, Clone, PartialEq)]

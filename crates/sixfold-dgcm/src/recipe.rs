@@ -10,11 +10,11 @@ use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
 
-use sixfold_experience::CropOptions;
 use crate::model::DgcmModel;
 use crate::networks::{CompactConfig, Network, PaperConfig};
 use crate::samples::{Pool, PoolOptions};
 use crate::training::{DgcmTraining, DgcmTrainingOptions};
+use sixfold_experience::CropOptions;
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -119,7 +119,8 @@ fn size(folder: &Path) -> u64 {
 fn fingerprint(mesh: &Mesh, info: &ModelInfo) -> u64 {
     let symmetries = info.symmetries_discrete.iter().map(Pose::to_matrix);
     let symmetries = symmetries.flat_map(|m| m.iter().copied().collect::<Vec<f64>>());
-    let axes = info.symmetries_continuous.iter().flat_map(|s| [s.axis, s.offset]).flat_map(|v| [v.x, v.y, v.z]);
+    let axes =
+        info.symmetries_continuous.iter().flat_map(|s| [s.axis, s.offset]).flat_map(|v| [v.x, v.y, v.z]);
     let vertices = mesh.vertices().iter().flat_map(|v| [v.x, v.y, v.z]);
     let numbers = vertices.chain(symmetries).chain(axes).flat_map(f64::to_le_bytes);
     let faces = mesh.faces().iter().flatten().flat_map(|i| i.to_le_bytes());

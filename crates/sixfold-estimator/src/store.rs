@@ -11,7 +11,9 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, PoseError};
-use sixfold_mesh::{ContinuousSymmetry, Mesh, MeshError, MeshFileError, ModelInfo, PlyFormat, Unit, read_mesh, write_ply};
+use sixfold_mesh::{
+    ContinuousSymmetry, Mesh, MeshError, MeshFileError, ModelInfo, PlyFormat, Unit, read_mesh, write_ply,
+};
 use thiserror::Error;
 
 use crate::cache::{Cache, CacheError};
@@ -409,9 +411,15 @@ mod tests {
         Mesh::new(vertices, vec![[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]).unwrap()
     }
 
-    fn add(store: &ObjectStore, scale: f64, replace: bool, derived: Result<(), &str>) -> Result<(), StoreError> {
+    fn add(
+        store: &ObjectStore,
+        scale: f64,
+        replace: bool,
+        derived: Result<(), &str>,
+    ) -> Result<(), StoreError> {
         let mesh = mesh(scale);
-        let record = ObjectRecord::of_mesh(Path::new("a.ply"), Unit::Metre, &mesh, &ModelInfo::of_mesh(&mesh));
+        let record =
+            ObjectRecord::of_mesh(Path::new("a.ply"), Unit::Metre, &mesh, &ModelInfo::of_mesh(&mesh));
         store.add("part", NewObject { mesh: Some(&mesh), record: &record, replace }, |object| {
             std::fs::write(object.file("kept.bin").unwrap(), b"kept")?;
             derived.map_err(Into::into)

@@ -3,15 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use sixfold_bop::{
-    CameraFile, CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections,
-    parse_results, parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets, read_depth,
-    read_mask, read_rgb,
+    CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections, parse_results,
+    parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets,
 };
 #[cfg(feature = "networks")]
-use sixfold_dgcm::store::{ExperienceStore, Position, SqliteStore};
+use sixfold_experience::{ExperienceStore, Position, SqliteStore};
 use sixfold_geometry::Pose;
 use sixfold_grasp::parse_gripper;
-use sixfold_match::ObjectModel;
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 use sixfold_mesh::{
     Mesh, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
 };
@@ -23,6 +22,7 @@ use sixfold_nn::pretrained::PretrainedFile;
 use sixfold_nn::training_log::read_training_log;
 #[cfg(feature = "networks")]
 use sixfold_nn::weights::read_card;
+use sixfold_ppf::ObjectModel;
 
 use crate::seeds;
 

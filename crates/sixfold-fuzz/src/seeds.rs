@@ -1,19 +1,20 @@
 //! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
 
-use sixfold_bop::{Rle, write_depth, write_mask, write_rgb};
+use sixfold_bop::Rle;
 #[cfg(feature = "networks")]
-use sixfold_dgcm::crop::{Crop, CropOptions};
+use sixfold_experience::{Copy, Experience, ExperienceStore, SqliteStore};
 #[cfg(feature = "networks")]
-use sixfold_dgcm::store::{Copy, Experience, ExperienceStore, SqliteStore};
+use sixfold_experience::{Crop, CropOptions};
 #[cfg(feature = "networks")]
 use sixfold_geometry::{Camera, Pose};
 use sixfold_geometry::{Image, Mask, Vec3};
 #[cfg(feature = "networks")]
 use sixfold_grasp::Gripper;
-use sixfold_match::{ModelOptions, ObjectModel};
+use sixfold_io::{write_depth, write_mask, write_rgb};
 use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes};
 #[cfg(feature = "networks")]
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
+use sixfold_ppf::{ModelOptions, ObjectModel};
 
 fn texts(all: &[&str]) -> Vec<Vec<u8>> {
     all.iter().map(|text| text.as_bytes().to_vec()).collect()
@@ -259,7 +260,7 @@ pub(crate) fn experience() -> Vec<Vec<u8>> {
         camera_from_gripper: Pose::exp(&[0.0, 0.01, 0.7, 0.1, 3.0, 0.0].into()),
         opening: 0.07,
         width: 0.05,
-        copies: vec![Copy { angle: 0.0, feature: vec![0.1; sixfold_dgcm::networks::FEATURE] }],
+        copies: vec![Copy { angle: 0.0, feature: vec![0.1; sixfold_experience::FEATURE] }],
         network: "seed".to_owned(),
         gripper: Gripper::built_in("jaws-85").expect("a built-in gripper"),
         object: "box".to_owned(),

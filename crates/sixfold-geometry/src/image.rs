@@ -135,7 +135,8 @@ impl Image<bool> {
         let (mut x0, mut y0, mut x1, mut y1) = (usize::MAX, usize::MAX, 0, 0);
         for y in 0..self.height {
             let row = self.row(y);
-            let (Some(first), Some(last)) = (row.iter().position(|m| *m), row.iter().rposition(|m| *m)) else {
+            let (Some(first), Some(last)) = (row.iter().position(|m| *m), row.iter().rposition(|m| *m))
+            else {
                 continue;
             };
             (x0, y0, x1, y1) = (x0.min(first), y0.min(y), x1.max(last + 1), y + 1);

@@ -6,13 +6,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{KdTree, Pose, Vec3};
-use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_mttm::model::MttmModel;
-use sixfold_mttm::{
-    MttmOptions, KnownObject, MatchedBy, ObjectTemplates, Search, Stages, TemplateOptions,
-};
+use sixfold_mttm::{KnownObject, MatchedBy, MttmOptions, ObjectTemplates, Search, Stages, TemplateOptions};
 use sixfold_render::render_depth;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

@@ -4,8 +4,8 @@
 //! as its main failure (section 5.3.3). Here the template's points are laid on the scene's, so hidden parts pull
 //! nowhere: first along the ray, then by ICP.
 
-use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2, Vec3, icp};
 use sixfold_align::DepthRegion;
+use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2, Vec3, icp};
 
 /// Lays a template's points (view frame) on the scene, starting from a pose that is right within a few times `tolerance`
 /// metres.

@@ -2,11 +2,11 @@
 //! section 5.2.4).
 
 use rayon::prelude::*;
-use sixfold_geometry::{Pose, Vec3};
 use sixfold_align::DepthRegion;
+use sixfold_geometry::{Pose, Vec3};
 
 use crate::align::camera_from_view;
-use crate::estimate::{MttmOptions, KnownObject, MatchedBy, Placed, Stages, apart, is_known, place_at};
+use crate::estimate::{KnownObject, MatchedBy, MttmOptions, Placed, Stages, apart, is_known, place_at};
 use crate::learned::Learned;
 use crate::matching::Entry;
 use crate::model::{Encoded, PairSays};

@@ -222,7 +222,11 @@ impl<'a> Search<'a> {
 
 /// Finds the object in the scene, best first; empty when nothing scores high enough. The same input gives the same output at
 /// any number of threads. For several objects in one scene [`Search`] is faster.
-pub fn estimate(scene: &DepthRegion, object: &KnownObject, options: &MttmOptions) -> (Vec<MttmEstimate>, Stages) {
+pub fn estimate(
+    scene: &DepthRegion,
+    object: &KnownObject,
+    options: &MttmOptions,
+) -> (Vec<MttmEstimate>, Stages) {
     Search::new(scene).estimate(object, options)
 }
 
@@ -445,7 +449,9 @@ fn judge_all(
     let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
     let poses: Vec<Pose> = kept.iter().map(|p| pose_of(p)).collect();
     let mut judged: Vec<(Pose, f64, VerificationScore, usize)> = match &object.mesh {
-        None => kept.iter().zip(poses).enumerate().map(|(i, (p, pose))| (pose, p.support, p.score, i)).collect(),
+        None => {
+            kept.iter().zip(poses).enumerate().map(|(i, (p, pose))| (pose, p.support, p.score, i)).collect()
+        }
         Some(mesh) => verify(scene, mesh, &poses, threshold, &options.verification)
             .into_iter()
             .zip(&kept)

@@ -120,7 +120,9 @@ impl PoseEstimator for MttmEstimator {
             let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
             let wrap = |e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) };
             let kept = kept.map_err(wrap)?;
-            notes.extend(kept.note.map(|n| format!("mesh of {} not kept, or simplified again: {n}", object.name)));
+            notes.extend(
+                kept.note.map(|n| format!("mesh of {} not kept, or simplified again: {n}", object.name)),
+            );
             rendered = Some(kept.mesh);
         }
         let mut known = KnownObject::new(templates, rendered);
@@ -135,7 +137,12 @@ impl PoseEstimator for MttmEstimator {
                 }
             };
         }
-        Ok(Box::new(MttmObject { name: object.name.clone(), mesh: object.mesh.clone(), object: known, notes }))
+        Ok(Box::new(MttmObject {
+            name: object.name.clone(),
+            mesh: object.mesh.clone(),
+            object: known,
+            notes,
+        }))
     }
 
     fn estimate(

@@ -1,9 +1,9 @@
 //! Judging a pose without a mesh: the scores of the dissertation's section 5.2.5, computed with the template that was
 //! matched in place of a rendering (what its section 5.4 leaves for the future).
 
-use sixfold_geometry::{PointCloud, Pose};
 use sixfold_align::verification::{Agreement, pierced};
 use sixfold_align::{PreparedDepth, VerificationOptions, VerificationScore};
+use sixfold_geometry::{PointCloud, Pose};
 
 use crate::template::{SIDE, Template};
 

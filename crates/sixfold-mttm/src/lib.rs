@@ -52,7 +52,7 @@ mod views;
 mod without_network;
 
 pub use error::{StoreError, TemplateError};
-pub use estimate::{MttmEstimate, MttmOptions, KnownObject, MatchedBy, Search, Stages, estimate};
+pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};
 pub use estimator::{MttmEstimator, MttmObject, TEMPLATES_FILE};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};

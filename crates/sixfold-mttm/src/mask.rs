@@ -1,7 +1,7 @@
 //! Which pixels of the scene belong to an object, by the template that lies on it.
 
-use sixfold_geometry::{Mask, Pose, Vec2, Vec3};
 use sixfold_align::DepthRegion;
+use sixfold_geometry::{Mask, Pose, Vec2, Vec3};
 
 use crate::template::{SIDE, Template};
 

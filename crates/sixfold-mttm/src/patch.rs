@@ -30,7 +30,13 @@ impl Patch {
 
     /// The region about `roi`'s centre, `size` metres wide. Pixels (numbers in the image) that `seen` refuses are not
     /// measured.
-    pub fn of_scene(scene: &DepthRegion, roi: &Roi, size: f64, side: usize, seen: impl Fn(usize) -> bool) -> Patch {
+    pub fn of_scene(
+        scene: &DepthRegion,
+        roi: &Roi,
+        size: f64,
+        side: usize,
+        seen: impl Fn(usize) -> bool,
+    ) -> Patch {
         Patch::of_cells(&roi.look(scene, size, side, seen), size, side)
     }
 
@@ -104,8 +110,8 @@ mod tests {
     use super::*;
     use crate::align::camera_from_view;
     use crate::template::{ObjectTemplates, TemplateOptions};
-    use sixfold_geometry::{Camera, Vec3};
     use sixfold_align::DepthOptions;
+    use sixfold_geometry::{Camera, Vec3};
     use sixfold_mesh::Mesh;
     use sixfold_render::render_depth;
 

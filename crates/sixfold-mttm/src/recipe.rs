@@ -16,8 +16,8 @@ use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
-use sixfold_synth::shapes::{Family, member, toy};
 use sixfold_simulation::{ConvexParts, PileOptions, drop_objects};
+use sixfold_synth::shapes::{Family, member, toy};
 
 use crate::model::MttmModel;
 use crate::network::{CompactConfig, Network, PaperConfig};

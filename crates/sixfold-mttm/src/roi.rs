@@ -4,9 +4,9 @@
 //! The *ROI frame* has its origin at the centre and its z axis along the ray through it, so that a template matches wherever
 //! in the image its object stands.
 
+use sixfold_align::DepthRegion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
-use sixfold_align::DepthRegion;
 
 /// Cells along a side of a region.
 pub const GRID: usize = 20;
@@ -44,7 +44,13 @@ impl Roi {
     }
 
     /// The same on a grid of `grid x grid` cells.
-    pub fn look(&self, scene: &DepthRegion, size: f64, grid: usize, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
+    pub fn look(
+        &self,
+        scene: &DepthRegion,
+        size: f64,
+        grid: usize,
+        seen: impl Fn(usize) -> bool,
+    ) -> Vec<Cell> {
         let camera = scene.camera();
         let rotation = ray_rotation(&self.centre);
         let (axis, back) = (self.centre.normalize(), rotation.inverse().to_rotation_matrix().cast::<f32>());
@@ -161,8 +167,8 @@ fn sample(scene: &DepthRegion, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sixfold_geometry::{Camera, DepthImage};
     use sixfold_align::DepthOptions;
+    use sixfold_geometry::{Camera, DepthImage};
 
     /// A tilted table with a near and a far box on it that face the camera, 640x480.
     fn scene() -> DepthRegion {

@@ -7,14 +7,14 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
-use sixfold_align::{DepthOptions, DepthRegion, verification_mesh};
 use sixfold_io::{read_depth, read_mask};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    Coverage, DepthView, MttmOptions, KnownObject, MatchedBy, ObjectTemplates, Search, TemplateOptions,
+    Coverage, DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, Search, TemplateOptions,
 };
 
 fn data() -> Option<PathBuf> {
@@ -56,7 +56,8 @@ fn objects_of_lmo_frame_3_in_clutter() {
     let dataset = BopDataset::open(&data.join("lmo"), "test").unwrap();
     let frame = dataset.scene(2).unwrap();
     let depth = frame.depth(3).unwrap().unwrap();
-    let scene = DepthRegion::from_depth(&depth, &frame.camera(3).unwrap(), None, &DepthOptions::default()).unwrap();
+    let scene =
+        DepthRegion::from_depth(&depth, &frame.camera(3).unwrap(), None, &DepthOptions::default()).unwrap();
     let infos = dataset.models_info(Models::Rendering).unwrap().unwrap();
     let network = network();
     let ways = [MatchedBy::Points, MatchedBy::Network, MatchedBy::Both];
@@ -105,7 +106,8 @@ fn objects_of_two_ycbv_frames() {
     for im_id in frames.image_ids() {
         let depth = frames.depth(im_id).unwrap().unwrap();
         let scene =
-            DepthRegion::from_depth(&depth, &frames.camera(im_id).unwrap(), None, &DepthOptions::default()).unwrap();
+            DepthRegion::from_depth(&depth, &frames.camera(im_id).unwrap(), None, &DepthOptions::default())
+                .unwrap();
         let search = Search::new(&scene);
         for g in &frames.image(im_id).unwrap().ground_truth {
             let name = names.iter().find(|n| n.0 == g.obj_id).unwrap().1;
@@ -135,7 +137,8 @@ fn the_object_of_the_tyol_frame() {
     let dataset = BopDataset::open(&data.join("tyol_frame"), "test").unwrap();
     let frames = dataset.scene(dataset.scene_ids()[0]).unwrap();
     let depth = frames.depth(10).unwrap().unwrap();
-    let scene = DepthRegion::from_depth(&depth, &frames.camera(10).unwrap(), None, &DepthOptions::default()).unwrap();
+    let scene =
+        DepthRegion::from_depth(&depth, &frames.camera(10).unwrap(), None, &DepthOptions::default()).unwrap();
     let mesh = read_mesh(data.join("tyol_frame/obj.ply"), Unit::Millimetre).unwrap();
     let object = known(&mesh, Coverage::Around, &network());
     let options = MttmOptions { max_instances: 5, ..MttmOptions::default() };

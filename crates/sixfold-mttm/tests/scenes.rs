@@ -1,8 +1,8 @@
 //! Objects on a table with simulated depth: found by their templates, hidden in part, not there, and known from one view only.
 
+use sixfold_align::{DepthOptions, DepthRegion, VerificationOptions, verification_mesh};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec3};
-use sixfold_align::{DepthOptions, DepthRegion, VerificationOptions, verification_mesh};
 use sixfold_mesh::Mesh;
 use sixfold_mttm::align::camera_from_view;
 use sixfold_mttm::judge::{Surface, judge};
@@ -13,7 +13,7 @@ use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::patch::Patch;
 use sixfold_mttm::roi::Roi;
 use sixfold_mttm::{
-    DepthView, MttmEstimate, MttmOptions, KnownObject, ObjectTemplates, Search, Template, TemplateOptions,
+    DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateOptions,
     estimate,
 };
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
@@ -265,8 +265,7 @@ fn what_is_not_there_is_not_surely_found() {
         assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
         // An empty table: nothing at all.
         let (depth, _) = look(&[], 3);
-        let (nothing, stages) =
-            estimate(&prepared(&depth), &object.without_mesh(), &MttmOptions::default());
+        let (nothing, stages) = estimate(&prepared(&depth), &object.without_mesh(), &MttmOptions::default());
         assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
         assert!(stages.sampled < 400, "{}", stages.sampled);
     }

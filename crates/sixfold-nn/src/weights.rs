@@ -15,8 +15,8 @@ use burn::tensor::{Bool, Int, Tensor, TensorData};
 use half::{bf16, f16};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use sixfold_io::write_atomically_with;
 use sixfold_geometry::FrameId;
+use sixfold_io::write_atomically_with;
 
 use crate::files::explain;
 

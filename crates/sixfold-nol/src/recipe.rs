@@ -4,12 +4,12 @@
 use std::path::PathBuf;
 
 use burn::tensor::Device;
-use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use crate::loss::Perceptual;
 use crate::model::NolModel;

@@ -1,13 +1,13 @@
 //! A photograph cut to the object, with what is known of its geometry at the present pose.
 
-use sixfold_synth::augment::{Coverage, Patch};
+use crate::error::NolError;
+use crate::projection::{Projection, TargetSurface};
+use crate::window::object_window;
 use sixfold_data::{PosedImage, PosedImageError};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
-use crate::error::NolError;
-use crate::projection::{Projection, TargetSurface};
-use crate::window::object_window;
+use sixfold_synth::augment::{Coverage, Patch};
 
 /// Colour where the crop reaches out of the image.
 const OUTSIDE: f32 = 0.5;

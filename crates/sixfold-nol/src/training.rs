@@ -5,12 +5,12 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_synth::augment::Backgrounds;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::recurrent::gather;
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
+use sixfold_synth::augment::Backgrounds;
 
 use crate::loss::{Perceptual, WEIGHTS, image_loss, smooth_loss, squared_error};
 use crate::network::{Blend, COLOURS, Network, Parts};

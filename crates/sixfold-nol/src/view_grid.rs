@@ -3,12 +3,12 @@
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
-use sixfold_synth::augment::{Coverage, Patch};
-use sixfold_geometry::random::{stream, uniform};
+use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_data::PosedImage;
+use sixfold_synth::augment::{Coverage, Patch};
 
 use crate::synthesis::NewView;
 use crate::window::object_window;

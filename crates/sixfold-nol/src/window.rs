@@ -1,8 +1,8 @@
 //! The part of an image that an object fills.
 
-use sixfold_synth::augment::Window;
 use sixfold_geometry::{Camera, Pose, Vec2};
 use sixfold_mesh::Mesh;
+use sixfold_synth::augment::Window;
 
 /// A square about the mesh at a pose, `room` times as wide as the longer side of its box in the image; `None` where a vertex
 /// lies behind the camera.

@@ -1,6 +1,6 @@
 //! Time per box of each part of an estimate: DATASET TARGETS.json WEIGHTS.
-use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_align::outline::outline_mesh;
+use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::refine::{RefineOptions, refine};

@@ -2,11 +2,11 @@
 //!
 //! Prints the recall of ADD(-S) below a tenth of the diameter, and the median error along the view axis.
 use rayon::prelude::*;
+use sixfold_align::outline::outline_mesh;
 use sixfold_bop::{
     BopDataset, ModelPoints, Models, Placement, VISIBILITY_DELTA, add, adi, ground_truth_visibility,
 };
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
-use sixfold_align::outline::outline_mesh;
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
 use sixfold_pix2pose::estimate::{EstimateOptions, Found, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;

@@ -7,16 +7,16 @@
 //! `close` draws few samples large, without changes of colour, occluders and second stage: to check borders.
 //! `FRAMES` is `scene:image,image,...` (only these images are opened), or `scene:/N` for every N-th.
 
+use sixfold_bop::{BopDataset, Models};
+use sixfold_data::{FrameId, TrainingObject, read_posed_images};
+use sixfold_geometry::RgbImage;
+use sixfold_io::write_rgb;
+use sixfold_mesh::ModelInfo;
+use sixfold_pix2pose::samples::{Sample, SampleOptions, SampleSource};
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation, PhotographOptions};
 use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
-use sixfold_synth::augment::{Backgrounds, ColorAugmentation, PhotographOptions};
-use sixfold_bop::{BopDataset, Models};
-use sixfold_io::write_rgb;
-use sixfold_data::{FrameId, TrainingObject, read_posed_images};
-use sixfold_geometry::RgbImage;
-use sixfold_mesh::ModelInfo;
-use sixfold_pix2pose::samples::{Sample, SampleOptions, SampleSource};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -4,8 +4,8 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use serde_json::{Map, Value, json};
-use sixfold_align::outline::outline_mesh;
 use sixfold_align::DepthOptions;
+use sixfold_align::outline::outline_mesh;
 use sixfold_estimator::{
     Diagnostic, EstimatorError, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
     downcast,
@@ -47,7 +47,13 @@ impl Pix2PoseEstimator {
 
     /// A model with default options.
     pub fn new(model: Pix2PoseModel) -> Pix2PoseEstimator {
-        Pix2PoseEstimator { model, options: AlignOptions::default(), refine: true, icp: false, object_id: None }
+        Pix2PoseEstimator {
+            model,
+            options: AlignOptions::default(),
+            refine: true,
+            icp: false,
+            object_id: None,
+        }
     }
 
     /// What the model knows of an object; without an id, of its only one.
@@ -60,7 +66,8 @@ impl Pix2PoseEstimator {
             (None, [only]) => Ok(only),
             (None, several) => {
                 let ids: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
-                let text = format!("--object-id N is missing: the model knows the objects {}", ids.join(", "));
+                let text =
+                    format!("--object-id N is missing: the model knows the objects {}", ids.join(", "));
                 Err(EstimatorError::method(text))
             }
         }
@@ -74,12 +81,12 @@ impl Pix2PoseEstimator {
         let entry = self.entry(object.id.or(self.object_id))?;
         let mut notes = vec![];
         match &object.mesh {
-            Some(mesh) => entry.check_mesh(mesh).map_err(|e| EstimatorError::Object {
-                object: object.name.clone(),
-                source: Box::new(e),
-            })?,
+            Some(mesh) => entry
+                .check_mesh(mesh)
+                .map_err(|e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) })?,
             None => notes.push(
-                "without --object NAME_OR_MESH the outline is not aligned, and the overlay shows a box".to_owned(),
+                "without --object NAME_OR_MESH the outline is not aligned, and the overlay shows a box"
+                    .to_owned(),
             ),
         }
         let name = if object.name.is_empty() { format!("object {}", entry.id) } else { object.name.clone() };
@@ -219,7 +226,8 @@ impl PoseEstimator for Pix2PoseEstimator {
                 advice: "give one, or leave out --icp",
             })?;
             let seen = region.pixels_for_icp();
-            match align(depth, mesh, object.diameter, &posed.camera_from_object, &posed.found, seen.as_ref()) {
+            match align(depth, mesh, object.diameter, &posed.camera_from_object, &posed.found, seen.as_ref())
+            {
                 Ok(aligned) => {
                     estimate.camera_from_object = aligned.camera_from_object;
                     icp = json!({ "inliers": aligned.inliers, "rms_mm": 1000.0 * aligned.rms });

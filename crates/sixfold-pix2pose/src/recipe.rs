@@ -5,6 +5,7 @@ use std::f32::consts::PI;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
+use sixfold_align::outline::outline_mesh;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::learner::Checkpointed;
@@ -14,17 +15,18 @@ use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_fro
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 use sixfold_nn::weights::{ModelCard, training_frames};
-use sixfold_align::outline::outline_mesh;
 
 use crate::adversarial::{AdversarialBatch, AdversarialOptions, AdversarialTraining};
 use crate::aligned::measure_corrections;
-use sixfold_data::{FrameId, PosedImage, TrainingObject, TrainingSet, backgrounds_with_images};
 use crate::model::{ImageSizes, Network, Pix2PoseModel};
-use crate::networks::{Compact, CompactConfig, PaperGenerator, PaperGeneratorConfig, ResNet50Generator, ResNet50GeneratorConfig};
+use crate::networks::{
+    Compact, CompactConfig, PaperGenerator, PaperGeneratorConfig, ResNet50Generator, ResNet50GeneratorConfig,
+};
 use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
 use crate::preset::Preset;
 use crate::samples::{SampleOptions, SampleSource};
 use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
+use sixfold_data::{FrameId, PosedImage, TrainingObject, TrainingSet, backgrounds_with_images};
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -363,8 +365,8 @@ impl Recipe for Pix2PoseRecipe {
         session: &mut Session<'_>,
     ) -> Result<Option<SampleSource>, TrainError> {
         let Context { objects, real, sizes, .. } = context;
-        let backgrounds =
-            backgrounds_with_images(self.backgrounds.as_deref(), real, objects).map_err(TrainError::method)?;
+        let backgrounds = backgrounds_with_images(self.backgrounds.as_deref(), real, objects)
+            .map_err(TrainError::method)?;
         session.note(&format!(
             "making {} objects and {} photographed instances ready",
             objects.len(),

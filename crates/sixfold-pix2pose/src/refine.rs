@@ -11,9 +11,9 @@
 
 use crate::estimate::{Found, Hypothesis, View};
 use crate::samples::second_stage::GREY;
+use sixfold_align::outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_align::outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
 use sixfold_synth::augment::{Patch, Window};
 
 /// How poses are aligned.

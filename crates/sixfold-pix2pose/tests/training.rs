@@ -1,7 +1,6 @@
 //! A training that is interrupted and goes on ends with the same numbers as one that is not.
 
 use burn::tensor::Device;
-use sixfold_synth::augment::Backgrounds;
 use sixfold_data::TrainingObject;
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
@@ -14,6 +13,7 @@ use sixfold_pix2pose::object::SymmetryMap;
 use sixfold_pix2pose::samples::{SampleOptions, SampleSource};
 use sixfold_pix2pose::training::{CompactTraining, Pix2PoseTrainingOptions};
 use sixfold_render::BoundingBoxScale;
+use sixfold_synth::augment::Backgrounds;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 

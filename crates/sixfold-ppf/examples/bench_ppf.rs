@@ -8,11 +8,11 @@ use std::path::Path;
 use std::time::Instant;
 
 use serde_json::{Value, json};
+use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_bop::{BopDataset, ModelPoints, Models, Target, mssd};
 use sixfold_geometry::{PointCloud, Pose};
-use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_ppf::estimate::estimate_timed;
-use sixfold_ppf::{PpfOptions, ModelOptions, ObjectModel};
+use sixfold_ppf::{ModelOptions, ObjectModel, PpfOptions};
 
 fn rows(pose: &Pose) -> Value {
     let m = pose.to_matrix();

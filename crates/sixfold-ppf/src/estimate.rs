@@ -158,7 +158,13 @@ fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usi
 
 /// How well the visible samples agree with the depth image, in 0..=1.
 #[doc(hidden)]
-pub fn screening_score(scene: &DepthRegion, model: &ObjectModel, pose: &Pose, tolerance: f32, cosine: f32) -> f32 {
+pub fn screening_score(
+    scene: &DepthRegion,
+    model: &ObjectModel,
+    pose: &Pose,
+    tolerance: f32,
+    cosine: f32,
+) -> f32 {
     let rotation = pose.rotation_matrix().cast::<f32>();
     let t: V3 = pose.translation().cast();
     let (fx, fy) = (scene.camera().fx as f32, scene.camera().fy as f32);
@@ -291,7 +297,12 @@ fn verified(
         .map(|(v, h)| {
             let support = f64::from(h.votes / most_votes.max(1.0)).clamp(0.0, 1.0);
             let confidence = v.score.ranking() * support.powf(options.vote_power);
-            PpfEstimate { camera_from_object: v.camera_from_object, score: v.score, votes: h.votes, confidence }
+            PpfEstimate {
+                camera_from_object: v.camera_from_object,
+                score: v.score,
+                votes: h.votes,
+                confidence,
+            }
         })
         .collect();
     // A stable sort: equal scores stay in the order of the screening.

@@ -222,7 +222,8 @@ impl ObjectModel {
         let mut dense = PointCloud::default();
         let mut views = Vec::with_capacity(VIEWS);
         let mut frame = Frame::new(&camera);
-        let flat = verification_mesh(mesh).map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
+        let flat =
+            verification_mesh(mesh).map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
         for direction in &directions {
             let pose = look_at(&centre, direction, distance);
             let objects = [SceneObject { mesh: &flat, camera_from_object: pose }];

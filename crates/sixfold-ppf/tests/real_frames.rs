@@ -5,12 +5,12 @@
 
 use std::path::{Path, PathBuf};
 
+use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_bop::{BopDataset, Models};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec3};
-use sixfold_align::{DepthOptions, DepthRegion};
-use sixfold_ppf::{PpfEstimate, PpfOptions, ModelOptions, ObjectModel, estimate};
 use sixfold_io::read_depth;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
+use sixfold_ppf::{ModelOptions, ObjectModel, PpfEstimate, PpfOptions, estimate};
 
 fn data() -> Option<PathBuf> {
     let folder = std::env::var_os("SIXFOLD_DATA")
@@ -35,7 +35,12 @@ fn adi(points: &[Vec3], estimated: &Pose, truth: &Pose) -> f64 {
         / points.len() as f64
 }
 
-fn find(scene: &DepthRegion, mesh: &Mesh, instances: usize, symmetries: &[Pose]) -> (Vec<PpfEstimate>, ObjectModel) {
+fn find(
+    scene: &DepthRegion,
+    mesh: &Mesh,
+    instances: usize,
+    symmetries: &[Pose],
+) -> (Vec<PpfEstimate>, ObjectModel) {
     let model = ObjectModel::new(mesh, symmetries, &ModelOptions::default()).unwrap();
     let options = PpfOptions { max_instances: instances, ..PpfOptions::default() };
     (estimate(scene, &model, &options), model)
@@ -127,7 +132,8 @@ fn the_object_of_the_tyol_frame() {
     let frames = dataset.scene(dataset.scene_ids()[0]).unwrap();
     let camera = frames.camera(10).unwrap();
     let scene =
-        DepthRegion::from_depth(&frames.depth(10).unwrap().unwrap(), &camera, None, &DepthOptions::default()).unwrap();
+        DepthRegion::from_depth(&frames.depth(10).unwrap().unwrap(), &camera, None, &DepthOptions::default())
+            .unwrap();
     let mesh = read_mesh(data.join("tyol_frame/obj.ply"), Unit::Millimetre).unwrap();
     let (found, model) = find(&scene, &mesh, 1, &[]);
     let truth = frames.image(10).unwrap().ground_truth[0].camera_from_object;

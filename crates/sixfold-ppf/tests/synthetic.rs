@@ -1,14 +1,11 @@
 //! The whole matching on rendered scenes, where the truth is known exactly.
 
-use sixfold_geometry::{Camera, DepthImage, DepthImageError, Mask, Pose, Vec3};
 use sixfold_align::{DepthOptions, DepthRegion, PreparedDepthError, VerificationOptions, Verifier};
+use sixfold_geometry::{Camera, DepthImage, DepthImageError, Mask, Pose, Vec3};
+use sixfold_mesh::Mesh;
 use sixfold_ppf::clustering::{ClusterOptions, cluster};
 use sixfold_ppf::voting::{Hypothesis, VotingOptions, vote};
-use sixfold_ppf::{
-    PpfOptions, ModelError, ModelFileError, ModelOptions, ObjectModel,
-    estimate,
-};
-use sixfold_mesh::Mesh;
+use sixfold_ppf::{ModelError, ModelFileError, ModelOptions, ObjectModel, PpfOptions, estimate};
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 
 fn camera() -> Camera {
@@ -258,7 +255,8 @@ fn a_mask_keeps_the_other_instance_out() {
     let depth = depth_of(&[(&mesh, left), (&mesh, right)], Some(5));
     for (truth, side) in [(left, false), (right, true)] {
         let mask = Mask::from_fn(400, 300, |x, _| (x >= 200) == side);
-        let scene = DepthRegion::from_depth(&depth, &camera(), Some(&mask), &DepthOptions::default()).unwrap();
+        let scene =
+            DepthRegion::from_depth(&depth, &camera(), Some(&mask), &DepthOptions::default()).unwrap();
         let found = estimate(&scene, &model, &PpfOptions::default());
         assert!(found[0].camera_from_object.distance_to(&truth) < 0.005, "{found:?}");
     }
@@ -297,8 +295,9 @@ fn a_description_is_kept_and_a_bad_one_made_anew() {
 fn unusable_input_is_named() {
     let camera = camera();
     let empty = DepthImage::filled(400, 300, 0.0);
-    let new =
-        |depth: &DepthImage, mask: Option<&Mask>| DepthRegion::from_depth(depth, &camera, mask, &DepthOptions::default());
+    let new = |depth: &DepthImage, mask: Option<&Mask>| {
+        DepthRegion::from_depth(depth, &camera, mask, &DepthOptions::default())
+    };
     assert!(matches!(
         new(&empty, None),
         Err(PreparedDepthError::Depth(DepthImageError::NoDepth { pixels: 120_000 }))

@@ -237,7 +237,12 @@ impl DatasetRun<'_> {
                     Ok(estimates) => estimates,
                     // One bad region costs its own target only.
                     Err(error @ EstimatorError::Region { .. }) => {
-                        let text = format!("image {}/{im_id}, object {}: {}", target.scene_id, o.obj_id, describe(&error));
+                        let text = format!(
+                            "image {}/{im_id}, object {}: {}",
+                            target.scene_id,
+                            o.obj_id,
+                            describe(&error)
+                        );
                         events(DatasetEvent::Note(text))?;
                         continue;
                     }

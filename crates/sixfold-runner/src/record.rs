@@ -67,11 +67,18 @@ impl RunRecord {
         let Some(before) = text.and_then(|t| serde_json::from_str::<Record>(&t).ok()) else {
             return Err(RunError::NoRecord { results: results.into(), record: path });
         };
-        let pairs = [("version", &before.version, &record.version), ("method", &before.method, &record.method)];
+        let pairs =
+            [("version", &before.version, &record.version), ("method", &before.method, &record.method)];
         let differs = pairs.into_iter().find(|(_, a, b)| a != b);
         let differs = differs.map(|(name, a, b)| (name.to_owned(), a.clone(), b.clone()));
         if let Some((option, before, now)) = differs.or_else(|| options.difference(&before.options)) {
-            return Err(RunError::OtherOptions { results: results.into(), record: path, option, before, now });
+            return Err(RunError::OtherOptions {
+                results: results.into(),
+                record: path,
+                option,
+                before,
+                now,
+            });
         }
         Ok(RunRecord { path, record: Record { done: before.done, ..record } })
     }

@@ -47,7 +47,10 @@ impl RegionSource {
     ///
     /// # Errors
     /// [`RunError::Dataset`].
-    pub fn read(dataset: &BopDataset, file: &Path) -> Result<(RegionSource, Vec<String>, Vec<String>), RunError> {
+    pub fn read(
+        dataset: &BopDataset,
+        file: &Path,
+    ) -> Result<(RegionSource, Vec<String>, Vec<String>), RunError> {
         let options = ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() };
         let read = read_detections(file, &options)?;
         let (mut changed, mut left_out) = (vec![], vec![]);

@@ -10,7 +10,9 @@ use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::{Random, stream};
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
-use sixfold_render::{DepthSensor, Frame, Light, Material, RenderOptions, SceneObject, shade, simulate_depth};
+use sixfold_render::{
+    DepthSensor, Frame, Light, Material, RenderOptions, SceneObject, shade, simulate_depth,
+};
 
 use crate::parts::ConvexParts;
 use crate::pile::{PileOptions, drop_objects};

@@ -6,7 +6,11 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use serde::Serialize;
-use sixfold_bop::{Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType, ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half, read_detections, read_results, read_results_lenient, write_recall_curves};
+use sixfold_bop::{
+    Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType,
+    ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half,
+    read_detections, read_results, read_results_lenient, write_recall_curves,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
-use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
+use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_mesh::{Mesh, Unit};
 use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
 

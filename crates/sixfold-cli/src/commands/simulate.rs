@@ -6,11 +6,15 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use serde_json::json;
-use sixfold_bop::{BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets};
-use sixfold_io::write_rgb;
+use sixfold_bop::{
+    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
+};
 use sixfold_geometry::{Camera, DepthImage, Pose};
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane};
+use sixfold_render::{
+    DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report};

@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use serde_json::Value;
-use sixfold_bop::{Detection, Rle, VISIBILITY_DELTA, ground_truth_visibility, read_results, write_detections};
+use sixfold_bop::{
+    Detection, Rle, VISIBILITY_DELTA, ground_truth_visibility, read_results, write_detections,
+};
 use sixfold_geometry::{Mask, Rect};
 
 use crate::support::*;

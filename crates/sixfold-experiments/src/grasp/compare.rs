@@ -9,13 +9,19 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use sixfold_io::write_rgb;
 use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::transfer::{
+    Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
+};
 use sixfold_experience::StorePlace;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome};
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps,
+};
+use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
-use sixfold_simulation::{AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval_of_share};
+use sixfold_simulation::{
+    AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval_of_share,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, memory, model};

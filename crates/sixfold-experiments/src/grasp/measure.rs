@@ -9,7 +9,10 @@ use clap::Args;
 use serde::Serialize;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
 use sixfold_io::write_rgb;
-use sixfold_simulation::{Attempt, AttemptOptions, ConvexParts, Ending, PartsOptions, TrialOptions, TrialReport, attempt, wilson_interval};
+use sixfold_simulation::{
+    Attempt, AttemptOptions, ConvexParts, Ending, PartsOptions, TrialOptions, TrialReport, attempt,
+    wilson_interval,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};

@@ -3,9 +3,9 @@
 use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_align::DepthRegion;
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::{Mask, Pose, Vec3};
-use sixfold_align::DepthRegion;
 use sixfold_mesh::Mesh;
 
 use crate::from_mesh::draw_rotated;
@@ -187,7 +187,12 @@ pub(super) fn anchor(
 }
 
 /// A region about a point where no object is looked for, as if for an object of `diameter` metres.
-pub(super) fn without_object(scene: &DepthRegion, point: &Vec3, diameter: f64, options: &AnchorOptions) -> Anchor {
+pub(super) fn without_object(
+    scene: &DepthRegion,
+    point: &Vec3,
+    diameter: f64,
+    options: &AnchorOptions,
+) -> Anchor {
     let (size, kept) = (REACH * diameter, options.kept_side());
     let cells = Roi { centre: *point }.look(scene, size * kept as f64 / options.side as f64, kept, |_| true);
     Anchor {
@@ -200,7 +205,13 @@ pub(super) fn without_object(scene: &DepthRegion, point: &Vec3, diameter: f64, o
 }
 
 /// Which cells of a region look at pixels of a kind.
-fn looks_at(scene: &DepthRegion, roi: &Roi, size: f64, side: usize, of_kind: impl Fn(usize) -> bool) -> Vec<bool> {
+fn looks_at(
+    scene: &DepthRegion,
+    roi: &Roi,
+    size: f64,
+    side: usize,
+    of_kind: impl Fn(usize) -> bool,
+) -> Vec<bool> {
     roi.look(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
 }
 

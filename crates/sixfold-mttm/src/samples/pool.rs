@@ -6,10 +6,10 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Vec3};
-use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
 

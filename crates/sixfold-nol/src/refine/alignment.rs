@@ -4,9 +4,9 @@
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
+use sixfold_align::outline::{Outline, color_odds};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_align::outline::{Outline, color_odds};
 
 use super::appearance::{Common, Light, Shown, look};
 use super::arrangement::{Arrangement, Wanted};

@@ -6,9 +6,9 @@
 //! still share the poses of the cameras ([`super::alignment`]).
 
 use rayon::prelude::*;
+use sixfold_align::outline::outline_mesh;
 use sixfold_data::PosedImage;
 use sixfold_mesh::Mesh;
-use sixfold_align::outline::outline_mesh;
 use sixfold_render::Frame;
 
 use super::alignment::{Object, Scene, shown};

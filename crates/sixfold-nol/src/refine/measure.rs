@@ -1,7 +1,7 @@
 //! What one photograph says about the pose of its object: colours against those of the others, the outline, the given pose.
 
-use sixfold_geometry::{NormalEquations, Pose, Vec3};
 use sixfold_align::outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
+use sixfold_geometry::{NormalEquations, Pose, Vec3};
 use sixfold_render::Frame;
 use sixfold_synth::augment::Coverage;
 

@@ -6,10 +6,10 @@
 //! a change of the error below a millionth. The gradient with respect to the rotation is taken in Euler angles, as the text
 //! says (the author's code takes the angles of the matrix of gradients, which is none of a rotation).
 
+use sixfold_align::outline::motion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_align::outline::motion;
 use sixfold_render::Frame;
 
 use crate::maps::Maps;

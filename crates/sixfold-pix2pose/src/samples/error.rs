@@ -1,7 +1,7 @@
 //! What can be wrong with training data.
 
-use sixfold_synth::augment::AugmentError;
 use sixfold_data::PosedImageError;
+use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
 /// Why no samples can be made.

@@ -1,11 +1,11 @@
 //! What samples look like.
 
+use super::error::SampleError;
 use rand::RngExt;
-use sixfold_synth::augment::ColorAugmentation;
-use sixfold_geometry::random::Random;
 use sixfold_data::{PoseVariation, image_color_augmentation};
 use sixfold_geometry::Camera;
-use super::error::SampleError;
+use sixfold_geometry::random::Random;
+use sixfold_synth::augment::ColorAugmentation;
 
 /// Sizes, shares and ranges. The defaults are for few real images of objects on a table, with occlusion.
 #[derive(Debug, Clone, PartialEq)]

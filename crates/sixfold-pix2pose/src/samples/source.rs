@@ -1,14 +1,5 @@
 //! The source of training samples: objects, photographs and backgrounds go in, samples come out.
 
-use std::collections::BTreeMap;
-use rand::RngExt;
-use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
-use sixfold_geometry::random::{Random, stream, uniform};
-use sixfold_data::{DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors, default_distances, distances, is_textured, random_lights, random_material};
-use sixfold_synth::randomly_colored;
-use sixfold_geometry::{Camera, Mask, Pose, Vec2};
-use sixfold_mesh::{Mesh, ModelInfo};
-use sixfold_render::BoundingBoxScale;
 use super::composition::{Composition, Scenery, gain};
 use super::error::SampleError;
 use super::options::SampleOptions;
@@ -16,6 +7,18 @@ use super::second_stage;
 use super::symmetry::canonical;
 use super::targets::targets;
 use super::window::{Extent, turned, turned_pixel, window_around};
+use rand::RngExt;
+use sixfold_data::{
+    DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors,
+    default_distances, distances, is_textured, random_lights, random_material,
+};
+use sixfold_geometry::random::{Random, stream, uniform};
+use sixfold_geometry::{Camera, Mask, Pose, Vec2};
+use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_render::BoundingBoxScale;
+use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
+use sixfold_synth::randomly_colored;
+use std::collections::BTreeMap;
 
 /// Renders of each object that serve as clutter and occluders, and their side in pixels.
 const CUTOUTS_PER_OBJECT: u64 = 16;

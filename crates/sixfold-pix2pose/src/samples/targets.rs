@@ -1,9 +1,9 @@
 //! What a network is to find: the object's coordinates and silhouette.
 
-use sixfold_synth::augment::Coverage;
 use sixfold_geometry::{Camera, Pose};
 use sixfold_mesh::Mesh;
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
+use sixfold_synth::augment::Coverage;
 
 /// Coordinates (3 planes, normalised, 0 outside) and silhouette (0 or 1) of the whole object.
 pub(super) fn targets(

@@ -1,13 +1,13 @@
 //! Samples of a box whose colours are its coordinates: what is seen can be compared with what is to be learnt.
 
-use std::sync::Arc;
-use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
+use super::targets::targets;
+use super::*;
 use sixfold_data::{PosedImage, PosedImageError, TrainingObject, colors};
 use sixfold_geometry::{Camera, Mask, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo};
 use sixfold_render::{BoundingBoxScale, Light, Material};
-use super::targets::targets;
-use super::*;
+use sixfold_synth::augment::{Backgrounds, ColorAugmentation};
+use std::sync::Arc;
 
 const GREY: [u8; 3] = [128; 3];
 

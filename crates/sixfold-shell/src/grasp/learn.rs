@@ -13,8 +13,8 @@ use sixfold_experience::StorePlace;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, middle_between_pads};
 use sixfold_mesh::Mesh;
-use sixfold_synth::shapes::{Family, Member, Rest, member};
 use sixfold_simulation::{ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval};
+use sixfold_synth::shapes::{Family, Member, Rest, member};
 
 use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
 use super::journal::Journal;

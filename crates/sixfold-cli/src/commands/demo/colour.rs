@@ -8,15 +8,15 @@ use std::time::Instant;
 use anyhow::{Result, bail};
 use serde::Serialize;
 use sixfold_bop::{BopDataset, Target};
-use sixfold_io::write_rgb;
 use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
+use sixfold_io::write_rgb;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
 
 use super::arguments::DemoArguments;
 use super::samples::{Known, add_s, found_upwards};
-use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::training::was_trained_on;
 
@@ -143,7 +143,9 @@ fn with_model(
                 let (Some(region), Some(truth)) = (found.first(), truth) else { continue };
                 let start = Instant::now();
                 let Some(object) = objects.get(&o.obj_id) else { continue };
-                let Some(posed) = pix2pose.pose_in_box(&image, &camera, object, &region.bbox)? else { continue };
+                let Some(posed) = pix2pose.pose_in_box(&image, &camera, object, &region.bbox)? else {
+                    continue;
+                };
                 let error = add_s(k, posed.camera_from_object, truth);
                 colour.poses.push(Row {
                     image: format!("{scene_id}/{im_id}"),

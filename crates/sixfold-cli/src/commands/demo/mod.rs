@@ -11,10 +11,10 @@ use std::time::Instant;
 
 use anyhow::Result;
 use serde::Serialize;
-use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
-use sixfold_io::write_rgb;
-use sixfold_geometry::Pose;
 use sixfold_align::{DepthOptions, DepthRegion};
+use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
+use sixfold_geometry::Pose;
+use sixfold_io::write_rgb;
 use sixfold_ppf::{PpfOptions, estimate};
 
 use self::arguments::DemoArguments;
@@ -22,7 +22,7 @@ use self::colour::Colour;
 use self::samples::{Known, add_s, sample_folder};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::report;
-use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Serialize)]

@@ -156,7 +156,11 @@ impl EstimateArguments {
     pub fn run_options(&self) -> RunOptions {
         let mut options = RunOptions::default();
         let common = CommonArguments::augment_args(Command::new("common"));
-        let ids = common.get_arguments().chain(&self.method.arguments()).map(|a| a.get_id().to_string()).collect::<Vec<_>>();
+        let ids = common
+            .get_arguments()
+            .chain(&self.method.arguments())
+            .map(|a| a.get_id().to_string())
+            .collect::<Vec<_>>();
         for id in ids.iter().filter(|id| !NOT_OF_RESULTS.contains(&id.as_str())) {
             if let Ok(Some(values)) = self.matches.try_get_raw(id) {
                 let values: Vec<_> = values.map(|v| v.to_string_lossy()).collect();
@@ -180,7 +184,8 @@ impl Args for EstimateArguments {
         let mut command = CommonArguments::augment_args(command.arg(method));
         for method in METHODS {
             for argument in method.arguments() {
-                let users: Vec<&str> = METHODS.iter().filter(|m| m.has(argument.get_id())).map(|m| m.name).collect();
+                let users: Vec<&str> =
+                    METHODS.iter().filter(|m| m.has(argument.get_id())).map(|m| m.name).collect();
                 if users.first() == Some(&method.name) {
                     let heading = format!("Options of --method {}", users.join(" and "));
                     command = command.arg(argument.help_heading(clap::builder::Str::from(heading)));

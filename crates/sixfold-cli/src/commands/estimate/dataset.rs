@@ -11,7 +11,7 @@ use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunErr
 use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::report;
-use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, interrupted};
 
 use super::arguments::{CommonArguments, EstimateArguments};
@@ -87,7 +87,11 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
 }
 
 /// Where the options say that the targets are, and what was left out of a file of detections.
-fn regions(a: &CommonArguments, dataset: &BopDataset, targets: &[Target]) -> Result<(RegionSource, Vec<String>)> {
+fn regions(
+    a: &CommonArguments,
+    dataset: &BopDataset,
+    targets: &[Target],
+) -> Result<(RegionSource, Vec<String>)> {
     let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
     Ok(match (a.boxes.as_deref(), &a.detector) {
         (Some("gt"), _) => (RegionSource::GroundTruth, vec![]),

@@ -12,11 +12,11 @@ use sixfold_mttm::mask::to_image;
 use sixfold_runner::{FoundObject, ImageReport, ImageRun, pose_table};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{report, write_atomically};
-use sixfold_shell::overlay::{Drawn, self};
+use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 use super::arguments::{CommonArguments, EstimateArguments};
-use super::region::{Where, self};
+use super::region::{self, Where};
 
 /// One image, without lens distortion.
 struct Input {
@@ -32,7 +32,9 @@ impl Input {
     fn read(a: &CommonArguments, estimator: &dyn PoseEstimator) -> Result<Input> {
         let (needs, method) = (estimator.needs(), estimator.name());
         if needs.depth == Need::Required && a.depth.is_none() {
-            bail!("--method {method} works on depth: give --depth FILE (with --camera and --object) or --dataset DIR");
+            bail!(
+                "--method {method} works on depth: give --depth FILE (with --camera and --object) or --dataset DIR"
+            );
         }
         if needs.rgb == Need::Required && a.rgb.is_none() {
             bail!(
@@ -50,7 +52,8 @@ impl Input {
             }
             _ => None,
         };
-        let raw_rgb = a.rgb.as_ref().map(|path| Ok::<_, anyhow::Error>((path, read_rgb(path)?))).transpose()?;
+        let raw_rgb =
+            a.rgb.as_ref().map(|path| Ok::<_, anyhow::Error>((path, read_rgb(path)?))).transpose()?;
         // The image that the method works on says which size the camera is for.
         let size = match (&raw_rgb, &raw_depth) {
             (Some((_, rgb)), _) if needs.rgb == Need::Required => rgb.size(),
@@ -71,10 +74,15 @@ impl Input {
     }
 
     /// The image as the method wants it.
-    fn prepared(&self, a: &CommonArguments, estimator: &dyn PoseEstimator) -> Result<Option<Arc<PreparedDepth>>> {
+    fn prepared(
+        &self,
+        a: &CommonArguments,
+        estimator: &dyn PoseEstimator,
+    ) -> Result<Option<Arc<PreparedDepth>>> {
         let Some(depth) = &self.depth else { return Ok(None) };
         let named = || a.depth.as_ref().map_or_else(String::new, |p| p.display().to_string());
-        let prepared = PreparedDepth::new(depth, &self.camera, &estimator.depth_options()).with_context(named)?;
+        let prepared =
+            PreparedDepth::new(depth, &self.camera, &estimator.depth_options()).with_context(named)?;
         Ok(Some(prepared))
     }
 }
@@ -161,7 +169,12 @@ fn search(a: &CommonArguments, image: &ImageRun<'_>, nowhere: bool) -> Result<Ve
 }
 
 /// Writes the poses, then the images, and prints the poses.
-fn finish(a: &CommonArguments, input: &Input, found: &[FoundObject], mut whole: ImageReport) -> Result<Outcome> {
+fn finish(
+    a: &CommonArguments,
+    input: &Input,
+    found: &[FoundObject],
+    mut whole: ImageReport,
+) -> Result<Outcome> {
     let mut images = vec![];
     if let Some(folder) = &a.out {
         let path = folder.join("overlay.png");

@@ -32,7 +32,12 @@ pub(crate) struct Method {
 
 impl Method {
     const fn of<A: MethodArguments>(name: &'static str, about: &'static str) -> Method {
-        Method { name, about, options: A::augment_args, build: |matches, common| A::from_arg_matches(matches)?.build(common) }
+        Method {
+            name,
+            about,
+            options: A::augment_args,
+            build: |matches, common| A::from_arg_matches(matches)?.build(common),
+        }
     }
 
     /// Its own options.
@@ -59,7 +64,10 @@ trait MethodArguments: Args {
 /// All methods; the first is the default.
 pub(crate) static METHODS: &[Method] = &[
     Method::of::<PpfArguments>("ppf", "point pair features on depth, no training"),
-    Method::of::<Pix2PoseArguments>("pix2pose", "object coordinates from colour by a trained network, in boxes"),
+    Method::of::<Pix2PoseArguments>(
+        "pix2pose",
+        "object coordinates from colour by a trained network, in boxes",
+    ),
     Method::of::<MttmArguments>(
         "mttm",
         "templates in depth, from a mesh or from depth images of the object, no training",
@@ -75,7 +83,10 @@ struct PpfArguments {
 
 impl MethodArguments for PpfArguments {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
-        Ok(Box::new(PpfEstimator { depth: depth_options(self.keep_plane, common), ..PpfEstimator::default() }))
+        Ok(Box::new(PpfEstimator {
+            depth: depth_options(self.keep_plane, common),
+            ..PpfEstimator::default()
+        }))
     }
 }
 
@@ -99,7 +110,9 @@ struct Pix2PoseArguments {
 impl MethodArguments for Pix2PoseArguments {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
         let weights = self.weights.as_deref().ok_or_else(|| {
-            anyhow!("--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes")
+            anyhow!(
+                "--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes"
+            )
         })?;
         let mut estimator = Pix2PoseEstimator::load(weights)?;
         estimator.options.estimate.seed = common.seed;

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
-use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_grasp::{GraspView, ViewOptions, find_objects};
+use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 
 /// A depth image and what belongs to it.
 #[derive(Debug, Args)]

@@ -7,13 +7,16 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 use sixfold_geometry::Pose;
-use sixfold_grasp::{AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper, antipodal_grasps, cluster_grasps, draw_grasps};
+use sixfold_grasp::{
+    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
+    antipodal_grasps, cluster_grasps, draw_grasps,
+};
 use sixfold_io::write_rgb;
 
-use super::input::{Input, InputArguments, self};
+use super::input::{self, Input, InputArguments};
 use sixfold_shell::Outcome;
 #[cfg(feature = "experience")]
-use sixfold_shell::grasp::experience::{NetworkArguments, self};
+use sixfold_shell::grasp::experience::{self, NetworkArguments};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
 use sixfold_shell::overlay;

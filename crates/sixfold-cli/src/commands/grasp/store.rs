@@ -11,7 +11,7 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_grasp::{AntipodalQuality, Grasp};
 use sixfold_io::write_rgb;
 
-use super::input::{InputArguments, self};
+use super::input::{self, InputArguments};
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, model, now};
 use sixfold_shell::grasp::gripper::gripper;

@@ -9,7 +9,9 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::gripper_pose;
 use sixfold_mesh::Unit;
-use sixfold_simulation::{ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_in_middle, try_grasp};
+use sixfold_simulation::{
+    ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_in_middle, try_grasp,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::trial::{PhysicsArguments, physics};

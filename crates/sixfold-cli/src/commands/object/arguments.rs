@@ -7,7 +7,6 @@ use sixfold_mesh::Unit;
 use sixfold_mttm::Coverage;
 use sixfold_shell::output::JsonArguments;
 
-
 #[derive(Debug, Args)]
 pub(crate) struct ObjectArguments {
     /// Folder of stored objects

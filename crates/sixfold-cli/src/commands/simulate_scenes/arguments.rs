@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
-use sixfold_io::CameraFile;
 use sixfold_geometry::Camera;
+use sixfold_io::CameraFile;
 use sixfold_mesh::Unit;
-use sixfold_synth::shapes::Family;
 use sixfold_simulation::{PileOptions, TabletopOptions};
+use sixfold_synth::shapes::Family;
 
 use crate::commands::simulate::Sensor;
 use sixfold_shell::output::JsonArguments;

@@ -3,16 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use sixfold_synth::augment::Backgrounds;
-use sixfold_geometry::random::stream;
 use sixfold_bop::{GroundTruth, GroundTruthInfo, NewImage, SceneWriter};
+use sixfold_data::PosedImage;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, Mask, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
+use sixfold_nol::SourceView;
 use sixfold_nol::synthesis::ViewMaker;
 use sixfold_nol::view_grid::{ViewGrid, over_background};
-use sixfold_data::PosedImage;
-use sixfold_nol::SourceView;
 use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
+use sixfold_synth::augment::Backgrounds;
 
 use super::arguments::SynthesizeArguments;
 use super::input::Subject;

@@ -8,7 +8,10 @@ use sixfold_detect::recipe::{DetectorKind, DetectorRecipe, MIN_VISIBILITY};
 use sixfold_nn::choice::Choice;
 
 use super::options::{Degrees, choices};
-use super::{LearntFrom, MaterialArguments, training_set, Shown, Summary, checked, command_line, loss, summary, train_in};
+use super::{
+    LearntFrom, MaterialArguments, Shown, Summary, checked, command_line, loss, summary, train_in,
+    training_set,
+};
 
 fn default() -> DetectorRecipe {
     DetectorRecipe::default()

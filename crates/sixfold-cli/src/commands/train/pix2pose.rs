@@ -11,7 +11,10 @@ use sixfold_pix2pose::recipe::{MIN_VISIBILITY, NetworkKind, Pix2PoseRecipe};
 use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
 
 use super::options::{Degrees, choices};
-use super::{LearntFrom, MaterialArguments, training_set, Shown, Summary, checked, command_line, loss, summary, train_in};
+use super::{
+    LearntFrom, MaterialArguments, Shown, Summary, checked, command_line, loss, summary, train_in,
+    training_set,
+};
 
 fn default() -> Pix2PoseRecipe {
     Pix2PoseRecipe::default()

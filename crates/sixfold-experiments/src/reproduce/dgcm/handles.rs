@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_on_part};
 use sixfold_geometry::Vec3;
-use sixfold_grasp::{AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps, middle_between_pads};
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps, middle_between_pads,
+};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};

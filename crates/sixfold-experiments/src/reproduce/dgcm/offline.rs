@@ -18,7 +18,9 @@ use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
 use sixfold_experience::{Crop, Experience, SqliteStore};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, gripper_pose};
+use sixfold_grasp::{
+    AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, gripper_pose,
+};
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 

@@ -15,8 +15,8 @@ use std::collections::BTreeMap;
 
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
-use sixfold_mesh::Mesh;
 use sixfold_data::PosedImage;
+use sixfold_mesh::Mesh;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::similarity::Judge;
 

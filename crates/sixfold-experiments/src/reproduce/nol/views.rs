@@ -4,7 +4,6 @@ use anyhow::Result;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_synth::augment::Patch;
 use sixfold_data::PosedImage;
 use sixfold_geometry::{Mask, Vec3};
 use sixfold_mesh::{Mesh, simplify};
@@ -15,6 +14,7 @@ use sixfold_nol::model::NolModel;
 use sixfold_nol::similarity::{Judge, Similarity, in_light_of, in_place_of, without_border};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
+use sixfold_synth::augment::Patch;
 
 /// Photographs behind a view (dissertation: 6).
 pub(super) const PER_VIEW: usize = 6;

@@ -5,7 +5,10 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use rand::RngExt;
-use sixfold_bop::{GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility, write_targets};
+use sixfold_bop::{
+    GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility,
+    write_targets,
+};
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};

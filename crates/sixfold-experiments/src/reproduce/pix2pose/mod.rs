@@ -21,12 +21,12 @@ use sixfold_geometry::{FrameId, Rect};
 use sixfold_mesh::Mesh;
 use sixfold_pix2pose::estimate::Quirks;
 
+use self::model::Pix2Pose;
 use self::row::{Row, Setting};
 use super::kept::{fnv, kept_or_made, same_inputs};
-use sixfold_shell::Outcome;
 use sixfold_runner::RegionSource;
+use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
-use self::model::Pix2Pose;
 use sixfold_shell::progress::check_interrupt;
 use sixfold_shell::training::was_trained_on;
 

@@ -9,9 +9,9 @@ use sixfold_bop::{Models, Target};
 use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
 
 use super::super::kept::kept_or_made;
+use super::model::Pix2Pose;
 use super::row::{Row, Setting};
 use super::{Bench, Regions, ReproducePix2PoseArguments, fourfold};
-use super::model::Pix2Pose;
 use sixfold_shell::training::{MaterialArguments, Shown, command_line, loss, train_in, training_set};
 
 /// What a training of the comparison learns.
