@@ -213,7 +213,7 @@ impl Recipe for MttmRecipe {
         let Some(test) = make_pool(objects, scenes, &test, session.stop, made)? else { return Ok(None) };
         session.note(&format!("test scenes: {} regions with an object", test.with_object().len()));
         let quality = quality(&network, &test);
-        card.extra["quality"] = serde_json::to_value(&quality).map_err(TrainError::method)?;
+        card.extra["quality"] = serde_json::to_value(quality).map_err(TrainError::method)?;
         MttmModel::new(network, card).save(&path).map_err(TrainError::method)?;
         Ok(Some(quality))
     }
