@@ -39,8 +39,12 @@ fn finds_the_pose_and_draws_it() {
         .collect();
     assert!(changed.len() > 1000, "{} pixels drawn", changed.len());
     assert!(changed.iter().all(|(x, y)| (x - middle.x).hypot(y - middle.y) < 120.0));
-    // The description was kept beside the mesh.
-    assert!(case.path().join("part.sixfold-ppf").is_file());
+    // The description was kept in the cache, and nothing beside the mesh.
+    assert!(cached(case.path(), "ppf.bin").is_file());
+    let mut beside: Vec<_> =
+        std::fs::read_dir(case.path()).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    beside.sort();
+    assert_eq!(beside, ["cache-of-tests", "camera.json", "depth.png", "out", "part.ply", "rgb.png"]);
 }
 
 #[test]
@@ -54,7 +58,10 @@ fn same_bytes_on_one_thread_and_on_two() {
     let first = at("--threads 1");
     assert_eq!(first, at("--threads 2"));
     assert_eq!(first, at("--threads 2 --seed 0"));
-    std::fs::remove_file(case.path().join("part.sixfold-ppf")).unwrap();
+    let kept = cached(case.path(), "ppf.bin");
+    std::fs::remove_file(&kept).unwrap();
+    assert_eq!(first, at("--threads 2 --no-cache"));
+    assert!(!kept.exists());
     assert_eq!(first, at("--threads 2"));
 }
 

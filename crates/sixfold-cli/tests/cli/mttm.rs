@@ -24,15 +24,15 @@ fn finds_the_pose_by_templates_with_and_without_the_mesh() {
     assert_eq!(run["poses"][0]["verified_by"], "mesh");
     assert!(dir.join("out/overlay.png").is_file() && dir.join("out/poses.json").is_file());
     assert!(dir.join("out/masks/1-part-1.png").is_file());
-    // The templates are kept beside the mesh and taken the next time.
-    let kept = dir.join("part.sixfold-templates");
+    // The templates are kept in the cache and used the next time.
+    let kept = cached(dir, "templates.bin");
     let before = std::fs::read(&kept).unwrap();
     let alone =
         sixfold(dir, &format!("{DEPTH} --object part.ply --unit mm --json --templates-only")).expect(0);
     assert_eq!(alone.json()["poses"][0]["verified_by"], "template");
     assert_near(&pose_of(&alone.json()["poses"][0]["camera_from_object"]), &case.truth);
     assert_eq!(std::fs::read(&kept).unwrap(), before);
-    // A damaged file is made anew, with a note.
+    // A damaged file is made again, with a note.
     std::fs::write(&kept, &before[..1000]).unwrap();
     let again = sixfold(dir, &format!("{DEPTH} --object part.ply --unit mm --json")).expect(0);
     assert!(again.stderr.contains("cut off"), "{}", again.stderr);

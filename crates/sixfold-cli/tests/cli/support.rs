@@ -35,12 +35,24 @@ impl Run {
     }
 }
 
+/// The cache folder of the runs in a folder.
+const CACHE: &str = "cache-of-tests";
+
+/// The only file of this name in the cache of the runs in `dir`.
+pub fn cached(dir: &Path, name: &str) -> PathBuf {
+    let folders = std::fs::read_dir(dir.join(CACHE)).unwrap().map(|entry| entry.unwrap().path());
+    let files: Vec<PathBuf> = folders.map(|folder| folder.join(name)).filter(|file| file.is_file()).collect();
+    assert_eq!(files.len(), 1, "{name}: {files:?}");
+    files[0].clone()
+}
+
 /// Runs the tested program in `dir` with arguments separated by spaces.
 pub fn sixfold(dir: &Path, arguments: &str) -> Run {
     let output = Command::new(crate::PROGRAM)
         .args(arguments.split_whitespace())
         .current_dir(dir)
         .env_remove("SIXFOLD_STORE")
+        .env("SIXFOLD_CACHE", dir.join(CACHE))
         .output()
         .unwrap();
     let run = Run {

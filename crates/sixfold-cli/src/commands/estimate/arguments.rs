@@ -39,7 +39,7 @@ impl StoreArguments {
 pub(crate) struct CacheArguments {
     /// Folder for what methods derive from mesh files and datasets, to be faster the next time; at most 1 GB (default: sixfold in
     /// the user's cache folder, ~/.cache)
-    #[arg(long, value_name = "DIR", env = "SIXFOLD_CACHE", conflicts_with = "no_cache")]
+    #[arg(long, value_name = "DIR", env = "SIXFOLD_CACHE")]
     pub cache: Option<PathBuf>,
     /// Keep nothing of what methods derive from mesh files
     #[arg(long)]
