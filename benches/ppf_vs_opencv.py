@@ -41,9 +41,9 @@ def main():
     root = pathlib.Path(__file__).resolve().parent.parent
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
-        build = ["cargo", "build", "--release", "-q", "-p", "sixfold-match", "--example", "bench_ppf"]
+        build = ["cargo", "build", "--release", "-q", "-p", "sixfold-ppf", "--example", "bench_ppf"]
         subprocess.run(build, cwd=root, check=True)
-        run = ["cargo", "run", "--release", "-q", "-p", "sixfold-match", "--example", "bench_ppf", "--"]
+        run = ["cargo", "run", "--release", "-q", "-p", "sixfold-ppf", "--example", "bench_ppf", "--"]
         subprocess.run([*run, str(pathlib.Path(dataset).resolve()), every, str(folder)], cwd=root, check=True)
         ours = json.loads((folder / "ours.json").read_text())
         load = lambda path: np.fromfile(path, "<f4").reshape(-1, 6)
