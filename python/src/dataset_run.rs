@@ -62,18 +62,6 @@ impl News {
     }
 }
 
-/// Why a run failed, before it becomes Python's.
-enum Failure {
-    Run(RunError),
-    Detector(sixfold_detect::model::ModelError),
-}
-
-impl<E: Into<RunError>> From<E> for Failure {
-    fn from(error: E) -> Failure {
-        Failure::Run(error.into())
-    }
-}
-
 /// Runs, and tells the callback. Ctrl-C, or an error of the callback, ends the run after the current image, whose rows are on the
 /// disk.
 pub(crate) fn run<'py>(
@@ -87,23 +75,22 @@ pub(crate) fn run<'py>(
     if let (Some(boxes), Some(_)) = (&run.boxes, &run.detector) {
         return Err(bad("boxes", "None beside a detector", boxes.display().to_string()));
     }
-    let done = reporting(
+    let summary = reporting(
         py,
         Leave::WhenDone,
         move |stop, tell: &Tell<News>| run.run(stop, tell),
         |news| news.report(py, progress.as_ref()),
-    )?;
-    let summary = done.map_err(|failure| match failure {
-        Failure::Run(error) => run_error(error),
-        Failure::Detector(error) => file_or_value(&error),
-    })?;
+    )??;
     Ok(json_to_python(py, &summary)?.cast_into::<PyDict>()?)
 }
 
 impl Run {
-    fn run(&self, stop: &Stop, tell: &Tell<News>) -> Result<DatasetSummary, Failure> {
-        let dataset = BopDataset::open(&self.path, &self.split)?;
-        let targets = dataset.object_targets(&dataset.targets(self.targets.as_deref())?)?;
+    // The callback's error is the runner's.
+    #[allow(clippy::result_large_err)]
+    fn run(&self, stop: &Stop, tell: &Tell<News>) -> PyResult<DatasetSummary> {
+        let dataset = BopDataset::open(&self.path, &self.split).map_err(dataset_error)?;
+        let targets = dataset.targets(self.targets.as_deref()).map_err(dataset_error)?;
+        let targets = dataset.object_targets(&targets).map_err(dataset_error)?;
         let (regions, mut skipped) = self.regions(&dataset, &targets, tell)?;
         let images: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
         let (cache, options) = (self.cache(), self.options());
@@ -117,17 +104,19 @@ impl Run {
             options: &options,
         };
         let (mut done, total) = (0, images.len());
-        let mut summary = run.run(&self.out, stop.flag(), &mut |event| {
-            match event {
-                DatasetEvent::Image { image, .. } => {
-                    done += 1;
-                    tell.tell(News::Image { image, done, total });
-                }
-                DatasetEvent::Note(text) => tell.tell(News::Note(text)),
-                DatasetEvent::Result(_) => {}
+        let mut hear = |event: DatasetEvent<'_>| match event {
+            DatasetEvent::Image { image, .. } => {
+                done += 1;
+                tell.tell(News::Image { image, done, total });
             }
+            DatasetEvent::Note(text) => tell.tell(News::Note(text)),
+            DatasetEvent::Result(_) => {}
+        };
+        let summary = run.run(&self.out, stop.flag(), &mut |event| {
+            hear(event);
             Ok(())
-        })?;
+        });
+        let mut summary = summary.map_err(run_error)?;
         skipped.append(&mut summary.skipped);
         summary.skipped = skipped;
         Ok(summary)
@@ -139,18 +128,18 @@ impl Run {
         dataset: &BopDataset,
         targets: &[Target],
         tell: &Tell<News>,
-    ) -> Result<(RegionSource, Vec<String>), Failure> {
+    ) -> PyResult<(RegionSource, Vec<String>)> {
         if let Some(weights) = &self.detector {
             let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
-            let detector = TrainedDetector::load(weights).map_err(Failure::Detector)?;
+            let detector = TrainedDetector::load(weights).map_err(|error| file_or_value(&error))?;
             let detector = Box::new(detector.with_threshold(MIN_DETECTION));
-            return Ok((RegionSource::of_detector(detector, ids)?, vec![]));
+            return Ok((RegionSource::of_detector(detector, ids).map_err(run_error)?, vec![]));
         }
         match self.boxes.as_deref() {
             None => Ok((RegionSource::Anywhere, vec![])),
             Some(gt) if gt == Path::new("gt") => Ok((RegionSource::GroundTruth, vec![])),
             Some(file) => {
-                let (source, changed, left_out) = RegionSource::read(dataset, file)?;
+                let (source, changed, left_out) = RegionSource::read(dataset, file).map_err(run_error)?;
                 changed.into_iter().for_each(|note| tell.tell(News::Note(note)));
                 Ok((source, left_out))
             }
