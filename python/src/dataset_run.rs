@@ -38,19 +38,19 @@ pub(crate) struct Run {
     pub record: RunOptions,
 }
 
-/// What a run tells of its progress, as it crosses from its thread.
-enum News {
+/// What a run reports, as it crosses from its thread.
+enum Event {
     Image { image: String, done: usize, total: usize },
     Note(String),
 }
 
-impl News {
+impl Event {
     /// Notes as Python's warnings; images for the user's callback.
     fn report(self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
         match (self, progress) {
-            (News::Note(text), _) => py.import("warnings")?.call_method1("warn", (text,)).map(drop),
-            (News::Image { .. }, None) => Ok(()),
-            (News::Image { image, done, total }, Some(progress)) => {
+            (Event::Note(text), _) => py.import("warnings")?.call_method1("warn", (text,)).map(drop),
+            (Event::Image { .. }, None) => Ok(()),
+            (Event::Image { image, done, total }, Some(progress)) => {
                 let event = PyDict::new(py);
                 event.set_item("stage", "estimating")?;
                 event.set_item("done", done)?;
@@ -62,7 +62,7 @@ impl News {
     }
 }
 
-/// Runs, and tells the callback. Ctrl-C, or an error of the callback, ends the run after the current image, whose rows are on the
+/// Runs, and calls the callback. Ctrl-C, or an error of the callback, ends the run after the current image, whose rows are on the
 /// disk.
 pub(crate) fn run<'py>(
     py: Python<'py>,
@@ -78,8 +78,8 @@ pub(crate) fn run<'py>(
     let summary = reporting(
         py,
         Leave::WhenDone,
-        move |stop, tell: &Tell<News>| run.run(stop, tell),
-        |news| news.report(py, progress.as_ref()),
+        move |stop, tell: &Tell<Event>| run.run(stop, tell),
+        |event| event.report(py, progress.as_ref()),
     )??;
     Ok(json_to_python(py, &summary)?.cast_into::<PyDict>()?)
 }
@@ -87,7 +87,7 @@ pub(crate) fn run<'py>(
 impl Run {
     // The callback's error is the runner's.
     #[allow(clippy::result_large_err)]
-    fn run(&self, stop: &Stop, tell: &Tell<News>) -> PyResult<DatasetSummary> {
+    fn run(&self, stop: &Stop, tell: &Tell<Event>) -> PyResult<DatasetSummary> {
         let dataset = BopDataset::open(&self.path, &self.split).map_err(dataset_error)?;
         let targets = dataset.targets(self.targets.as_deref()).map_err(dataset_error)?;
         let targets = dataset.object_targets(&targets).map_err(dataset_error)?;
@@ -104,16 +104,16 @@ impl Run {
             options: &options,
         };
         let (mut done, total) = (0, images.len());
-        let mut hear = |event: DatasetEvent<'_>| match event {
+        let mut report = |event: DatasetEvent<'_>| match event {
             DatasetEvent::Image { image, .. } => {
                 done += 1;
-                tell.tell(News::Image { image, done, total });
+                tell.tell(Event::Image { image, done, total });
             }
-            DatasetEvent::Note(text) => tell.tell(News::Note(text)),
+            DatasetEvent::Note(text) => tell.tell(Event::Note(text)),
             DatasetEvent::Result(_) => {}
         };
         let summary = run.run(&self.out, stop.flag(), &mut |event| {
-            hear(event);
+            report(event);
             Ok(())
         });
         let mut summary = summary.map_err(run_error)?;
@@ -127,7 +127,7 @@ impl Run {
         &self,
         dataset: &BopDataset,
         targets: &[Target],
-        tell: &Tell<News>,
+        tell: &Tell<Event>,
     ) -> PyResult<(RegionSource, Vec<String>)> {
         if let Some(weights) = &self.detector {
             let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
@@ -140,7 +140,7 @@ impl Run {
             Some(gt) if gt == Path::new("gt") => Ok((RegionSource::GroundTruth, vec![])),
             Some(file) => {
                 let (source, changed, left_out) = RegionSource::read(dataset, file).map_err(run_error)?;
-                changed.into_iter().for_each(|note| tell.tell(News::Note(note)));
+                changed.into_iter().for_each(|note| tell.tell(Event::Note(note)));
                 Ok((source, left_out))
             }
         }
@@ -150,7 +150,7 @@ impl Run {
         self.cache.as_ref().map_or_else(Cache::none, |folder| Cache::new(folder, Cache::LIMIT))
     }
 
-    /// What decides about the results.
+    /// The options that decide about the results.
     fn options(&self) -> RunOptions {
         let mut options = self.record.clone();
         options.add("split", &self.split);
@@ -165,8 +165,8 @@ impl Run {
                 options.add(name, &file.display().to_string());
             }
         }
-        if let Some(least) = self.min_confidence {
-            options.add("min_confidence", &least.to_string());
+        if let Some(min) = self.min_confidence {
+            options.add("min_confidence", &min.to_string());
         }
         options
     }
@@ -187,7 +187,7 @@ fn run_error(error: RunError) -> PyErr {
         ),
         RunError::NoRecord { results, record } => bad(
             "out",
-            "a new file, or one that this call began",
+            "a new file, or one that this call started",
             format!("{} without {}", results.display(), record.display()),
         ),
         RunError::OtherOptions { results, record, option, before, now } => PyValueError::new_err(format!(
@@ -195,7 +195,7 @@ fn run_error(error: RunError) -> PyErr {
             results.display(),
             record.display()
         )),
-        RunError::Interrupted => PyRuntimeError::new_err("the run was interrupted; call it again to go on"),
+        RunError::Interrupted => PyRuntimeError::new_err("the run was interrupted; call it again to resume"),
         _ => PyValueError::new_err(text),
     }
 }

@@ -8,16 +8,13 @@ use numpy::PyArray2;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_align::{DepthOptions, PreparedDepth};
+use sixfold_align::PreparedDepth;
 use sixfold_estimator::{
     EstimatorError, Need, Object, PoseEstimate, PoseEstimator, PreparedObject, Query, Region,
 };
 use sixfold_geometry::{Camera, Mask, Rect};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_mttm::mask::to_image;
-use sixfold_mttm::{MatchedBy, MttmEstimator, MttmOptions};
-use sixfold_pix2pose::estimator::Pix2PoseEstimator;
-use sixfold_ppf::PpfEstimator;
 use sixfold_runner::{RunOptions, describe};
 
 use crate::arrays::{self, about, bad, seed, whole};
@@ -26,9 +23,8 @@ use crate::camera::PyCamera;
 use crate::dataset_run::{self, Run};
 use crate::guard::{free, interruptible};
 use crate::mesh::PyMesh;
-use crate::mttm::{matched_by, network};
+use crate::methods::{Options, make};
 use crate::ppf::{depth_error, verification_to_python};
-use crate::training::file_or_value;
 
 /// A pose that an Estimator found.
 #[pyclass(name = "Estimate", module = "sixfold", frozen)]
@@ -42,11 +38,11 @@ pub(crate) struct PyPoseEstimate {
     /// The object's visible pixels, (H, W) bool, where the method segments; None otherwise.
     #[pyo3(get)]
     mask: Option<Py<PyArray2<bool>>>,
-    /// What the method says besides, under its own keys as `sixfold estimate --json` prints them; with `verification`, a dict as
+    /// Other results of the method, under its own keys as `sixfold estimate --json` prints them; with `verification`, a dict as
     /// that of PpfEstimate, where there is depth.
     #[pyo3(get)]
     details: Py<PyDict>,
-    /// What to know of this pose, a sentence each; usually empty.
+    /// Remarks on this pose, a sentence each; usually empty.
     #[pyo3(get)]
     notes: Vec<String>,
 }
@@ -70,118 +66,6 @@ fn to_python(py: Python<'_>, estimate: PoseEstimate, camera: &Camera) -> PyResul
         mask: estimate.mask.as_ref().map(image).transpose()?.map(Bound::unbind),
         details: details.unbind(),
         notes: estimate.notes,
-    })
-}
-
-/// The methods' options as they were given.
-struct Options {
-    weights: Option<PathBuf>,
-    keep_plane: bool,
-    matcher: String,
-    templates_only: bool,
-    refine: bool,
-    passes: Option<usize>,
-    icp: bool,
-    seed: u64,
-}
-
-/// Each method with its own options beside the seed.
-const METHODS: [(&str, &[&str]); 3] = [
-    ("ppf", &["keep_plane"]),
-    ("mttm", &["keep_plane", "weights", "matcher", "templates_only"]),
-    ("pix2pose", &["weights", "refine", "passes", "icp"]),
-];
-
-/// The default of `matcher`.
-const BOTH: &str = "both";
-
-impl Options {
-    /// The options that differ from their defaults, by name.
-    fn given(&self) -> Vec<(&'static str, String)> {
-        let all = [
-            ("weights", self.weights.as_ref().map(|w| w.display().to_string())),
-            ("keep_plane", self.keep_plane.then(|| "True".to_owned())),
-            ("matcher", (self.matcher != BOTH).then(|| self.matcher.clone())),
-            ("templates_only", self.templates_only.then(|| "True".to_owned())),
-            ("refine", (!self.refine).then(|| "False".to_owned())),
-            ("passes", self.passes.map(|p| p.to_string())),
-            ("icp", self.icp.then(|| "True".to_owned())),
-        ];
-        all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
-    }
-
-    /// The method's name, after it was seen that every given option is one of its own.
-    fn check(&self, method: &str) -> PyResult<&'static str> {
-        let names = || METHODS.map(|(name, _)| format!("{name:?}")).join(" or ");
-        let known = METHODS.iter().find(|(name, _)| *name == method);
-        let (method, own) = known.ok_or_else(|| bad("method", names(), format!("{method:?}")))?;
-        for (option, value) in self.given() {
-            if !own.contains(&option) {
-                let users = METHODS.iter().filter(|(_, own)| own.contains(&option));
-                let users = users.map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(" and ");
-                let expected = format!("its default: it is no option of {method:?}, but of {users}");
-                return Err(bad(option, expected, value));
-            }
-        }
-        Ok(method)
-    }
-
-    /// What a run over a dataset resumes with.
-    fn record(&self) -> RunOptions {
-        let mut record = RunOptions::default();
-        for (name, value) in self.given() {
-            record.add(name, &value);
-        }
-        record.add("seed", &self.seed.to_string());
-        record
-    }
-}
-
-/// A method, and the ids of the objects that its weights know.
-type Made = (Arc<dyn PoseEstimator>, Vec<u32>);
-
-fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<Made> {
-    let depth =
-        DepthOptions { remove_plane: !options.keep_plane, seed: options.seed, ..DepthOptions::default() };
-    let weights = options.weights.clone();
-    Ok(match method {
-        "ppf" => (Arc::new(PpfEstimator { depth, ..PpfEstimator::default() }), vec![]),
-        "mttm" => {
-            let matched_by = matched_by(&options.matcher)?;
-            let network = match (matched_by, weights) {
-                (MatchedBy::Points, None) => None,
-                (MatchedBy::Points, Some(file)) => {
-                    return Err(bad("weights", "None with matcher=\"points\"", file.display().to_string()));
-                }
-                (_, weights) => {
-                    let read = interruptible(py, move |_| network(weights))?;
-                    Some(read.map_err(|error| file_or_value(&error))?)
-                }
-            };
-            let estimator = MttmEstimator {
-                depth,
-                options: MttmOptions { matched_by, ..MttmOptions::default() },
-                network,
-                templates_only: options.templates_only,
-                ..MttmEstimator::default()
-            };
-            (Arc::new(estimator), vec![])
-        }
-        _ => {
-            let weights = weights.ok_or_else(|| {
-                bad("weights", "a file that train_pix2pose or `sixfold train pix2pose` wrote", "None")
-            })?;
-            let read = interruptible(py, move |_| Pix2PoseEstimator::load(&weights))?;
-            let mut estimator = read.map_err(|error| file_or_value(&error))?;
-            estimator.options.estimate.seed = options.seed;
-            if let Some(passes) = options.passes {
-                estimator.options.looks = passes;
-            }
-            estimator.refine = options.refine;
-            estimator.icp = options.icp;
-            let ids = estimator.model.objects().iter().map(|o| o.id).collect();
-            (Arc::new(estimator), ids)
-        }
     })
 }
 
@@ -236,7 +120,7 @@ impl Searched {
 /// coordinates from colour by a trained network, in boxes. weights: pix2pose's network (needed), or another one for mttm than
 /// that of the package. keep_plane (ppf, mttm): search points on the table plane too. matcher (mttm): "points", "network" or
 /// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. refine (pix2pose): align the
-/// rendered outline with the image where there is a mesh; passes: most passes over an object (1 unless given); icp: align
+/// rendered outline with the image where there is a mesh; passes: max number of passes over an object (1 unless given); icp: align
 /// poses with the depth image. seed of everything random.
 ///
 /// Raises ValueError for another method, an option other than its default that is not one of the method's, a file that is no
@@ -317,8 +201,8 @@ impl PyEstimator {
     ///
     /// object: a Mesh, or None where the method's weights know the object (pix2pose without icp; its outline is not aligned
     /// then); id: which of the weights' objects it is, not needed where they know one. depth (H, W) metres; rgb (H, W, 3) uint8;
-    /// images are without lens distortion, and what the method does not use is not looked at (`needs`). box (4,) x, y, width,
-    /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: most poses;
+    /// images are without lens distortion, and what the method does not use is ignored (`needs`). box (4,) x, y, width,
+    /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: max number of poses;
     /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0 for pix2pose). What is
     /// derived from an object is kept for the next call. The same input gives the same result at any number of threads. Ctrl-C
     /// is heard.
@@ -389,8 +273,8 @@ impl PyEstimator {
     }
 
     /// Looks for all targets of a BOP dataset and writes the poses to a result file as the BOP Challenge has it, image by image:
-    /// what `sixfold estimate --dataset` does. A file that is there is gone on with, if the same call made it; `out`.run.json
-    /// beside it says with which options.
+    /// what `sixfold estimate --dataset` does. An existing file is resumed if the same call made it; `out`.run.json beside it
+    /// holds the options.
     ///
     /// path: the dataset's folder; out: the result file (.csv). boxes: "gt" for the boxes of the ground truth, or a file of
     /// COCO detections; detector: a weight file that `train_detector` wrote, whose boxes are taken; without both the whole
@@ -400,7 +284,7 @@ impl PyEstimator {
     /// total, image.
     ///
     /// Returns a dict with images, targets, poses (rows of the file), skipped (what was left out, and why), seconds_per_image
-    /// (of those done now, or None), results. Ctrl-C ends the run after the current image; call it again to go on.
+    /// (of those done now, or None), results. Ctrl-C ends the run after the current image; call it again to resume.
     ///
     /// Raises OSError for files that cannot be read or written; ValueError for broken ones, a method that needs boxes without
     /// any, a result file that was made with other options.

@@ -23,6 +23,7 @@ mod gripper;
 mod guard;
 mod made_up;
 mod mesh;
+mod methods;
 mod metrics;
 mod mttm;
 mod photograph;

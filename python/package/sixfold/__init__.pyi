@@ -25,7 +25,7 @@ Texts = list[str]
 View = tuple[ArrayLike, Camera, ArrayLike] | tuple[ArrayLike, Camera, ArrayLike, ArrayLike]
 """Depth, camera, mask, and the pose where it is known."""
 Progress = Callable[[dict[str, Any]], object]
-"""Called with stage, done, total; for a dataset image; while training seconds, learning_rate, samples_per_second, losses."""
+"""Called with stage, done, total; dataset: image; training: seconds, learning_rate, samples_per_second, losses."""
 Levels = Iterable[tuple[float, int, int]]
 """Rejection distance in metres, iterations, stride."""
 
@@ -376,7 +376,7 @@ class Estimator:
         icp: bool = False,
         seed: int = 0,
     ) -> Estimator:
-        """weights: pix2pose (needed), mttm; keep_plane: ppf, mttm; matcher, templates_only: mttm; the others: pix2pose."""
+        """weights: pix2pose (needed), mttm; keep_plane: ppf, mttm; matcher, templates_only: mttm; others: pix2pose."""
     @property
     def name(self) -> str: ...
     @property
@@ -395,7 +395,7 @@ class Estimator:
         *,
         id: int | None = None,
     ) -> list[Estimate]:
-        """Looks for an object in an image: best first, empty where it is not found. id: which of the weights' objects."""
+        """Looks for an object in an image: best first, empty if not found. id: which of the weights' objects."""
     def run_dataset(
         self,
         path: Path,
