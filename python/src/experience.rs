@@ -179,7 +179,7 @@ impl ExperienceStore {
             let crop = look.crop(&model)?;
             let part = part.as_deref();
             let experience =
-                Experience::new(&*model, crop, &grasp, &gripper, &object, part, time, &provenance);
+                Experience::new(model.as_ref(), crop, &grasp, &gripper, &object, part, time, &provenance);
             if !experience.region.contains(&true) {
                 let expected = "a gripper at the object, in metres in the camera's frame";
                 return Err(bad("grasp", expected, "one that is nowhere near it"));
@@ -244,7 +244,7 @@ impl ExperienceStore {
             for summary in opened.store.list()? {
                 stop.check();
                 if let Some(stored) = opened.store.get(summary.id)? {
-                    added += usize::from(target.add(&stored.experience.encoded(&*model)?)?.1);
+                    added += usize::from(target.add(&stored.experience.encoded(model.as_ref())?)?.1);
                 }
             }
             Ok(added)

@@ -16,7 +16,7 @@ use sixfold_mesh::ModelInfo;
 use crate::arrays::{self, bad};
 use crate::bop::{PyDataset, PyEstimate, json_to_python};
 use crate::camera::PyCamera;
-use crate::guard::{dataset_error, eval_error, free, interruptible, results_error};
+use crate::guard::{dataset_error, eval_error, free, image_error, interruptible, results_error};
 use crate::mesh::PyMesh;
 
 #[derive(FromPyObject)]
@@ -399,7 +399,7 @@ fn bop19<'py>(
         interruptible(py, move |stop| evaluate(&dataset, &estimates, &targets, &options, &|_| stop.check()))?
             .map_err(eval_error)?;
     if let Some(path) = curves {
-        free(py, || write_recall_curves(&path, &scores))?.map_err(dataset_error)?;
+        free(py, || write_recall_curves(&path, &scores))?.map_err(image_error)?;
     }
     json_to_python(py, &scores)
 }

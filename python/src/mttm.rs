@@ -12,7 +12,7 @@ use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
 use sixfold_mttm::mask::to_image;
 use sixfold_mttm::model::{ModelError, MttmModel};
 use sixfold_mttm::{
-    Coverage, DepthView, EstimateOptions, KnownObject, MatchedBy, ObjectTemplates, SIDE, Source, StoreError,
+    Coverage, DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, SIDE, Source, StoreError,
     TemplateError, TemplateOptions, estimate,
 };
 
@@ -20,7 +20,7 @@ use crate::arrays::{self, bad, whole};
 use crate::camera::PyCamera;
 use crate::guard::{interruptible, os_error};
 use crate::mesh::PyMesh;
-use crate::ppf::{model_of, scene_of, verification_to_python};
+use crate::ppf::{rendered_of, scene_of, verification_to_python};
 use crate::training::file_or_value;
 
 fn template_error(argument: &str, error: &TemplateError) -> PyErr {
@@ -193,8 +193,16 @@ fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
 const MATCHERS: [(&str, MatchedBy); 3] =
     [("points", MatchedBy::Points), ("network", MatchedBy::Network), ("both", MatchedBy::Both)];
 
+/// Who matches, by its name.
+pub(crate) fn matched_by(matcher: &str) -> PyResult<MatchedBy> {
+    let known = MATCHERS.into_iter().find(|(name, _)| *name == matcher);
+    known.map(|(_, by)| by).ok_or_else(|| {
+        bad("matcher", MATCHERS.map(|(name, _)| format!("{name:?}")).join(" or "), format!("{matcher:?}"))
+    })
+}
+
 /// The network within the package, read once, or that of a file.
-fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelError> {
+pub(crate) fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelError> {
     static SHIPPED: OnceLock<Arc<MttmModel>> = OnceLock::new();
     match (weights, SHIPPED.get()) {
         (Some(file), _) => MttmModel::load(&file).map(Arc::new),
@@ -241,10 +249,7 @@ impl Mttm {
         weights: Option<PathBuf>,
         cache: Option<PathBuf>,
     ) -> PyResult<Self> {
-        let known = MATCHERS.into_iter().find(|(name, _)| *name == matcher);
-        let (_, matched_by) = known.ok_or_else(|| {
-            bad("matcher", MATCHERS.map(|(name, _)| format!("{name:?}")).join(" or "), format!("{matcher:?}"))
-        })?;
+        let matched_by = matched_by(matcher)?;
         for (argument, file) in [("weights", &weights), ("cache", &cache)] {
             if let (MatchedBy::Points, Some(file)) = (matched_by, file) {
                 return Err(bad(argument, "None with matcher=\"points\"", file.display().to_string()));
@@ -257,11 +262,10 @@ impl Mttm {
         } else {
             return Err(bad("templates", "Templates or a Mesh", templates.get_type().to_string()));
         };
-        let model = mesh.map(|mesh| model_of(py, "mesh", mesh)).transpose()?;
+        let rendered = mesh.map(|mesh| rendered_of(py, "mesh", mesh)).transpose()?;
         let made = interruptible(py, move |_| -> Result<_, ModelError> {
             let network = (matched_by != MatchedBy::Points).then(|| network(weights)).transpose()?;
-            let known =
-                KnownObject::new(ObjectTemplates::clone(&templates), model.map(|m| m.as_ref().clone()));
+            let known = KnownObject::new(ObjectTemplates::clone(&templates), rendered);
             Ok(match (network, cache) {
                 (None, _) => (known, None),
                 (Some(network), None) => (known.with_network(network), None),
@@ -362,7 +366,7 @@ pub(crate) fn estimate_mttm(
         }
         Err(_) => return Err(bad("model", "an Mttm, Templates or a Mesh", model.get_type().to_string())),
     };
-    let options = EstimateOptions { matched_by, max_instances, min_score, ..EstimateOptions::default() };
+    let options = MttmOptions { matched_by, max_instances, min_score, ..MttmOptions::default() };
     let size = scene.depth().size();
     let found = interruptible(py, move |_| estimate(&scene, &known, &options).0)?;
     found

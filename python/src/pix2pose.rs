@@ -8,21 +8,23 @@ use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyType};
-use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
+use sixfold_estimator::Object;
+use sixfold_geometry::Rect;
 use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
-use sixfold_align::outline::outline_mesh;
-use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
-use sixfold_pix2pose::depth::DepthScene;
-use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found, estimate};
+use sixfold_pix2pose::aligned::AlignOptions;
+use sixfold_pix2pose::depth::{align, prepare};
+use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found};
+use sixfold_pix2pose::estimator::{self, Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_pix2pose::model::{ModelError, Pix2PoseModel};
+use sixfold_runner::describe;
 
 use crate::arrays::{self, about, bad, positive, seed};
 use crate::camera::PyCamera;
 use crate::guard::{interruptible, os_error};
 use crate::mesh::PyMesh;
 
-fn model_error(error: ModelError) -> PyErr {
+pub(crate) fn model_error(error: ModelError) -> PyErr {
     match &error {
         ModelError::Weights(WeightsError::Read { source, .. }) => os_error(source.kind(), error.to_string()),
         _ => PyValueError::new_err(error.to_string()),
@@ -83,15 +85,13 @@ impl Pix2PosePose {
 /// What a call found in one box, before it becomes Python's.
 struct Posed {
     object_id: u32,
-    camera_from_object: Pose,
-    refined: bool,
+    pose: estimator::Pix2PosePose,
     aligned: bool,
-    found: Found,
 }
 
 impl Posed {
     fn into_python(self, py: Python<'_>) -> PyResult<Pix2PosePose> {
-        let Found { hypotheses, view, object_points, image_points, .. } = self.found;
+        let Found { hypotheses, view, object_points, image_points, .. } = self.pose.found;
         let list = PyList::empty(py);
         for h in &hypotheses {
             let entry = PyDict::new(py);
@@ -106,9 +106,9 @@ impl Posed {
         let coordinates = PyArray1::from_vec(py, p.coordinates.into_flattened()).reshape([side, side, 3])?;
         Ok(Pix2PosePose {
             object_id: self.object_id,
-            camera_from_object: arrays::from_pose(py, &self.camera_from_object)?.unbind(),
-            score: hypotheses.first().map_or(0.0, |h| h.score),
-            refined: self.refined,
+            camera_from_object: arrays::from_pose(py, &self.pose.camera_from_object)?.unbind(),
+            score: self.pose.score,
+            refined: self.pose.refined,
             aligned_to_depth: self.aligned,
             hypotheses: list.unbind(),
             window: PyArray1::from_vec(py, vec![w.x, w.y, w.width, w.height]).unbind(),
@@ -128,59 +128,23 @@ impl Posed {
 /// >>> poses = pix2pose(rgb, [[330, 120, 110, 150]], object_ids=[8])  # doctest: +SKIP
 #[pyclass(name = "Pix2Pose", module = "sixfold", frozen)]
 pub(crate) struct Pix2Pose {
-    model: Arc<Pix2PoseModel>,
+    estimator: Pix2PoseEstimator,
     camera: Option<PyCamera>,
     meshes: Meshes,
 }
 
-type Meshes = BTreeMap<u32, ObjectMesh>;
+/// Objects by their ids, and the mesh of each.
+type Meshes = BTreeMap<u32, (Arc<Pix2PoseObject>, Arc<Mesh>)>;
 
-/// An object's mesh, whole and with no more faces than its outline needs.
-#[derive(Clone)]
-struct ObjectMesh {
-    whole: Arc<Mesh>,
-    outline: Arc<Mesh>,
-}
-
-fn meshes_of(model: &Pix2PoseModel, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
+fn meshes_of(estimator: &Pix2PoseEstimator, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
     let mut out = BTreeMap::new();
     for (id, mesh) in meshes.unwrap_or_default() {
-        let (_, entry) =
-            model.object(id).map_err(|error| PyValueError::new_err(format!("meshes: {error}")))?;
         let mesh = mesh.get().mesh.clone();
-        let named = |error| PyValueError::new_err(format!("meshes: for object {id}: {error}"));
-        entry.check_mesh(&mesh).map_err(named)?;
-        let outline = Arc::new(outline_mesh(&mesh));
-        out.insert(id, ObjectMesh { whole: mesh, outline });
+        let object = Object { name: id.to_string(), mesh: Some(mesh.clone()), ..Object::of_model(Some(id)) };
+        let named = |error| PyValueError::new_err(format!("meshes: {}", describe(&error)));
+        out.insert(id, (Arc::new(estimator.object(&object).map_err(named)?), mesh));
     }
     Ok(out)
-}
-
-/// One box: with the outline aligned where there is a mesh and it is wanted, as PnP left it elsewhere.
-fn look_into(
-    (model, image, camera): (&Pix2PoseModel, &RgbImage, &Camera),
-    object_id: u32,
-    region: &Rect,
-    mesh: Option<&ObjectMesh>,
-    refine: bool,
-    options: &AlignOptions,
-) -> Result<Option<Posed>, EstimateError> {
-    if let (Some(mesh), true) = (mesh, refine) {
-        let aligned = estimate_aligned(model, image, camera, object_id, region, &mesh.outline, options)?;
-        return Ok(aligned.map(|a| Posed {
-            object_id,
-            camera_from_object: a.camera_from_object,
-            refined: a.improved,
-            aligned: false,
-            found: a.found,
-        }));
-    }
-    let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
-        return Ok(None);
-    };
-    let Some(best) = found.hypotheses.first() else { return Ok(None) };
-    let camera_from_object = best.camera_from_object;
-    Ok(Some(Posed { object_id, camera_from_object, refined: false, aligned: false, found }))
 }
 
 #[pymethods]
@@ -201,21 +165,22 @@ impl Pix2Pose {
         meshes: Option<BTreeMap<u32, Py<PyMesh>>>,
     ) -> PyResult<Self> {
         let model = interruptible(py, move |_| Pix2PoseModel::load(&path))?.map_err(model_error)?;
-        let meshes = meshes_of(&model, meshes)?;
-        Ok(Pix2Pose { model: Arc::new(model), camera, meshes })
+        let estimator = Pix2PoseEstimator::new(model);
+        let meshes = meshes_of(&estimator, meshes)?;
+        Ok(Pix2Pose { estimator, camera, meshes })
     }
 
     /// What the model knows: a list of dicts with id, diameter (metres), centre and half_size (3,) of its coordinates in
     /// metres, thresholds.
     #[getter]
     fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        crate::bop::json_to_python(py, &self.model.objects())
+        crate::bop::json_to_python(py, &self.estimator.model.objects())
     }
 
     /// The model's card: what it was trained on, how, with which scores.
     #[getter]
     fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        crate::bop::json_to_python(py, self.model.card())
+        crate::bop::json_to_python(py, self.estimator.model.card())
     }
 
     /// Looks for one object in every box of an image: a list with a Pix2PosePose for each box, None where it is not seen.
@@ -256,7 +221,7 @@ impl Pix2Pose {
         let camera = camera.of_image("rgb", image.size())?;
         let ids = match object_ids {
             Some(ids) => arrays::ids("object_ids", ids)?,
-            None => match self.model.objects() {
+            None => match self.estimator.model.objects() {
                 [only] => vec![only.id; boxes.len()],
                 several => {
                     let known: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
@@ -268,11 +233,14 @@ impl Pix2Pose {
         if ids.len() != boxes.len() {
             return Err(bad("object_ids", format!("{} ids, one a box", boxes.len()), ids.len().to_string()));
         }
+        let mut objects = BTreeMap::new();
         for id in &ids {
-            self.model.object(*id).map_err(about("object_ids"))?;
+            let object = self.estimator.object(&Object::of_model(Some(*id)));
+            let named = |error| PyValueError::new_err(format!("object_ids: {}", describe(&error)));
+            objects.insert(*id, Arc::new(object.map_err(named)?));
         }
         let meshes = match meshes {
-            Some(meshes) => meshes_of(&self.model, Some(meshes))?,
+            Some(meshes) => meshes_of(&self.estimator, Some(meshes))?,
             None => self.meshes.clone(),
         };
         let depth = depth.map(|d| arrays::depth("depth", d)).transpose()?;
@@ -299,28 +267,34 @@ impl Pix2Pose {
             correct,
             ..AlignOptions::default()
         };
-        let model = self.model.clone();
+        objects.extend(meshes.iter().map(|(id, (object, _))| (*id, object.clone())));
+        let estimator = Pix2PoseEstimator { options, refine, ..self.estimator.clone() };
+        let prepared = match depth {
+            None => None,
+            Some(depth) => {
+                Some(interruptible(py, move |_| prepare(&depth, &camera))?.map_err(about("depth"))?)
+            }
+        };
         let found = interruptible(py, move |stop| {
-            let scene = depth.as_ref().map(|d| DepthScene::new(d, &camera));
             let mut out: Vec<Option<Posed>> = Vec::with_capacity(boxes.len());
             for (region, object_id) in boxes.iter().zip(ids) {
                 stop.check();
-                let mesh = meshes.get(&object_id);
-                let look = (model.as_ref(), &image, &camera);
-                let Some(mut posed) = look_into(look, object_id, region, mesh, refine, &options)? else {
+                let object = &objects[&object_id];
+                let Some(mut pose) = estimator.pose_in_box(&image, &camera, object, region)? else {
                     out.push(None);
                     continue;
                 };
-                if let (Some(mesh), Some(scene)) = (mesh, &scene) {
-                    let diameter = model.object(object_id).map(|(_, o)| o.diameter)?;
+                let mut aligned = false;
+                if let (Some((_, mesh)), Some(depth)) = (meshes.get(&object_id), &prepared) {
+                    let diameter = estimator.model.object(object_id).map(|(_, o)| o.diameter)?;
+                    let start = pose.camera_from_object;
                     // Too little depth on the object leaves the pose that colour gave.
-                    let start = posed.camera_from_object;
-                    if let Ok(aligned) = scene.align(&mesh.whole, diameter, &start, &posed.found, None) {
-                        posed.camera_from_object = aligned.camera_from_object;
-                        posed.aligned = true;
+                    if let Ok(to_depth) = align(depth, mesh, diameter, &start, &pose.found, None) {
+                        pose.camera_from_object = to_depth.camera_from_object;
+                        aligned = true;
                     }
                 }
-                out.push(Some(posed));
+                out.push(Some(Posed { object_id, pose, aligned }));
             }
             Ok::<_, EstimateError>(out)
         })?;
@@ -337,7 +311,7 @@ impl Pix2Pose {
     }
 
     fn __repr__(&self) -> String {
-        let ids: Vec<String> = self.model.objects().iter().map(|o| o.id.to_string()).collect();
+        let ids: Vec<String> = self.estimator.model.objects().iter().map(|o| o.id.to_string()).collect();
         format!("<Pix2Pose: objects {}>", ids.join(", "))
     }
 }

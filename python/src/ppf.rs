@@ -7,9 +7,9 @@ use numpy::PyArray2;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_match::{
-    EstimateOptions, ModelOptions, ObjectModel, Scene, SceneError, SceneOptions, VerificationScore,
-};
+use sixfold_align::{DepthOptions, DepthRegion, PreparedDepthError, VerificationScore, verification_mesh};
+use sixfold_mesh::Mesh;
+use sixfold_ppf::{ModelOptions, ObjectModel, PpfOptions};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::camera::PyCamera;
@@ -32,7 +32,7 @@ const SYMMETRY_STEP: f64 = 0.05;
 /// >>> model = PpfModel(Mesh.load("data/demo/models/obj_000008.ply", "mm"))  # doctest: +SKIP
 #[pyclass(name = "PpfModel", module = "sixfold", frozen)]
 pub(crate) struct PpfModel {
-    model: Arc<ObjectModel>,
+    pub(crate) model: Arc<ObjectModel>,
     /// Why a description in `cache` was not taken, or could not be written; None otherwise.
     #[pyo3(get)]
     cache_note: Option<String>,
@@ -92,6 +92,14 @@ impl PpfModel {
     }
 }
 
+/// A depth image or a mask that cannot be searched.
+pub(crate) fn depth_error(error: PreparedDepthError) -> PyErr {
+    match &error {
+        PreparedDepthError::MaskSize { .. } => about("mask")(error),
+        _ => about("depth")(error),
+    }
+}
+
 /// A depth image prepared for estimate_ppf: in-painting, normals, table plane, thinned points. Prepare once, search any
 /// number of objects.
 ///
@@ -102,7 +110,7 @@ impl PpfModel {
 ///
 /// >>> scene = PpfScene(depth, camera)  # doctest: +SKIP
 #[pyclass(name = "PpfScene", module = "sixfold", frozen)]
-pub(crate) struct PpfScene(pub(crate) Arc<Scene>);
+pub(crate) struct PpfScene(pub(crate) Arc<DepthRegion>);
 
 #[pymethods]
 impl PpfScene {
@@ -121,12 +129,10 @@ impl PpfScene {
         let camera = camera.of_image("depth", depth.size())?;
         let mask = mask.map(|m| arrays::mask("mask", m)).transpose()?;
         let (max_depth, seed) = (positive("max_depth", max_depth)?, self::seed(seed)?);
-        let options = SceneOptions { remove_plane, max_depth, seed, ..SceneOptions::default() };
-        let scene = interruptible(py, move |_| Scene::new(&depth, &camera, mask.as_ref(), &options))?;
-        let scene = scene.map_err(|error| match &error {
-            SceneError::MaskSize { .. } => about("mask")(error),
-            _ => about("depth")(error),
-        })?;
+        let options = DepthOptions { remove_plane, max_depth, seed, ..DepthOptions::default() };
+        let scene =
+            interruptible(py, move |_| DepthRegion::from_depth(&depth, &camera, mask.as_ref(), &options))?;
+        let scene = scene.map_err(depth_error)?;
         Ok(PpfScene(Arc::new(scene)))
     }
 
@@ -201,7 +207,7 @@ pub(crate) fn estimate_ppf(
     seed: i64,
 ) -> PyResult<Vec<PpfEstimate>> {
     let mut options =
-        EstimateOptions { max_instances: whole("instances", instances, 1)?, ..EstimateOptions::default() };
+        PpfOptions { max_instances: whole("instances", instances, 1)?, ..PpfOptions::default() };
     if !(0.0..=1.0).contains(&min_score) {
         return Err(bad("min_score", "a number from 0 to 1", min_score.to_string()));
     }
@@ -210,7 +216,7 @@ pub(crate) fn estimate_ppf(
     options.refined = refined.map_or(Ok(options.refined), |r| whole("refined", r, 1))?;
     let scene = scene_of(py, scene, camera, mask, seed)?;
     let model = model_of(py, "model", model)?;
-    let found = interruptible(py, move |_| sixfold_match::estimate(&scene, &model, &options))?;
+    let found = interruptible(py, move |_| sixfold_ppf::estimate(&scene, &model, &options))?;
     found
         .into_iter()
         .map(|e| {
@@ -231,7 +237,7 @@ pub(crate) fn scene_of(
     camera: Option<PyCamera>,
     mask: Option<&Bound<'_, PyAny>>,
     seed: i64,
-) -> PyResult<Arc<Scene>> {
+) -> PyResult<Arc<DepthRegion>> {
     match scene.cast::<PpfScene>() {
         Ok(scene) => {
             if camera.is_some() || mask.is_some() {
@@ -247,15 +253,26 @@ pub(crate) fn scene_of(
 }
 
 /// A PpfModel, or a Mesh described as one.
-pub(crate) fn model_of(
-    py: Python<'_>,
-    argument: &str,
-    model: &Bound<'_, PyAny>,
-) -> PyResult<Arc<ObjectModel>> {
+fn model_of(py: Python<'_>, argument: &str, model: &Bound<'_, PyAny>) -> PyResult<Arc<ObjectModel>> {
     match model.extract::<ModelOrMesh<'_>>() {
         Ok(ModelOrMesh::Model(model)) => Ok(model.get().model.clone()),
         Ok(ModelOrMesh::Mesh(mesh)) => Ok(describe(py, mesh.get(), ModelOptions::default(), None)?.model),
         Err(_) => Err(bad(argument, "a PpfModel or a Mesh", model.get_type().to_string())),
+    }
+}
+
+/// What verification renders of a Mesh, or of the mesh of a PpfModel.
+pub(crate) fn rendered_of(py: Python<'_>, argument: &'static str, mesh: &Bound<'_, PyAny>) -> PyResult<Mesh> {
+    match mesh.extract::<ModelOrMesh<'_>>() {
+        Ok(ModelOrMesh::Model(model)) => Ok(model.get().model.mesh().clone()),
+        Ok(ModelOrMesh::Mesh(mesh)) => {
+            let mesh = mesh.get().mesh.clone();
+            if mesh.faces().is_empty() {
+                return Err(bad(argument, "a mesh with faces", "points without faces"));
+            }
+            interruptible(py, move |_| verification_mesh(&mesh))?.map_err(about(argument))
+        }
+        Err(_) => Err(bad(argument, "a PpfModel or a Mesh", mesh.get_type().to_string())),
     }
 }
 

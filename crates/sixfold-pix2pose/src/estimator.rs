@@ -260,7 +260,8 @@ fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
             "camera_from_object": rows(&h.camera_from_object),
             "confidence": h.score,
             "inliers": h.inliers,
-            "threshold": h.threshold,
+            // As a decimal: 0.15, not the single-precision number next to it.
+            "threshold": (f64::from(h.threshold) * 1e6).round() / 1e6,
         })
     };
     let hypotheses: Vec<Value> = posed.found.hypotheses.iter().map(hypothesis).collect();

@@ -25,7 +25,7 @@ Texts = list[str]
 View = tuple[ArrayLike, Camera, ArrayLike] | tuple[ArrayLike, Camera, ArrayLike, ArrayLike]
 """Depth, camera, mask, and the pose where it is known."""
 Progress = Callable[[dict[str, Any]], object]
-"""Called with stage, done, total, and while training seconds, learning_rate, samples_per_second, losses."""
+"""Called with stage, done, total; dataset: image; training: seconds, learning_rate, samples_per_second, losses."""
 Levels = Iterable[tuple[float, int, int]]
 """Rejection distance in metres, iterations, stride."""
 
@@ -347,6 +347,69 @@ def estimate_ppf(
     verified: int | None = None,
     seed: int = 0,
 ) -> list[PpfEstimate]: ...
+
+class Estimate:
+    @property
+    def camera_from_object(self) -> Float: ...
+    @property
+    def confidence(self) -> float: ...
+    @property
+    def mask(self) -> Bool | None: ...
+    @property
+    def details(self) -> dict[str, Any]: ...
+    @property
+    def notes(self) -> Texts: ...
+
+class Estimator:
+    """A method of `sixfold estimate`, the same interface for all of them."""
+
+    def __new__(
+        cls,
+        method: Literal["ppf", "mttm", "pix2pose"],
+        *,
+        weights: Path | None = None,
+        keep_plane: bool = False,
+        matcher: Literal["points", "network", "both"] = "both",
+        templates_only: bool = False,
+        refine: bool = True,
+        passes: int | None = None,
+        icp: bool = False,
+        seed: int = 0,
+    ) -> Estimator:
+        """weights: pix2pose (needed), mttm; keep_plane: ppf, mttm; matcher, templates_only: mttm; others: pix2pose."""
+    @property
+    def name(self) -> str: ...
+    @property
+    def needs(self) -> dict[str, str]:
+        """Of depth, rgb, region and object: "required", "optional" or "unused"."""
+    def find(
+        self,
+        object: Mesh | None,
+        camera: Camera,
+        depth: ArrayLike | None = None,
+        rgb: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        instances: int = 1,
+        min_confidence: float | None = None,
+        *,
+        id: int | None = None,
+    ) -> list[Estimate]:
+        """Looks for an object in an image: best first, empty if not found. id: which of the weights' objects."""
+    def run_dataset(
+        self,
+        path: Path,
+        out: Path,
+        split: str = "test",
+        boxes: Path | None = None,
+        detector: Path | None = None,
+        targets: Path | None = None,
+        min_confidence: float | None = None,
+        *,
+        cache: Path | None = None,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Looks for all targets of a BOP dataset, into a result file. boxes: "gt", or a file of COCO detections."""
 
 class Pix2PosePose:
     @property

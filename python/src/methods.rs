@@ -1,0 +1,129 @@
+//! The methods of `Estimator`: a name, options, and how they become an estimator, as `sixfold estimate` does it.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use pyo3::prelude::*;
+use sixfold_align::DepthOptions;
+use sixfold_estimator::PoseEstimator;
+use sixfold_mttm::{MatchedBy, MttmEstimator, MttmOptions};
+use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+use sixfold_ppf::PpfEstimator;
+use sixfold_runner::RunOptions;
+
+use crate::arrays::bad;
+use crate::guard::interruptible;
+use crate::mttm::{matched_by, network};
+use crate::training::file_or_value;
+
+/// The methods' options as they were given.
+pub(crate) struct Options {
+    pub weights: Option<PathBuf>,
+    pub keep_plane: bool,
+    pub matcher: String,
+    pub templates_only: bool,
+    pub refine: bool,
+    pub passes: Option<usize>,
+    pub icp: bool,
+    pub seed: u64,
+}
+
+/// Each method with its own options beside the seed.
+const METHODS: [(&str, &[&str]); 3] = [
+    ("ppf", &["keep_plane"]),
+    ("mttm", &["keep_plane", "weights", "matcher", "templates_only"]),
+    ("pix2pose", &["weights", "refine", "passes", "icp"]),
+];
+
+/// The default of `matcher`.
+const BOTH: &str = "both";
+
+impl Options {
+    /// The options that differ from their defaults, by name.
+    fn given(&self) -> Vec<(&'static str, String)> {
+        let all = [
+            ("weights", self.weights.as_ref().map(|w| w.display().to_string())),
+            ("keep_plane", self.keep_plane.then(|| "True".to_owned())),
+            ("matcher", (self.matcher != BOTH).then(|| self.matcher.clone())),
+            ("templates_only", self.templates_only.then(|| "True".to_owned())),
+            ("refine", (!self.refine).then(|| "False".to_owned())),
+            ("passes", self.passes.map(|p| p.to_string())),
+            ("icp", self.icp.then(|| "True".to_owned())),
+        ];
+        all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
+    }
+
+    /// The method's name, after it was seen that every given option is one of its own.
+    pub fn check(&self, method: &str) -> PyResult<&'static str> {
+        let names = || METHODS.map(|(name, _)| format!("{name:?}")).join(" or ");
+        let known = METHODS.iter().find(|(name, _)| *name == method);
+        let (method, own) = known.ok_or_else(|| bad("method", names(), format!("{method:?}")))?;
+        for (option, value) in self.given() {
+            if !own.contains(&option) {
+                let users = METHODS.iter().filter(|(_, own)| own.contains(&option));
+                let users = users.map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(" and ");
+                let expected = format!("its default: it is no option of {method:?}, but of {users}");
+                return Err(bad(option, expected, value));
+            }
+        }
+        Ok(method)
+    }
+
+    /// The options that a run over a dataset resumes with.
+    pub fn record(&self) -> RunOptions {
+        let mut record = RunOptions::default();
+        for (name, value) in self.given() {
+            record.add(name, &value);
+        }
+        record.add("seed", &self.seed.to_string());
+        record
+    }
+}
+
+/// A method, and the ids of the objects that its weights know.
+pub(crate) type Made = (Arc<dyn PoseEstimator>, Vec<u32>);
+
+pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<Made> {
+    let depth =
+        DepthOptions { remove_plane: !options.keep_plane, seed: options.seed, ..DepthOptions::default() };
+    let weights = options.weights.clone();
+    Ok(match method {
+        "ppf" => (Arc::new(PpfEstimator { depth, ..PpfEstimator::default() }), vec![]),
+        "mttm" => {
+            let matched_by = matched_by(&options.matcher)?;
+            let network = match (matched_by, weights) {
+                (MatchedBy::Points, None) => None,
+                (MatchedBy::Points, Some(file)) => {
+                    return Err(bad("weights", "None with matcher=\"points\"", file.display().to_string()));
+                }
+                (_, weights) => {
+                    let read = interruptible(py, move |_| network(weights))?;
+                    Some(read.map_err(|error| file_or_value(&error))?)
+                }
+            };
+            let estimator = MttmEstimator {
+                depth,
+                options: MttmOptions { matched_by, ..MttmOptions::default() },
+                network,
+                templates_only: options.templates_only,
+                ..MttmEstimator::default()
+            };
+            (Arc::new(estimator), vec![])
+        }
+        _ => {
+            let weights = weights.ok_or_else(|| {
+                bad("weights", "a file that train_pix2pose or `sixfold train pix2pose` wrote", "None")
+            })?;
+            let read = interruptible(py, move |_| Pix2PoseEstimator::load(&weights))?;
+            let mut estimator = read.map_err(|error| file_or_value(&error))?;
+            estimator.options.estimate.seed = options.seed;
+            if let Some(passes) = options.passes {
+                estimator.options.looks = passes;
+            }
+            estimator.refine = options.refine;
+            estimator.icp = options.icp;
+            let ids = estimator.model.objects().iter().map(|o| o.id).collect();
+            (Arc::new(estimator), ids)
+        }
+    })
+}
