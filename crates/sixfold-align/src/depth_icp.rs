@@ -22,19 +22,19 @@ pub struct AlignedToDepth {
     pub rms: f64,
 }
 
-/// Fewer pixels with depth say nothing of the distance.
+/// Fewer pixels with depth say nothing of the distance; chosen by hand, not swept.
 const MIN_PIXELS: usize = 20;
-/// Rejection distances of the three levels, as fractions of the diameter.
+/// Rejection distances of the three levels, as fractions of the diameter; chosen by hand, not swept.
 const REJECTION: [f64; 3] = [0.15, 0.08, 0.04];
-/// Iterations of a level.
+/// Iterations of a level; chosen by hand, not swept.
 const ITERATIONS: usize = 8;
-/// About so many points of the rendered surface are used.
+/// About so many points of the rendered surface are used; chosen by hand, not swept.
 const POINTS: usize = 1000;
-/// Normals of a correspondence agree within this angle, degrees.
+/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 45.0;
-/// A level ends at steps smaller than this, metres and radians.
+/// A level ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
 const CONVERGENCE: f64 = 1e-5;
-/// Factors of the distance outside of which something else than the object was measured.
+/// Factors of the distance outside of which something else than the object was measured; chosen by hand, not swept.
 const PLAUSIBLE: std::ops::Range<f64> = 0.5..2.0;
 
 /// Aligns a pose; `diameter` in metres. `visible` says which pixels (column, row) show the object.

@@ -7,8 +7,8 @@ use std::sync::{Arc, OnceLock};
 use rayon::prelude::*;
 use sixfold_geometry::{
     Camera, CameraError, DepthImage, DepthImageError, Image, IndexedCloud, Mask, NormalImage, NormalOptions,
-    Plane, PlaneOptions, PointCloud, Vec2, Vec3, dominant_plane, inpaint_depth, normals_from_depth,
-    usable_depth,
+    OptionError, Plane, PlaneOptions, PointCloud, Vec2, Vec3, dominant_plane, inpaint_depth,
+    normals_from_depth, usable_depth,
 };
 use thiserror::Error;
 
@@ -35,15 +35,8 @@ pub enum PreparedDepthError {
     #[error(transparent)]
     Depth(#[from] DepthImageError),
     /// An option is out of range.
-    #[error("option {option}: found {found}, expected {expected}")]
-    Option {
-        /// Name of the option.
-        option: &'static str,
-        /// Its value.
-        found: f64,
-        /// What it should be.
-        expected: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
 }
 
 /// How a depth image is prepared.
@@ -63,33 +56,39 @@ pub struct DepthOptions {
     pub seed: u64,
 }
 
-/// Radius in pixels within which a normal is fitted for matching: wider than for ICP, as features need smooth normals.
+/// Radius in pixels within which a normal is fitted for matching: wider than for ICP, as features need smooth normals. Chosen by
+/// hand; not swept.
 const MATCHING_NORMAL_RADIUS: usize = 4;
+
+/// Rounds of in-painting, each a pixel into the holes. The dissertation, section 5.3.1, in-paints; how far was chosen by hand.
+const INPAINT_ROUNDS: usize = 2;
+/// Depth beyond which points are left out, metres; chosen by hand, not swept.
+const MAX_DEPTH: f64 = 5.0;
 
 impl Default for DepthOptions {
     fn default() -> Self {
         DepthOptions {
             normals: NormalOptions { radius: MATCHING_NORMAL_RADIUS, ..NormalOptions::default() },
-            inpaint_rounds: 2,
+            inpaint_rounds: INPAINT_ROUNDS,
             remove_plane: true,
             plane: PlaneOptions::default(),
-            max_depth: 5.0,
+            max_depth: MAX_DEPTH,
             seed: 0,
         }
     }
 }
 
 impl DepthOptions {
-    /// Tests every field.
+    /// Checks every field.
     ///
     /// # Errors
-    /// [`PreparedDepthError::Option`].
-    pub fn check(&self) -> Result<(), PreparedDepthError> {
-        if !(self.max_depth > 0.0) {
-            let (option, found) = ("max_depth", self.max_depth);
-            return Err(PreparedDepthError::Option { option, found, expected: "metres above 0" });
-        }
-        Ok(())
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.normals.check()?;
+        OptionError::unless_within("inpaint_rounds", self.inpaint_rounds, ..=1000, "0 to 1000")?;
+        self.plane.check()?;
+        let fits = self.max_depth > 0.0;
+        if fits { Ok(()) } else { Err(OptionError::new("max_depth", self.max_depth, "metres above 0")) }
     }
 }
 
@@ -106,9 +105,9 @@ pub struct PreparedDepth {
     edge_distance: OnceLock<Image<u8>>,
 }
 
-/// Points of a region are thinned to this first, metres: about the noise of depth cameras at a metre.
+/// Points of a region are thinned to this first, metres: about the noise of depth cameras at a metre. Chosen by hand; not swept.
 const BASE_STEP: f64 = 0.002;
-/// Normals further apart than this stay apart when points are thinned, radians.
+/// Normals further apart than this stay apart when points are thinned, radians. Chosen by hand; not swept.
 const BASE_ANGLE: f64 = 1.0;
 
 impl PreparedDepth {
@@ -300,26 +299,36 @@ impl DepthRegion {
     }
 }
 
-/// Distance in pixels (8-neighbour steps) to the nearest depth edge, at most 255: a jump of more than 1.5 % of
-/// the depth plus 5 mm between neighbours, or a crease of more than 35 degrees between the normals four pixels to both
-/// sides (an object on a table has no jump where it stands).
+/// A depth edge is a jump between neighbours of more than this many metres ([`EDGE_JUMP`]) and this fraction of the nearer depth
+/// ([`EDGE_SLOPE`]): the fraction allows for slanted surfaces. Both chosen by hand; not swept.
+const EDGE_JUMP: f32 = 0.005;
+/// See [`EDGE_JUMP`].
+const EDGE_SLOPE: f32 = 0.015;
+/// A crease: normals on both sides enclose an angle with less than this cosine, about 35 degrees. Chosen by hand; not swept.
+const CREASE_COSINE: f32 = 0.82;
+/// Pixels from a crease to where its normals are taken, to both sides; chosen by hand, not swept.
+const CREASE_REACH: usize = 4;
+
+/// Distance in pixels (8-neighbour steps) to the nearest depth edge, at most 255: a jump between neighbours, or a crease (an
+/// object on a table has no jump where it stands).
 fn edge_distances(depth: &DepthImage, normals: &NormalImage) -> Image<u8> {
-    const REACH: usize = 4;
     let crease = |a: [f32; 3], b: [f32; 3]| {
-        a != [0.0; 3] && b != [0.0; 3] && a[0] * b[0] + a[1] * b[1] + a[2] * b[2] < 0.82
+        a != [0.0; 3] && b != [0.0; 3] && a[0] * b[0] + a[1] * b[1] + a[2] * b[2] < CREASE_COSINE
     };
     let (width, height) = depth.size();
-    let jump = |a: f32, b: f32| (a > 0.0) != (b > 0.0) || (a - b).abs() > 0.005 + 0.015 * a.min(b);
+    let jump = |a: f32, b: f32| (a > 0.0) != (b > 0.0) || (a - b).abs() > EDGE_JUMP + EDGE_SLOPE * a.min(b);
     let mut distance = Image::from_fn(width, height, |x, y| {
         let z = depth[(x, y)];
         let right = x + 1 < width && jump(z, depth[(x + 1, y)]);
         let left = x > 0 && jump(z, depth[(x - 1, y)]);
         let down = y + 1 < height && jump(z, depth[(x, y + 1)]);
         let up = y > 0 && jump(z, depth[(x, y - 1)]);
-        let bent = (x >= REACH
-            && x + REACH < width
-            && crease(normals[(x - REACH, y)], normals[(x + REACH, y)]))
-            || (y >= REACH && y + REACH < height && crease(normals[(x, y - REACH)], normals[(x, y + REACH)]));
+        let bent = (x >= CREASE_REACH
+            && x + CREASE_REACH < width
+            && crease(normals[(x - CREASE_REACH, y)], normals[(x + CREASE_REACH, y)]))
+            || (y >= CREASE_REACH
+                && y + CREASE_REACH < height
+                && crease(normals[(x, y - CREASE_REACH)], normals[(x, y + CREASE_REACH)]));
         if right || left || down || up || bent { 0u8 } else { 255 }
     });
     // Two sweeps of the chessboard distance (Rosenfeld and Pfaltz 1966).
@@ -363,4 +372,23 @@ fn edge_distances(depth: &DepthImage, normals: &NormalImage) -> Image<u8> {
         }
     }
     distance
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = DepthOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        assert_eq!(DepthOptions { max_depth: f64::INFINITY, ..options }.check(), Ok(()));
+        let named = |options: DepthOptions| options.check().unwrap_err().option;
+        assert_eq!(named(DepthOptions { max_depth: f64::NAN, ..options }), "max_depth");
+        assert_eq!(named(DepthOptions { inpaint_rounds: 1001, ..options }), "inpaint_rounds");
+        let normals = NormalOptions { max_relative_step: -1.0, ..options.normals };
+        assert_eq!(named(DepthOptions { normals, ..options }), "normals.max_relative_step");
+        let plane = PlaneOptions { min_share: f64::NAN, ..options.plane };
+        assert_eq!(named(DepthOptions { plane, ..options }), "plane.min_share");
+    }
 }

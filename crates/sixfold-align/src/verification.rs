@@ -8,7 +8,9 @@
 //! outline. Hidden pixels behind a surface that goes on smoothly from what is seen of the object ([`pierced`]
 //! (VerificationScore::pierced)) are no excuse and stay in `N_m - N_occ`.
 
-use sixfold_geometry::{Camera, Pose, Rect, Vec3};
+use std::f64::consts::FRAC_PI_2;
+
+use sixfold_geometry::{Camera, OptionError, Pose, Rect, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 
@@ -29,21 +31,51 @@ pub struct VerificationOptions {
     pub occluders_have_edges: bool,
 }
 
+/// Depth inlier threshold as a fraction of the diameter, where none is given; chosen by hand, not swept.
+const DEPTH_THRESHOLD: f64 = 0.05;
+/// Its bounds, metres: what the dissertation, section 5.2.5, takes for small objects and for all others.
+const DEPTH_THRESHOLDS: (f64, f64) = (0.005, 0.010);
+/// Normals of an inlier agree within this angle, degrees; chosen by hand, not swept.
+const NORMAL_ANGLE: f64 = 30.0;
+/// A silhouette pixel lies on a scene edge within this distance, pixels; chosen by hand, not swept.
+const BOUNDARY_DISTANCE: u8 = 3;
+/// Visibility at which [`VerificationScore::ranking`] is half the total; chosen by hand, not swept.
+const HALF_RANKING: f64 = 0.1;
+/// A rendered point whose normal has a z (camera frame, towards the camera negative) above this is seen at a grazing angle, less
+/// than 9 degrees, and slides out of its pixel. Chosen by hand; not swept.
+const GRAZING: f32 = -0.15;
+/// Pixels by which the crop that is rendered exceeds the projected box to the upper left, and to the lower right: silhouettes need
+/// an empty pixel beside them.
+const CROP_MARGINS: (f64, f64) = (1.0, 2.0);
+
 impl Default for VerificationOptions {
     fn default() -> Self {
         VerificationOptions {
             depth_threshold: None,
-            normal_angle: 30f64.to_radians(),
-            boundary_distance: 3,
+            normal_angle: NORMAL_ANGLE.to_radians(),
+            boundary_distance: BOUNDARY_DISTANCE,
             occluders_have_edges: true,
         }
     }
 }
 
 impl VerificationOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        if let Some(metres) = self.depth_threshold {
+            OptionError::unless_positive("verification.depth_threshold", metres, "metres above 0")?;
+        }
+        let expected = "radians from 0 to a quarter of a turn";
+        OptionError::unless_within("verification.normal_angle", self.normal_angle, 0.0..=FRAC_PI_2, expected)
+    }
+
     /// The depth inlier threshold for an object of this diameter, metres.
     pub fn threshold_for(&self, diameter: f64) -> f64 {
-        self.depth_threshold.unwrap_or((0.05 * diameter).clamp(0.005, 0.010))
+        let (low, high) = DEPTH_THRESHOLDS;
+        self.depth_threshold.unwrap_or((DEPTH_THRESHOLD * diameter).clamp(low, high))
     }
 }
 
@@ -82,7 +114,7 @@ impl VerificationScore {
     /// bet.
     pub fn ranking(&self) -> f64 {
         let v = self.visible_share();
-        self.total * v / (v + 0.1)
+        self.total * v / (v + HALF_RANKING)
     }
 }
 
@@ -142,10 +174,10 @@ impl Verifier {
             };
             (x0, y0, x1, y1) = (x0.min(p.x), y0.min(p.y), x1.max(p.x), y1.max(p.y));
         }
-        let x0 = (x0.floor() - 1.0).clamp(0.0, camera.width as f64);
-        let y0 = (y0.floor() - 1.0).clamp(0.0, camera.height as f64);
-        let x1 = (x1.ceil() + 2.0).clamp(0.0, camera.width as f64);
-        let y1 = (y1.ceil() + 2.0).clamp(0.0, camera.height as f64);
+        let x0 = (x0.floor() - CROP_MARGINS.0).clamp(0.0, camera.width as f64);
+        let y0 = (y0.floor() - CROP_MARGINS.0).clamp(0.0, camera.height as f64);
+        let x1 = (x1.ceil() + CROP_MARGINS.1).clamp(0.0, camera.width as f64);
+        let y1 = (y1.ceil() + CROP_MARGINS.1).clamp(0.0, camera.height as f64);
         if x1 <= x0 || y1 <= y0 {
             return None;
         }
@@ -255,7 +287,7 @@ impl Verifier {
                 }
                 let normal = normals[(x, y)];
                 // Grazing surface slides out of its pixel.
-                if normal[2] > -0.15 {
+                if normal[2] > GRAZING {
                     continue;
                 }
                 let measured = f64::from(image.depth()[(x + x0, y + y0)]);
@@ -337,4 +369,19 @@ pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
         total += (pixels * without_edge).checked_div(border).unwrap_or(0);
     }
     total
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = VerificationOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        let angle = VerificationOptions { normal_angle: f64::NAN, ..options };
+        assert_eq!(angle.check().unwrap_err().option, "verification.normal_angle");
+        let threshold = VerificationOptions { depth_threshold: Some(0.0), ..options };
+        assert_eq!(threshold.check().unwrap_err().option, "verification.depth_threshold");
+    }
 }

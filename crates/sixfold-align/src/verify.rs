@@ -18,15 +18,15 @@ pub struct VerifiedPose {
 }
 
 /// Levels of the ICP: rejection distance as a multiple of the depth inlier threshold, and iterations. The dissertation takes 30
-/// iterations (chapter 5); the mesh is rendered again between these levels, so fewer do.
+/// iterations (chapter 5); the mesh is rendered again between these levels, so fewer do. The multiples were chosen by hand; not swept.
 const LEVELS: [(f64, usize); 3] = [(2.0, 5), (1.2, 5), (0.8, 8)];
-/// Points rendered for a level, about.
+/// Points rendered for a level, about; chosen by hand, not swept.
 const POINTS: usize = 600;
-/// Rendered points this many rejection distances off the measured surface are not the object's.
+/// Rendered points this many rejection distances off the measured surface are not the object's; chosen by hand, not swept.
 const NEAR: f64 = 2.0;
-/// Normals of a correspondence agree within this angle, degrees.
+/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 45.0;
-/// A level ends at steps smaller than this, metres and radians.
+/// A level ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
 const CONVERGENCE: f64 = 1e-5;
 /// Fewer correspondences do not hold six degrees of freedom twice over.
 const MIN_CORRESPONDENCES: usize = 12;

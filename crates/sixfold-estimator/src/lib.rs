@@ -21,6 +21,6 @@ pub use error::EstimatorError;
 pub use estimate::{Diagnostic, PoseEstimate};
 pub use method::{MinConfidence, Need, Needs, PoseEstimator, PreparedObject, downcast};
 pub use object::Object;
-pub use query::{Memo, Query};
+pub use query::{Memo, Query, check_min_confidence};
 pub use region::Region;
 pub use store::{FreeAxis, NewObject, ObjectRecord, ObjectStore, StoreError};

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use sixfold_align::{DepthRegion, PreparedDepth, PreparedDepthError};
-use sixfold_geometry::{Camera, RgbImage};
+use sixfold_geometry::{Camera, OptionError, RgbImage};
 
 use crate::error::EstimatorError;
 use crate::region::Region;
@@ -25,6 +25,14 @@ impl Memo {
     }
 }
 
+/// Whether a number can be the confidence below which estimates are left out: 0 or more, not NaN.
+///
+/// # Errors
+/// [`OptionError`].
+pub fn check_min_confidence(value: f64) -> Result<(), OptionError> {
+    OptionError::unless_within("min_confidence", value, 0.0.., "a number, 0 to 1")
+}
+
 /// An image of a pinhole camera and where to look in it. One query serves any number of objects: what depends on the image alone
 /// is computed once.
 pub struct Query<'a> {
@@ -36,9 +44,9 @@ pub struct Query<'a> {
     pub depth: Option<&'a Arc<PreparedDepth>>,
     /// Where to look; `None` is everywhere.
     pub region: Option<&'a Region>,
-    /// Most instances of an object.
+    /// Most instances of an object, 1 or more.
     pub max_instances: usize,
-    /// Estimates of lower confidence are left out.
+    /// Estimates of lower confidence are left out, 0 or more. Confidences are 0 to 1: above 1 all are left out.
     pub min_confidence: f64,
     /// Whether images for people are wanted.
     pub diagnostics: bool,
@@ -63,6 +71,15 @@ impl<'a> Query<'a> {
             memo: Memo::default(),
             depth_region: OnceLock::new(),
         }
+    }
+
+    /// Checks the limits. Runners call it before they ask a method.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first limit that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_some("max_instances", self.max_instances)?;
+        check_min_confidence(self.min_confidence)
     }
 
     /// The part of the depth image in which to look.
@@ -90,5 +107,25 @@ impl<'a> Query<'a> {
     pub fn rgb(&self, method: &'static str) -> Result<&'a RgbImage, EstimatorError> {
         let advice = "give one, or choose a method that works on depth";
         self.rgb.ok_or(EstimatorError::Input { what: "colour image", method, advice })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_out_of_range_are_named() {
+        let camera = Camera::new(300.0, 300.0, 159.5, 119.5, 320, 240).unwrap();
+        let named = |query: Query<'_>| query.check().map_err(|error| error.option);
+        assert_eq!(named(Query::new(&camera)), Ok(()));
+        for value in [0.0, 1.0, 1.1, f64::INFINITY] {
+            assert_eq!(named(Query { min_confidence: value, ..Query::new(&camera) }), Ok(()), "{value}");
+        }
+        for value in [-0.1, f64::NAN] {
+            let query = Query { min_confidence: value, ..Query::new(&camera) };
+            assert_eq!(named(query), Err("min_confidence"), "{value}");
+        }
+        assert_eq!(named(Query { max_instances: 0, ..Query::new(&camera) }), Err("max_instances"));
     }
 }

@@ -15,6 +15,7 @@ mod image;
 mod kabsch;
 mod nearest;
 mod normals;
+mod option_error;
 mod plane;
 mod pnp;
 mod pose;
@@ -34,6 +35,7 @@ pub use image::{DepthImage, Image, ImageError, Mask, NormalImage, PointImage, Re
 pub use kabsch::{AlignmentError, Similarity, kabsch, umeyama};
 pub use nearest::{KdTree, Neighbour};
 pub use normals::{NormalOptions, inpaint_depth, normals_from_depth};
+pub use option_error::OptionError;
 pub use plane::{Plane, PlaneOptions, dominant_plane, fit_plane};
 pub use pnp::{
     PnpError, PnpOptions, PnpReport, PnpSolver, RefineOptions, RefineReport, epnp, p3p, pnp_ransac,

@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::{Camera, DepthImage, Image, NormalImage, Vec3};
+use crate::{Camera, DepthImage, Image, NormalImage, OptionError, Vec3};
 
 /// How normals are computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +20,18 @@ pub struct NormalOptions {
 impl Default for NormalOptions {
     fn default() -> Self {
         NormalOptions { radius: 3, max_relative_step: 0.02 }
+    }
+}
+
+impl NormalOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_within("normals.radius", self.radius, 1..=100, "1 to 100 pixels")?;
+        let step = self.max_relative_step;
+        OptionError::unless_positive("normals.max_relative_step", step, "a fraction of the depth above 0")
     }
 }
 

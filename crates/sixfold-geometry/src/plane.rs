@@ -1,11 +1,13 @@
 //! The dominant plane of a cloud (a table, a floor, the bottom of a bin) by seeded RANSAC
 //! (Fischler and Bolles 1981) and a least-squares fit to its inliers.
 
+use std::f64::consts::FRAC_PI_2;
+
 use nalgebra::SymmetricEigen;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{Mat3, PointCloud, Vec3};
+use crate::{Mat3, OptionError, PointCloud, Vec3};
 
 /// All points `p` with `normal . p = offset`; lengths in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,6 +46,21 @@ pub struct PlaneOptions {
 impl Default for PlaneOptions {
     fn default() -> Self {
         PlaneOptions { threshold: 0.01, iterations: 300, min_share: 0.15, max_angle: 30f64.to_radians() }
+    }
+}
+
+impl PlaneOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_positive("plane.threshold", self.threshold, "metres above 0")?;
+        OptionError::unless_some("plane.iterations", self.iterations)?;
+        OptionError::unless_fraction("plane.min_share", self.min_share)?;
+        let angle = "radians above 0, at most a quarter of a turn";
+        OptionError::unless_positive("plane.max_angle", self.max_angle, angle)?;
+        OptionError::unless_within("plane.max_angle", self.max_angle, ..=FRAC_PI_2, angle)
     }
 }
 

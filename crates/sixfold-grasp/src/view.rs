@@ -3,8 +3,9 @@
 use std::collections::VecDeque;
 
 use sixfold_geometry::{
-    Camera, CameraError, DepthImage, DepthImageError, Image, Mask, NormalOptions, Plane, PlaneOptions,
-    PointCloud, Rect, Vec2, Vec3, dominant_plane, inpaint_depth, normals_from_depth, usable_depth,
+    Camera, CameraError, DepthImage, DepthImageError, Image, Mask, NormalOptions, OptionError, Plane,
+    PlaneOptions, PointCloud, Rect, Vec2, Vec3, dominant_plane, inpaint_depth, normals_from_depth,
+    usable_depth,
 };
 use thiserror::Error;
 
@@ -29,6 +30,9 @@ pub enum ViewError {
         /// Height of the depth image.
         height: usize,
     },
+    /// An option is out of its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The depth image holds nothing that could be the scene.
     #[error(transparent)]
     Depth(#[from] DepthImageError),
@@ -108,6 +112,25 @@ impl Default for ViewOptions {
             max_depth: 3.0,
             seed: 0,
         }
+    }
+}
+
+impl ViewOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.normals.check()?;
+        OptionError::unless_within("inpaint_rounds", self.inpaint_rounds, ..=1000, "0 to 1000")?;
+        self.plane.check()?;
+        OptionError::unless_weight("table_margin", self.table_margin)?;
+        OptionError::unless_positive("gap", self.gap, "metres above 0")?;
+        OptionError::unless_some("min_pixels", self.min_pixels)?;
+        OptionError::unless_weight("surroundings", self.surroundings)?;
+        OptionError::unless_positive("step", self.step, "metres above 0")?;
+        let fits = self.max_depth > 0.0;
+        if fits { Ok(()) } else { Err(OptionError::new("max_depth", self.max_depth, "metres above 0")) }
     }
 }
 
@@ -323,6 +346,7 @@ fn footprint(
 }
 
 fn checked(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Result<DepthImage, ViewError> {
+    options.check()?;
     camera.check()?;
     camera.check_image(depth.width(), depth.height())?;
     let depth = usable_depth(depth)?;
@@ -389,4 +413,18 @@ fn apart(a: &[usize], b: &[usize], depth: &DepthImage, camera: &Camera) -> bool 
     };
     let tree = sixfold_geometry::KdTree::new(&points(a));
     points(b).iter().all(|p| tree.nearest(p).is_none_or(|n| n.distance > 0.04))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = ViewOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        let named = |options: ViewOptions| options.check().unwrap_err().option;
+        assert_eq!(named(ViewOptions { max_depth: f64::NAN, ..options }), "max_depth");
+        assert_eq!(named(ViewOptions { gap: 0.0, ..options }), "gap");
+    }
 }

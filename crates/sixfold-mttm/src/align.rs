@@ -7,23 +7,43 @@
 use sixfold_align::DepthRegion;
 use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2, Vec3, icp};
 
+/// Levels of the ICP: rejection distance as a multiple of the tolerance of depths, and iterations. Chosen by hand; not swept.
+const LEVELS: [(f64, usize); 3] = [(1.5, 4), (0.8, 5), (0.5, 5)];
+/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+const MAX_ANGLE: f64 = 50.0;
+/// A level ends at steps smaller than this, metres and radians; chosen by hand, below the noise of depth.
+const CONVERGENCE: f64 = 2e-4;
+/// Fewest correspondences of the ICP; chosen by hand, not swept.
+const MIN_CORRESPONDENCES: usize = 10;
+/// An ICP that moves a template by more than this multiple of the tolerance has slid off to something else; chosen by hand, not
+/// swept.
+const MAX_SHIFT: f64 = 4.0;
+/// The same for rotations, radians: views are some 8 degrees apart and turned in steps of 15. Chosen by hand; not swept.
+const MAX_ROTATION: f64 = 0.7;
+/// Along the ray, differences to the scene count that are smaller than this multiple of the tolerance: the others are not the
+/// object's. Chosen by hand; not swept.
+const NEAR: f64 = 1.5;
+/// Fewer differences say nothing of the distance; chosen by hand, not swept.
+const MIN_DIFFERENCES: usize = 8;
+
 /// Lays a template's points (view frame) on the scene, starting from a pose that is right within a few times `tolerance`
 /// metres.
 pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
     let start = along_the_ray(scene, cloud, camera_from_view, tolerance);
     let target = DepthTarget { depth: scene.depth(), normals: scene.normals(), camera: scene.camera() };
     let level =
-        |share: f64, iterations| IcpLevel { rejection_distance: share * tolerance, iterations, stride: 1 };
+        |(share, iterations)| IcpLevel { rejection_distance: share * tolerance, iterations, stride: 1 };
     let options = IcpOptions {
-        levels: vec![level(1.5, 4), level(0.8, 5), level(0.5, 5)],
-        max_angle: 50f64.to_radians(),
-        convergence: 2e-4,
-        min_correspondences: 10,
+        levels: LEVELS.map(level).to_vec(),
+        max_angle: MAX_ANGLE.to_radians(),
+        convergence: CONVERGENCE,
+        min_correspondences: MIN_CORRESPONDENCES,
     };
     let Ok(report) = icp(cloud, &target, &start, &options) else { return start };
-    // Further than that it has slid off to something else.
     let moved = report.target_from_source.distance_to(camera_from_view);
-    if moved < 4.0 * tolerance && report.target_from_source.rotation_angle_to(camera_from_view) < 0.7 {
+    if moved < MAX_SHIFT * tolerance
+        && report.target_from_source.rotation_angle_to(camera_from_view) < MAX_ROTATION
+    {
         report.target_from_source
     } else {
         start
@@ -48,10 +68,10 @@ fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pos
             let z = f64::from(*scene.depth().get(x as usize, y as usize)?);
             let seen = camera.unproject(&Vec2::new(x, y), z);
             let off = ray.dot(&(seen - p));
-            (z > 0.0 && off.abs() < 1.5 * tolerance).then_some(off)
+            (z > 0.0 && off.abs() < NEAR * tolerance).then_some(off)
         })
         .collect();
-    if off.len() < 8 {
+    if off.len() < MIN_DIFFERENCES {
         return *camera_from_view;
     }
     let middle = off.len() / 2;

@@ -6,7 +6,9 @@ use sixfold_align::DepthRegion;
 use sixfold_geometry::{Pose, Vec3};
 
 use crate::align::camera_from_view;
-use crate::estimate::{KnownObject, MatchedBy, MttmOptions, Placed, Stages, apart, is_known, place_at};
+use crate::estimate::{
+    APART, KnownObject, MatchedBy, MttmOptions, Placed, SAME_ROTATION, Stages, apart, is_known, place_at,
+};
 use crate::learned::Learned;
 use crate::matching::Entry;
 use crate::model::{Encoded, PairSays};
@@ -14,14 +16,26 @@ use crate::patch::Patch;
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
-/// Regions of which pairs are looked at: fewest and most.
+/// Regions of which pairs are compared: fewest and most. Chosen by hand; not swept.
 const LOOKED_AT: (usize, usize) = (64, 400);
-/// Hypotheses that the network adds to a region's.
+/// Hypotheses that the network adds to a region's; chosen by hand, not swept.
 const HYPOTHESES: usize = 2;
-/// Pairs that go through the network at a time.
+/// Pairs that go through the network at a time; of no influence on the result.
 const AT_A_TIME: usize = 32;
-/// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several.
+/// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
+/// hand; not swept.
 const LEAST_TRUST: f64 = 0.1;
+
+/// Between those bounds, of the sampled regions one in [`ONE_IN`] less [`LESS`] is compared: the more there is in the scene, the more
+/// looks like the object at first sight. Chosen by hand; not swept.
+const ONE_IN: usize = 5;
+/// See [`ONE_IN`].
+const LESS: usize = 30;
+/// Of the compared ones, so many in so many that match best are laid on the scene; chosen by hand, not swept.
+const LAID: (usize, usize) = (3, 4);
+/// Nearest templates among which a region's hypotheses are looked for, for each of them: most of them are neighbours of one another.
+/// Chosen by hand; not swept.
+const NEAREST: usize = 60;
 
 /// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene where the network
 /// says. With `MatchedBy::Both` each is also matched by points there, and what agrees better with the scene is kept.
@@ -41,9 +55,8 @@ pub(crate) fn first_matching(
     let nearest = learned.nearest(&regions.descriptors);
     let mut order: Vec<usize> = (0..rois.len()).collect();
     order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
-    // The more there is in the scene, the more looks like the object at first sight.
-    let looked_at = (rois.len() / 5).saturating_sub(30).clamp(LOOKED_AT.0, LOOKED_AT.1);
-    let chosen = apart(rois, order, 0.15 * diameter, looked_at);
+    let looked_at = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(LOOKED_AT.0, LOOKED_AT.1);
+    let chosen = apart(rois, order, APART * diameter, looked_at);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
     let says: Vec<Vec<PairSays>> = chosen
         .par_chunks(AT_A_TIME)
@@ -55,7 +68,7 @@ pub(crate) fn first_matching(
     let says = says.concat();
     let mut order: Vec<usize> = (0..chosen.len()).collect();
     order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
-    order.truncate(3 * looked_at / 4);
+    order.truncate(LAID.0 * looked_at / LAID.1);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
         // Where the network sees the middle of the object.
         let centred: Vec<Roi> = order
@@ -122,13 +135,13 @@ pub(crate) fn second_matching(
             let pose =
                 |e: &Entry| object.object_pose(&camera_from_view(&camera_from_roi, e.turn), e.template);
             let mut chosen: Vec<(usize, Entry)> = vec![];
-            for (_, entry) in learned.ranked(descriptor).into_iter().take(60 * HYPOTHESES) {
+            for (_, entry) in learned.ranked(descriptor).into_iter().take(NEAREST * HYPOTHESES) {
                 if chosen.len() >= HYPOTHESES {
                     break;
                 }
                 let entry = object.matcher.entries()[entry];
                 let new = pose(&entry);
-                if !chosen.iter().any(|c| pose(&c.1).rotation_angle_to(&new) < 0.3) {
+                if !chosen.iter().any(|c| pose(&c.1).rotation_angle_to(&new) < SAME_ROTATION) {
                     chosen.push((region, entry));
                 }
             }

@@ -3,13 +3,16 @@
 use std::io;
 use std::path::PathBuf;
 
-use sixfold_geometry::CameraError;
+use sixfold_geometry::{CameraError, OptionError};
 use thiserror::Error;
 
 /// Why there are no templates.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum TemplateError {
+    /// An option is out of its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// There is nothing to render.
     #[error("the mesh has {faces} faces, templates need a surface: give a mesh, not a point cloud")]
     NoSurface {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use rayon::prelude::*;
 use serde::Serialize;
 use sixfold_align::{DepthRegion, VerificationOptions, VerificationScore, verify};
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{OptionError, Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::align::{align, camera_from_view};
@@ -63,22 +63,83 @@ pub struct MttmOptions {
     pub min_score: f64,
 }
 
+/// [`MttmOptions::placed`]; chosen by hand for the time that it takes, not swept.
+const PLACED: usize = 160;
+/// [`MttmOptions::masked`]; chosen by hand for the time that it takes, not swept.
+const MASKED: usize = 50;
+/// [`MttmOptions::regions`]; chosen by hand, not swept.
+const REGIONS: usize = 10;
+/// [`MttmOptions::hypotheses`] (dissertation: 5).
+const HYPOTHESES: usize = 5;
+/// [`MttmOptions::verified`]; chosen by hand for the time that it takes, not swept.
+const VERIFIED: usize = 16;
+/// [`MttmOptions::min_score`]: lower ones are guesses. Chosen by hand; not swept.
+const MIN_SCORE: f64 = 0.05;
+
+/// Regions of the first matching lie further apart than this fraction of the diameter; chosen by hand, not swept.
+pub(crate) const APART: f64 = 0.15;
+/// Poses whose rotations differ by less than this are the same hypothesis, radians: about the 15 degrees between turns in the image
+/// plane. Chosen by hand; not swept.
+pub(crate) const SAME_ROTATION: f64 = 0.3;
+/// Two masks of the first matching are one region where this multiple of what they have in common exceeds the smaller of them: from
+/// half of it on. Chosen by hand; not swept.
+const OVERLAP: usize = 2;
+/// Fewest pixels of a region's mask, of every second column and row; chosen by hand, not swept.
+const MIN_MASK: usize = 20;
+/// Cells of the masks' grid by which a region is widened for the second matching: templates that differ reach further. Chosen by hand;
+/// not swept.
+const WIDENED: usize = 2;
+/// Shift of the centres that the second matching tries along every axis, as a fraction of the diameter; chosen by hand, not swept.
+const SHIFT: f64 = 0.07;
+/// Best matches among which a region's hypotheses are looked for, for each of them: most of them are neighbours of one another. Chosen
+/// by hand; not swept.
+const RANKED: usize = 40;
+/// Fewest hypotheses that are verified for each instance; chosen by hand, not swept.
+const VERIFIED_OF_INSTANCE: usize = 2;
+/// How much the matched template says beside the verification with the mesh, as an exponent; chosen by hand, not swept.
+const TEMPLATE_POWER: f64 = 0.2;
+/// Fraction of its pixels, as a numerator and a denominator, that an estimate may share with a better one; as for point pair
+/// features. Chosen by hand; not swept.
+const MAX_SHARED: (usize, usize) = (3, 10);
+
 impl Default for MttmOptions {
     fn default() -> Self {
         MttmOptions {
             matched_by: MatchedBy::Both,
             predicted_pose: true,
             proposals: ProposalOptions::default(),
-            placed: 160,
-            masked: 50,
-            regions: 10,
-            hypotheses: 5,
-            verified: 16,
+            placed: PLACED,
+            masked: MASKED,
+            regions: REGIONS,
+            hypotheses: HYPOTHESES,
+            verified: VERIFIED,
             align: true,
             verification: VerificationOptions::default(),
             max_instances: 1,
-            min_score: 0.05,
+            min_score: MIN_SCORE,
         }
+    }
+}
+
+impl MttmOptions {
+    /// Checks every field, also those of proposals and verification.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.proposals.check()?;
+        for (option, value) in [
+            ("placed", self.placed),
+            ("masked", self.masked),
+            ("regions", self.regions),
+            ("hypotheses", self.hypotheses),
+            ("verified", self.verified),
+            ("max_instances", self.max_instances),
+        ] {
+            OptionError::unless_some(option, value)?;
+        }
+        self.verification.check()?;
+        OptionError::unless_within("min_score", self.min_score, 0.0.., "0 or more")
     }
 }
 
@@ -92,7 +153,7 @@ pub struct KnownObject {
     pub(crate) learned: Option<Learned>,
 }
 
-/// Points of a template that ICP uses.
+/// Points of a template that ICP uses; chosen by hand, not swept.
 const ICP_POINTS: usize = 160;
 
 impl KnownObject {
@@ -291,7 +352,7 @@ fn first_matching(
     let matches = object.matcher.best(rois.len(), |i| rois[i].cells(scene, size, |_| true));
     let mut order: Vec<usize> = (0..rois.len()).filter(|&i| matches[i].score > 0.0).collect();
     order.sort_by(|&a, &b| matches[b].score.total_cmp(&matches[a].score).then(a.cmp(&b)));
-    let chosen = apart(&rois, order, 0.15 * object.templates.diameter, options.placed);
+    let chosen = apart(&rois, order, APART * object.templates.diameter, options.placed);
     chosen.par_iter().map(|&i| place(scene, object, &rois[i], matches[i], options)).collect()
 }
 
@@ -347,12 +408,12 @@ pub(crate) fn place_at(
 pub(crate) fn is_known(object: &KnownObject, found: &[Placed], template: usize, start: &Pose) -> bool {
     let new = object.object_pose(start, template);
     found.iter().any(|f| {
-        object.object_pose(&f.camera_from_view, f.template).rotation_angle_to(&new) < 0.3
+        object.object_pose(&f.camera_from_view, f.template).rotation_angle_to(&new) < SAME_ROTATION
             && (object.templates.source != crate::Source::Depth || f.template == template)
     })
 }
 
-/// Masks on every so many-th pixel while regions are merged.
+/// Masks are taken on every n-th column and row while regions are merged; chosen by hand, not swept.
 const STRIDE: usize = 2;
 
 /// The masks of the placed templates, without those that overlap a better one by more than half.
@@ -379,8 +440,8 @@ fn merge(
         if regions.len() >= options.regions {
             break;
         }
-        let overlaps = |other: &Pixels| 2 * common(mask, other) > mask.len().min(other.len());
-        if mask.len() >= 20 && !regions.iter().any(|(_, other)| overlaps(other)) {
+        let overlaps = |other: &Pixels| OVERLAP * common(mask, other) > mask.len().min(other.len());
+        if mask.len() >= MIN_MASK && !regions.iter().any(|(_, other)| overlaps(other)) {
             regions.push((placed[i].clone(), mask.clone()));
         }
     }
@@ -402,16 +463,15 @@ fn second_matching(
     let mut inside = vec![false; columns * rows];
     for &p in mask {
         let (x, y) = (p as usize % width / STRIDE, p as usize / width / STRIDE);
-        // A little more than the mask: templates that differ reach further.
-        for v in y.saturating_sub(2)..=(y + 2).min(rows - 1) {
-            for u in x.saturating_sub(2)..=(x + 2).min(columns - 1) {
+        for v in y.saturating_sub(WIDENED)..=(y + WIDENED).min(rows - 1) {
+            for u in x.saturating_sub(WIDENED)..=(x + WIDENED).min(columns - 1) {
                 inside[v * columns + u] = true;
             }
         }
     }
     let seen = |pixel: usize| inside[pixel / width / STRIDE * columns + pixel % width / STRIDE];
     let centre = seed.camera_from_view.translation();
-    let shift = 0.07 * object.templates.diameter;
+    let shift = SHIFT * object.templates.diameter;
     let shifts = [
         Vec3::zeros(),
         Vec3::x() * shift,
@@ -423,7 +483,7 @@ fn second_matching(
     ];
     let rois = shifts.map(|s| Roi { centre: centre + s });
     let cells: Vec<_> = rois.iter().map(|r| r.cells(scene, object.templates.size, seen)).collect();
-    for (matched, region) in object.matcher.ranked(&cells).into_iter().take(40 * options.hypotheses) {
+    for (matched, region) in object.matcher.ranked(&cells).into_iter().take(RANKED * options.hypotheses) {
         if found.len() > options.hypotheses {
             break;
         }
@@ -444,7 +504,7 @@ fn judge_all(
 ) -> Vec<MttmEstimate> {
     let templates = &object.templates;
     let threshold = options.verification.threshold_for(templates.diameter);
-    let most = options.verified.max(2 * options.max_instances);
+    let most = options.verified.max(VERIFIED_OF_INSTANCE * options.max_instances);
     let kept: Vec<&Placed> = hypotheses.iter().take(most).collect();
     let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
     let poses: Vec<Pose> = kept.iter().map(|p| pose_of(p)).collect();
@@ -458,7 +518,7 @@ fn judge_all(
             .enumerate()
             .map(|(i, (v, p))| {
                 // Two witnesses: the rendered mesh, and the template it came from.
-                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(0.2);
+                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(TEMPLATE_POWER);
                 (v.camera_from_object, confidence, v.score, i)
             })
             .collect(),
@@ -478,11 +538,38 @@ fn judge_all(
             object.matcher.tolerance(),
             1,
         );
-        let shared = |other: &MttmEstimate| 10 * common(&mask, &other.mask) > 3 * mask.len();
+        let shared =
+            |other: &MttmEstimate| MAX_SHARED.1 * common(&mask, &other.mask) > MAX_SHARED.0 * mask.len();
         if mask.is_empty() || estimates.iter().any(shared) {
             continue;
         }
         estimates.push(MttmEstimate { camera_from_object, confidence, score, template, mask });
     }
     estimates
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::template::TemplateOptions;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = MttmOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        assert_eq!(MttmOptions { min_score: 1.1, ..options }.check(), Ok(()));
+        let named = |options: MttmOptions| options.check().unwrap_err().option;
+        assert_eq!(named(MttmOptions { min_score: f64::NAN, ..options }), "min_score");
+        assert_eq!(named(MttmOptions { hypotheses: 0, ..options }), "hypotheses");
+        let proposals = ProposalOptions { step: f64::NAN, ..options.proposals };
+        assert_eq!(named(MttmOptions { proposals, ..options }), "proposals.step");
+        let verification = VerificationOptions { depth_threshold: Some(-1.0), ..options.verification };
+        assert_eq!(named(MttmOptions { verification, ..options }), "verification.depth_threshold");
+        let templates = TemplateOptions::default();
+        assert_eq!(templates.check(), Ok(()));
+        let distance = TemplateOptions { distance: f64::NAN, ..templates };
+        assert_eq!(distance.check().unwrap_err().option, "templates.distance");
+        let margin = TemplateOptions { margin: 0.0, ..templates };
+        assert_eq!(margin.check().unwrap_err().option, "templates.margin");
+    }
 }

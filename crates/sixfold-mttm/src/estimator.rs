@@ -156,6 +156,7 @@ impl PoseEstimator for MttmEstimator {
             min_score: query.min_confidence,
             ..self.options
         };
+        options.check().map_err(EstimatorError::method)?;
         let regions = query.memo.get_or_default::<RegionCache>();
         let (found, stages) = search(query.depth_region(METHOD)?, &regions, &object.object, &options);
         let pose = |e: MttmEstimate| PoseEstimate {

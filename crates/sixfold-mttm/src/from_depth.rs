@@ -6,10 +6,22 @@ use crate::error::TemplateError;
 use crate::roi::ray_rotation;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 
-/// Sizes of tabletop objects, metres.
+/// Sizes of tabletop objects, metres: smaller and larger ones are a wrong depth scale or mask. Chosen by hand; not swept.
 const SIZES: (f64, f64) = (0.015, 0.6);
-/// A view must have so many pixels with depth.
+/// A view must have so many pixels with depth; chosen by hand, not swept.
 const FEWEST_PIXELS: usize = 200;
+/// Points further from the median depth than this multiple of the deviation that [`WITHIN`] of them have do not belong to the object: masks
+/// bleed over edges. Chosen by hand; not swept.
+const FAR_OFF: f64 = 5.0;
+/// See [`FAR_OFF`].
+const WITHIN: f64 = 0.8;
+/// The least of that deviation, metres, for flat things that face the camera; chosen by hand, not swept.
+const MIN_DEVIATION: f64 = 0.01;
+/// Directions in which an extent is measured: about 15 degrees apart over all of the sphere.
+const DIRECTIONS: usize = 120;
+/// Fractions of the points along a direction between which its extent lies: half a point in a hundred at either end may be astray.
+/// Chosen by hand; not swept.
+const ENDS: (f64, f64) = (0.005, 0.995);
 
 /// An object in a depth image.
 #[derive(Debug, Clone)]
@@ -31,12 +43,13 @@ impl ObjectTemplates {
     /// camera, its origin in the middle of the points seen.
     ///
     /// # Errors
-    /// [`TemplateError`]: no view, sizes that do not fit, too little depth within a mask, an object too small or large, or poses
+    /// [`TemplateError`]: an option out of its range, no view, sizes that do not fit, too little depth within a mask, an object too small or large, or poses
     /// for some views only.
     pub fn from_depth(
         views: &[DepthView<'_>],
         options: &TemplateOptions,
     ) -> Result<ObjectTemplates, TemplateError> {
+        options.check()?;
         let first = views.first().ok_or(TemplateError::NoViews)?;
         let posed = first.camera_from_object.is_some();
         let mut extent = 0f64;
@@ -95,7 +108,7 @@ fn masked_points(view: &DepthView<'_>) -> Result<Vec<Seen>, TemplateError> {
     if let Some(&median) = depths.get(depths.len() / 2) {
         let mut off: Vec<f64> = depths.iter().map(|z| (z - median).abs()).collect();
         off.sort_by(f64::total_cmp);
-        let limit = 5.0 * off[(0.8 * off.len() as f64) as usize].max(0.01);
+        let limit = FAR_OFF * off[(WITHIN * off.len() as f64) as usize].max(MIN_DEVIATION);
         seen.retain(|s| (s.1.z - median).abs() <= limit);
     }
     if seen.len() < FEWEST_PIXELS {
@@ -106,13 +119,12 @@ fn masked_points(view: &DepthView<'_>) -> Result<Vec<Seen>, TemplateError> {
 
 /// The largest distance between extreme points, metres.
 fn largest_extent(seen: &[Seen]) -> f64 {
-    let directions = sixfold_geometry::sphere_directions(120);
+    let directions = sixfold_geometry::sphere_directions(DIRECTIONS);
     let width = |d: &Vec3| {
         let mut along: Vec<f64> = seen.iter().map(|s| d.dot(&s.1)).collect();
         along.sort_by(f64::total_cmp);
-        // A pixel in a hundred at either end may be astray.
         let at = |share: f64| along[(share * (along.len() - 1) as f64) as usize];
-        at(0.995) - at(0.005)
+        at(ENDS.1) - at(ENDS.0)
     };
     directions.iter().map(width).fold(0.0, f64::max)
 }

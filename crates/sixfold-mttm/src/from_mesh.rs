@@ -13,15 +13,19 @@ use crate::error::{StoreError, TemplateError};
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 use crate::views::{view_directions, view_rotation};
 
-/// More faces than this are finer than a template's pixels.
+/// More faces than this are finer than a template's pixels; chosen by hand, not swept.
 const MOST_FACES: usize = 12_000;
+/// Times that a view is centred on the middle of what it shows: the perspective changes what is seen a little each time. Chosen by hand;
+/// not swept.
+const CENTRINGS: usize = 3;
 
 impl ObjectTemplates {
     /// Draws `mesh` (metres) from all sides that the options ask for.
     ///
     /// # Errors
-    /// [`TemplateError::NoSurface`].
+    /// [`TemplateError::Option`] and [`TemplateError::NoSurface`].
     pub fn from_mesh(mesh: &Mesh, options: &TemplateOptions) -> Result<ObjectTemplates, TemplateError> {
+        options.check()?;
         if mesh.faces().is_empty() {
             return Err(TemplateError::NoSurface { faces: 0 });
         }
@@ -102,7 +106,7 @@ pub(crate) fn draw_rotated(
     let (low, high) = mesh.bounding_box();
     // The middle of the box on the axis at first, then the middle of what is seen.
     let mut pose = Pose::new(rotation, Vec3::z() * distance - rotation * ((low + high) * 0.5));
-    for _ in 0..3 {
+    for _ in 0..CENTRINGS {
         frame.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
         let depth = frame.depth();
         let pixels: Vec<[usize; 2]> =

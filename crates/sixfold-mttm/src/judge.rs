@@ -7,6 +7,13 @@ use sixfold_geometry::{PointCloud, Pose};
 
 use crate::template::{SIDE, Template};
 
+/// A template's point whose normal has a z (view frame) above this is seen at a grazing angle, less than 9 degrees, and slides out of
+/// its pixel: as in verification by rendering. Chosen by hand; not swept.
+const GRAZING: f64 = -0.15;
+/// Least cosine between ray and normal by which a difference of depth counts as one along the normal, as in the screening of point
+/// pair features: grazing surface may miss by more in depth. Chosen by hand; not swept.
+const MIN_SLOPE: f64 = 0.3;
+
 /// What a template shows, for alignment and judgement.
 #[derive(Debug, Clone)]
 pub struct Surface {
@@ -41,8 +48,7 @@ impl Surface {
         let stride = ((dense.len() as f64 / sparse.max(1) as f64).sqrt().round() as usize).max(1);
         let mut few = PointCloud::default();
         for (i, &[x, y]) in pixels.iter().enumerate() {
-            // Grazing surface slides out of its pixel.
-            if x % stride == 0 && y % stride == 0 && dense.normals[i].z < -0.15 {
+            if x % stride == 0 && y % stride == 0 && dense.normals[i].z < GRAZING {
                 few.points.push(dense.points[i]);
                 few.normals.push(dense.normals[i]);
             }
@@ -77,8 +83,7 @@ pub fn judge(
         let at = (x as usize, y as usize);
         let measured = f64::from(scene.depth()[at]);
         let n = camera_from_view.transform_direction(&surface.dense.normals[i]);
-        // As in the screening of point pair features: grazing surface may miss by more in depth.
-        let slope = (-n.dot(&p) / p.norm()).clamp(0.3, 1.0);
+        let slope = (-n.dot(&p) / p.norm()).clamp(MIN_SLOPE, 1.0);
         let off = (measured - p.z) * slope;
         let hidden = measured > 0.0 && off < -threshold;
         if hidden {

@@ -8,6 +8,10 @@ use crate::template::{SIDE, Template};
 /// Pixels of an image (numbers `y * width + x`), ascending.
 pub type Pixels = Vec<u32>;
 
+/// Half the side of the cube about a template's reference point in which its mask is searched, as a multiple of the patch's side: a
+/// little more than half its diagonal. Chosen by hand; not swept.
+const REACH: f64 = 0.75;
+
 /// The pixels whose depth agrees with the template within `tolerance` metres, every `stride`-th of every `stride`-th row.
 pub fn template_mask(
     scene: &DepthRegion,
@@ -20,7 +24,7 @@ pub fn template_mask(
     let camera = scene.camera();
     let patch = template.camera(size);
     let view_from_camera = camera_from_view.inverse();
-    let reach = 0.75 * size;
+    let reach = REACH * size;
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     for k in 0..8 {
         let corner = Vec3::from_fn(|i, _| if k >> i & 1 == 0 { -reach } else { reach });

@@ -7,14 +7,14 @@
 //! Sixteen regions are compared at a time, a number of each in one vector of the processor.
 
 use rayon::prelude::*;
-use sixfold_geometry::Vec3;
+use sixfold_geometry::{OptionError, Vec3};
 
 use crate::roi::{Cell, GRID, UNKNOWN};
 use crate::template::{ObjectTemplates, SIDE, Template};
 
-/// Regions compared at a time.
+/// Regions compared at a time: the single-precision numbers of a vector of 512 bits.
 pub const LANES: usize = 16;
-/// Points of a template that are compared.
+/// Points of a template that are compared; chosen by hand, not swept.
 const POINTS: usize = 64;
 
 /// How agreement is counted.
@@ -28,9 +28,40 @@ pub struct MatchOptions {
     pub hidden: f32,
 }
 
+/// [`MatchOptions::depth`]; chosen by hand, not swept.
+const DEPTH: f64 = 0.14;
+/// [`MatchOptions::limits`]; chosen by hand, not swept.
+const LIMITS: (f64, f64) = (0.012, 0.03);
+/// [`MatchOptions::hidden`]; chosen by hand, not swept.
+const HIDDEN: f32 = 0.25;
+/// An entry is left out that keeps fewer than one in so many of the [`POINTS`] within the region; chosen by hand, not swept.
+const KEPT: usize = 4;
+/// What a cell counts by its depth alone, and by the squared cosine between the normals: those at edges are not to be trusted. Chosen
+/// by hand; not swept.
+const DEPTH_ALONE: f32 = 0.2;
+/// See [`DEPTH_ALONE`]; both together are 1.
+const BY_NORMALS: f32 = 0.8;
+
 impl Default for MatchOptions {
     fn default() -> Self {
-        MatchOptions { depth: 0.14, limits: (0.012, 0.03), hidden: 0.25 }
+        MatchOptions { depth: DEPTH, limits: LIMITS, hidden: HIDDEN }
+    }
+}
+
+impl MatchOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_positive("matching.depth", self.depth, "a fraction of the diameter above 0")?;
+        let (low, high) = self.limits;
+        let ordered = low > 0.0 && low <= high && high.is_finite();
+        if !ordered {
+            let expected = "metres above 0, the smaller first";
+            return Err(OptionError::new("matching.limits", format!("{low}, {high}"), expected));
+        }
+        OptionError::unless_within("matching.hidden", self.hidden, 0.0..=1.0, "0 to 1")
     }
 }
 
@@ -88,7 +119,7 @@ impl Matcher {
                 turns
                     .iter()
                     .map(|&turn| (Entry { template: number, turn }, turned(&chosen, turn)))
-                    .filter(|(_, points)| points.len() >= POINTS / 4)
+                    .filter(|(_, points)| points.len() >= POINTS / KEPT)
                     .collect()
             })
             .collect();
@@ -176,8 +207,7 @@ impl Matcher {
                 let near = 1.0 - off.abs() * inverse;
                 let near = if near > 0.0 { near } else { 0.0 };
                 let facing = if cosine > 0.0 { cosine } else { 0.0 };
-                // Depth alone counts a little: normals at edges are not to be trusted.
-                good[l] += near * (0.2 + 0.8 * facing * facing);
+                good[l] += near * (DEPTH_ALONE + BY_NORMALS * facing * facing);
                 behind[l] += if off > tolerance { 1.0 } else { 0.0 };
                 hidden[l] += if off < -tolerance { 1.0 } else { 0.0 };
             }
@@ -292,6 +322,17 @@ mod tests {
         (0..pixels.len())
             .map(|i| Chosen { place: place(&pixels[i]), depth: cloud.points[i].z, normal: cloud.normals[i] })
             .collect()
+    }
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = MatchOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        let named = |options: MatchOptions| options.check().unwrap_err().option;
+        assert_eq!(named(MatchOptions { depth: f64::NAN, ..options }), "matching.depth");
+        assert_eq!(named(MatchOptions { limits: (0.03, 0.012), ..options }), "matching.limits");
+        assert_eq!(named(MatchOptions { limits: (f64::NAN, 0.012), ..options }), "matching.limits");
+        assert_eq!(named(MatchOptions { hidden: -0.1, ..options }), "matching.hidden");
     }
 
     #[test]

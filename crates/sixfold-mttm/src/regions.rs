@@ -12,16 +12,23 @@ use crate::patch::{Patch, REACH};
 use crate::roi::{ProposalOptions, Roi, propose};
 
 /// Distance of sampled centres as a share of the diameter. The network was trained with regions that are off by half of it, and
-/// says how far they are off.
+/// says how far they are off. Chosen by hand; not swept.
 const STEP: f64 = 0.3;
-/// Most regions that are described.
+/// Most regions that are described; chosen by hand for the time that it takes, not swept.
 const MOST: usize = 3000;
-/// A region is worth describing when so many of its cells show something about as far away as its centre.
+/// A region is worth describing when so many of its cells show something about as far away as its centre. Chosen by hand;
+/// not swept.
 const LEAST_CELLS: f32 = 0.08;
-/// Regions that go through the network at a time.
+/// Regions that go through the network at a time; of no influence on the result.
 const AT_A_TIME: usize = 64;
-/// Objects whose diameters differ by less than this factor share regions.
+/// Objects whose diameters differ by less than this factor share regions; chosen by hand, not swept.
 const RATIO: f64 = 1.25;
+
+/// What a patch holds for "measured" lies above this, for "not measured" below.
+const KNOWN: f32 = 0.5;
+/// A cell shows something as far away as the centre where its depth (in halves of the patch's size) is less than this off it.
+/// Chosen by hand; not swept.
+const AT_CENTRE: f32 = 0.5;
 
 /// The diameter that stands for all about as large.
 pub(crate) fn shared_diameter(diameter: f64) -> f64 {
@@ -75,7 +82,7 @@ impl Regions {
 fn share_at_centre(patch: &Patch) -> f32 {
     let pixels = patch.side * patch.side;
     let (depth, known) = (&patch.values[3 * pixels..4 * pixels], &patch.values[4 * pixels..]);
-    let near = depth.iter().zip(known).filter(|(d, k)| **k > 0.5 && d.abs() < 0.5).count();
+    let near = depth.iter().zip(known).filter(|(d, k)| **k > KNOWN && d.abs() < AT_CENTRE).count();
     near as f32 / pixels as f32
 }
 

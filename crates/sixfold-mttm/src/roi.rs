@@ -6,9 +6,9 @@
 
 use sixfold_align::DepthRegion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
-use sixfold_geometry::{Pose, Vec2, Vec3};
+use sixfold_geometry::{OptionError, Pose, Vec2, Vec3};
 
-/// Cells along a side of a region.
+/// Cells along a side of a region; chosen by hand, not swept.
 pub const GRID: usize = 20;
 
 /// A region: its centre in the camera frame (metres) need not lie on a measured point.
@@ -23,7 +23,7 @@ pub struct Roi {
 pub type Cell = [f32; 4];
 
 /// A cell in which nothing was measured, or which is not looked at: like something far in front, it neither agrees nor
-/// contradicts.
+/// contradicts. A thousand kilometres are in front of any scene.
 pub const UNKNOWN: Cell = [-1e6, 0.0, 0.0, 0.0];
 
 /// The rotation camera from ROI: z to the ray through `point`, with as little turn as possible.
@@ -91,9 +91,38 @@ pub struct ProposalOptions {
     pub most: usize,
 }
 
+/// [`ProposalOptions::step`]; chosen by hand, not swept.
+const STEP_OF_DIAMETER: f64 = 0.12;
+/// [`ProposalOptions::layer`]; chosen by hand, not swept.
+const LAYER: f64 = 0.15;
+/// [`ProposalOptions::most`]; chosen by hand for the time that matching takes, not swept.
+const MOST: usize = 4000;
+/// The grid is fine enough for what is as far as this fraction of the scene's points: a few beyond may be astray. Chosen by hand; not
+/// swept.
+const FAR: f64 = 0.95;
+/// Least distance of centres, pixels; chosen by hand, not swept.
+const MIN_STEP: f64 = 3.0;
+/// Least factor by which the step grows while there are too many regions, so that the search ends.
+const GROWTH: f64 = 1.05;
+/// Fewest points of a layer that a region is centred on; chosen by hand, not swept.
+const MIN_POINTS: usize = 4;
+
 impl Default for ProposalOptions {
     fn default() -> Self {
-        ProposalOptions { step: 0.12, layer: 0.15, most: 4000 }
+        ProposalOptions { step: STEP_OF_DIAMETER, layer: LAYER, most: MOST }
+    }
+}
+
+impl ProposalOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        let expected = "a fraction of the diameter above 0";
+        OptionError::unless_positive("proposals.step", self.step, expected)?;
+        OptionError::unless_positive("proposals.layer", self.layer, expected)?;
+        OptionError::unless_some("proposals.most", self.most)
     }
 }
 
@@ -107,16 +136,16 @@ pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) ->
         return vec![];
     }
     // The grid is fine enough for what is far; for what is near only some of its places are taken.
-    let far = (0.95 * (depths.len() - 1) as f64) as usize;
+    let far = (FAR * (depths.len() - 1) as f64) as usize;
     let far = *depths.select_nth_unstable_by(far, f64::total_cmp).1;
     let mut share = options.step;
     loop {
-        let step = (share * diameter * focal / far).max(3.0);
+        let step = (share * diameter * focal / far).max(MIN_STEP);
         let rois = sample(scene, step, share * diameter * focal, options.layer * diameter);
         if rois.len() <= options.most {
             return rois;
         }
-        share *= (rois.len() as f64 / options.most as f64).sqrt().max(1.05);
+        share *= (rois.len() as f64 / options.most as f64).sqrt().max(GROWTH);
     }
 }
 
@@ -153,7 +182,7 @@ fn sample(scene: &DepthRegion, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
                 if end == near.len() || near[end] - near[start] > layer {
                     let distance = near[(start + end) / 2];
                     let every = (wanted / distance / step).round().max(1.0) as usize;
-                    if end - start >= 4 && i % every == 0 && j % every == 0 {
+                    if end - start >= MIN_POINTS && i % every == 0 && j % every == 0 {
                         rois.push(Roi { centre: ray * distance });
                     }
                     start = end;

@@ -5,17 +5,19 @@
 //! ROIs of fixed metric size).
 
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::{Camera, DepthImage, NormalOptions, PointCloud, Pose, Vec2, Vec3, normals_from_depth};
+use sixfold_geometry::{
+    Camera, DepthImage, NormalOptions, OptionError, PointCloud, Pose, Vec2, Vec3, normals_from_depth,
+};
 
 use crate::views::Coverage;
 
-/// Pixels along a side of a template.
+/// Pixels along a side of a template; chosen by hand, not swept.
 pub const SIDE: usize = 64;
-/// Metres of a step of stored depth.
+/// Metres of a step of stored depth: well below the noise of depth.
 const DEPTH_STEP: f64 = 1e-4;
 /// Stored depth of the reference point; 0 is "nothing seen".
 const DEPTH_ZERO: i32 = 32_768;
-/// Normals of scenes are taken over windows of about so many metres; those of templates over the same.
+/// Normals of scenes are taken over windows of about so many metres; those of templates over the same. Chosen by hand; not swept.
 const NORMAL_REACH: f64 = 0.008;
 
 /// How templates are made.
@@ -29,9 +31,27 @@ pub struct TemplateOptions {
     pub distance: f64,
 }
 
+/// Radii of the window of a template's normals, pixels: the smallest and the largest. Chosen by hand; not swept.
+const NORMAL_RADII: (f64, f64) = (1.0, 4.0);
+/// [`TemplateOptions::margin`]: a little more than the object, whatever side is seen. Chosen by hand; not swept.
+const MARGIN: f64 = 1.1;
+/// [`TemplateOptions::distance`]: about that of objects on a table. Chosen by hand; not swept.
+const DISTANCE: f64 = 0.8;
+
 impl Default for TemplateOptions {
     fn default() -> Self {
-        TemplateOptions { coverage: Coverage::Above, margin: 1.1, distance: 0.8 }
+        TemplateOptions { coverage: Coverage::Above, margin: MARGIN, distance: DISTANCE }
+    }
+}
+
+impl TemplateOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_within("templates.margin", self.margin, 0.5..=5.0, "0.5 to 5 diameters")?;
+        OptionError::unless_within("templates.distance", self.distance, 0.05..=20.0, "0.05 m to 20 m")
     }
 }
 
@@ -118,7 +138,8 @@ impl Template {
     /// What is seen, in the view frame: points and normals of pixels with a normal, row by row, with their columns and rows.
     pub fn cloud(&self, size: f64) -> (PointCloud, Vec<[usize; 2]>) {
         let (camera, depth) = (self.camera(size), self.depth_image());
-        let radius = (NORMAL_REACH * SIDE as f64 / size).round().clamp(1.0, 4.0) as usize;
+        let radius =
+            (NORMAL_REACH * SIDE as f64 / size).round().clamp(NORMAL_RADII.0, NORMAL_RADII.1) as usize;
         let normals = normals_from_depth(&depth, &camera, &NormalOptions { radius, ..Default::default() });
         let (mut cloud, mut pixels) = (PointCloud::default(), vec![]);
         for y in 0..SIDE {

@@ -11,7 +11,7 @@ use crate::object::Correction;
 use crate::refine::{RefineOptions, refine};
 use sixfold_data::PosedImage;
 use sixfold_geometry::stats::upper_median;
-use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
+use sixfold_geometry::{Camera, OptionError, Pose, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
 
@@ -36,6 +36,18 @@ impl Default for AlignOptions {
             looks: 1,
             correct: true,
         }
+    }
+}
+
+impl AlignOptions {
+    /// Checks every field, also those of both passes and of the alignment.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.estimate.check()?;
+        self.refine.check()?;
+        OptionError::unless_some("looks", self.looks)
     }
 }
 
@@ -235,6 +247,22 @@ mod tests {
         let few = corrections(&shifts[..LEAST_PHOTOGRAPHS - 1], known);
         assert!(few.values().all(|c| c.shift == [0.0; 2]), "{few:?}");
         assert_eq!(few[&1].depth, found[&1].depth);
+    }
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = AlignOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        let named = |options: AlignOptions| options.check().unwrap_err().option;
+        assert_eq!(named(AlignOptions { looks: 0, ..options.clone() }), "looks");
+        let estimate = EstimateOptions { thresholds: vec![0.1, f32::NAN], ..options.estimate.clone() };
+        assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "thresholds");
+        let estimate = EstimateOptions { crop_factor: f64::NAN, ..options.estimate.clone() };
+        assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "crop_factor");
+        let refine = RefineOptions { edges: f64::NAN, ..options.refine.clone() };
+        assert_eq!(named(AlignOptions { refine, ..options.clone() }), "refine.edges");
+        let refine = RefineOptions { first_pass: 1.5, ..options.refine.clone() };
+        assert_eq!(named(AlignOptions { refine, ..options }), "refine.first_pass");
     }
 
     #[test]

@@ -8,7 +8,9 @@ use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
 use crate::samples::second_stage::GREY;
 use rayon::prelude::*;
-use sixfold_geometry::{Camera, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac};
+use sixfold_geometry::{
+    Camera, OptionError, PnpOptions, PnpSolver, Pose, Rect, RgbImage, Vec2, Vec3, pnp_ransac,
+};
 use sixfold_synth::augment::{Patch, Window};
 
 /// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
@@ -38,6 +40,22 @@ impl Default for EstimateOptions {
             seed: 0,
             quirks: Quirks::default(),
         }
+    }
+}
+
+impl EstimateOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        for threshold in &self.thresholds {
+            if threshold.is_nan() || *threshold <= 0.0 {
+                return Err(OptionError::new("thresholds", threshold, "numbers above 0"));
+            }
+        }
+        OptionError::unless_positive("crop_factor", self.crop_factor, "a finite number above 0")?;
+        OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")
     }
 }
 

@@ -198,6 +198,7 @@ impl PoseEstimator for Pix2PoseEstimator {
         query: &Query<'_>,
     ) -> Result<Vec<PoseEstimate>, EstimatorError> {
         let object: &Pix2PoseObject = downcast(object, METHOD)?;
+        self.options.check().map_err(EstimatorError::method)?;
         let image = query.rgb(METHOD)?;
         let region = query.region.ok_or(EstimatorError::Input {
             what: "region that says where the object is",

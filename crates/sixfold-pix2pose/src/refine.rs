@@ -12,7 +12,7 @@
 use crate::estimate::{Found, Hypothesis, View};
 use crate::samples::second_stage::GREY;
 use sixfold_align::outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
-use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{Camera, Mat3, NormalEquations, OptionError, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::{Patch, Window};
 
@@ -60,6 +60,35 @@ impl Default for RefineOptions {
             color: 2.0,
             edges: 8.0,
         }
+    }
+}
+
+/// Shortest crop in which an outline can be looked for at all, pixels.
+const MIN_CROP: usize = 16;
+
+impl RefineOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        for reach in &self.reaches {
+            OptionError::unless_positive("refine.reaches", *reach, "pixels above 0")?;
+        }
+        OptionError::unless_some("refine.iterations", self.iterations)?;
+        OptionError::unless_within("refine.smallest", self.smallest, MIN_CROP.., "16 pixels or more")?;
+        OptionError::unless_within("refine.largest", self.largest, MIN_CROP.., "16 pixels or more")?;
+        for (option, weight) in [
+            ("refine.correspondences", self.correspondences),
+            ("refine.shape", self.shape),
+            ("refine.line", self.line),
+            ("refine.robust", self.robust),
+            ("refine.color", f64::from(self.color)),
+            ("refine.edges", self.edges),
+        ] {
+            OptionError::unless_weight(option, weight)?;
+        }
+        OptionError::unless_within("refine.first_pass", self.first_pass, 0.0..=1.0, "0 to 1")
     }
 }
 

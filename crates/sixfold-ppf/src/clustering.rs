@@ -2,7 +2,7 @@
 //! section 3.5).
 
 use nalgebra::UnitQuaternion;
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{OptionError, Pose, Vec3};
 
 use crate::voting::Hypothesis;
 
@@ -17,9 +17,35 @@ pub struct ClusterOptions {
     pub max_clusters: usize,
 }
 
+/// Largest distance of the centres of poses that are joined, as a fraction of the diameter; chosen by hand, not swept.
+const DISTANCE: f64 = 0.08;
+/// Largest rotation between poses that are joined, degrees; chosen by hand, not swept.
+const ANGLE: f64 = 15.0;
+/// Most clusters; chosen by hand, not swept.
+const MAX_CLUSTERS: usize = 400;
+/// At most about this many symmetries are tried when poses are joined: those of a continuous one are 10 degrees apart then.
+const MAX_SYMMETRIES: usize = 36;
+/// Clusters that may be founded, as a multiple of those returned: weak hypotheses may support a cluster, but found none once there
+/// are plenty. Chosen by hand; not swept.
+const FOUNDED: usize = 4;
+
 impl Default for ClusterOptions {
     fn default() -> Self {
-        ClusterOptions { distance: 0.08, angle: 15f64.to_radians(), max_clusters: 400 }
+        ClusterOptions { distance: DISTANCE, angle: ANGLE.to_radians(), max_clusters: MAX_CLUSTERS }
+    }
+}
+
+impl ClusterOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        let distance = "a fraction of the diameter above 0";
+        OptionError::unless_positive("clustering.distance", self.distance, distance)?;
+        let angle = "radians from 0 to half a turn";
+        OptionError::unless_within("clustering.angle", self.angle, 0.0..=std::f64::consts::PI, angle)?;
+        OptionError::unless_some("clustering.max_clusters", self.max_clusters)
     }
 }
 
@@ -43,7 +69,7 @@ pub fn cluster(
     order.sort_by(|&a, &b| hypotheses[b].votes.total_cmp(&hypotheses[a].votes).then(a.cmp(&b)));
     let reach = options.distance * diameter;
     // With a continuous symmetry there are hundreds: a coarse subset is enough to join.
-    let stride = symmetries.len().div_ceil(36).max(1);
+    let stride = symmetries.len().div_ceil(MAX_SYMMETRIES).max(1);
     let symmetries: Vec<&Pose> = symmetries.iter().step_by(stride).collect();
     let cosine = (0.5 * options.angle).cos();
     let mut clusters: Vec<Cluster> = Vec::new();
@@ -70,8 +96,7 @@ pub fn cluster(
             joined = true;
             break;
         }
-        // Weak hypotheses may support a cluster but found none once there are plenty.
-        if !joined && clusters.len() < 4 * options.max_clusters {
+        if !joined && clusters.len() < FOUNDED * options.max_clusters {
             clusters.push(Cluster {
                 seed: h.camera_from_object,
                 seed_centre: c,

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 use sixfold_align::{DepthRegion, VerificationOptions, VerificationScore, Verifier, verify};
-use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, icp};
+use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, OptionError, PointCloud, Pose, icp};
 
 use crate::V3;
 use crate::clustering::{ClusterOptions, cluster};
@@ -27,13 +27,67 @@ pub struct PpfOptions {
     pub refined: usize,
     /// Hypotheses that get a full ICP and are verified by rendering.
     pub verified: usize,
-    /// How much the votes say beside the verification: 0 nothing.
+    /// How much the votes say beside the verification, as an exponent from 0 (nothing) to 1.
     pub vote_power: f64,
-    /// Most instances of the object returned.
+    /// Most instances of the object returned, 1 or more.
     pub max_instances: usize,
-    /// Estimates whose [`PpfEstimate::confidence`] is lower are not returned.
+    /// Estimates whose [`PpfEstimate::confidence`] (0 to 1) is lower are not returned.
     pub min_score: f64,
 }
+
+/// [`PpfOptions::refined`]; chosen by hand for the time that it takes, not swept.
+const REFINED: usize = 100;
+/// [`PpfOptions::verified`]; chosen by hand for the time that it takes, not swept.
+const VERIFIED: usize = 40;
+/// [`PpfOptions::vote_power`]; chosen by hand, not swept.
+const VOTE_POWER: f64 = 0.3;
+/// [`PpfOptions::min_score`]: lower ones are guesses. Chosen by hand; not swept.
+const MIN_SCORE: f64 = 0.05;
+
+/// Scene points nearer than this to the surface of an instance that was found belong to it and do not vote for the next, metres:
+/// the points are thinned to 2 mm. Chosen by hand; not swept.
+const EXPLAINED: f64 = 0.003;
+/// Fraction of its pixels, as a numerator and a denominator, that an instance may share with those found before; chosen by hand,
+/// not swept.
+const MAX_SHARED: (usize, usize) = (3, 10);
+/// Samples nearer to the camera than this are not screened, metres: depth cameras measure nothing there.
+const NEAREST: f32 = 0.05;
+/// Least cosine between ray and normal by which a difference of depth counts as one along the normal: surface seen at a grazing
+/// angle may be off by more in depth. Chosen by hand; not swept.
+const MIN_SLOPE: f32 = 0.3;
+/// What a sample counts in screening whose depth agrees and whose normal does not, 0 to 1; chosen by hand, not swept.
+const DEPTH_ALONE: f32 = 0.2;
+/// Weight of all samples in the denominator of the screening score, where occluded ones do not count: the fewer samples are seen, the
+/// lower the score. Chosen by hand; not swept.
+const HIDDEN_WEIGHT: f32 = 0.15;
+/// Tolerance of depth in the first screening, in sampling steps: poses of votes are off by about so much. Chosen by hand; not swept.
+const COARSE_TOLERANCE: f64 = 1.5;
+/// The least of it, metres; chosen by hand, not swept.
+const MIN_COARSE_TOLERANCE: f64 = 0.006;
+/// Cosine above which normals agree in the first screening, about 45 degrees; chosen by hand, not swept.
+const COARSE_COSINE: f32 = 0.7;
+/// Tolerance of depth in the screening after the short ICP, in sampling steps; at least the inlier threshold of the verification.
+/// Chosen by hand; not swept.
+const FINE_TOLERANCE: f64 = 0.7;
+/// Cosine above which normals agree in that screening, about 37 degrees; chosen by hand, not swept.
+const FINE_COSINE: f32 = 0.8;
+/// One of so many of the hypotheses that are refined is chosen by votes whatever its screening score; chosen by hand, not swept.
+const BY_VOTES: usize = 3;
+/// Levels of the short ICP: rejection distance in sampling steps, and iterations. Chosen by hand; not swept.
+const SHORT_LEVELS: [(f64, usize); 2] = [(2.5, 4), (1.2, 4)];
+/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+const SHORT_ANGLE: f64 = 50.0;
+/// A level of the short ICP ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
+const SHORT_CONVERGENCE: f64 = 1e-4;
+/// Fewest correspondences of the short ICP, two more than fix a pose; chosen by hand, not swept.
+const SHORT_CORRESPONDENCES: usize = 8;
+/// Poses whose centres are nearer than this fraction of the diameter, and whose rotations differ by less than [`SAME_ANGLE`], are
+/// one after the short ICP. Chosen by hand; not swept.
+const SAME_PLACE: f64 = 0.03;
+/// See [`SAME_PLACE`]; radians.
+const SAME_ANGLE: f64 = 0.1;
+/// Factor by which more hypotheses are verified where there may be several instances; chosen by hand, not swept.
+const SEVERAL: usize = 2;
 
 impl Default for PpfOptions {
     fn default() -> Self {
@@ -41,12 +95,29 @@ impl Default for PpfOptions {
             voting: VotingOptions::default(),
             clustering: ClusterOptions::default(),
             verification: VerificationOptions::default(),
-            refined: 100,
-            verified: 40,
-            vote_power: 0.3,
+            refined: REFINED,
+            verified: VERIFIED,
+            vote_power: VOTE_POWER,
             max_instances: 1,
-            min_score: 0.05,
+            min_score: MIN_SCORE,
         }
+    }
+}
+
+impl PpfOptions {
+    /// Checks every field, also those of voting, joining and verification.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.voting.check()?;
+        self.clustering.check()?;
+        self.verification.check()?;
+        OptionError::unless_some("refined", self.refined)?;
+        OptionError::unless_some("verified", self.verified)?;
+        OptionError::unless_fraction("vote_power", self.vote_power)?;
+        OptionError::unless_some("max_instances", self.max_instances)?;
+        OptionError::unless_within("min_score", self.min_score, 0.0.., "0 or more")
     }
 }
 
@@ -110,7 +181,7 @@ pub fn estimate_timed(
                     scene.camera().unproject(&sixfold_geometry::Vec2::new(x as f64, y as f64), z)
                 })
                 .collect();
-            cloud = scene.cloud_without(&explained, 0.003);
+            cloud = scene.cloud_without(&explained, EXPLAINED);
             &cloud
         };
         let votes = vote(model, voters, &options.voting);
@@ -132,7 +203,7 @@ pub fn estimate_timed(
             }
             let mut pixels = verifier.explained_pixels(scene, &model.mesh, &e.camera_from_object, threshold);
             let shared = pixels.iter().filter(|p| taken.binary_search(p).is_ok()).count();
-            if pixels.is_empty() || shared * 10 > pixels.len() * 3 {
+            if pixels.is_empty() || shared * MAX_SHARED.1 > pixels.len() * MAX_SHARED.0 {
                 continue;
             }
             taken.append(&mut pixels);
@@ -174,7 +245,7 @@ pub fn screening_score(
     for i in visible_samples(model, pose) {
         let p = rotation * model.samples.points[i].cast::<f32>() + t;
         let n = rotation * model.samples.normals[i].cast::<f32>();
-        if p.z <= 0.05 {
+        if p.z <= NEAREST {
             continue;
         }
         let x = (fx * p.x / p.z + cx).round();
@@ -190,7 +261,7 @@ pub fn screening_score(
             continue;
         }
         // Distance to the tangent plane along the ray: grazing surface may miss by more in depth.
-        let slope = (-n.dot(&p) / p.norm()).clamp(0.3, 1.0);
+        let slope = (-n.dot(&p) / p.norm()).clamp(MIN_SLOPE, 1.0);
         let difference = (z - p.z) * slope;
         if difference > tolerance {
             out += 1.0;
@@ -199,14 +270,14 @@ pub fn screening_score(
         } else {
             let m = scene.normals()[pixel];
             let agreement = n.x * m[0] + n.y * m[1] + n.z * m[2];
-            good += if agreement > cosine { 1.0 } else { 0.2 };
+            good += if agreement > cosine { 1.0 } else { DEPTH_ALONE };
         }
     }
     if total == 0.0 {
         return 0.0;
     }
     let seen = total - occluded;
-    good / (seen + 0.15 * total) * (1.0 - out / total)
+    good / (seen + HIDDEN_WEIGHT * total) * (1.0 - out / total)
 }
 
 /// The first sieve: the samples of every hypothesis against the depth image, a short ICP for the best
@@ -219,31 +290,29 @@ pub fn screen(
     options: &PpfOptions,
 ) -> Vec<Hypothesis> {
     let step = model.diameter * model.options.sampling_step;
-    let coarse = (1.5 * step).max(0.006) as f32;
+    let coarse = (COARSE_TOLERANCE * step).max(MIN_COARSE_TOLERANCE) as f32;
     let mut scored: Vec<(f32, usize)> = clusters
         .par_iter()
         .enumerate()
-        .map(|(i, h)| (screening_score(scene, model, &h.camera_from_object, coarse, 0.7), i))
+        .map(|(i, h)| (screening_score(scene, model, &h.camera_from_object, coarse, COARSE_COSINE), i))
         .collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     // The best by agreement, and those with the most votes whatever they score: a coarse pose of a thin or curved
     // object agrees badly before it is refined.
-    let by_votes = options.refined / 3;
+    let by_votes = options.refined / BY_VOTES;
     let mut rank = 0;
     scored.retain(|&(_, i)| {
         rank += 1;
         rank <= options.refined - by_votes || i < by_votes
     });
+    let level = |(steps, iterations)| IcpLevel { rejection_distance: steps * step, iterations, stride: 1 };
     let short = IcpOptions {
-        levels: vec![
-            IcpLevel { rejection_distance: 2.5 * step, iterations: 4, stride: 1 },
-            IcpLevel { rejection_distance: 1.2 * step, iterations: 4, stride: 1 },
-        ],
-        max_angle: 50f64.to_radians(),
-        convergence: 1e-4,
-        min_correspondences: 8,
+        levels: SHORT_LEVELS.map(level).to_vec(),
+        max_angle: SHORT_ANGLE.to_radians(),
+        convergence: SHORT_CONVERGENCE,
+        min_correspondences: SHORT_CORRESPONDENCES,
     };
-    let fine = (0.7 * step).max(options.verification.threshold_for(model.diameter)) as f32;
+    let fine = (FINE_TOLERANCE * step).max(options.verification.threshold_for(model.diameter)) as f32;
     let mut refined: Vec<(f32, usize, Pose)> = scored
         .par_iter()
         .map(|&(_, i)| {
@@ -254,12 +323,12 @@ pub fn screen(
                 source.normals.push(model.samples.normals[k]);
             }
             let pose = icp(&source, target, &start, &short).map_or(start, |r| r.target_from_source);
-            (screening_score(scene, model, &pose, fine, 0.8), i, pose)
+            (screening_score(scene, model, &pose, fine, FINE_COSINE), i, pose)
         })
         .collect();
     refined.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     // Votes and agreement are two witnesses; half of the places go to each one's favourites.
-    let limit = options.verified * if options.max_instances > 1 { 2 } else { 1 };
+    let limit = options.verified * if options.max_instances > 1 { SEVERAL } else { 1 };
     let mut by_votes: Vec<_> = refined.clone();
     by_votes.sort_by_key(|&(_, i, _)| i);
     let mixed = refined.into_iter().zip(by_votes).flat_map(|(a, b)| [a, b]);
@@ -269,8 +338,8 @@ pub fn screen(
         let votes = clusters[i].votes;
         let centre = |p: &Pose| p.transform_point(&model.centre);
         let same = kept.iter().position(|k| {
-            (centre(&k.camera_from_object) - centre(&pose)).norm() < 0.03 * model.diameter
-                && k.camera_from_object.rotation_angle_to(&pose) < 0.1
+            (centre(&k.camera_from_object) - centre(&pose)).norm() < SAME_PLACE * model.diameter
+                && k.camera_from_object.rotation_angle_to(&pose) < SAME_ANGLE
         });
         match same {
             Some(k) => kept[k].votes = kept[k].votes.max(votes),
@@ -308,4 +377,26 @@ fn verified(
     // A stable sort: equal scores stay in the order of the screening.
     verified.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
     verified
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = PpfOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        assert_eq!(PpfOptions { min_score: 1.1, ..options.clone() }.check(), Ok(()));
+        let named = |options: PpfOptions| options.check().unwrap_err().option;
+        let voting = VotingOptions { bin_margin: f32::NAN, ..options.voting };
+        assert_eq!(named(PpfOptions { voting, ..options.clone() }), "voting.bin_margin");
+        let clustering = ClusterOptions { distance: 0.0, ..options.clustering };
+        assert_eq!(named(PpfOptions { clustering, ..options.clone() }), "clustering.distance");
+        let verification = VerificationOptions { normal_angle: -1.0, ..options.verification };
+        assert_eq!(named(PpfOptions { verification, ..options.clone() }), "verification.normal_angle");
+        assert_eq!(named(PpfOptions { vote_power: f64::NAN, ..options.clone() }), "vote_power");
+        assert_eq!(named(PpfOptions { min_score: f64::NAN, ..options.clone() }), "min_score");
+        assert_eq!(named(PpfOptions { max_instances: 0, ..options }), "max_instances");
+    }
 }

@@ -101,6 +101,7 @@ impl PoseEstimator for PpfEstimator {
             min_score: query.min_confidence,
             ..self.options.clone()
         };
+        options.check().map_err(EstimatorError::method)?;
         let found = estimate(query.depth_region(METHOD)?, &object.model, &options);
         let pose = |e: crate::PpfEstimate| PoseEstimate {
             verification: Some(e.score),

@@ -9,12 +9,13 @@
 
 use rayon::prelude::*;
 use sixfold_align::verification_mesh;
-use sixfold_geometry::{Camera, PointCloud, Pose, Vec3, sphere_directions};
+use sixfold_geometry::{Camera, OptionError, PointCloud, Pose, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 use thiserror::Error;
 
 use crate::V3;
+use crate::voting::THINNING_ANGLE;
 
 /// Why a mesh cannot be described.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -39,15 +40,8 @@ pub enum ModelError {
         needed: usize,
     },
     /// An option is out of range.
-    #[error("option {option}: found {found}, expected {expected}")]
-    Option {
-        /// Name of the option.
-        option: &'static str,
-        /// Its value.
-        found: f64,
-        /// What it should be.
-        expected: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
 }
 
 /// How an object is described.
@@ -60,33 +54,55 @@ pub struct ModelOptions {
     pub angle_steps: usize,
 }
 
+/// Distance between samples as a fraction of the diameter (Drost et al. 2010: 0.05).
+const SAMPLING_STEP: f64 = 0.05;
+/// Steps of each of the feature's angles over half a turn: 12 degrees each (Drost et al. 2010: 30 steps of a whole turn).
+const ANGLE_STEPS: usize = 15;
+
 impl Default for ModelOptions {
     fn default() -> Self {
-        ModelOptions { sampling_step: 0.05, angle_steps: 15 }
+        ModelOptions { sampling_step: SAMPLING_STEP, angle_steps: ANGLE_STEPS }
     }
 }
 
 impl ModelOptions {
-    /// Tests every field.
+    /// Checks every field.
     ///
     /// # Errors
-    /// [`ModelError::Option`].
-    pub fn check(&self) -> Result<(), ModelError> {
-        if !(self.sampling_step >= 0.02 && self.sampling_step <= 0.2) {
-            let found = self.sampling_step;
-            return Err(ModelError::Option { option: "sampling_step", found, expected: "0.02 to 0.2" });
-        }
-        if !(4..=60).contains(&self.angle_steps) {
-            let found = self.angle_steps as f64;
-            return Err(ModelError::Option { option: "angle_steps", found, expected: "4 to 60" });
-        }
-        Ok(())
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_within("sampling_step", self.sampling_step, 0.02..=0.2, "0.02 to 0.2")?;
+        OptionError::unless_within("angle_steps", self.angle_steps, 4..=60, "4 to 60")
     }
 }
 
-/// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each.
+/// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each of a word.
 pub const VIEWS: usize = 64;
+/// Side of a view, pixels: several in the width of a sampling step. Chosen by hand; not swept.
 const VIEW_PIXELS: usize = 160;
+/// Distance of the views, in diameters; chosen by hand, not swept.
+const VIEW_DISTANCE: f64 = 4.0;
+/// Fraction of a view that a sphere of [`VIEW_SPAN`] diameters would fill, seen from its distance; chosen by hand, so that every
+/// object lies inside.
+const VIEW_FILL: f64 = 0.9;
+/// See [`VIEW_FILL`].
+const VIEW_SPAN: f64 = 1.15;
+/// Pixels whose normals have a z (camera frame) above this are seen at a grazing angle: they say little about the surface and much
+/// about the silhouette. Chosen by hand; not swept.
+const GRAZING: f32 = -0.3;
+/// A sample is seen by a view where the cosine between its normal and the ray is below this; chosen by hand, not swept.
+const SEEN_COSINE: f64 = -0.1;
+/// A sample is seen by a view where it lies behind its depth image by less than this fraction of a sampling step: the samples are
+/// means over cells of that size.
+const SEEN_TOLERANCE: f64 = 0.5;
+/// Fewest samples that make a model; chosen by hand, not swept.
+const MIN_SAMPLES: usize = 20;
+/// Points nearer than this have no direction between them, metres.
+const SAME_POINT: f32 = 1e-6;
+/// Logarithm (metres, radians) of a transformation below which it is the identity.
+const IDENTITY: f64 = 1e-9;
+/// The camera's up direction is the object's z unless the ray has a z above this, where it is the object's y.
+const UPRIGHT: f64 = 0.9;
 
 /// An object ready to be matched.
 #[derive(Debug, Clone)]
@@ -146,7 +162,7 @@ impl FeatureTable {
 pub(crate) fn pair_feature(p1: &V3, n1: &V3, p2: &V3, n2: &V3) -> Option<(f32, [f32; 3])> {
     let d = p2 - p1;
     let length = d.norm();
-    if length < 1e-6 {
+    if length < SAME_POINT {
         return None;
     }
     let u = d / length;
@@ -182,7 +198,7 @@ pub(crate) fn turn_about_normal(frame: &[V3; 3], d: &V3) -> u8 {
 /// A camera pose that looks at `centre` from `direction`, `distance` metres away.
 pub(crate) fn look_at(centre: &Vec3, direction: &Vec3, distance: f64) -> Pose {
     let z = -direction;
-    let up = if z.z.abs() < 0.9 { Vec3::z() } else { Vec3::y() };
+    let up = if z.z.abs() < UPRIGHT { Vec3::z() } else { Vec3::y() };
     let x = up.cross(&z).normalize();
     let y = z.cross(&x);
     let rotation = sixfold_geometry::Mat3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]);
@@ -207,8 +223,8 @@ impl ObjectModel {
         let centre = (low + high) * 0.5;
         let step = diameter * options.sampling_step;
         let directions = sphere_directions(VIEWS);
-        let distance = 4.0 * diameter;
-        let focal = 0.9 * VIEW_PIXELS as f64 * distance / (diameter * 1.15);
+        let distance = VIEW_DISTANCE * diameter;
+        let focal = VIEW_FILL * VIEW_PIXELS as f64 * distance / (diameter * VIEW_SPAN);
         let middle = (VIEW_PIXELS as f64 - 1.0) / 2.0;
         let camera = Camera {
             fx: focal,
@@ -229,23 +245,22 @@ impl ObjectModel {
             let objects = [SceneObject { mesh: &flat, camera_from_object: pose }];
             frame.render(&objects, &RenderOptions::default());
             let depth = frame.depth();
-            // Grazing pixels say little about the surface and much about the silhouette.
-            let normals = frame.normals(&objects).map(|n| if n[2] < -0.3 { *n } else { [0.0; 3] });
+            let normals = frame.normals(&objects).map(|n| if n[2] < GRAZING { *n } else { [0.0; 3] });
             let seen = PointCloud::from_depth(&depth, Some(&normals), &camera);
             let back = seen.transformed(&pose.inverse());
             dense.points.extend(back.points);
             dense.normals.extend(back.normals);
             views.push((pose, depth));
         }
-        let samples = dense.voxel_downsample(step, 30f64.to_radians());
-        let tolerance = 0.5 * step;
+        let samples = dense.voxel_downsample(step, THINNING_ANGLE.to_radians());
+        let tolerance = SEEN_TOLERANCE * step;
         let mut kept = PointCloud::default();
         let mut visible_from = Vec::new();
         for (p, n) in samples.points.iter().zip(&samples.normals) {
             let mut bits = 0u64;
             for (i, (pose, depth)) in views.iter().enumerate() {
                 let q = pose.transform_point(p);
-                if pose.transform_direction(n).dot(&q.normalize()) > -0.1 {
+                if pose.transform_direction(n).dot(&q.normalize()) > SEEN_COSINE {
                     continue;
                 }
                 let Some(pixel) = camera.project(&q) else { continue };
@@ -260,9 +275,8 @@ impl ObjectModel {
                 visible_from.push(bits);
             }
         }
-        const NEEDED: usize = 20;
-        if kept.len() < NEEDED {
-            return Err(ModelError::TooFewSamples { found: kept.len(), needed: NEEDED });
+        if kept.len() < MIN_SAMPLES {
+            return Err(ModelError::TooFewSamples { found: kept.len(), needed: MIN_SAMPLES });
         }
         Ok(ObjectModel::assemble(
             Description { mesh: flat, options: *options, diameter, centre, samples: kept, visible_from },
@@ -276,7 +290,7 @@ impl ObjectModel {
         let step = diameter * options.sampling_step;
         let table = build_table(&samples, &visible_from, step, diameter, options.angle_steps);
         let mut all_symmetries = vec![Pose::identity()];
-        all_symmetries.extend(symmetries.iter().filter(|s| s.log().amax() > 1e-9));
+        all_symmetries.extend(symmetries.iter().filter(|s| s.log().amax() > IDENTITY));
         let view_directions = sphere_directions(VIEWS).iter().map(|d| d.cast()).collect();
         ObjectModel {
             mesh,

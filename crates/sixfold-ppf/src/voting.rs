@@ -9,7 +9,7 @@ use std::f32::consts::PI;
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use rayon::prelude::*;
-use sixfold_geometry::{PointCloud, Pose};
+use sixfold_geometry::{OptionError, PointCloud, Pose};
 
 use crate::V3;
 use crate::model::{FeatureTable, ObjectModel, fast_acos, local_frame, turn_about_normal};
@@ -38,19 +38,53 @@ pub struct VotingOptions {
     pub peak_share: f32,
 }
 
+/// Every so many-th scene point is a reference point (Drost et al. 2010: every fifth).
+const REFERENCE_STRIDE: usize = 5;
+/// Most reference points; chosen by hand for the time that voting takes, not swept.
+const MAX_REFERENCES: usize = 2500;
+/// Fraction of a bin at each border from which the neighbouring bin votes too. The idea is that of Hinterstoisser et al. (2016) and
+/// Vidal et al. (2018); the number was chosen by hand, not swept.
+const BIN_MARGIN: f32 = 0.25;
+/// Most peaks of a reference point; chosen by hand, not swept.
+const PEAKS_PER_REFERENCE: usize = 4;
+/// Votes that a peak needs, as a fraction of the reference point's best; chosen by hand, not swept.
+const PEAK_SHARE: f32 = 0.7;
+/// Neighbouring scene points whose normals enclose more than this stay apart when the scene is thinned, degrees (as in the model:
+/// [`crate::model`]). Chosen by hand; not swept.
+pub(crate) const THINNING_ANGLE: f64 = 30.0;
+/// Squared distance below which two points are one and have no feature, square metres: a hundredth of a millimetre.
+const SAME_POINT: f32 = 1e-10;
+/// Reference points that a thread takes at a time; of no influence on the result.
+const CHUNK: usize = 32;
+
 impl Default for VotingOptions {
     fn default() -> Self {
         VotingOptions {
-            reference_stride: 5,
-            max_references: 2500,
-            bin_margin: 0.25,
-            peaks_per_reference: 4,
-            peak_share: 0.7,
+            reference_stride: REFERENCE_STRIDE,
+            max_references: MAX_REFERENCES,
+            bin_margin: BIN_MARGIN,
+            peaks_per_reference: PEAKS_PER_REFERENCE,
+            peak_share: PEAK_SHARE,
         }
     }
 }
 
-/// Steps of the turn about the normal.
+impl VotingOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_some("voting.reference_stride", self.reference_stride)?;
+        OptionError::unless_some("voting.max_references", self.max_references)?;
+        OptionError::unless_within("voting.bin_margin", self.bin_margin, 0.0..=0.5, "0 to 0.5")?;
+        OptionError::unless_some("voting.peaks_per_reference", self.peaks_per_reference)?;
+        OptionError::unless_within("voting.peak_share", self.peak_share, 0.0..=1.0, "0 to 1")
+    }
+}
+
+/// Steps of the turn about the normal, 11.25 degrees each: Hinterstoisser et al. (2016) and Vidal et al. (2018) keep the votes that
+/// were cast in the 32 bits of a word, one for each step, and so does this.
 const TURNS: usize = 32;
 
 /// The scene cloud at the model's sampling step, sorted into cells of the model's diameter so that all partners
@@ -117,7 +151,7 @@ impl Grid {
 /// of the reference points; the same at any number of threads.
 pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) -> Vec<Hypothesis> {
     let step = model.diameter * model.options.sampling_step;
-    let thinned = cloud.voxel_downsample(step, 30f64.to_radians());
+    let thinned = cloud.voxel_downsample(step, THINNING_ANGLE.to_radians());
     let Some(grid) = Grid::new(&thinned, model.diameter as f32) else { return vec![] };
     let least = grid.points.len().div_ceil(options.max_references.max(1));
     let stride = options.reference_stride.max(1).max(least);
@@ -125,7 +159,7 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
     let model_points: Vec<V3> = model.samples.points.iter().map(|p| p.cast()).collect();
     let model_frames: Vec<[V3; 3]> = model.samples.normals.iter().map(|n| local_frame(&n.cast())).collect();
     references
-        .par_chunks(32)
+        .par_chunks(CHUNK)
         .map(|chunk| {
             let mut counter = Counter::new(model.samples.len(), &model.table);
             let mut found = Vec::new();
@@ -177,7 +211,7 @@ impl Counter {
         grid.for_neighbours(&p, |i| {
             let d = grid.points[i] - p;
             let squared = d.norm_squared();
-            if i == r || squared > diameter * diameter || squared < 1e-10 {
+            if i == r || squared > diameter * diameter || squared < SAME_POINT {
                 return;
             }
             let m = &grid.normals[i];

@@ -12,6 +12,7 @@ use sixfold_align::PreparedDepth;
 use sixfold_bop::{BopDataset, Estimate, Models, ResultsAppender, Scene, Target};
 use sixfold_estimator::{
     Cache, EstimatorError, Need, Object, PoseEstimate, PoseEstimator, PreparedObject, Query, Region,
+    check_min_confidence,
 };
 use sixfold_geometry::{Camera, RgbImage};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
@@ -110,6 +111,9 @@ impl DatasetRun<'_> {
         stop: &AtomicBool,
         events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
     ) -> Result<DatasetSummary, RunError> {
+        if let Some(min) = self.min_confidence {
+            check_min_confidence(min).map_err(EstimatorError::method)?;
+        }
         let needs = self.estimator.needs();
         if needs.region == Need::Required && matches!(self.regions, RegionSource::Anywhere) {
             return Err(RunError::NoRegions { method: self.estimator.name() });
@@ -225,6 +229,9 @@ impl DatasetRun<'_> {
             let Some(object) = known.get(&o.obj_id) else { continue };
             let posed = |estimate| PosedObject { obj_id: o.obj_id, mesh: &object.mesh, estimate };
             if matches!(self.regions, RegionSource::Anywhere) {
+                if o.inst_count == 0 {
+                    continue;
+                }
                 whole.max_instances = o.inst_count;
                 let estimates = self.estimator.estimate(object.prepared.as_ref(), &whole)?;
                 found.extend(estimates.into_iter().map(posed));

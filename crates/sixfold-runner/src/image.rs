@@ -31,8 +31,9 @@ impl ImageRun<'_> {
     /// Searches one object. What the image says of all objects is computed for the first alone.
     ///
     /// # Errors
-    /// [`EstimatorError`].
+    /// [`EstimatorError`], also for a query whose limits are out of their range.
     pub fn find(&self, object: &Object) -> Result<FoundObject, EstimatorError> {
+        self.query.check().map_err(EstimatorError::method)?;
         let start = Instant::now();
         let object = self.estimator.prepare(object)?;
         let estimates = self.estimator.estimate(object.as_ref(), &self.query)?;

@@ -7,11 +7,39 @@ use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Frame, RenderOptions, SceneObject};
 use sixfold_synth::augment::Patch;
 
-/// Fewer lines do not hold a pose.
+/// Fewer lines do not hold a pose: twice its six degrees of freedom.
 pub const LEAST_LINES: usize = 12;
 
-/// Faces of a mesh that is drawn for its outline alone.
+/// Faces of a mesh that is drawn for its outline alone; chosen by hand, not swept.
 const OUTLINE_FACES: usize = 4000;
+
+/// Standard deviation of the blur of the silhouette whose gradient is the outline's normal, pixels; chosen by hand, not swept.
+const SILHOUETTE_BLUR: f32 = 1.5;
+/// Pixels at the crop's border on which no outline is looked for: its normal would need what lies outside.
+const CROP_MARGIN: usize = 2;
+/// A blurred silhouette that changes less than this a pixel has no normal (thin parts); chosen by hand, not swept.
+const MIN_STEEPNESS: f64 = 0.05;
+/// How far the outline may lie from the middle of its pixel along the normal, pixels, inwards and outwards; chosen by hand, not
+/// swept.
+const SUBPIXEL: (f64, f64) = (-1.0, 1.5);
+/// Pixels between samples on a line; chosen by hand, not swept.
+const STEP: f64 = 0.5;
+/// Mean log odds that the inner third of a line has at least, and the outer third at most with the other sign, for a border to be
+/// between them: a probability of 0.62. Chosen by hand; not swept.
+const MIN_ODDS: f32 = 0.5;
+/// Least variance of a border's place, squared pixels, so that no line outweighs all others; chosen by hand, not swept.
+const MIN_VARIANCE: f64 = 0.1;
+/// From the median of absolute deviations to the standard deviation of a normal distribution.
+const DEVIATION_FROM_MEDIAN: f64 = 1.4826;
+/// Least deviation of all lines that robust weights are taken in, pixels; chosen by hand, not swept.
+const MIN_DEVIATION: f64 = 0.5;
+/// Variance that every line has beside its border's, squared pixels: that of the rendered outline. Chosen by hand; not swept.
+const LINE_VARIANCE: f64 = 0.5;
+/// A border at `reach` counts as a residual of this many deviations: those at the end of a line weigh about two thirds. Chosen by
+/// hand; not swept.
+const REACH_DEVIATIONS: f64 = 2.0;
+/// Tuning of Tukey's biweight, in deviations: 95 % efficiency for normal noise (Holland and Welsch 1977).
+const TUKEY: f64 = 4.685;
 
 /// The mesh with no more faces than its outline needs: scans have tens of thousands, and drawing them takes
 /// longer than all the rest.
@@ -90,10 +118,10 @@ impl<'a> Outline<'a> {
         for (value, z) in soft.data[..side * side].iter_mut().zip(inverse_depth) {
             *value = f32::from(*z > 0.0);
         }
-        soft.blur(1.5);
+        soft.blur(SILHOUETTE_BLUR);
         let soft = &soft.data[..side * side];
         let mut lines = Vec::new();
-        let margin = 2;
+        let margin = CROP_MARGIN;
         for y in margin..side - margin {
             for x in margin..side - margin {
                 let i = y * side + x;
@@ -107,13 +135,13 @@ impl<'a> Outline<'a> {
                     f64::from(soft[i + side] - soft[i - side]) * 0.5,
                 );
                 let steep = gradient.norm();
-                if steep < 0.05 {
+                if steep < MIN_STEEPNESS {
                     continue;
                 }
                 let normal = -gradient / steep;
                 // The outline lies where the blurred silhouette is one half.
                 let start = Vec2::new(x as f64, y as f64)
-                    + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(-1.0, 1.5);
+                    + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(SUBPIXEL.0, SUBPIXEL.1);
                 if let Some((offset, variance)) = self.border(&start, &normal, reach) {
                     let depth = 1.0 / f64::from(inverse_depth[i]);
                     lines.push(Line { point: self.crop.unproject(&start, depth), normal, offset, variance });
@@ -125,7 +153,6 @@ impl<'a> Outline<'a> {
 
     /// Mean and variance of the border's place on a line through `start` along the outward normal.
     fn border(&self, start: &Vec2, normal: &Vec2, reach: f64) -> Option<(f64, f64)> {
-        const STEP: f64 = 0.5;
         let count = (2.0 * reach / STEP) as usize + 1;
         let at = |k: usize| k as f64 * STEP - reach;
         let odds: Vec<f32> = (0..count)
@@ -137,7 +164,7 @@ impl<'a> Outline<'a> {
         // Something covers the object here, or there is no border within reach.
         let third = count / 3;
         let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-        if mean(&odds[..third]) < 0.5 || mean(&odds[count - third..]) > -0.5 {
+        if mean(&odds[..third]) < MIN_ODDS || mean(&odds[count - third..]) > -MIN_ODDS {
             return None;
         }
         // Log likelihood of a border before sample k: object up to there, background behind.
@@ -165,11 +192,11 @@ impl<'a> Outline<'a> {
             second += weight * place * place;
         }
         let mean = first / total;
-        Some((mean, (second / total - mean * mean).max(0.1)))
+        Some((mean, (second / total - mean * mean).max(MIN_VARIANCE)))
     }
 }
 
-/// Change of the channel that changes most from one pixel to the next (0 to 1) that is half an edge.
+/// Change of the channel that changes most from one pixel to the next (0 to 1) that is half an edge; chosen by hand, not swept.
 const EDGE: f64 = 0.06;
 
 /// The change along x and y of the channel that changes most, at every pixel.
@@ -220,13 +247,14 @@ pub fn add_lines(
     }
     let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
     let middle = offsets.len() / 2;
-    let deviation = 1.4826 * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let robust = robust * deviation.max(0.5);
+    let deviation = DEVIATION_FROM_MEDIAN * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let robust = robust * deviation.max(MIN_DEVIATION);
     for line in lines {
         let rows = motion(crop, &line.point, centre);
         let jacobian: [f64; 6] =
             std::array::from_fn(|k| line.normal.x * rows[0][k] + line.normal.y * rows[1][k]);
-        let mut weight = line_weight * tukey(2.0 * line.offset / reach) / (line.variance + 0.5);
+        let mut weight =
+            line_weight * tukey(REACH_DEVIATIONS * line.offset / reach) / (line.variance + LINE_VARIANCE);
         if robust > 0.0 {
             weight *= tukey(line.offset / robust);
         }
@@ -251,7 +279,7 @@ pub fn motion(camera: &Camera, point: &Vec3, centre: &Vec3) -> [[f64; 6]; 2] {
 
 /// Weight of a residual in units of its noise (Tukey's biweight, tuned to 95 % efficiency).
 pub fn tukey(r: f64) -> f64 {
-    let t = r / 4.685;
+    let t = r / TUKEY;
     if t.abs() >= 1.0 { 0.0 } else { (1.0 - t * t).powi(2) }
 }
 

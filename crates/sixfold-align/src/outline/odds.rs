@@ -2,15 +2,31 @@
 
 use sixfold_synth::augment::Patch;
 
-/// Bins of the colour histograms along each channel.
+/// Bins of the colour histograms along each channel; chosen by hand, not swept.
 const BINS: usize = 16;
+/// Log odds are at most this, either way: neither source is ever certain. Chosen by hand; not swept.
+const MAX_ODDS: f32 = 3.0;
+/// Probabilities are kept off 0 and 1 by this, so that their log odds are finite.
+const CERTAIN: f32 = 0.01;
+/// The prior takes a pixel above the first for the object and below the second for the background; chosen by hand, not swept.
+const OBJECT: f32 = 0.75;
+/// See [`OBJECT`].
+const BACKGROUND: f32 = 0.25;
+/// What every bin holds before any pixel is counted, in pixels; chosen by hand, not swept.
+const EMPTY_BIN: f32 = 0.5;
+/// How much of a bin stays in it, and goes to each of its neighbours, along each channel: a binomial filter.
+const SMOOTHING: (f32, f32) = (0.5, 0.25);
 
 /// Log odds of object against background at every pixel: from the prior's probability, and, times `color`, from
 /// [`color_odds`].
 pub fn log_odds(patch: &Patch, prior: &[f32], color: f32) -> Vec<f32> {
-    let logit = |p: f32| (p / (1.0 - p)).ln().clamp(-3.0, 3.0);
+    let logit = |p: f32| (p / (1.0 - p)).ln().clamp(-MAX_ODDS, MAX_ODDS);
     let colors = color_odds(patch, prior);
-    prior.iter().zip(colors).map(|(p, colors)| logit(p.clamp(0.01, 0.99)) + color * colors).collect()
+    prior
+        .iter()
+        .zip(colors)
+        .map(|(p, colors)| logit(p.clamp(CERTAIN, 1.0 - CERTAIN)) + color * colors)
+        .collect()
 }
 
 /// Log odds of object against background at every pixel from its colour alone: histograms of what the prior (a probability per
@@ -18,16 +34,16 @@ pub fn log_odds(patch: &Patch, prior: &[f32], color: f32) -> Vec<f32> {
 pub fn color_odds(patch: &Patch, prior: &[f32]) -> Vec<f32> {
     let area = prior.len();
     let bins = BINS * BINS * BINS;
-    let mut counts = [vec![0.5f32; bins], vec![0.5f32; bins]];
+    let mut counts = [vec![EMPTY_BIN; bins], vec![EMPTY_BIN; bins]];
     let bin = |i: usize| {
         (0..3)
             .fold(0, |bin, c| bin * BINS + ((patch.data[c * area + i] * BINS as f32) as usize).min(BINS - 1))
     };
     for (i, p) in prior.iter().enumerate() {
         // What is uncertain says nothing.
-        if *p > 0.75 {
+        if *p > OBJECT {
             counts[0][bin(i)] += *p;
-        } else if *p < 0.25 {
+        } else if *p < BACKGROUND {
             counts[1][bin(i)] += 1.0 - *p;
         }
     }
@@ -39,7 +55,7 @@ pub fn color_odds(patch: &Patch, prior: &[f32]) -> Vec<f32> {
                 let place = b / stride % BINS;
                 let below = if place > 0 { before[b - stride] } else { before[b] };
                 let above = if place + 1 < BINS { before[b + stride] } else { before[b] };
-                *value = 0.5 * before[b] + 0.25 * (below + above);
+                *value = SMOOTHING.0 * before[b] + SMOOTHING.1 * (below + above);
             }
         }
         let sum: f32 = count.iter().sum();
@@ -48,7 +64,7 @@ pub fn color_odds(patch: &Patch, prior: &[f32]) -> Vec<f32> {
     (0..area)
         .map(|i| {
             let b = bin(i);
-            (counts[0][b] / counts[1][b]).ln().clamp(-3.0, 3.0)
+            (counts[0][b] / counts[1][b]).ln().clamp(-MAX_ODDS, MAX_ODDS)
         })
         .collect()
 }

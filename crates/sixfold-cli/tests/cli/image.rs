@@ -101,6 +101,15 @@ fn min_score_leaves_poses_out() {
 }
 
 #[test]
+fn a_min_score_that_is_no_number_is_refused() {
+    let case = OneImage::new();
+    for value in ["nan", "=-0.5", "much"] {
+        let option = if value.starts_with('=') { "--min-score" } else { "--min-score " };
+        fails(case.path(), &format!("{} {option}{value}", OneImage::ARGUMENTS), &["--min-score"]);
+    }
+}
+
+#[test]
 fn two_instances_and_boxes() {
     let case = OneImage::new();
     let part = part();

@@ -6,7 +6,9 @@
 //! normalised coordinates, as equation 6.5 does; the second aligns metres.
 
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::{IcpLevel, IcpOptions, IndexedCloud, PointCloud, Pose, Vec3, icp, kabsch};
+use sixfold_geometry::{
+    IcpLevel, IcpOptions, IndexedCloud, OptionError, PointCloud, Pose, Vec3, icp, kabsch,
+};
 
 use sixfold_experience::{Crop, Extent};
 
@@ -34,6 +36,20 @@ impl Default for AlignOptions {
             icp_distance: 0.03,
             icp_angle: 25f64.to_radians(),
         }
+    }
+}
+
+impl AlignOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_positive("align.threshold", self.threshold, "a distance of VD-NOC above 0")?;
+        OptionError::unless_some("align.min_pixels", self.min_pixels)?;
+        OptionError::unless_weight("align.max_residual", self.max_residual)?;
+        OptionError::unless_weight("align.icp_distance", self.icp_distance)?;
+        OptionError::unless_weight("align.icp_angle", self.icp_angle)
     }
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use rayon::prelude::*;
 use sixfold_experience::{Crop, CropError, Match, StoreError, Summary, turn};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
-use sixfold_geometry::{IcpError, IndexedCloud, Pose, Vec3};
+use sixfold_geometry::{IcpError, IndexedCloud, OptionError, Pose, Vec3};
 use sixfold_grasp::{Grasp, GraspFitter, Gripper, middle_between_pads};
 use thiserror::Error;
 
@@ -26,6 +26,9 @@ pub enum ProposeError {
     /// The object's cloud has no normals.
     #[error(transparent)]
     Cloud(#[from] IcpError),
+    /// An option is out of its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
 }
 
 /// How grasps are transferred.
@@ -52,6 +55,17 @@ impl Default for ProposeOptions {
             only: None,
             without_object: None,
         }
+    }
+}
+
+impl ProposeOptions {
+    /// Checks every field, also those of the alignment.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_some("neighbours", self.neighbours)?;
+        self.align.check()
     }
 }
 
@@ -143,6 +157,7 @@ pub fn propose(
     memory: &mut Memory,
     options: &ProposeOptions,
 ) -> Result<Proposals, ProposeError> {
+    options.check()?;
     let (view, gripper) = (fitter.view(), fitter.gripper());
     let crop = Crop::of_view(view, model.crop_options())?;
     let input = model.encode(&crop);
@@ -331,6 +346,16 @@ mod tests {
     use sixfold_experience::CropOptions;
     use sixfold_geometry::{Camera, Image, Mask};
     use sixfold_grasp::{AntipodalQuality, gripper_pose};
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let options = ProposeOptions::default();
+        assert_eq!(options.check(), Ok(()));
+        let none = ProposeOptions { neighbours: 0, ..options.clone() };
+        assert_eq!(none.check().unwrap_err().option, "neighbours");
+        let align = AlignOptions { threshold: f64::NAN, ..options.align };
+        assert_eq!(ProposeOptions { align, ..options }.check().unwrap_err().option, "align.threshold");
+    }
 
     #[test]
     fn what_a_grasp_holds_is_looked_up_between_its_pads() {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, Command, FromArgMatches};
-use sixfold_estimator::{Cache, ObjectStore};
+use sixfold_estimator::{Cache, ObjectStore, check_min_confidence};
 use sixfold_mesh::Unit;
 use sixfold_runner::RunOptions;
 use sixfold_shell::output::JsonArguments;
@@ -122,7 +122,7 @@ pub(crate) struct CommonArguments {
     pub overlays: Option<PathBuf>,
     /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image and 0.05 for a dataset with --method ppf, 0.45
     /// and 0.05 with mttm, 0 with pix2pose)
-    #[arg(long, value_name = "SCORE")]
+    #[arg(long, value_name = "SCORE", value_parser = min_score)]
     pub min_score: Option<f64>,
     /// Seed of everything random
     #[arg(long, default_value = "0")]
@@ -133,6 +133,12 @@ pub(crate) struct CommonArguments {
     pub cache: CacheArguments,
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+/// A number that can be the lowest confidence.
+fn min_score(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    check_min_confidence(value).map(|()| value).map_err(|error| format!("expected {}", error.expected))
 }
 
 /// The options of `sixfold estimate`, of which a method's own are accepted for that method only.
