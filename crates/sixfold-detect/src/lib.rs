@@ -6,10 +6,10 @@
 
 pub mod detect;
 pub mod detector;
-pub mod loss;
+mod loss;
 pub mod model;
 pub mod network;
 pub mod recipe;
 pub mod samples;
-pub mod targets;
+mod targets;
 pub mod training;

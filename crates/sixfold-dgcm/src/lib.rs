@@ -10,11 +10,11 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod learner;
-pub mod loss;
+mod loss;
 pub mod model;
-pub mod networks;
+mod networks;
 pub mod outcome;
 pub mod recipe;
-pub mod samples;
-pub mod training;
+mod samples;
+mod training;
 pub mod transfer;

@@ -25,7 +25,7 @@ pub mod similarity;
 mod source;
 mod surface;
 pub mod synthesis;
-pub mod training;
+mod training;
 pub mod view_grid;
 mod window;
 
