@@ -54,7 +54,7 @@ impl Method {
 }
 
 /// The options of a method.
-pub(super) trait MethodArguments: Args {
+pub(crate) trait MethodArguments: Args {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>>;
 }
 
