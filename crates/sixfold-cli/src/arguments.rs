@@ -4,6 +4,7 @@ use std::num::NonZeroUsize;
 
 use clap::{Parser, Subcommand};
 
+use crate::commands::NETWORKS;
 use crate::commands::completions::CompletionsArguments;
 use crate::commands::demo::arguments::DemoArguments;
 use crate::commands::detect_arguments::DetectArguments;
@@ -14,6 +15,7 @@ use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::object::arguments::ObjectArguments;
 use crate::commands::render::RenderArguments;
 use crate::commands::simulate::SimulateArguments;
+use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
 use crate::commands::train::TrainArguments;
 
 /// 6D object pose and grasp transfer from little data.
@@ -40,7 +42,7 @@ pub(crate) enum Command {
     #[command(after_help = ESTIMATE_HELP)]
     Estimate(Box<EstimateArguments>),
     /// Detect objects in colour images: boxes and masks, for `sixfold estimate` or any COCO tool
-    #[command(after_help = "Examples:\n  \
+    #[command(hide = !NETWORKS, after_help = "Examples:\n  \
         sixfold detect --weights detector.safetensors --rgb c.png --out out\n  \
         sixfold detect --weights detector.safetensors --dataset lmo --out detections.json")]
     Detect(Box<DetectArguments>),
@@ -73,10 +75,11 @@ pub(crate) enum Command {
     )]
     SimulateScenes(Box<crate::commands::simulate_scenes::arguments::SimulateScenesArguments>),
     /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
-    #[command(after_help = crate::commands::synthesize::arguments::AFTER_HELP)]
-    Synthesize(Box<crate::commands::synthesize::arguments::SynthesizeArguments>),
+    #[command(hide = !NETWORKS, after_help = SYNTHESIZE_HELP)]
+    Synthesize(Box<SynthesizeArguments>),
     /// Train a network on a few posed photographs and renders
     #[command(
+        hide = !NETWORKS,
         after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo"
     )]
     Train(TrainArguments),

@@ -1,6 +1,6 @@
 //! Random numbers: one ChaCha stream per sample, so that a sample is a function of seed and number alone.
 
-use rand::{RngExt, SeedableRng};
+use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// The generator of the whole house.
@@ -16,4 +16,10 @@ pub fn stream(seed: u64, number: u64) -> Random {
 /// Uniform between the two ends of `range`; its first end where they are equal or not in order.
 pub fn uniform(random: &mut Random, range: [f32; 2]) -> f32 {
     range[0] + (range[1] - range[0]).max(0.0) * random.random::<f32>()
+}
+
+/// A number of the standard normal distribution (Box, Muller 1958).
+pub fn normal(random: &mut impl Rng) -> f32 {
+    let (u, v): (f32, f32) = (1.0 - random.random::<f32>(), random.random());
+    (-2.0 * u.ln()).sqrt() * (std::f32::consts::TAU * v).cos()
 }

@@ -1,21 +1,29 @@
 //! Matching by the network: descriptors find templates, pairs say mask, rotation, place, and whether they match (dissertation,
 //! section 5.2.4).
 
+use std::path::Path;
+use std::sync::Arc;
+
 use rayon::prelude::*;
 use sixfold_align::DepthRegion;
+use sixfold_estimator::Object;
 use sixfold_geometry::{Pose, Vec3};
 
 use crate::align::camera_from_view;
+use crate::error::StoreError;
 use crate::estimate::{
     APART, KnownObject, MatchedBy, MttmOptions, Placed, SAME_ROTATION, Stages, apart, is_known, place_at,
 };
+use crate::estimator::MttmEstimator;
 use crate::learned::Learned;
 use crate::matching::Entry;
-use crate::model::{Encoded, PairSays};
+use crate::model::{Encoded, MttmModel, PairSays};
 use crate::patch::Patch;
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
+/// Where the descriptors of an object's templates are kept in its folder.
+const DESCRIPTORS_FILE: &str = "descriptors.bin";
 /// Regions of which pairs are compared: fewest and most. Chosen by hand; not swept.
 const LOOKED_AT: (usize, usize) = (64, 400);
 /// Hypotheses that the network adds to a region's; chosen by hand, not swept.
@@ -36,6 +44,46 @@ const LAID: (usize, usize) = (3, 4);
 /// Nearest templates among which a region's hypotheses are looked for, for each of them: most of them are neighbours of one another.
 /// Chosen by hand; not swept.
 const NEAREST: usize = 60;
+impl KnownObject {
+    /// The same object as a network knows it too.
+    pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
+        self.learned = Some(Learned::new(model, &self.templates, self.matcher.entries()));
+        self
+    }
+
+    /// The same, with the network's descriptors kept in a file. The second value tells why a file that was there could not be
+    /// used, or that the new one could not be written.
+    pub fn with_network_cached(
+        mut self,
+        model: Arc<MttmModel>,
+        path: &Path,
+    ) -> (KnownObject, Option<StoreError>) {
+        let (learned, note) = Learned::cached(path, model, &self.templates, self.matcher.entries());
+        self.learned = Some(learned);
+        (self, note)
+    }
+}
+
+impl MttmEstimator {
+    /// The same object as the network knows it too, where there is one; what went wrong with its file is added to `notes`.
+    pub(crate) fn described(
+        &self,
+        known: KnownObject,
+        object: &Object,
+        notes: &mut Vec<String>,
+    ) -> KnownObject {
+        let Some(network) = &self.network else { return known };
+        match object.file(DESCRIPTORS_FILE) {
+            None => known.with_network(network.clone()),
+            Some(file) => {
+                let (known, note) = known.with_network_cached(network.clone(), &file);
+                let say = |n| format!("descriptors of {} not kept, or computed again: {n}", object.name);
+                notes.extend(note.map(say));
+                known
+            }
+        }
+    }
+}
 
 /// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene where the network
 /// says. With `MatchedBy::Both` each is also matched by points there, and what agrees better with the scene is kept.

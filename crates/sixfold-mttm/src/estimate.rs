@@ -15,12 +15,7 @@ use crate::mask::{Pixels, common, template_mask};
 use crate::matching::{Match, MatchOptions, Matcher};
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::ObjectTemplates;
-#[cfg(not(feature = "network"))]
-use crate::without_network::{self as by_network, Learned, RegionCache};
-#[cfg(feature = "network")]
-use crate::{by_network, error::StoreError, learned::Learned, model::MttmModel, regions::RegionCache};
-#[cfg(feature = "network")]
-use std::{path::Path, sync::Arc};
+use crate::{by_network, learned::Learned, regions::RegionCache};
 
 /// Who matches regions with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -163,26 +158,6 @@ impl KnownObject {
         let surfaces =
             templates.templates.par_iter().map(|t| Surface::new(t, templates.size, ICP_POINTS)).collect();
         KnownObject { templates, matcher, surfaces, mesh, learned: None }
-    }
-
-    /// The same object as a network knows it too.
-    #[cfg(feature = "network")]
-    pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
-        self.learned = Some(Learned::new(model, &self.templates, self.matcher.entries()));
-        self
-    }
-
-    /// The same, with the network's descriptors kept in a file. The second value tells why a file that was there could not be
-    /// used, or that the new one could not be written.
-    #[cfg(feature = "network")]
-    pub fn with_network_cached(
-        mut self,
-        model: Arc<MttmModel>,
-        path: &Path,
-    ) -> (KnownObject, Option<StoreError>) {
-        let (learned, note) = Learned::cached(path, model, &self.templates, self.matcher.entries());
-        self.learned = Some(learned);
-        (self, note)
     }
 
     /// Whether a network knows it.

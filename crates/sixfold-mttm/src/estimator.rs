@@ -11,15 +11,12 @@ use sixfold_estimator::{
 use sixfold_mesh::Mesh;
 
 use crate::estimate::{KnownObject, MttmEstimate, MttmOptions, Stages, search};
-use crate::model::MttmModel;
 use crate::regions::RegionCache;
 use crate::template::{ObjectTemplates, Source, TemplateOptions};
 
 const METHOD: &str = "mttm";
 /// Where an object's templates are kept in its folder.
 pub const TEMPLATES_FILE: &str = "templates.bin";
-/// Where the network's descriptors of the templates are kept.
-const DESCRIPTORS_FILE: &str = "descriptors.bin";
 /// Where the mesh that verification renders is kept.
 const MESH_FILE: &str = "verification-mesh.bin";
 
@@ -32,8 +29,9 @@ pub struct MttmEstimator {
     pub options: MttmOptions,
     /// Which templates are rendered from a mesh, where its folder holds none yet.
     pub templates: TemplateOptions,
-    /// The network; without one, points match alone.
-    pub network: Option<Arc<MttmModel>>,
+    /// The network (feature `network`); without one, points match alone.
+    #[cfg(feature = "network")]
+    pub network: Option<Arc<crate::model::MttmModel>>,
     /// Judge poses by the matched templates alone, as if there were no mesh.
     pub templates_only: bool,
 }
@@ -125,18 +123,7 @@ impl PoseEstimator for MttmEstimator {
             );
             rendered = Some(kept.mesh);
         }
-        let mut known = KnownObject::new(templates, rendered);
-        if let Some(network) = &self.network {
-            known = match object.file(DESCRIPTORS_FILE) {
-                None => known.with_network(network.clone()),
-                Some(file) => {
-                    let (known, note) = known.with_network_cached(network.clone(), &file);
-                    let say = |n| format!("descriptors of {} not kept, or computed again: {n}", object.name);
-                    notes.extend(note.map(say));
-                    known
-                }
-            };
-        }
+        let known = self.described(KnownObject::new(templates, rendered), object, &mut notes);
         Ok(Box::new(MttmObject {
             name: object.name.clone(),
             mesh: object.mesh.clone(),

@@ -50,6 +50,8 @@ pub mod training;
 mod views;
 #[cfg(not(feature = "network"))]
 mod without_network;
+#[cfg(not(feature = "network"))]
+use without_network::{self as by_network, self as learned, self as regions};
 
 pub use error::{StoreError, TemplateError};
 pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};

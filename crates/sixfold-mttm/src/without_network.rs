@@ -1,34 +1,48 @@
 //! In the place of `by_network`, `learned` and `regions` when the feature `network` is off: no object is known to a network, so
 //! none of this is ever called.
 
-use sixfold_match::Scene;
+use sixfold_align::DepthRegion;
+use sixfold_estimator::Object;
 
-use crate::estimate::{EstimateOptions, KnownObject, Placed, Stages};
+use crate::estimate::{KnownObject, MttmOptions, Placed, Stages};
+use crate::estimator::MttmEstimator;
 
 /// There is none.
 #[derive(Debug, Clone)]
 pub(crate) enum Learned {}
+
+impl MttmEstimator {
+    /// The same object.
+    pub(crate) fn described(
+        &self,
+        known: KnownObject,
+        _object: &Object,
+        _notes: &mut Vec<String>,
+    ) -> KnownObject {
+        known
+    }
+}
 
 /// Keeps nothing.
 #[derive(Debug, Default)]
 pub(crate) struct RegionCache;
 
 pub(crate) fn first_matching(
-    _scene: &Scene,
+    _scene: &DepthRegion,
     _object: &KnownObject,
     learned: &Learned,
     _cache: &RegionCache,
-    _options: &EstimateOptions,
+    _options: &MttmOptions,
     _stages: &mut Stages,
 ) -> Vec<Placed> {
     match *learned {}
 }
 
 pub(crate) fn second_matching(
-    _scene: &Scene,
+    _scene: &DepthRegion,
     _object: &KnownObject,
     learned: &Learned,
-    _options: &EstimateOptions,
+    _options: &MttmOptions,
     _found: &mut [Vec<Placed>],
 ) {
     match *learned {}

@@ -4,7 +4,7 @@ use crate::kernels::{Activation, ConvSpec};
 use crate::ops::conv;
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
-use rand::{Rng, RngExt};
+use rand::Rng;
 
 /// How a convolution treats the border.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -84,11 +84,7 @@ impl ConvConfig {
     }
 }
 
-/// A number of the standard normal distribution (Box, Muller 1958).
-pub fn normal(rng: &mut impl Rng) -> f32 {
-    let (u, v): (f32, f32) = (1.0 - rng.random::<f32>(), rng.random());
-    (-2.0 * u.ln()).sqrt() * (std::f32::consts::TAU * v).cos()
-}
+pub use sixfold_geometry::random::normal;
 
 /// `activation(conv(x) + bias)`, made by [`ConvConfig`].
 #[derive(Module, Debug)]

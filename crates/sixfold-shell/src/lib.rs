@@ -1,6 +1,7 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, pictures, and the
 //! arguments, stores and scenes that both take.
 
+#[cfg(feature = "networks")]
 pub mod detector;
 pub mod frames;
 pub mod grasp;
@@ -8,6 +9,7 @@ pub mod objects;
 pub mod output;
 pub mod overlay;
 pub mod progress;
+#[cfg(feature = "networks")]
 pub mod training;
 
 use std::num::NonZeroUsize;

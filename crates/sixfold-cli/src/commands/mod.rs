@@ -2,7 +2,9 @@
 
 pub(crate) mod completions;
 pub(crate) mod demo;
+#[cfg(feature = "networks")]
 pub(crate) mod detect;
+#[cfg(feature = "networks")]
 pub(crate) mod detect_arguments;
 pub(crate) mod estimate;
 pub(crate) mod eval;
@@ -13,5 +15,17 @@ pub(crate) mod render;
 pub(crate) mod simulate;
 #[cfg(feature = "physics")]
 pub(crate) mod simulate_scenes;
+#[cfg(feature = "networks")]
 pub(crate) mod synthesize;
+#[cfg(feature = "networks")]
 pub(crate) mod train;
+#[cfg(not(feature = "networks"))]
+pub(crate) mod without_networks;
+#[cfg(not(feature = "networks"))]
+pub(crate) use self::{
+    without_networks as detect, without_networks as detect_arguments, without_networks as synthesize,
+    without_networks as train,
+};
+
+/// Whether the commands that need a network are built in; without them they say so, and help does not list them.
+pub(crate) const NETWORKS: bool = cfg!(feature = "networks");

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod dataset;
+#[cfg(feature = "networks")]
 mod detect;
 mod eval;
 #[cfg(all(feature = "experience", feature = "physics"))]
@@ -10,14 +11,19 @@ mod experience;
 mod experiments;
 mod grasp;
 mod image;
+#[cfg(feature = "networks")]
 mod mttm;
 mod objects;
+#[cfg(feature = "networks")]
 mod pix2pose;
 mod simulate;
 #[cfg(feature = "physics")]
 mod simulate_scenes;
 mod support;
+#[cfg(feature = "networks")]
 mod synthesize;
+#[cfg(not(feature = "networks"))]
+mod without_networks;
 
 /// What is tested.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold");

@@ -5,8 +5,8 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_geometry::Pose;
+use sixfold_geometry::random::normal;
 use sixfold_grasp::Gripper;
-use sixfold_nn::layers::normal;
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{AttemptOptions, Ending, TrialOptions};
 

@@ -1,8 +1,13 @@
 //! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures. Here poses from depth and the
-//! report; `colour.rs` adds poses from colour, `samples.rs` is what both know of the samples.
+//! report; `colour_poses.rs` adds poses from colour, `samples.rs` is what both know of the samples.
 
 pub(crate) mod arguments;
 mod colour;
+#[cfg(feature = "networks")]
+mod colour_poses;
+#[cfg(not(feature = "networks"))]
+#[path = "without_networks.rs"]
+mod colour_poses;
 mod samples;
 
 use std::collections::BTreeMap;
@@ -114,7 +119,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let curves = a.out.join("recall.png");
     write_recall_curves(&curves, &evaluation)?;
     pictures.push(curves);
-    let colour = colour::run(a, &dataset, &targets, &known)?;
+    let colour = colour_poses::run(a, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
     let whole = Whole {
         poses: rows,
@@ -135,7 +140,7 @@ fn drawn<'a>(found: &[(u32, Pose)], known: &'a BTreeMap<u32, Known>) -> Vec<Draw
         .iter()
         .filter_map(|(id, camera_from_object)| {
             Some(Drawn {
-                mesh: &known.get(id)?.mesh,
+                mesh: known.get(id)?.mesh()?,
                 camera_from_object: *camera_from_object,
                 color: overlay::color(*id as usize),
             })

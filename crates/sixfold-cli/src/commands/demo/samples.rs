@@ -1,7 +1,6 @@
 //! The samples: where they are, and what is known of their objects.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models, Placement, adi};
@@ -14,7 +13,6 @@ use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject};
 /// An object of the samples, described for point pair features.
 pub(super) struct Known {
     pub object: Object,
-    pub mesh: Arc<Mesh>,
     pub info: ModelInfo,
     pub model: ObjectModel,
     points: ModelPoints,
@@ -34,8 +32,12 @@ impl Known {
         let prepared = PpfEstimator::default().prepare(&object)?;
         prepared.notes().iter().for_each(|note| eprintln!("note: {note}"));
         let model = downcast::<PpfObject>(prepared.as_ref(), "ppf")?.model().clone();
-        let mesh = object.needed_mesh("ppf")?.clone();
-        Ok(Known { object, mesh, info, model, points })
+        Ok(Known { object, info, model, points })
+    }
+
+    /// Its surface.
+    pub fn mesh(&self) -> Option<&Mesh> {
+        self.object.mesh.as_deref()
     }
 }
 

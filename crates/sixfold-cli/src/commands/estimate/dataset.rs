@@ -3,9 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, Target};
-use sixfold_detect::detector::TrainedDetector;
 use sixfold_io::write_rgb;
 use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunError};
 use sixfold_shell::Outcome;
@@ -15,9 +14,7 @@ use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, interrupted};
 
 use super::arguments::{CommonArguments, EstimateArguments};
-
-/// Detections this sure are passed on: a pose's own confidence sorts them further.
-const MIN_DETECTION: f32 = 0.1;
+use super::networks;
 
 pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     let common = &a.common;
@@ -95,11 +92,7 @@ fn regions(
     let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
     Ok(match (a.boxes.as_deref(), &a.detector) {
         (Some("gt"), _) => (RegionSource::GroundTruth, vec![]),
-        (None | Some("detect"), Some(weights)) => {
-            let detector = TrainedDetector::load(weights)?.with_threshold(MIN_DETECTION);
-            let of_detector = RegionSource::of_detector(Box::new(detector), ids);
-            (of_detector.with_context(|| weights.display().to_string())?, vec![])
-        }
+        (None | Some("detect"), Some(weights)) => (networks::regions(weights, ids)?, vec![]),
         (Some("detect"), None) => {
             bail!("--boxes detect needs --detector FILE.safetensors, which `sixfold train detector` writes")
         }

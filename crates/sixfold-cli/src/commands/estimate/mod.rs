@@ -4,6 +4,11 @@ pub(crate) mod arguments;
 mod dataset;
 mod image;
 mod methods;
+#[cfg(feature = "networks")]
+mod networks;
+#[cfg(not(feature = "networks"))]
+#[path = "without_networks.rs"]
+mod networks;
 mod region;
 
 use anyhow::Result;

@@ -3,15 +3,12 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_detect::detector::TrainedDetector;
-use sixfold_estimator::{ObjectDetector, Region};
+use sixfold_estimator::Region;
 use sixfold_geometry::{Camera, Mask, Rect, RgbImage, Vec2};
 use sixfold_io::read_mask;
 
 use super::arguments::CommonArguments;
-
-/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
-const MIN_SCORE: f32 = 0.4;
+use super::networks;
 
 /// Where to look.
 pub(super) enum Where {
@@ -31,7 +28,10 @@ pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>)
             bail!("--detector: give it, or --box or --mask, but not both");
         }
         let image = image.ok_or_else(|| anyhow!("--detector needs a colour image: give --rgb FILE"))?;
-        return detected(weights, image, a.object_id);
+        let id = a.object_id;
+        let id = id.ok_or_else(|| anyhow!("--detector needs --object-id N: which of its objects is it?"))?;
+        let found = networks::detected(weights, image, id)?;
+        return Ok(found.map_or(Where::Nowhere, Where::In));
     }
     let mask = a.mask.as_deref().map(|path| given_mask(path, lens, boxed.as_ref())).transpose()?;
     Ok(match (mask, boxed) {
@@ -82,18 +82,6 @@ fn given_mask(path: &Path, lens: &Camera, boxed: Option<&Rect>) -> Result<Region
     }
     // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
     Ok(Region::of_box(undistorted(&region.bbox, lens)))
-}
-
-/// Where a detector sees the object best, if at all.
-fn detected(weights: &Path, image: &RgbImage, id: Option<u32>) -> Result<Where> {
-    let id = id.ok_or_else(|| anyhow!("--detector needs --object-id N: which of its objects is it?"))?;
-    let detector = TrainedDetector::load(weights)?;
-    let threshold = detector.options().threshold.min(MIN_SCORE);
-    let detector = detector.with_threshold(threshold);
-    detector.check_object(id).with_context(|| weights.display().to_string())?;
-    let found = detector.detect(image)?.into_iter().filter(|d| d.object_id == id);
-    let best = found.max_by(|a, b| a.region.score.total_cmp(&b.region.score));
-    Ok(best.map_or(Where::Nowhere, |d| Where::In(d.region)))
 }
 
 /// The box that holds what a box of the raw image shows, in the pinhole image.

@@ -23,7 +23,8 @@ use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_nol::{NolError, SourceView};
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
-use self::arguments::{SynthesizeArguments, WeightingKind};
+use self::arguments::WeightingKind;
+pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
 use self::input::{Input, Subject};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{go_on_with, report};

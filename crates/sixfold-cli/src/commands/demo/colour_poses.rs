@@ -1,0 +1,139 @@
+//! Poses from colour in the samples. A detector says where the objects are; without its weights the ground truth does.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Result, bail};
+use sixfold_bop::{BopDataset, Target};
+use sixfold_data::FrameId;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_io::write_rgb;
+use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
+use sixfold_runner::RegionSource;
+
+use super::arguments::DemoArguments;
+use super::colour::{Colour, Row};
+use super::samples::{Known, add_s, found_upwards};
+use sixfold_shell::overlay::{self, Drawn};
+use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::training::was_trained_on;
+
+/// Weights of the sample objects, relative to the repository.
+const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
+/// The detector of the sample objects.
+const DETECTOR: &str = "weights/detector-lmo.safetensors";
+/// Detections this sure are passed on, as `sixfold estimate --dataset` does.
+const MIN_DETECTION: f32 = 0.1;
+
+pub(super) fn run(
+    a: &DemoArguments,
+    dataset: &BopDataset,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<Colour> {
+    let Some(weights) = a.weights.clone().or_else(|| found_upwards(Path::new(WEIGHTS))) else {
+        return Ok(Colour::none(
+            None,
+            format!("no {WEIGHTS}; `sixfold train pix2pose` makes weights, --weights FILE takes them"),
+        ));
+    };
+    let result = Pix2PoseEstimator::load(&weights)
+        .map_err(anyhow::Error::from)
+        .and_then(|pix2pose| with_model(a, &pix2pose, &weights, dataset, targets, known));
+    match result {
+        Ok(colour) => Ok(colour),
+        // Those that were asked for have to be right.
+        Err(error) if a.weights.is_some() => Err(error),
+        Err(error) => Ok(Colour::none(Some(weights), sixfold_shell::describe(&error))),
+    }
+}
+
+/// The targets' objects as the model knows them; an error unless it was trained on their meshes.
+fn objects(
+    pix2pose: &Pix2PoseEstimator,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<BTreeMap<u32, Pix2PoseObject>> {
+    let wanted = |id: &u32| targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id));
+    let wanted = known.iter().filter(|(id, _)| wanted(id));
+    wanted.map(|(id, k)| Ok((*id, pix2pose.object(&k.object)?))).collect()
+}
+
+fn with_model(
+    a: &DemoArguments,
+    pix2pose: &Pix2PoseEstimator,
+    weights: &Path,
+    dataset: &BopDataset,
+    targets: &[Target],
+    known: &BTreeMap<u32, Known>,
+) -> Result<Colour> {
+    let objects = objects(pix2pose, targets, known)?;
+    let detector = a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR)));
+    let (mut regions, mut detector_card) = (RegionSource::GroundTruth, None);
+    if let Some(file) = &detector {
+        let trained = TrainedDetector::load(file)?.with_threshold(MIN_DETECTION);
+        detector_card = Some(trained.model().card().clone());
+        regions = RegionSource::of_detector(Box::new(trained), known.keys().copied())?;
+    }
+    let mut colour = Colour {
+        weights: Some(weights.to_owned()),
+        detector,
+        reason: None,
+        ..Colour::none(None, String::new())
+    };
+    let mut progress = Progress::new("poses from colour", targets.len());
+    for scene_id in dataset.scene_ids() {
+        let scene = dataset.scene(scene_id)?;
+        for im_id in scene.image_ids() {
+            check_interrupt("run it again")?;
+            let Some(image) = scene.rgb(im_id)? else { continue };
+            let detector = detector_card.as_ref().zip(colour.detector.as_deref());
+            for (card, file) in [(pix2pose.model.card(), weights)].into_iter().chain(detector) {
+                if was_trained_on(card, file, FrameId { scene_id, im_id })? {
+                    bail!("{}: was trained on frame {scene_id}/{im_id} of the samples", file.display());
+                }
+            }
+            let camera = scene.camera(im_id)?;
+            let mut drawn = vec![];
+            for t in targets.iter().filter(|t| (t.scene_id, t.im_id) == (scene_id, im_id)) {
+                let Some((o, k)) = t.object.and_then(|o| Some((o, known.get(&o.obj_id)?))) else { continue };
+                colour.targets += 1;
+                progress.step(format!("image {im_id}, object {}", o.obj_id));
+                let found = regions.of_target(&scene, t, &o, |id| known.get(&id).and_then(Known::mesh))?;
+                let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
+                let (Some(region), Some(truth), Some(mesh)) = (found.first(), truth, k.mesh()) else {
+                    continue;
+                };
+                let start = Instant::now();
+                let Some(object) = objects.get(&o.obj_id) else { continue };
+                let Some(posed) = pix2pose.pose_in_box(&image, &camera, object, &region.bbox)? else {
+                    continue;
+                };
+                let error = add_s(k, posed.camera_from_object, truth);
+                colour.poses.push(Row {
+                    image: format!("{scene_id}/{im_id}"),
+                    object: o.obj_id,
+                    add_s_mm: 1000.0 * error,
+                    add_s_of_diameter: error / k.info.diameter,
+                    confidence: posed.score,
+                    seconds: start.elapsed().as_secs_f64(),
+                });
+                drawn.push(Drawn {
+                    mesh,
+                    camera_from_object: posed.camera_from_object,
+                    color: overlay::color(o.obj_id as usize),
+                });
+            }
+            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}_colour.png"));
+            write_rgb(&picture, &overlay::draw(&image, &camera, &drawn))?;
+            colour.pictures.push(picture);
+        }
+    }
+    progress.finish();
+    colour.correct = colour.poses.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
+    if colour.targets == 0 {
+        colour.reason = Some("the samples have no colour images".into());
+    }
+    Ok(colour)
+}

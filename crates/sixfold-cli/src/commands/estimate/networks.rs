@@ -1,0 +1,96 @@
+//! What `sixfold estimate` does with networks: `--method pix2pose`, `--detector`, and the network of `--method mttm`.
+
+use std::collections::BTreeSet;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result, anyhow};
+use clap::Args;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_estimator::{ObjectDetector, PoseEstimator, Region};
+use sixfold_geometry::RgbImage;
+use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::{MatchedBy, MttmEstimator};
+use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+use sixfold_runner::RegionSource;
+
+use super::arguments::CommonArguments;
+use super::methods::{Method, MethodArguments};
+
+/// Who matches with `--method mttm`, unless `--matcher` says so.
+pub(super) const DEFAULT_MATCHER: &str = "both";
+/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
+const MIN_SCORE: f32 = 0.4;
+/// In datasets, detections this sure are passed on: a pose's own confidence sorts them further.
+const MIN_DETECTION: f32 = 0.1;
+
+/// Poses from colour.
+pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
+    "pix2pose",
+    "object coordinates from colour by a trained network, in boxes",
+);
+
+#[derive(Debug, Args)]
+struct Pix2PoseArguments {
+    /// Trained model that `sixfold train pix2pose` wrote; for mttm another network than that within the program
+    #[arg(long, value_name = "FILE.safetensors")]
+    weights: Option<PathBuf>,
+    /// Leave out the last step, which aligns the rendered mesh with the image
+    #[arg(long)]
+    no_refine: bool,
+    /// Most passes over an object: each but the first is into the box of the pose before, which helps where boxes are poor and
+    /// takes as long again (default: 1)
+    #[arg(long, alias = "looks", value_name = "N")]
+    passes: Option<NonZeroUsize>,
+    /// Align poses with the depth image (ICP)
+    #[arg(long)]
+    icp: bool,
+}
+
+impl MethodArguments for Pix2PoseArguments {
+    fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
+        let weights = self.weights.as_deref().ok_or_else(|| {
+            anyhow!(
+                "--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes"
+            )
+        })?;
+        let mut estimator = Pix2PoseEstimator::load(weights)?;
+        estimator.options.estimate.seed = common.seed;
+        if let Some(passes) = self.passes {
+            estimator.options.looks = passes.get();
+        }
+        estimator.refine = !self.no_refine;
+        estimator.icp = self.icp;
+        estimator.object_id = common.object_id;
+        Ok(Box::new(estimator))
+    }
+}
+
+/// Where a detector sees the object best, if at all.
+pub(super) fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Region>> {
+    let detector = TrainedDetector::load(weights)?;
+    let threshold = detector.options().threshold.min(MIN_SCORE);
+    let detector = detector.with_threshold(threshold);
+    detector.check_object(id).with_context(|| weights.display().to_string())?;
+    let found = detector.detect(image)?.into_iter().filter(|d| d.object_id == id);
+    let best = found.max_by(|a, b| a.region.score.total_cmp(&b.region.score));
+    Ok(best.map(|d| d.region))
+}
+
+/// Where a detector sees the objects `ids` in a dataset.
+pub(super) fn regions(weights: &Path, ids: BTreeSet<u32>) -> Result<RegionSource> {
+    let detector = TrainedDetector::load(weights)?.with_threshold(MIN_DETECTION);
+    let of_detector = RegionSource::of_detector(Box::new(detector), ids);
+    of_detector.with_context(|| weights.display().to_string())
+}
+
+/// The same with a network, where one matches: that in `weights`, or that within the program.
+pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
+    let network = match (estimator.options.matched_by, weights) {
+        (MatchedBy::Points, _) => None,
+        (_, Some(file)) => Some(MttmModel::load(file).context("--weights")?),
+        (_, None) => Some(MttmModel::shipped().context("the network within the program")?),
+    };
+    Ok(MttmEstimator { network: network.map(Arc::new), ..estimator })
+}

@@ -1,0 +1,33 @@
+//! In the place of `networks.rs` when the feature `networks` is off: what needs a network is refused.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use anyhow::{Result, bail};
+use sixfold_estimator::Region;
+use sixfold_geometry::RgbImage;
+use sixfold_mttm::{MatchedBy, MttmEstimator};
+use sixfold_runner::RegionSource;
+
+use crate::commands::without_networks::MESSAGE;
+
+/// Who matches with `--method mttm`, unless `--matcher` says so.
+pub(super) const DEFAULT_MATCHER: &str = "points";
+
+pub(super) fn detected(_weights: &Path, _image: &RgbImage, _id: u32) -> Result<Option<Region>> {
+    bail!("--detector: {MESSAGE}")
+}
+
+pub(super) fn regions(_weights: &Path, _ids: BTreeSet<u32>) -> Result<RegionSource> {
+    bail!("--detector: {MESSAGE}")
+}
+
+/// The same, when points match alone.
+pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
+    match (estimator.options.matched_by, weights) {
+        (_, Some(_)) => bail!("--weights: {MESSAGE}"),
+        (MatchedBy::Network, None) => bail!("--matcher network: {MESSAGE}"),
+        (MatchedBy::Both, None) => bail!("--matcher both: {MESSAGE}"),
+        (MatchedBy::Points, None) => Ok(estimator),
+    }
+}

@@ -1,0 +1,30 @@
+//! In the place of the commands that need a network when the feature `networks` is off: they say so.
+
+use std::ffi::OsString;
+
+use anyhow::{Result, anyhow};
+use clap::Args;
+use sixfold_shell::Outcome;
+
+/// Why the program does not do what was asked for.
+pub(crate) const MESSAGE: &str =
+    "this program was built without the feature networks: cargo install --path crates/sixfold-cli";
+
+/// Whatever is asked, the answer is the same.
+#[derive(Debug, Args)]
+#[command(disable_help_flag = true)]
+pub(crate) struct Unanswered {
+    #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true)]
+    _arguments: Vec<OsString>,
+}
+
+pub(crate) type DetectArguments = Unanswered;
+pub(crate) type SynthesizeArguments = Unanswered;
+pub(crate) type TrainArguments = Unanswered;
+
+/// Nothing can be said of how to use a command that is not there.
+pub(crate) const AFTER_HELP: &str = "";
+
+pub(crate) fn run(_: &Unanswered) -> Result<Outcome> {
+    Err(anyhow!(MESSAGE))
+}
