@@ -231,6 +231,7 @@ impl Tiny {
         Tiny::with(with_depth, false)
     }
 
+    #[cfg(feature = "networks")]
     /// With colour images and depth.
     pub fn coloured() -> Tiny {
         Tiny::with(true, true)
