@@ -12,7 +12,7 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-//! let truth = Pose::exp(&[0.02, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let truth = Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.02, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &truth, &camera); // stands for an image of a depth camera
 //!
 //! let method = PpfEstimator::default();
@@ -42,7 +42,7 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.035, 0.08, 0.004, 0.025)?;
-//! let at = |x: f64| Pose::exp(&[x, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let at = |x: f64| Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(x, 0.0, 0.5));
 //! let two = [-0.06, 0.06].map(|x| SceneObject { mesh: &mesh, camera_from_object: at(x) });
 //! let mut frame = Frame::new(&camera);
 //! frame.render(&two, &RenderOptions::default());
@@ -68,7 +68,7 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-//! let truth = Pose::exp(&[0.02, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let truth = Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.02, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &truth, &camera);
 //! let image = PreparedDepth::new(&depth, &camera, &PpfEstimator::default().depth_options())?;
 //! let options = VerificationOptions::default();
