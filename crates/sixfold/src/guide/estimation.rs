@@ -5,6 +5,7 @@
 //! Every method is a [`PoseEstimator`](crate::estimator::PoseEstimator): it prepares an object once and answers queries.
 //!
 //! ```
+//! use sixfold::align::DepthOptions;
 //! use sixfold::mesh::ModelInfo;
 //! use sixfold::prelude::*;
 //! use sixfold::render::render_depth;
@@ -15,7 +16,9 @@
 //! let truth = Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.02, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &truth, &camera); // stands for an image of a depth camera
 //!
-//! let method = PpfEstimator::default();
+//! // There is no table in this image: its largest plane is kept.
+//! let depth_options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+//! let method = PpfEstimator { depth: depth_options, ..PpfEstimator::default() };
 //! let info = ModelInfo::of_mesh(&mesh);
 //! let diameter = info.diameter;
 //! let object = method.prepare(&Object::of_mesh("mug", mesh, info))?;
@@ -33,6 +36,7 @@
 //! A box that somebody drew, a detector's, or a mask.
 //!
 //! ```
+//! use sixfold::align::DepthOptions;
 //! use sixfold::geometry::Rect;
 //! use sixfold::mesh::ModelInfo;
 //! use sixfold::prelude::*;
@@ -47,7 +51,9 @@
 //! let mut frame = Frame::new(&camera);
 //! frame.render(&two, &RenderOptions::default());
 //!
-//! let method = PpfEstimator::default();
+//! // There is no table in this image: its largest plane is kept.
+//! let depth_options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+//! let method = PpfEstimator { depth: depth_options, ..PpfEstimator::default() };
 //! let prepared = PreparedDepth::new(&frame.depth(), &camera, &method.depth_options())?;
 //! let left = Region::of_box(Rect { x: 0.0, y: 0.0, width: 75.0, height: 120.0 });
 //! let query = Query { depth: Some(&prepared), region: Some(&left), ..Query::new(&camera) };
