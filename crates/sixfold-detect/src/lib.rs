@@ -6,10 +6,10 @@
 
 pub mod detect;
 pub mod detector;
-mod loss;
+pub mod loss;
 pub mod model;
 pub mod network;
 pub mod recipe;
 pub mod samples;
-mod targets;
+pub mod targets;
 pub mod training;

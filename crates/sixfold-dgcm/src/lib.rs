@@ -10,11 +10,11 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod learner;
-mod loss;
+pub mod loss;
 pub mod model;
-mod networks;
+pub mod networks;
 pub mod outcome;
 pub mod recipe;
-mod samples;
-mod training;
+pub mod samples;
+pub mod training;
 pub mod transfer;

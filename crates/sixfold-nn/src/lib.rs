@@ -9,7 +9,7 @@ pub mod ops;
 pub mod recurrent;
 
 pub mod batch_norm;
-mod checkpoint;
+pub mod checkpoint;
 pub mod choice;
 pub mod conv_norm;
 pub mod conv_transpose;

@@ -25,7 +25,7 @@ pub mod similarity;
 mod source;
 mod surface;
 pub mod synthesis;
-mod training;
+pub mod training;
 pub mod view_grid;
 mod window;
 

@@ -9,7 +9,7 @@ mod critic;
 pub mod depth;
 pub mod estimate;
 pub mod estimator;
-mod loss;
+pub mod loss;
 pub mod model;
 pub mod networks;
 pub mod object;

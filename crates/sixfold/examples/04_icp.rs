@@ -9,7 +9,8 @@ use sixfold::synth::primitives::mug;
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = Camera::new(572.4, 573.6, 325.3, 242.0, 640, 480)?;
     let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-    let truth = Pose::exp(&[0.05, -0.02, 0.7, 1.9, 0.3, 0.4].into());
+    let truth =
+        Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.05, -0.02, 0.7));
 
     // What a depth camera would measure.
     let ideal = render_depth(&mesh, &truth, &camera);

@@ -5,6 +5,7 @@
 //! Every method is a [`PoseEstimator`](crate::estimator::PoseEstimator): it prepares an object once and answers queries.
 //!
 //! ```
+//! use sixfold::align::DepthOptions;
 //! use sixfold::mesh::ModelInfo;
 //! use sixfold::prelude::*;
 //! use sixfold::render::render_depth;
@@ -12,10 +13,12 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-//! let truth = Pose::exp(&[0.02, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let truth = Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.02, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &truth, &camera); // stands for an image of a depth camera
 //!
-//! let method = PpfEstimator::default();
+//! // There is no table in this image: its largest plane is kept.
+//! let depth_options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+//! let method = PpfEstimator { depth: depth_options, ..PpfEstimator::default() };
 //! let info = ModelInfo::of_mesh(&mesh);
 //! let diameter = info.diameter;
 //! let object = method.prepare(&Object::of_mesh("mug", mesh, info))?;
@@ -33,6 +36,7 @@
 //! A box that somebody drew, a detector's, or a mask.
 //!
 //! ```
+//! use sixfold::align::DepthOptions;
 //! use sixfold::geometry::Rect;
 //! use sixfold::mesh::ModelInfo;
 //! use sixfold::prelude::*;
@@ -42,12 +46,14 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.035, 0.08, 0.004, 0.025)?;
-//! let at = |x: f64| Pose::exp(&[x, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let at = |x: f64| Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(x, 0.0, 0.5));
 //! let two = [-0.06, 0.06].map(|x| SceneObject { mesh: &mesh, camera_from_object: at(x) });
 //! let mut frame = Frame::new(&camera);
 //! frame.render(&two, &RenderOptions::default());
 //!
-//! let method = PpfEstimator::default();
+//! // There is no table in this image: its largest plane is kept.
+//! let depth_options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+//! let method = PpfEstimator { depth: depth_options, ..PpfEstimator::default() };
 //! let prepared = PreparedDepth::new(&frame.depth(), &camera, &method.depth_options())?;
 //! let left = Region::of_box(Rect { x: 0.0, y: 0.0, width: 75.0, height: 120.0 });
 //! let query = Query { depth: Some(&prepared), region: Some(&left), ..Query::new(&camera) };
@@ -68,7 +74,7 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-//! let truth = Pose::exp(&[0.02, 0.0, 0.5, 1.9, 0.3, 0.4].into());
+//! let truth = Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.02, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &truth, &camera);
 //! let image = PreparedDepth::new(&depth, &camera, &PpfEstimator::default().depth_options())?;
 //! let options = VerificationOptions::default();

@@ -14,7 +14,7 @@
 //! let camera_from_object = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
 //! let depth = render_depth(&mesh, &camera_from_object, &camera);
 //! assert_eq!(depth.size(), (160, 120));
-//! assert!((depth[(80, 60)] - 0.504).abs() < 1e-3); // the inside of the floor
+//! assert!((depth[(80, 60)] - 0.5).abs() < 1e-3); // the floor of the mug, seen from below
 //! assert_eq!(depth[(0, 0)], 0.0); // nothing there
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

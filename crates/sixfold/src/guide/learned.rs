@@ -15,7 +15,7 @@
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
 //! let poses: Vec<Pose> =
-//!     (0..6).map(|k| Pose::exp(&[0.0, 0.0, 0.5, 2.0, 0.0, 0.5 * f64::from(k)].into())).collect();
+//!     (0..6).map(|k| Pose::exp(&[0.0, 0.0, 0.0, 2.0, 0.0, 0.5 * f64::from(k)].into()).with_translation(Vec3::new(0.0, 0.0, 0.5))).collect();
 //! let depths: Vec<DepthImage> = poses.iter().map(|pose| render_depth(&mesh, pose, &camera)).collect();
 //! let masks: Vec<Mask> = depths.iter().map(|depth| depth.map(|z| *z > 0.0)).collect();
 //! let views: Vec<DepthView<'_>> = (0..6)
@@ -102,7 +102,7 @@
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
 //! let mesh = mug(0.04, 0.10, 0.004, 0.03)?;
-//! let pose = |angle: f64| Pose::exp(&[0.0, 0.0, 0.5, 2.0, 0.0, angle].into());
+//! let pose = |angle: f64| Pose::exp(&[0.0, 0.0, 0.0, 2.0, 0.0, angle].into()).with_translation(Vec3::new(0.0, 0.0, 0.5));
 //! let image = Arc::new(RgbImage::filled(160, 120, [200, 40, 40])); // stands for a photograph
 //! let posed = PosedImage::new("photograph", 1, image, camera, pose(0.0))?;
 //! let sources = vec![SourceView::new(&posed, &mesh, 64)?];
