@@ -4,7 +4,7 @@
     python benches/icp_vs_open3d_small_gicp.py [--cases 60]
 
 An object of 10 cm (an ellipsoid with bumps) on a table: the target is what a depth camera sees of both, 1 mm of noise, 5 % stray points,
-a third of the object hidden; the source is 2,000 points of the side of the model that faces the camera; the start is off by up to 10 mm and
+a third of the object hidden; the source is 2,000 points of the side of the model that faces the camera; the start has an error of up to 10 mm and
 10 degrees. Rejection distances 20, 10 and 5 mm with at most 10, 10 and 20 iterations for all. A success is below 3 mm and 3 degrees.
 Index: the search tree of the target. Normals are given to Open3D as to us; small_gicp estimates its own beforehand, not timed.
 """

@@ -264,7 +264,7 @@ def compare_metrics(arguments):
         ours_ms.append(ms)
         numpy_ms.append(slow)
     print(
-        f"  vsd    {max(differences):20.1e}    {np.mean(ours_ms):25.3f} ms {np.mean(numpy_ms):8.3f} ms  from drawn depth images"
+        f"  vsd    {max(differences):20.1e}    {np.mean(ours_ms):25.3f} ms {np.mean(numpy_ms):8.3f} ms  from rendered depth images"
     )
 
 

@@ -1,4 +1,4 @@
-"""Quickstart: from a mesh and an image to poses, with a picture of every step.
+"""Quickstart: from a mesh and an image to poses, with an image of every step.
 
     pip install ./python matplotlib
     python python/examples/quickstart.py [--data data/demo] [--weights weights/pix2pose-lmo.safetensors]
@@ -29,7 +29,7 @@ parser.add_argument(
 )
 parser.add_argument("--weights", type=pathlib.Path, default=ROOT / "weights/pix2pose-lmo.safetensors")
 parser.add_argument("--detector", type=pathlib.Path, default=ROOT / "weights/detector-lmo.safetensors")
-parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for the picture")
+parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for the image")
 arguments = parser.parse_args()
 COLORS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#d55e00", "#cc79a7", "#0072b2", "#a06e3c"]
 SCENE, IMAGE, SHOWN = 2, 3, 8
@@ -45,7 +45,7 @@ def outline(axes, mesh, pose, color, label):
 
 
 def judge(mesh, pose, truth):
-    """ADD or, for a symmetric object, ADI, in millimetres and as a share of the diameter."""
+    """ADD or, for a symmetric object, ADI, in millimetres and as a fraction of the diameter."""
     error = (metrics.adi if len(mesh.symmetries) > 1 else metrics.add)(mesh, pose, truth)
     return 1000 * error, error / mesh.diameter
 
@@ -87,7 +87,7 @@ panels[0, 1].scatter(*pixels[~inliers].T, s=2, c="#d55e00", label=f"{(~inliers).
 panels[0, 1].legend(loc="lower right")
 panels[0, 1].set_title("PnP with every second correspondence wrong")
 
-# %% ICP: the object's surface against the measured depth, from a pose that is off by 1 cm and 8 degrees
+# %% ICP: the object's surface against the measured depth, from a pose with an error of 1 cm and 8 degrees
 start = truth[SHOWN] @ sixfold.pose_exp([0.006, -0.004, 0.007, 0.1, -0.08, 0.06])
 seen = sixfold.render(mesh, start, camera)
 surface = seen.coordinates[seen.mask]
@@ -180,7 +180,7 @@ if rest is not None:
     trial = sixfold.try_grasp(solid, grasp, world_from_object=rest, gripper="jaws-140")
     print(f"physics: object {SHOWN} in {solid.part_count} convex parts, grasped from above: {trial.outcome}")
 
-# %% The picture, and the estimates as a result file of the BOP Challenge
+# %% The image, and the estimates as a result file of the BOP Challenge
 arguments.out.mkdir(parents=True, exist_ok=True)
 figure.savefig(arguments.out / "quickstart.png", dpi=110)
 estimates = [bop.Estimate(SCENE, IMAGE, i, 1.0, pose) for i, pose in from_depth.items()]

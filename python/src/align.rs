@@ -68,7 +68,7 @@ impl PnpResult {
     }
 }
 
-/// Samples above this are worth a thread that hears Ctrl-C.
+/// Samples above this are worth a thread that handles Ctrl-C.
 const MANY_ITERATIONS: usize = 20_000;
 
 /// The pose that most correspondences agree with: AP3P (Ke and Roumeliotis 2017) or EPnP (Lepetit et al. 2009) in a

@@ -25,8 +25,8 @@ use crate::guard::{camera_file_error, free};
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) struct PyCamera(pub(crate) Camera);
 
-/// Largest image that is drawn: 64 megapixels.
-const MOST_PIXELS: u64 = 1 << 26;
+/// Largest image that is rendered: 64 megapixels.
+const MAX_PIXELS: u64 = 1 << 26;
 
 impl PyCamera {
     /// The camera, or an error where only images without distortion are taken.
@@ -44,11 +44,11 @@ impl PyCamera {
     /// The camera, or an error where an image of its size would not fit the memory: that would end the interpreter.
     pub(crate) fn drawable(&self) -> PyResult<Camera> {
         let pixels = self.0.width as u64 * self.0.height as u64;
-        if pixels > MOST_PIXELS {
+        if pixels > MAX_PIXELS {
             let found = format!("{} x {}", self.0.width, self.0.height);
             return Err(bad(
                 "camera",
-                format!("an image of at most {MOST_PIXELS} pixels to draw into"),
+                format!("an image of at most {MAX_PIXELS} pixels to draw into"),
                 found,
             ));
         }

@@ -172,7 +172,7 @@ impl Run {
     }
 }
 
-/// A run that cannot go on.
+/// A run that cannot continue.
 fn run_error(error: RunError) -> PyErr {
     let text = describe(&error);
     match error {

@@ -110,7 +110,7 @@ impl ExperienceStore {
     }
 }
 
-/// The store, also after a call that ended in a panic: what it has in memory is read anew when it is asked for.
+/// The store, also after a call that ended in a panic: what it has in memory is read again when it is asked for.
 pub(crate) fn lock(opened: &Mutex<Opened>) -> MutexGuard<'_, Opened> {
     opened.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -226,7 +226,7 @@ impl ExperienceStore {
         })
     }
 
-    /// Encodes all experiences anew with another network, into another store: how many are new there.
+    /// Encodes all experiences again with another network, into another store: how many are new there.
     ///
     /// out: the other file; weights: a DgcmNet or the path of its file. Ctrl-C keeps what was encoded until then.
     ///
@@ -251,7 +251,7 @@ impl ExperienceStore {
         })
     }
 
-    /// Writes all experiences as files of a folder, 000001.png and 000001.json, ...: a picture, and everything else. How
+    /// Writes all experiences as files of a folder, 000001.png and 000001.json, ...: an image, and everything else. How
     /// many were written, and for each that cannot be read why. Ctrl-C is heard.
     ///
     /// Raises OSError when a file cannot be written.

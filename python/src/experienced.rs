@@ -139,7 +139,7 @@ impl PyExperience {
         PyArray1::from_vec(py, copies.first().map(|c| c.feature.clone()).unwrap_or_default())
     }
 
-    /// Three pictures side by side, (4 side, 12 side, 3) uint8: normals with the gripper, coordinates, the pixels near the
+    /// Three images side by side, (4 side, 12 side, 3) uint8: normals with the gripper, coordinates, the pixels near the
     /// gripper.
     fn picture<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let picture = crate::guard::free(py, || self.0.experience.picture())?;

@@ -39,10 +39,10 @@ pub(crate) struct PyGrasp {
     /// Part of the quality: how much surface each pad meets.
     #[pyo3(get)]
     support: f64,
-    /// Part of the quality: how near the closing axis passes to the object's middle.
+    /// Part of the quality: how near the closing axis passes to the object's centre.
     #[pyo3(get)]
     centring: f64,
-    /// Part of the quality: share of the contact points that were seen rather than assumed.
+    /// Part of the quality: fraction of the contact points that were seen rather than assumed.
     #[pyo3(get)]
     observed: f64,
     /// How many proposals were joined into this one.

@@ -77,7 +77,7 @@ impl PyGripper {
         self.0.friction
     }
 
-    /// The gripper as a Mesh in its own frame, the pads `opening` metres apart, for pictures.
+    /// The gripper as a Mesh in its own frame, the pads `opening` metres apart, for images.
     ///
     /// Raises ValueError for an opening that it does not have.
     fn mesh(&self, opening: f64) -> PyResult<PyMesh> {

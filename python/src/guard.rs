@@ -80,7 +80,7 @@ impl<U> Tell<U> {
 }
 
 enum Message<T, U> {
-    News(U),
+    Progress(U),
     Done(std::thread::Result<T>),
 }
 
@@ -100,7 +100,7 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
         .spawn(move || {
             // The receiver is gone when the call was left; then nobody wants news or result.
             let news = send.clone();
-            let tell = Tell(Box::new(move |value| drop(news.send(Message::News(value)))));
+            let tell = Tell(Box::new(move |value| drop(news.send(Message::Progress(value)))));
             let result = catch_unwind(AssertUnwindSafe(|| work(&flag, &tell)));
             let _ = send.send(Message::Done(result));
         })
@@ -118,8 +118,8 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
                     (None, Err(payload)) => Err(internal(payload.as_ref())),
                 };
             }
-            Ok(Message::News(_)) if pending.is_some() => Ok(()),
-            Ok(Message::News(news)) => hear(news),
+            Ok(Message::Progress(_)) if pending.is_some() => Ok(()),
+            Ok(Message::Progress(news)) => hear(news),
             Err(RecvTimeoutError::Timeout) => Ok(()),
             Err(RecvTimeoutError::Disconnected) => {
                 return Err(PyRuntimeError::new_err(

@@ -13,7 +13,7 @@ use crate::guard::{free, interruptible};
 use crate::mesh::PyMesh;
 use crate::trial::{PySolid, simulation_error};
 
-/// Draws a made-up object, a Mesh in metres: of a household family, "can", "mug", "cup", "bottle", "bowl", "box", "clamp" or
+/// Draws a synthetic object, a Mesh in metres: of a household family, "can", "mug", "cup", "bottle", "bowl", "box", "clamp" or
 /// "drill", or a "toy", which is of none. Another seed gives another one.
 ///
 /// Raises ValueError for another kind.
@@ -40,8 +40,8 @@ pub(crate) fn made_up_mesh(py: Python<'_>, kind: &str, seed: i64) -> PyResult<Py
 /// up, the table's top at z = 0; None for what rolled away or does not come to rest.
 ///
 /// solids: Solids, the same one as often as wanted. radius of the disc around the origin over which they are let go, reach
-/// beyond which they are taken away, metres; upright: share of them that start with their z axis up, the others in any
-/// orientation; stacked: share that falls wherever it falls, the others look for a free place. The same arguments give the same
+/// beyond which they are taken away, metres; upright: fraction of them that start with their z axis up, the others in any
+/// orientation; stacked: fraction that falls wherever it falls, the others look for a free place. The same arguments give the same
 /// result on every machine. Ctrl-C is heard.
 ///
 /// Raises ValueError for options out of range.

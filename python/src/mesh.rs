@@ -179,7 +179,7 @@ impl PyMesh {
     /// do not say it.
     ///
     /// Raises OSError when the file cannot be read; ValueError when it is broken, or with check_size when the object
-    /// would be smaller than 5 mm or larger than 5 m (the message says which unit fits).
+    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits).
     ///
     /// >>> Mesh.load("data/demo/models/obj_000001.ply", unit="mm").diameter  # doctest: +SKIP
     /// 0.10209...

@@ -216,8 +216,8 @@ fn vsd_options(taus: Option<&Bound<'_, PyAny>>, delta: f64) -> PyResult<VsdOptio
 
 /// Visible surface discrepancy (Hodan et al. 2018, equation 1; step cost, visibility "bop19"), 0 to 1, one number a tau.
 ///
-/// mesh is drawn at estimate and ground_truth (4, 4); depth (H, W) metres is what the sensor saw, 0 where nothing. taus:
-/// misalignment tolerances as shares of the diameter (default .05 to .5); delta: tolerance of the visibility test in
+/// mesh is rendered at estimate and ground_truth (4, 4); depth (H, W) metres is what the sensor saw, 0 where nothing. taus:
+/// misalignment tolerances as fractions of the diameter (default .05 to .5); delta: tolerance of the visibility test in
 /// metres. diameter: default that of the mesh.
 ///
 /// Raises ValueError when depth and camera differ in size or the mesh has no faces.
@@ -313,7 +313,7 @@ fn area_under_accuracy(errors: Vec<f64>, largest: f64) -> PyResult<Option<f64>> 
     Ok(sixfold_bop::area_under_accuracy(&errors, arrays::positive("largest", largest)?))
 }
 
-/// The share of errors (N,) below a threshold, 0 to 1; None for an empty list.
+/// The fraction of errors (N,) below a threshold, 0 to 1; None for an empty list.
 ///
 /// >>> recall_below([0.01, 0.2], 0.1)
 /// 0.5
@@ -368,7 +368,7 @@ fn models_of(word: &str) -> PyResult<Models> {
 ///
 /// dataset: a bop.Dataset or its folder; results: a CSV file in BOP's form (millimetres in the file) or a list of
 /// bop.Estimate. targets: a targets file (default test_targets_bop19.json); vsd=False leaves VSD out, which takes longest;
-/// visib_gt_min: least visible share of a target in place of BOP's rule; models: "eval" or "rendering"; curves: a PNG
+/// visib_gt_min: least visible fraction of a target in place of BOP's rule; models: "eval" or "rendering"; curves: a PNG
 /// file for recall curves. Ctrl-C is heard.
 ///
 /// Raises OSError for files that cannot be read, ValueError for broken ones.

@@ -12,8 +12,8 @@ use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
 use sixfold_mttm::mask::to_image;
 use sixfold_mttm::model::{ModelError, MttmModel};
 use sixfold_mttm::{
-    Coverage, DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, SIDE, Source, StoreError,
-    TemplateError, TemplateOptions, estimate,
+    DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, SIDE, Source, StoreError, TemplateError,
+    TemplateOptions, ViewCoverage, estimate,
 };
 
 use crate::arrays::{self, bad, whole};
@@ -57,13 +57,13 @@ impl PyTemplates {
     /// Draws a mesh from all sides.
     ///
     /// coverage: "above" for what stands on a table, its z axis up, seen by a camera held upright within 45 degrees (305
-    /// views); "around" for all directions and any turn of the camera (642 views). Ctrl-C is heard.
+    /// views); "around" for all directions and any rotation of the camera (642 views). Ctrl-C is heard.
     ///
     /// Raises ValueError for a mesh without faces, another coverage.
     #[staticmethod]
     #[pyo3(signature = (mesh, *, coverage="above"))]
     fn from_mesh(py: Python<'_>, mesh: &Bound<'_, PyMesh>, coverage: &str) -> PyResult<Self> {
-        let known = [Coverage::Above, Coverage::Around];
+        let known = [ViewCoverage::Above, ViewCoverage::Around];
         let coverage = known.into_iter().find(|c| c.name() == coverage).ok_or_else(|| {
             bad("coverage", known.map(|c| format!("{:?}", c.name())).join(" or "), format!("{coverage:?}"))
         })?;
@@ -219,7 +219,7 @@ pub(crate) fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelE
 /// templates: Templates, or a Mesh, whose templates from above are made first. mesh: a Mesh or PpfModel of the object, with
 /// which poses are refined and verified; without it (and with Templates) the templates alone decide. matcher: who matches
 /// regions of the image with templates: "points" compares them point by point, "network" by a network's descriptors alone
-/// (as the dissertation does), "both" by both. The network was trained on made-up objects and comes with the package;
+/// (as the dissertation does), "both" by both. The network was trained on synthetic objects and comes with the package;
 /// weights: another one, a file that `train_mttm` or `sixfold train mttm` wrote. With `cache`, a file, its descriptors of the
 /// templates are read from there when they fit network and templates, and written there otherwise.
 ///

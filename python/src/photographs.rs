@@ -12,7 +12,7 @@ use sixfold_nn::weights::WeightsError;
 use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::{ModelError, NolModel};
-use sixfold_nol::refine::{RefineOptions, Refinement, SceneKind, SceneSource, refine_scene};
+use sixfold_nol::refine::{PoseRefinementOptions, PosedSource, Refinement, SceneKind, refine_scene};
 use sixfold_nol::synthesis::{NewView, ViewMaker, Weighting};
 
 use crate::arrays::{self, bad, whole};
@@ -63,7 +63,7 @@ impl RefinedPoses {
         self.numbers(py, |s| s.moved)
     }
 
-    /// How far the object was turned, (N,) float64, radians.
+    /// How far the object was rotated, (N,) float64, radians.
     #[getter]
     fn turned<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.numbers(py, |s| s.turned)
@@ -151,7 +151,7 @@ fn numbering(
 /// numbers for photographs cut out of the same image, whose objects share its camera. scene: "still" where only the camera
 /// moved, "moving" where objects may have, "judge" to decide it by the poses. rough: standard deviation of the given poses,
 /// metres and radians. shared: rounds at each resolution in which the error that all poses of an object share is looked for,
-/// for evenly painted objects under even light. progress: called with the share that is done. Ctrl-C is heard.
+/// for evenly painted objects under even light. progress: called with the fraction that is done. Ctrl-C is heard.
 ///
 /// Raises ValueError for no photograph, options out of range, a mesh that reaches behind a camera.
 ///
@@ -190,22 +190,22 @@ pub(crate) fn refine_poses(
     if !(rough.0 > 0.0 && rough.1 > 0.0 && rough.0.is_finite() && rough.1.is_finite()) {
         return Err(bad("rough", "metres and radians above 0", format!("{rough:?}")));
     }
-    let options = RefineOptions {
+    let options = PoseRefinementOptions {
         scene: *scene,
         rough: [rough.0, rough.1],
         shared: whole("shared", shared, 0)?,
         seed: arrays::seed(seed)?,
-        ..RefineOptions::default()
+        ..PoseRefinementOptions::default()
     };
     let kept = photographs.clone();
     let refinement = reporting(
         py,
         Leave::AtOnce,
         move |stop, tell: &Tell<f64>| {
-            let sources: Vec<SceneSource<'_>> = photographs
+            let sources: Vec<PosedSource<'_>> = photographs
                 .iter()
                 .zip(objects.iter().zip(&images))
-                .map(|(photograph, (object, image))| SceneSource {
+                .map(|(photograph, (object, image))| PosedSource {
                     object: *object,
                     image: *image,
                     photograph,
@@ -247,7 +247,7 @@ pub(crate) struct SynthesizedView {
     /// Where the object is but no photograph shows it, (H, W) bool: filled from what is near.
     #[pyo3(get)]
     unseen: Py<PyArray2<bool>>,
-    /// Share of the object's pixels that no photograph shows, 0 to 1.
+    /// Fraction of the object's pixels that no photograph shows, 0 to 1.
     #[pyo3(get)]
     unseen_share: f64,
     /// Numbers of the photographs that were used.
@@ -258,7 +258,7 @@ pub(crate) struct SynthesizedView {
 impl SynthesizedView {
     fn of(py: Python<'_>, view: NewView) -> PyResult<Self> {
         Ok(SynthesizedView {
-            unseen_share: view.unseen_share(),
+            unseen_share: view.unseen_fraction(),
             rgb: arrays::from_image_of(py, free(py, || view.patch.to_rgb())?)?.unbind(),
             mask: arrays::from_image(py, view.mask)?.unbind(),
             unseen: arrays::from_image(py, view.unseen)?.unbind(),

@@ -14,7 +14,7 @@ use sixfold_mesh::Mesh;
 use sixfold_nn::weights::WeightsError;
 use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::depth::{align, prepare};
-use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, Found};
+use sixfold_pix2pose::estimate::{EstimateError, Found, Pix2PoseOptions};
 use sixfold_pix2pose::estimator::{self, Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_pix2pose::model::{ModelError, Pix2PoseModel};
 use sixfold_runner::describe;
@@ -254,12 +254,12 @@ impl Pix2Pose {
             Some(list) => arrays::numbers("thresholds", list)?.into_iter().map(|t| t as f32).collect(),
             None => Vec::new(),
         };
-        let options = EstimateOptions {
+        let options = Pix2PoseOptions {
             thresholds,
             two_stages,
             crop_factor: positive("crop_factor", crop_factor)?,
             seed: self::seed(seed)?,
-            ..EstimateOptions::default()
+            ..Pix2PoseOptions::default()
         };
         let options = AlignOptions {
             estimate: options,

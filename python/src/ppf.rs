@@ -17,13 +17,13 @@ use crate::guard::interruptible;
 use crate::mesh::PyMesh;
 use crate::scene::PyPlane;
 
-/// Step of discretised symmetry axes in a description, as a share of the diameter: as the command line does.
+/// Step of discretised symmetry axes in a description, as a fraction of the diameter: as the command line does.
 const SYMMETRY_STEP: f64 = 0.05;
 
 /// An object ready to be matched in depth images by point pair features (Drost et al. 2010). Made once a mesh, used for
 /// any number of images.
 ///
-/// sampling_step: distance between samples as a share of the diameter; angle_steps: steps of each angle over half a turn.
+/// sampling_step: distance between samples as a fraction of the diameter; angle_steps: steps of each angle over half a turn.
 /// With `cache`, a file, the description is read from there when it fits mesh and options, and written there otherwise.
 /// Symmetries are those of the mesh.
 ///
@@ -289,7 +289,7 @@ pub(crate) fn verification_to_python(py: Python<'_>, s: &VerificationScore) -> P
         ("boundary", s.boundary),
         ("normals", s.normals),
         ("total", s.total),
-        ("visible_share", s.visible_share()),
+        ("visible_share", s.visible_fraction()),
     ] {
         verification.set_item(name, value)?;
     }

@@ -11,7 +11,7 @@ use crate::arrays::{positive, whole};
 use crate::bop::json_to_python;
 use crate::training::{Source, checked, choice, count, run, single, steps, summary};
 
-/// Trains Pix2Pose (dissertation, chapter 3) on posed photographs and renders of objects; the model is what Pix2Pose.load
+/// Trains Pix2Pose (dissertation, chapter 3) on posed images and renders of objects; the model is what Pix2Pose.load
 /// reads. A dict with model (its path), steps, seconds, losses.
 ///
 /// material: the folder of a BOP dataset, a bop.Dataset, or {id: Mesh} to learn from renders alone. out: a folder that gets
@@ -20,14 +20,14 @@ use crate::training::{Source, checked, choice, count, run, single, steps, summar
 /// network: "compact", which trains on two cores, or the dissertation's "paper" and "resnet50" for one object; steps,
 /// per_object (images of every object in a step) and learning_rate have its defaults if None. adversarial: against a
 /// discriminator; if None, all but the compact network. render_share and
-/// near_photographs: share of renders, and of those near a photograph's pose; rotation: largest turn of photographs in the
-/// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to go on from; encoder: torchvision's ResNet-50
+/// near_photographs: fraction of renders, and of those near a photograph's pose; rotation: largest rotation of photographs in the
+/// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to continue from; encoder: torchvision's ResNet-50
 /// weights for "resnet50"; backgrounds: a folder of photographs; preset: symmetries, thresholds
 /// and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless".
 ///
 /// progress: called with a dict: stage ("training" or "measuring"), done, total, and while training seconds,
 /// learning_rate, samples_per_second, losses. Ctrl-C, or an error of the callback, ends the training after the current
-/// step, which is kept: the same call goes on, with the same result as if it had not been stopped. Symmetries that a mesh
+/// step, which is kept: the same call resumes, with the same result as if it had not been stopped. Symmetries that a mesh
 /// does not have are a warning.
 ///
 /// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
@@ -100,8 +100,8 @@ pub(crate) fn train_pix2pose<'py>(
 ///
 /// material, out, ids, frames, split, renders_only, init, backgrounds, progress, Ctrl-C and going on: as train_pix2pose.
 /// network: "compact" or the dissertation's "retinanet"; batch: images in a step; encoder_share: the pretrained encoder's
-/// share of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_share: share of
-/// training images that are parts of photographs; render_share: share of renders among pasted objects; rotation: largest turn
+/// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_share: fraction of
+/// training images that are parts of photographs; render_share: fraction of renders among pasted objects; rotation: largest rotation
 /// in the image plane, radians, 15 degrees if None; longest_side: larger images are reduced to so many pixels before detection; threshold: score
 /// below which detections are left out by default.
 ///
@@ -165,7 +165,7 @@ pub(crate) fn train_detector<'py>(
     summary(py, run(py, progress, recipe, material, out)?)
 }
 
-/// Trains the network for grasps from experience (dissertation, chapter 6) on made-up objects; the model is what
+/// Trains the network for grasps from experience (dissertation, chapter 6) on synthetic objects; the model is what
 /// DgcmNet.load reads. A dict with model (its path), steps, seconds, losses.
 ///
 /// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first. network: "compact" or the
@@ -208,15 +208,15 @@ pub(crate) fn train_dgcm<'py>(
     summary(py, run(py, progress, recipe, (), out)?)
 }
 
-/// Trains the network that matches regions of depth images with templates (dissertation, chapter 5) on made-up objects that
+/// Trains the network that matches regions of depth images with templates (dissertation, chapter 5) on synthetic objects that
 /// fall on a table; the model is what Mttm takes as weights. A dict with model (its path), steps, seconds, losses, and quality,
-/// measured on objects that it was not trained on: regions (their number); shares of them: nearest (own template the nearest of
-/// 40), masks (overlap by more than half), matching (pairs told right); medians, of the nearest template and after the network's
-/// correction: rotation (radians), offset (share of a patch).
+/// measured on objects that it was not trained on: regions (their number); fractions of them: nearest (own template the nearest of
+/// 40), masks (overlap by more than half), matching (pairs classified correctly); medians, of the nearest template and after the network's
+/// correction: rotation (radians), offset (fraction of a patch).
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first, and out gets a picture of the first
+/// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first, and out gets an image of the first
 /// regions, samples.png. network: "compact", which trains on two cores, or the dissertation's "paper"; steps, anchors (regions
-/// with an object in a step) and learning_rate have its defaults if None; objects: made-up objects, 16 or more; scenes: scenes
+/// with an object in a step) and learning_rate have its defaults if None; objects: synthetic objects, 16 or more; scenes: scenes
 /// of them, 4 or more, each seen by five cameras; encoder: torchvision's ResNet-50 weights for "paper".
 ///
 /// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
@@ -259,12 +259,12 @@ pub(crate) fn train_mttm<'py>(
     Ok(dict)
 }
 
-/// Trains the network of Neural Object Learning (dissertation, chapter 4) on made-up objects; the model is what synthesize
-/// takes as weights. A dict with model (its path), steps, seconds, losses, quality (how like the truth it renders objects
+/// Trains the network of Neural Object Learning (dissertation, chapter 4) on synthetic objects; the model is what synthesize
+/// takes as weights. A dict with model (its path), steps, seconds, losses, quality (how similar to the ground truth it renders objects
 /// that it was not trained on, beside plain averaging).
 ///
 /// out, progress, Ctrl-C and going on: as train_pix2pose. network: "compact" or the dissertation's "paper"; steps and
-/// learning_rate have its defaults if None; backgrounds: a folder of photographs for textures, made-up ones only if None;
+/// learning_rate have its defaults if None; backgrounds: a folder of photographs for textures, synthetic ones only if None;
 /// lstm=False integrates the photographs' features by their mean; decoder=False leaves the decoder out; encoder:
 /// torchvision's DenseNet-121 weights for "paper".
 ///

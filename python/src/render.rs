@@ -7,7 +7,9 @@ use pyo3::prelude::*;
 use pyo3::types::{PyIterator, PyList, PyTuple};
 use sixfold_geometry::{Camera, Image, Mask, NormalImage, PointImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Culling, DepthSensor, Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{
+    Culling, DepthSensor, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade,
+};
 
 use crate::arrays::{self, about, bad, seed};
 use crate::camera::PyCamera;
@@ -160,7 +162,7 @@ fn lights_of(lights: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<Light>> {
     Ok(out)
 }
 
-/// How a picture is drawn, checked.
+/// How an image is drawn, checked.
 struct Style {
     lights: Vec<Light>,
     material: Material,
@@ -210,7 +212,7 @@ struct Drawn {
 fn draw(camera: &Camera, objects: &[(Arc<Mesh>, Pose)], style: &Style) -> Drawn {
     let objects: Vec<SceneObject<'_>> =
         objects.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&objects, &style.options);
     Drawn {
         depth: frame.depth(),

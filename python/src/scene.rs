@@ -12,7 +12,7 @@ use crate::guard::{free, interruptible};
 /// missing (Hinterstoisser et al. 2012, section 3.3).
 ///
 /// radius: half width of the window in pixels; max_relative_step: a neighbour counts when its depth differs by less than
-/// this share.
+/// this fraction.
 ///
 /// Raises ValueError when depth and camera differ in size.
 ///

@@ -108,7 +108,7 @@ where
     match outcome {
         Ok(Outcome::Finished(trained)) => Ok(trained),
         Ok(Outcome::Interrupted { step }) => Err(PyRuntimeError::new_err(format!(
-            "the training ended after step {step}; call it again to go on"
+            "the training ended after step {step}; call it again to continue"
         ))),
         Err(error) => Err(file_or_value(&error)),
     }
@@ -200,10 +200,10 @@ impl Source {
         Ok(Source::Dataset { root, split, ids, frames })
     }
 
-    pub(crate) fn read(self, py: Python<'_>, least_visible: f64) -> PyResult<TrainingSet> {
+    pub(crate) fn read(self, py: Python<'_>, min_visibility: f64) -> PyResult<TrainingSet> {
         let read = interruptible(py, move |_| match self {
             Source::Dataset { root, split, ids, frames } => {
-                TrainingSet::of_dataset(&root, &split, &ids, &frames, least_visible)
+                TrainingSet::of_dataset(&root, &split, &ids, &frames, min_visibility)
             }
             Source::Meshes(meshes) => Ok(TrainingSet::of_meshes(meshes, "meshes")),
         })?;

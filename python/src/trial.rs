@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use sixfold_geometry::Pose;
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{
-    ConvexParts, Outcome, PartsOptions, SimulationError, TrialOptions, TrialReport, settle_in_middle,
+    ConvexParts, Outcome, PartsOptions, SimulationError, TrialOptions, TrialReport, settle_at_centre,
     try_grasp as try_one,
 };
 
@@ -59,7 +59,7 @@ impl PySolid {
     /// Where the object comes to rest on the table (z up, its top at z = 0) when it falls from just above it, over the
     /// table's middle: (4, 4) world_from_object in metres, or None when it does not come to rest.
     ///
-    /// start (4, 4): how it is turned when it falls; its own z axis up, if None. Ctrl-C is heard.
+    /// start (4, 4): how it is rotated when it falls; its own z axis up, if None. Ctrl-C is heard.
     #[pyo3(signature = (start=None))]
     fn rest<'py>(
         &self,
@@ -82,7 +82,7 @@ impl PySolid {
 
     fn settled(&self, py: Python<'_>, start: Pose) -> PyResult<Option<Pose>> {
         let (mesh, parts) = (self.mesh.clone(), self.parts.clone());
-        interruptible(py, move |_| settle_in_middle(&mesh, &parts, &start))
+        interruptible(py, move |_| settle_at_centre(&mesh, &parts, &start))
     }
 }
 

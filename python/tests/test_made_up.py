@@ -25,7 +25,7 @@ def test_they_fall_and_rest():
     poses = sixfold.drop_objects(solids, stacked=0.0, upright=1.0, seed=2)
     assert len(poses) == 3 and all(pose is not None for pose in poses)
     for pose in poses:
-        # Upright on the table: the box's middle is half its height above it, within a millimetre.
+        # Upright on the table: the box's centre is half its height above it, within a millimetre.
         assert abs(pose[2, 3] - 0.02) < 1e-3 and pose[2, 2] > 0.99
     centres = np.array([pose[:2, 3] for pose in poses])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)[np.triu_indices(3, 1)]

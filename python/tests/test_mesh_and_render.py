@@ -1,4 +1,4 @@
-"""Meshes and pictures of them."""
+"""Meshes and images of them."""
 
 import pickle
 

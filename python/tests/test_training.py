@@ -1,4 +1,4 @@
-"""Trainings of a few steps: what they write, that they go on, that Ctrl-C keeps what was learnt."""
+"""Trainings of a few steps: what they write, that they continue, that Ctrl-C keeps what was learnt."""
 
 import inspect
 import os

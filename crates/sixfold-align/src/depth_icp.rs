@@ -7,7 +7,7 @@
 
 use sixfold_geometry::{DepthTarget, IcpError, IcpLevel, IcpOptions, PointCloud, Pose, icp};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::prepared::PreparedDepth;
 
@@ -49,7 +49,7 @@ pub fn align_to_depth(
     visible: &dyn Fn(usize, usize) -> bool,
 ) -> Result<AlignedToDepth, IcpError> {
     let camera = image.camera();
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     let mut pose = at_measured_distance(image, &mut frame, mesh, diameter, start, visible)?;
     let target = DepthTarget { depth: image.depth(), normals: image.normals(), camera };
     let (mut inliers, mut rms) = (0, 0.0);
@@ -86,7 +86,7 @@ pub fn align_to_depth(
 /// The pose moved along the ray of its centre by the median difference of measured and rendered depth.
 fn at_measured_distance(
     image: &PreparedDepth,
-    frame: &mut Frame,
+    frame: &mut VisibilityBuffer,
     mesh: &Mesh,
     diameter: f64,
     start: &Pose,

@@ -1,18 +1,18 @@
 //! Judging a pose by rendering it: does the depth image agree with what would be seen?
 //!
 //! The scores of the dissertation, section 5.2.5: depth fitness `S_D = P_O N_i / (N_m - N_occ)` with
-//! `P_O = 1 - N_out / N_m`, the share `S_N` of matched normals, the share `S_B` of the silhouette that lies on an edge
+//! `P_O = 1 - N_out / N_m`, the fraction `S_N` of matched normals, the fraction `S_B` of the silhouette that lies on an edge
 //! of the scene, and their product. `N_m` are the rendered pixels; a pixel is an inlier within the threshold,
 //! occluded when the scene is nearer, an outlier when the scene is further away (one would see through the object).
-//! Pixels without measured depth count in `N_m` only, as printed. Beyond the dissertation: what hides an object has an
-//! outline. Hidden pixels behind a surface that goes on smoothly from what is seen of the object ([`pierced`]
+//! Pixels without measured depth count in `N_m` only, as published. Beyond the dissertation: what hides an object has an
+//! outline. Hidden pixels behind a surface that continues smoothly from what is seen of the object ([`pierced`]
 //! (VerificationScore::pierced)) are no excuse and stay in `N_m - N_occ`.
 
 use std::f64::consts::FRAC_PI_2;
 
 use sixfold_geometry::{Camera, OptionError, Pose, Rect, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::prepared::PreparedDepth;
 
@@ -27,7 +27,7 @@ pub struct VerificationOptions {
     /// A silhouette pixel lies on a scene edge within this distance, pixels.
     pub boundary_distance: u8,
     /// Hidden pixels count as hidden only as far as the scene has an edge between them and what is seen; `false` as
-    /// printed.
+    /// published.
     pub occluders_have_edges: bool,
 }
 
@@ -94,26 +94,26 @@ pub struct VerificationScore {
     pub outliers: usize,
     /// Depth fitness `S_D`.
     pub depth: f64,
-    /// Share of the visible silhouette on a scene edge, `S_B`.
+    /// Fraction of the visible silhouette on a scene edge, `S_B`.
     pub boundary: f64,
-    /// Share of the inliers whose normals agree, `S_N`.
+    /// Fraction of the inliers whose normals agree, `S_N`.
     pub normals: f64,
     /// `S_D S_B S_N`.
     pub total: f64,
 }
 
 impl VerificationScore {
-    /// Inliers as a share of the rendered pixels: how much of the object is really seen.
-    pub fn visible_share(&self) -> f64 {
+    /// Inliers as a fraction of the rendered pixels: how much of the object is really seen.
+    pub fn visible_fraction(&self) -> f64 {
         if self.rendered == 0 { 0.0 } else { self.inliers as f64 / self.rendered as f64 }
     }
 
     /// The total, lowered where little of the object is seen: `total * v / (v + 0.1)` with `v` the
-    /// [`visible_share`](Self::visible_share). The dissertation removes every penalty for occlusion, so a pose hidden
+    /// [`visible_fraction`](Self::visible_fraction). The dissertation removes every penalty for occlusion, so a pose hidden
     /// behind something scores like one in full view; between hypotheses of one object the seen one is the better
     /// bet.
     pub fn ranking(&self) -> f64 {
-        let v = self.visible_share();
+        let v = self.visible_fraction();
         self.total * v / (v + HALF_RANKING)
     }
 }
@@ -121,7 +121,7 @@ impl VerificationScore {
 /// Renders poses into crops of a scene and compares; keeps its buffers.
 #[derive(Debug)]
 pub struct Verifier {
-    frame: Frame,
+    frame: VisibilityBuffer,
     agreement: Vec<Agreement>,
 }
 
@@ -142,7 +142,7 @@ pub enum Agreement {
 impl Default for Verifier {
     fn default() -> Self {
         let one = Camera { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1, distortion: None };
-        Verifier { frame: Frame::new(&one), agreement: vec![] }
+        Verifier { frame: VisibilityBuffer::new(&one), agreement: vec![] }
     }
 }
 
@@ -327,7 +327,7 @@ impl Verifier {
     }
 }
 
-/// How many hidden pixels no occluder excuses: of each connected part of them, the share of its border with inliers that
+/// How many hidden pixels no occluder excuses: of each connected part of them, the fraction of its border with inliers that
 /// lies on no edge of the scene. `agreement` holds rows of `width` pixels; its hidden ones are taken out.
 pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
     let mut total = 0;

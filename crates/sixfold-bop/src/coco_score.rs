@@ -49,7 +49,7 @@ pub struct CocoScores {
 
 const AREAS: [(f64, f64); 4] =
     [(0.0, 1e10), (0.0, 32.0 * 32.0), (32.0 * 32.0, 96.0 * 96.0), (96.0 * 96.0, 1e10)];
-const MOST_DETECTIONS: [usize; 3] = [1, 10, 100];
+const MAX_DETECTIONS: [usize; 3] = [1, 10, 100];
 const OVERLAPS: usize = 10;
 
 /// `count` numbers from `start` to `stop` as numpy's `linspace` computes them: every bit matters in comparisons.
@@ -105,14 +105,14 @@ pub fn evaluate_coco(
     }
     for candidates in detected.values_mut() {
         candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-        candidates.truncate(MOST_DETECTIONS[2]);
+        candidates.truncate(MAX_DETECTIONS[2]);
     }
 
     let overlaps = linspace(0.5, 0.95, OVERLAPS);
     let recalls = linspace(0.0, 1.0, 101);
     // precision[area][overlap] and recall[area][most][overlap]: one number per object that has ground truth.
     let mut precision = vec![vec![Vec::new(); OVERLAPS]; AREAS.len()];
-    let mut recall = vec![vec![vec![Vec::new(); OVERLAPS]; MOST_DETECTIONS.len()]; AREAS.len()];
+    let mut recall = vec![vec![vec![Vec::new(); OVERLAPS]; MAX_DETECTIONS.len()]; AREAS.len()];
     for &category in &categories {
         let with_overlaps: Vec<_> = images
             .iter()
@@ -131,7 +131,7 @@ pub fn evaluate_coco(
             if positives == 0 {
                 continue;
             }
-            for (m, &most) in MOST_DETECTIONS.iter().enumerate() {
+            for (m, &most) in MAX_DETECTIONS.iter().enumerate() {
                 let mut order: Vec<(f64, usize, usize)> = Vec::new();
                 for (i, result) in results.iter().enumerate() {
                     order.extend(result.scores.iter().take(most).enumerate().map(|(d, &s)| (s, i, d)));
@@ -140,7 +140,7 @@ pub fn evaluate_coco(
                 for t in 0..OVERLAPS {
                     let (p, r) = precision_and_recall(&results, &order, t, positives, &recalls);
                     recall[a][m][t].push(r);
-                    if most == MOST_DETECTIONS[2] {
+                    if most == MAX_DETECTIONS[2] {
                         precision[a][t].extend(p);
                     }
                 }

@@ -17,9 +17,9 @@ use crate::visibility::{VISIBILITY_DELTA, ground_truth_visibility};
 
 /// Objects less visible than this are marked as crowds: detections of them are neither right nor wrong. BOP leaves them
 /// out of its targets too.
-const LEAST_VISIBLE: f64 = 0.1;
+const MIN_VISIBILITY: f64 = 0.1;
 
-/// Ground truth of detection with the visible share of every object.
+/// Ground truth of detection with the visible fraction of every object.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct VisibleTruth {
     /// Images and annotations.
@@ -80,7 +80,7 @@ impl VisibleTruth {
                     category_id: truth.obj_id,
                     bbox,
                     area: rle.area() as f64,
-                    iscrowd: fraction < LEAST_VISIBLE,
+                    iscrowd: fraction < MIN_VISIBILITY,
                     segmentation: Some(rle),
                 });
                 out.visible.push(fraction);
@@ -151,9 +151,11 @@ impl CocoGroundTruth {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FoundAtHalf {
     /// Detections with a lower score were left out.
-    pub least_score: f64,
+    #[serde(rename = "least_score")]
+    pub min_score: f64,
     /// Objects at least this visible counted.
-    pub least_visible: f64,
+    #[serde(rename = "least_visible")]
+    pub min_visibility: f64,
     /// Those objects.
     pub objects: usize,
     /// Those found, over their number; `None` without objects.
@@ -169,11 +171,11 @@ pub struct FoundAtHalf {
 pub fn found_at_half(
     truth: &VisibleTruth,
     detections: &[Detection],
-    least_score: f64,
-    least_visible: f64,
+    min_score: f64,
+    min_visibility: f64,
 ) -> FoundAtHalf {
     let annotations = &truth.truth.annotations;
-    let mut order: Vec<&Detection> = detections.iter().filter(|d| d.score >= least_score).collect();
+    let mut order: Vec<&Detection> = detections.iter().filter(|d| d.score >= min_score).collect();
     order.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut taken = vec![false; annotations.len()];
     let mut wrong = 0usize;
@@ -196,15 +198,15 @@ pub fn found_at_half(
     }
     let mut counts: BTreeMap<u32, (usize, usize)> = BTreeMap::new();
     for ((annotation, visible), taken) in annotations.iter().zip(&truth.visible).zip(&taken) {
-        if *visible >= least_visible {
+        if *visible >= min_visibility {
             let count = counts.entry(annotation.category_id).or_default();
             *count = (count.0 + usize::from(*taken), count.1 + 1);
         }
     }
     let (found, objects) = counts.values().fold((0, 0), |(f, n), c| (f + c.0, n + c.1));
     FoundAtHalf {
-        least_score,
-        least_visible,
+        min_score,
+        min_visibility,
         objects,
         recall: (objects > 0).then(|| found as f64 / objects as f64),
         recall_of: counts.iter().map(|(id, (f, n))| (*id, *f as f64 / *n as f64)).collect(),

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use sixfold_geometry::{Camera, DepthImage, Pose};
 use sixfold_mesh::{Mesh, ModelInfo};
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use thiserror::Error;
 
 use crate::dataset::{BopDataset, Models, Scene};
@@ -423,7 +423,7 @@ fn visible_surface(
     object: &Object,
     camera: &Camera,
     test: &DepthImage,
-    frame: &mut Frame,
+    frame: &mut VisibilityBuffer,
     options: &VsdOptions,
 ) -> Result<Vec<Vec<Vec<f64>>>, VsdError> {
     let mut render = |pose: &Pose| {
@@ -585,7 +585,7 @@ pub fn evaluate(
             let scene = &scenes[&image.scene_id];
             let camera = scene.camera(image.im_id)?;
             let test = if no_vsd.is_none() { scene.depth(image.im_id)? } else { None };
-            let mut frame = test.as_ref().map(|_| Frame::new(&camera));
+            let mut frame = test.as_ref().map(|_| VisibilityBuffer::new(&camera));
             let mut scored = Vec::new();
             for task in &image.tasks {
                 let Some(object) = objects.get(&task.obj_id) else { continue };

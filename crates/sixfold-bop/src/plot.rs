@@ -1,4 +1,4 @@
-//! Recall curves as a picture.
+//! Recall curves as a figure.
 
 use std::path::Path;
 
@@ -104,7 +104,7 @@ pub fn draw_recall_curves(evaluation: &Evaluation) -> RgbImage {
         y += 22.0;
     };
     entry("all targets", 3.4, INK);
-    // What does not fit the picture is counted instead.
+    // What does not fit the image is counted instead.
     let shown = ids.len().min((2 * PANEL_HEIGHT - 2 * TOP) / 22 - 2);
     for (n, id) in ids.iter().take(shown).enumerate() {
         entry(&format!("object {id}"), 1.6, COLORS[n % COLORS.len()]);

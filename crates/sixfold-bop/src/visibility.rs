@@ -6,7 +6,7 @@
 
 use sixfold_geometry::{Camera, DepthImage, Image, Mask, Pose, Rect};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::scene_files::GroundTruthInfo;
 
@@ -50,12 +50,12 @@ pub fn ground_truth_visibility(
     });
     let scene: Vec<SceneObject<'_>> =
         objects.iter().map(|&(mesh, camera_from_object)| SceneObject { mesh, camera_from_object }).collect();
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     let instances = test_depth.is_none().then(|| {
         frame.render(&scene, &RenderOptions::default());
         frame.instances()
     });
-    let mut large = Frame::new(&large_camera);
+    let mut large = VisibilityBuffer::new(&large_camera);
     scene
         .iter()
         .enumerate()

@@ -10,7 +10,7 @@ use sixfold_bop::{
 use sixfold_geometry::nalgebra::Vector6;
 use sixfold_geometry::{Camera, Image, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 /// A box of 0.10 x 0.06 x 0.04 m, as vertices and triangles.
 fn brick() -> Mesh {
@@ -72,7 +72,7 @@ fn write_dataset(root: &Path) -> Vec<Target> {
             .iter()
             .map(|gt| SceneObject { mesh: &mesh, camera_from_object: gt.camera_from_object })
             .collect();
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         frame.render(&objects, &RenderOptions::default());
         let depth = frame.depth().map(|z| if *z > 0.0 { *z } else { 1.0 });
         let pairs: Vec<(&Mesh, Pose)> = truth.iter().map(|gt| (&mesh, gt.camera_from_object)).collect();

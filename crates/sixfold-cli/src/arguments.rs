@@ -77,7 +77,7 @@ pub(crate) enum Command {
     /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
     #[command(hide = !NETWORKS, after_help = SYNTHESIZE_HELP)]
     Synthesize(Box<SynthesizeArguments>),
-    /// Train a network on a few posed photographs and renders
+    /// Train a network on a few posed images and renders
     #[command(
         hide = !NETWORKS,
         after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo"

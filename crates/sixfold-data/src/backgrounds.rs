@@ -9,7 +9,7 @@ use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 use crate::posed_image::PosedImage;
 use crate::training_set::TrainingObject;
 
-/// Photographs of a folder if there is one, else procedural textures; and the share of textures that goes well with them.
+/// Photographs of a folder if there is one, else procedural textures; and the fraction of textures that goes well with them.
 ///
 /// # Errors
 /// [`AugmentError`] for a folder without photographs.
@@ -55,5 +55,5 @@ pub fn backgrounds_with_images(
     for (image, rects) in frames {
         backgrounds = backgrounds.with_image(image.clone(), rects)?;
     }
-    Ok(backgrounds.with_procedural_share(share))
+    Ok(backgrounds.with_procedural_fraction(share))
 }

@@ -1,7 +1,7 @@
 //! What methods learn from: posed images, training sets read from BOP datasets or made of meshes, and the drawing of
 //! training objects at random poses under random light. Nothing here knows a network.
 //!
-//! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] draws poses, [`color_patch`] pictures.
+//! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] draws poses, [`color_patch`] images.
 
 mod backgrounds;
 mod colors;
@@ -17,7 +17,7 @@ mod visible_mask;
 pub use backgrounds::{backgrounds_with_images, plain_backgrounds};
 pub use colors::image_color_augmentation;
 pub use error::{PosedImageError, TrainingSetError};
-pub use posed_image::{LEAST_PIXELS, PosedImage};
+pub use posed_image::{MIN_PIXELS, PosedImage};
 pub use poses::{DEFAULT_CAMERA, PoseRange, PoseVariation, default_distances, distances};
 pub use prepared_mesh::{PreparedMesh, is_textured};
 pub use reading::read_posed_images;

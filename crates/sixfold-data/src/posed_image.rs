@@ -8,8 +8,8 @@ use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 use crate::error::PosedImageError;
 use crate::visible_mask::VisibleMask;
 
-/// Fewer visible pixels teach nothing.
-pub const LEAST_PIXELS: usize = 64;
+/// Fewer visible pixels add nothing.
+pub const MIN_PIXELS: usize = 64;
 
 /// One object in one image: pinhole camera, pose, and where the object is visible, if that is known. The image is shared
 /// between its objects.
@@ -119,13 +119,13 @@ impl PosedImage {
     /// An error unless a mask shows enough of the object to learn from.
     ///
     /// # Errors
-    /// [`PosedImageError::NoMask`], and [`PosedImageError::NotVisible`] for fewer than [`LEAST_PIXELS`].
+    /// [`PosedImageError::NoMask`], and [`PosedImageError::NotVisible`] for fewer than [`MIN_PIXELS`].
     pub fn check_visible(&self) -> Result<(), PosedImageError> {
         let name = || self.name.clone();
         let Some(mask) = &self.mask else { return Err(PosedImageError::NoMask { name: name() }) };
         let pixels = mask.pixels();
-        if pixels < LEAST_PIXELS {
-            return Err(PosedImageError::NotVisible { name: name(), pixels, least: LEAST_PIXELS });
+        if pixels < MIN_PIXELS {
+            return Err(PosedImageError::NotVisible { name: name(), pixels, least: MIN_PIXELS });
         }
         Ok(())
     }
@@ -175,7 +175,7 @@ impl PosedImage {
         self.mask.as_ref().map(VisibleMask::bounding_box)
     }
 
-    /// Points of the image whose box is that of the visible part, however the image is turned; none without a mask.
+    /// Points of the image whose box is that of the visible part, however the image is rotated; none without a mask.
     pub fn outline(&self) -> &[Vec2] {
         self.mask.as_ref().map_or(&[], VisibleMask::outline)
     }
@@ -188,7 +188,7 @@ impl PosedImage {
         })
     }
 
-    /// The visible part as a picture of its own; `None` where nothing is visible.
+    /// The visible part as an image of its own; `None` where nothing is visible.
     pub fn cutout(&self) -> Option<Cutout> {
         let mask = self.mask.as_ref()?;
         let area = mask.bounding_box();

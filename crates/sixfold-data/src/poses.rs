@@ -50,7 +50,7 @@ pub fn default_distances(diameter: f64) -> [f64; 2] {
     [4.0 * diameter, 12.0 * diameter]
 }
 
-/// What poses are drawn from.
+/// What poses are sampled from.
 pub struct PoseRange<'a> {
     /// The camera.
     pub camera: &'a Camera,

@@ -1,4 +1,4 @@
-//! A mesh made ready to be drawn thousands of times: few faces, normals at hand, and what its box in an image needs.
+//! A mesh made ready to be rendered thousands of times: few faces, normals at hand, and what its box in an image needs.
 
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
@@ -28,7 +28,7 @@ impl PreparedMesh {
         let colored = (is_textured(mesh) || mesh.colors().is_some()) && !mesh.faces().is_empty();
         let extremes = mesh.extremes(extremes);
         let small = if mesh.faces().len() > faces { simplify(mesh, faces) } else { mesh.clone() };
-        // Normals looked up per sample would be computed anew every time.
+        // Normals looked up per sample would be recomputed every time.
         let normals = small.vertex_normals();
         let mesh = small.clone().with_normals(normals).unwrap_or(small);
         PreparedMesh { mesh, colored, centre: (low + high) * 0.5, extremes }

@@ -8,10 +8,10 @@ use sixfold_geometry::{FrameId, Pose};
 use sixfold_mesh::Mesh;
 
 use crate::error::TrainingSetError;
-use crate::posed_image::{LEAST_PIXELS, PosedImage};
+use crate::posed_image::{MIN_PIXELS, PosedImage};
 
 /// Reads the images of a dataset that show `objects`, one posed image for each instance; nothing but `frames` is opened.
-/// Instances less visible than `least_visible` (0..1), or with fewer than [`LEAST_PIXELS`] visible pixels, are left out.
+/// Instances less visible than `min_visibility` (0..1), or with fewer than [`MIN_PIXELS`] visible pixels, are left out.
 ///
 /// Visible masks come from the dataset (`mask_visib`); where a frame has none, all its annotated objects are rendered
 /// together. What is annotated nowhere and hides an object is then not known.
@@ -22,7 +22,7 @@ pub fn read_posed_images(
     dataset: &BopDataset,
     frames: &[FrameId],
     objects: &[u32],
-    least_visible: f64,
+    min_visibility: f64,
 ) -> Result<Vec<PosedImage>, TrainingSetError> {
     let mut images = Vec::new();
     let mut scenes = BTreeMap::new();
@@ -63,10 +63,10 @@ pub fn read_posed_images(
         }
         for ((truth, mask), fraction) in frame.ground_truth.iter().zip(masks).zip(fractions) {
             let (Some(mask), Some(fraction)) = (mask, fraction) else { continue };
-            if !objects.contains(&truth.obj_id) || fraction < least_visible {
+            if !objects.contains(&truth.obj_id) || fraction < min_visibility {
                 continue;
             }
-            if mask.as_slice().iter().filter(|v| **v).count() < LEAST_PIXELS {
+            if mask.as_slice().iter().filter(|v| **v).count() < MIN_PIXELS {
                 continue;
             }
             let pose = truth.camera_from_object;

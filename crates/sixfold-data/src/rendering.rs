@@ -4,7 +4,7 @@ use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::{Coverage, Patch};
 
 /// The object's colours and silhouette.
@@ -16,7 +16,7 @@ pub fn colors(
     material: &Material,
 ) -> (RgbImage, Coverage) {
     let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&objects, &RenderOptions::default());
     let image = shade(&frame, &objects, lights, material, None);
     let data = frame.inverse_depth().iter().map(|z| f32::from(*z > 0.0)).collect();

@@ -61,7 +61,7 @@ pub enum FrameSelection {
 
 impl TrainingSet {
     /// Objects of a BOP dataset (all that its models_info.json names if `ids` is empty), and the instances in its
-    /// images of which at least the share `least_visible` is seen.
+    /// images of which at least the fraction `min_visibility` is seen.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -70,7 +70,7 @@ impl TrainingSet {
         split: &str,
         ids: &[u32],
         frames: &FrameSelection,
-        least_visible: f64,
+        min_visibility: f64,
     ) -> Result<TrainingSet, TrainingSetError> {
         let dataset = BopDataset::open(root, split)?;
         let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
@@ -109,9 +109,9 @@ impl TrainingSet {
         };
         frames.sort_unstable();
         frames.dedup();
-        let images = read_posed_images(&dataset, &frames, &ids, least_visible)?;
+        let images = read_posed_images(&dataset, &frames, &ids, min_visibility)?;
         if images.is_empty() && !renders_only {
-            let (root, percent) = (root.to_owned(), 100.0 * least_visible);
+            let (root, percent) = (root.to_owned(), 100.0 * min_visibility);
             return Err(TrainingSetError::NothingVisible { root, frames: frames.len(), percent });
         }
         let name = root.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();

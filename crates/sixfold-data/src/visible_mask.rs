@@ -59,7 +59,7 @@ impl VisibleMask {
         Rect { x: side(self.x), y: side(self.y), width: side(self.width), height: side(self.height) }
     }
 
-    /// Points of the image whose box is that of the visible part, however the image is turned.
+    /// Points of the image whose box is that of the visible part, however the image is rotated.
     pub fn outline(&self) -> &[Vec2] {
         &self.outline
     }

@@ -1,4 +1,4 @@
-//! Training images a second of the compact detector, samples included, on renders of a made-up object.
+//! Training images a second of the compact detector, samples included, on renders of a synthetic object.
 //!
 //!     cargo run --release -p sixfold-detect --example bench_training -- [STEPS]
 
@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use sixfold_data::TrainingObject;
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneOptions, SceneSource};
+use sixfold_detect::samples::{TrainingImageOptions, TrainingImageSource};
 use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, ModelInfo};
@@ -24,8 +24,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mesh = Mesh::new(vertices, vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])?;
     let objects =
         vec![TrainingObject::new(1, mesh.clone(), ModelInfo { diameter: 0.12, ..ModelInfo::of_mesh(&mesh) })];
-    let options = SceneOptions { random_color_chance: 1.0, ..SceneOptions::default() };
-    let source = SceneSource::new(objects, &[], &[], Backgrounds::procedural(), options)?;
+    let options = TrainingImageOptions { random_color_probability: 1.0, ..TrainingImageOptions::default() };
+    let source = TrainingImageSource::new(objects, &[], &[], Backgrounds::procedural(), options)?;
     let device = Device::flex().autodiff();
     let config = DetectorConfig::compact(1);
     let network = config.init_with(Encoder::Lite0(imagenet_encoder(&device)?), 1, &device);

@@ -1,4 +1,4 @@
-//! Times of a trained detector on one image, and what the network says of it, for `benches/detector_vs_onnxruntime.py`.
+//! Times of a trained detector on one image, and what the network predicts for it, for `benches/detector_vs_onnxruntime.py`.
 //!
 //!     cargo run --release -p sixfold-detect --example detect_times -- WEIGHTS.safetensors IMAGE.png OUT [ROUNDS]
 //!

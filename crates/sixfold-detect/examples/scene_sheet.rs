@@ -4,7 +4,7 @@
 
 use sixfold_bop::{BopDataset, Models};
 use sixfold_data::{FrameId, TrainingObject, read_posed_images};
-use sixfold_detect::samples::{SceneOptions, SceneSource};
+use sixfold_detect::samples::{TrainingImageOptions, TrainingImageSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
 use sixfold_io::write_rgb;
@@ -32,12 +32,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         .collect::<Result<Vec<_>, Box<dyn Error>>>()?;
     let backgrounds = Backgrounds::from_folder(backgrounds, &PhotographOptions::default())?;
     println!("{} instances in photographs, {} to cut out", real.len(), cut.len());
-    let source = SceneSource::new(
+    let source = TrainingImageSource::new(
         objects,
         &real,
         &cut,
-        backgrounds.with_procedural_share(0.15),
-        SceneOptions::default(),
+        backgrounds.with_procedural_fraction(0.15),
+        TrainingImageOptions::default(),
     )?;
     println!("{:.1} ms per image on all threads", sample_time(&source, 60));
     let side = source.options().size;

@@ -15,7 +15,7 @@ pub struct DetectOptions {
     pub overlap: f32,
     /// Most detections of a class, the best ones.
     pub per_class: usize,
-    /// Most detections of an image, the best ones.
+    /// Maximum number of detections of an image, the best ones.
     pub most: usize,
     /// Make masks too.
     pub masks: bool,
@@ -182,8 +182,8 @@ pub fn decode(
     config: &DetectorConfig,
     options: &DetectOptions,
 ) -> Vec<Detected> {
-    /// Most candidates that suppression looks at.
-    const MOST_CANDIDATES: usize = 2000;
+    /// Maximum number of candidates that suppression looks at.
+    const MAX_CANDIDATES: usize = 2000;
     let threshold = options.threshold.clamp(1e-4, 1.0 - 1e-6);
     let least_logit = (threshold / (1.0 - threshold)).ln();
     let limits = image.filled.map(|side| side as f32 - 0.5);
@@ -212,7 +212,7 @@ pub fn decode(
         }
     }
     candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-    candidates.truncate(MOST_CANDIDATES);
+    candidates.truncate(MAX_CANDIDATES);
     let to_image = |v: f32, last: usize| {
         f64::from(((v + 0.5) * image.step - 0.5).clamp(0.0, last.saturating_sub(1) as f32))
     };
@@ -265,7 +265,7 @@ fn mask_of(
     };
     let per_mask = MASK_STRIDE as f32;
     for y in span(c.corners[1], c.corners[3], size.1) {
-        // Where the pixel lies between the middles of the prototypes' pixels.
+        // Where the pixel lies between the midpoints of the prototypes' pixels.
         let v = (((y as f32 + 0.5) / image.step) / per_mask - 0.5 - y0 as f32).max(0.0);
         for x in span(c.corners[0], c.corners[2], size.0) {
             let u = (((x as f32 + 0.5) / image.step) / per_mask - 0.5 - x0 as f32).max(0.0);

@@ -216,7 +216,7 @@ pub struct Detector {
     masks: Prototypes,
 }
 
-/// What a detector says of a batch, raw.
+/// What a detector predicts for a batch, raw.
 #[derive(Debug, Clone)]
 pub struct DetectorOutput {
     /// Of every level, finest first: logits, `batch x classes x height x width`.

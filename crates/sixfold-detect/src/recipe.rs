@@ -16,7 +16,7 @@ use sixfold_nn::weights::{ModelCard, training_frames};
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};
-use crate::samples::{SceneOptions, SceneSource};
+use crate::samples::{TrainingImageOptions, TrainingImageSource};
 use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Which network learns.
@@ -60,7 +60,7 @@ pub struct DetectorRecipe {
     pub batch: usize,
     /// Highest learning rate.
     pub learning_rate: f64,
-    /// The pretrained encoder's share of the learning rate, 0 to 1.
+    /// The pretrained encoder's fraction of the learning rate, 0 to 1.
     pub encoder_share: f64,
     /// Stages of the ImageNet encoder that stay as they are, of five.
     pub frozen_stages: usize,
@@ -68,11 +68,11 @@ pub struct DetectorRecipe {
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (RetinaNet: 128).
     pub size: usize,
-    /// Share of training images that are parts of photographs, 0 to 1.
+    /// Fraction of training images that are parts of photographs, 0 to 1.
     pub photograph_share: f32,
-    /// Share of renders among pasted objects that have photographs, 0 to 1.
+    /// Fraction of renders among pasted objects that have photographs, 0 to 1.
     pub render_share: f32,
-    /// Largest turn in the image plane, radians.
+    /// Largest rotation in the image plane, radians.
     pub rotation: f32,
     /// Draw the meshes in their own colours; otherwise in random ones.
     pub mesh_colors: bool,
@@ -80,9 +80,9 @@ pub struct DetectorRecipe {
     pub longest_side: usize,
     /// Score below which detections will be left out unless something else is asked for, 0 to 1.
     pub threshold: f32,
-    /// Go on from the weights of another training of the same objects instead of ImageNet's.
+    /// Continue from the weights of another training of the same objects instead of ImageNet's.
     pub init: Option<PathBuf>,
-    /// Folder of photographs for backgrounds; made-up textures without.
+    /// Folder of photographs for backgrounds; procedural textures without.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
     pub seed: u64,
@@ -94,7 +94,7 @@ impl Default for DetectorRecipe {
     fn default() -> Self {
         let DetectorTrainingOptions { common, batch, encoder_share, frozen_stages } = Default::default();
         let DetectorUse { longest_side, threshold } = DetectorUse::default();
-        let samples = SceneOptions::default();
+        let samples = TrainingImageOptions::default();
         DetectorRecipe {
             network: DetectorKind::Compact,
             steps: common.steps,
@@ -141,14 +141,14 @@ impl DetectorRecipe {
         }
     }
 
-    fn scenes(&self) -> SceneOptions {
-        SceneOptions {
+    fn scenes(&self) -> TrainingImageOptions {
+        TrainingImageOptions {
             size: self.size,
             photograph_share: self.photograph_share,
             render_share: self.render_share,
             rotation: self.rotation,
-            random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
-            ..SceneOptions::default()
+            random_color_probability: if self.mesh_colors { 0.0 } else { 1.0 },
+            ..TrainingImageOptions::default()
         }
     }
 
@@ -176,7 +176,7 @@ impl DetectorRecipe {
 
 impl Recipe for DetectorRecipe {
     type Data = TrainingSet;
-    type Samples = SceneSource;
+    type Samples = TrainingImageSource;
     type Training = DetectorTraining;
     type Context = Context;
     type Report = ();
@@ -231,7 +231,7 @@ impl Recipe for DetectorRecipe {
         &self,
         Context { material, classes }: &mut Context,
         session: &mut Session<'_>,
-    ) -> Result<Option<SceneSource>, TrainError> {
+    ) -> Result<Option<TrainingImageSource>, TrainError> {
         let ids: Vec<u32> = classes.iter().map(|c| c.id).collect();
         let photographs = material.images.len();
         session.note(&format!("making {} objects and {photographs} photographed instances ready", ids.len()));
@@ -240,8 +240,8 @@ impl Recipe for DetectorRecipe {
         let objects = std::mem::take(&mut material.objects);
         let (backgrounds, fraction) =
             plain_backgrounds(self.backgrounds.as_deref()).map_err(TrainError::method)?;
-        let backgrounds = backgrounds.with_procedural_share(fraction);
-        SceneSource::new(objects, &material.images, &cut, backgrounds, self.scenes())
+        let backgrounds = backgrounds.with_procedural_fraction(fraction);
+        TrainingImageSource::new(objects, &material.images, &cut, backgrounds, self.scenes())
             .map(Some)
             .map_err(TrainError::method)
     }

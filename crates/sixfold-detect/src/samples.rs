@@ -18,13 +18,13 @@ use sixfold_synth::augment::{
     AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape,
     procedural_texture,
 };
-use sixfold_synth::distractors::{random_solid, random_turn};
+use sixfold_synth::distractors::{random_rotation, random_solid};
 use sixfold_synth::randomly_colored;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Objects with fewer visible pixels in a training image are not learnt.
-const LEAST_PIXELS: usize = 64;
+const MIN_PIXELS: usize = 64;
 /// Photographs whose colours are kept of each object, and how many colours of each.
 const PALETTE_PICTURES: usize = 6;
 const PALETTE_COLORS: usize = 40;
@@ -33,60 +33,68 @@ const FACES: usize = 5000;
 /// Directions in which a mesh's farthest vertices decide about its box.
 const EXTREMES: usize = 200;
 
-/// Shares and ranges. The defaults are for few real images of objects on a table.
+/// Fractions and ranges. The defaults are for few real images of objects on a table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SceneOptions {
+pub struct TrainingImageOptions {
     /// Side of the training images, pixels; a multiple of 32.
     pub size: usize,
-    /// Share of images that are parts of photographs, 0..1.
+    /// Fraction of images that are parts of photographs, 0..1.
     pub photograph_share: f32,
-    /// Share of images without any object, 0..1.
-    pub empty_share: f32,
+    /// Fraction of images without any object, 0..1.
+    #[serde(rename = "empty_share")]
+    pub empty_fraction: f32,
     /// Factors on the size that objects have in the photographs.
     pub scale: [f32; 2],
-    /// Largest turn in the image plane to either side, radians.
+    /// Largest rotation in the image plane to either side, radians.
     pub rotation: f32,
     /// Most objects pasted on a background.
-    pub most_pasted: u32,
+    #[serde(rename = "most_pasted")]
+    pub max_pasted: u32,
     /// Most objects pasted on a part of a photograph.
-    pub most_added: u32,
-    /// Share of renders among pasted objects that have photographs, 0..1.
+    #[serde(rename = "most_added")]
+    pub max_added: u32,
+    /// Fraction of renders among pasted objects that have photographs, 0..1.
     pub render_share: f32,
     /// Most distractors: solids, shapes, and outlines of objects filled with something else.
-    pub most_distractors: u32,
-    /// Share of solids among them, 0..1.
-    pub solid_share: f32,
-    /// Objects of which a smaller part is visible than this share are not learnt.
-    pub least_visible: f32,
-    /// Chance that a rendered object has random colours.
-    pub random_color_chance: f32,
-    /// Share of rendered poses near one of a photograph, 0..1.
-    pub near_real_share: f32,
+    #[serde(rename = "most_distractors")]
+    pub max_distractors: u32,
+    /// Fraction of solids among them, 0..1.
+    #[serde(rename = "solid_share")]
+    pub solid_fraction: f32,
+    /// Objects of which a smaller part is visible than this fraction are not learnt.
+    #[serde(rename = "least_visible")]
+    pub min_visibility: f32,
+    /// Probability that a rendered object has random colours.
+    #[serde(rename = "random_color_chance")]
+    pub random_color_probability: f32,
+    /// Fraction of rendered poses near one of a photograph, 0..1.
+    #[serde(rename = "near_real_share")]
+    pub near_real_fraction: f32,
 }
 
-impl Default for SceneOptions {
+impl Default for TrainingImageOptions {
     fn default() -> Self {
-        SceneOptions {
+        TrainingImageOptions {
             size: 320,
             photograph_share: 0.45,
-            empty_share: 0.1,
+            empty_fraction: 0.1,
             scale: [0.65, 1.5],
             rotation: 15f32.to_radians(),
-            most_pasted: 7,
-            most_added: 3,
+            max_pasted: 7,
+            max_added: 3,
             render_share: 0.4,
-            most_distractors: 5,
-            solid_share: 0.6,
-            least_visible: 0.15,
-            random_color_chance: 0.0,
-            near_real_share: 0.6,
+            max_distractors: 5,
+            solid_fraction: 0.6,
+            min_visibility: 0.15,
+            random_color_probability: 0.0,
+            near_real_fraction: 0.6,
         }
     }
 }
 
 /// Why no training images can be made.
 #[derive(Debug, thiserror::Error)]
-pub enum SceneError {
+pub enum TrainingImageError {
     /// An option is out of its range.
     #[error("sample option {field}: found {found}, expected {expected}")]
     Option {
@@ -100,9 +108,9 @@ pub enum SceneError {
     /// There is nothing to learn.
     #[error("no object to learn was given; give at least one mesh")]
     NoObjects,
-    /// No picture can be had of an object.
+    /// No image can be had of an object.
     #[error(
-        "object {id}: no photograph shows it and its mesh has neither colours nor texture; give photographs or a coloured mesh, or set random_color_chance above 0"
+        "object {id}: no photograph shows it and its mesh has neither colours nor texture; give photographs or a coloured mesh, or set random_color_probability above 0"
     )]
     NoPictures {
         /// The object.
@@ -130,13 +138,13 @@ struct LabelledImage {
     image: Arc<RgbImage>,
     /// For every pixel 0 or the object's number in the photograph, from 1.
     labels: Vec<u8>,
-    /// Class, visible pixels and middle of each object.
+    /// Class, visible pixels and centre of each object.
     instances: Vec<(usize, f32, [f32; 2])>,
 }
 
 /// One training image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SceneSample {
+pub struct TrainingImage {
     /// 3 x side x side, in 0..1.
     pub rgb: Vec<f32>,
     /// What is in it.
@@ -144,12 +152,12 @@ pub struct SceneSample {
 }
 
 /// Draws training images; shared between threads by reference.
-pub struct SceneSource {
+pub struct TrainingImageSource {
     objects: Vec<Prepared>,
     photographs: Vec<LabelledImage>,
     backgrounds: Backgrounds,
     camera: Camera,
-    options: SceneOptions,
+    options: TrainingImageOptions,
     poses: PoseVariation,
     /// Colours of the finished image.
     color: ColorAugmentation,
@@ -169,7 +177,7 @@ struct Canvas {
 }
 
 impl Canvas {
-    /// Draws a small picture whose top left pixel comes to lie at `corner`; returns how many pixels it covers in all,
+    /// Draws a small image whose top left pixel comes to lie at `corner`; returns how many pixels it covers in all,
     /// also outside the canvas. `label` 0 hides what is there.
     fn paste(&mut self, patch: &Patch, cover: &Coverage, corner: [i64; 2], feather: f32, label: u8) -> f32 {
         let mut soft = cover.clone();
@@ -192,7 +200,7 @@ impl Canvas {
                     continue;
                 }
                 let to = to_y as usize * self.side + to_x as usize;
-                // Soft towards the inside: outside the picture has no colours.
+                // Soft towards the inside: outside the image has no colours.
                 let alpha_soft = alpha * (1.6 * soft.data[from]).min(1.0);
                 for c in 0..3 {
                     let value = &mut self.image.data[c * planes + to];
@@ -207,25 +215,25 @@ impl Canvas {
     }
 }
 
-impl SceneSource {
+impl TrainingImageSource {
     /// Makes objects and photographs ready, which takes seconds. `real` holds every visible object of the photographs
     /// that is to be learnt, `cut` those of them that are complete enough to be pasted elsewhere.
     ///
     /// # Errors
-    /// [`SceneError`].
+    /// [`TrainingImageError`].
     pub fn new(
         objects: Vec<TrainingObject>,
         real: &[PosedImage],
         cut: &[PosedImage],
         backgrounds: Backgrounds,
-        options: SceneOptions,
-    ) -> Result<Self, SceneError> {
+        options: TrainingImageOptions,
+    ) -> Result<Self, TrainingImageError> {
         options.check()?;
         for image in real.iter().chain(cut) {
             image.check_visible()?;
         }
         if objects.is_empty() {
-            return Err(SceneError::NoObjects);
+            return Err(TrainingImageError::NoObjects);
         }
         let camera = real.first().map_or(DEFAULT_CAMERA, |c| *c.camera()).without_distortion();
         let class_of: BTreeMap<u32, usize> = objects.iter().enumerate().map(|(i, o)| (o.id, i)).collect();
@@ -235,13 +243,13 @@ impl SceneSource {
             .map(|object| Prepared::new(object, real, cut, &options))
             .collect::<Result<Vec<_>, _>>()?;
         let poses = PoseVariation {
-            near_fraction: options.near_real_share,
+            near_fraction: options.near_real_fraction,
             rotation: options.rotation,
             view_rotation: options.rotation,
             ..PoseVariation::default()
         };
         let palette = prepared.iter().flat_map(Prepared::palette).collect();
-        Ok(SceneSource {
+        Ok(TrainingImageSource {
             objects: prepared,
             photographs,
             backgrounds,
@@ -255,7 +263,7 @@ impl SceneSource {
     }
 
     /// The options.
-    pub fn options(&self) -> &SceneOptions {
+    pub fn options(&self) -> &TrainingImageOptions {
         &self.options
     }
 
@@ -265,14 +273,14 @@ impl SceneSource {
     }
 
     /// A training image: the same for the same arguments, on any thread.
-    pub fn sample(&self, seed: u64, number: u64) -> SceneSample {
+    pub fn sample(&self, seed: u64, number: u64) -> TrainingImage {
         let mut random = stream(seed ^ 0x5ce9_e000, number);
         let random = &mut random;
         let options = &self.options;
         let kind = random.random::<f32>();
         let mut canvas = if kind < options.photograph_share && !self.photographs.is_empty() {
             let mut canvas = self.photograph(random);
-            for _ in 0..random.random_range(0..=options.most_added) {
+            for _ in 0..random.random_range(0..=options.max_added) {
                 self.paste_object(&mut canvas, random);
             }
             for _ in 0..random.random_range(0..=2) {
@@ -280,13 +288,13 @@ impl SceneSource {
             }
             canvas
         } else {
-            let empty = kind > 1.0 - options.empty_share;
+            let empty = kind > 1.0 - options.empty_fraction;
             let mut canvas = self.background(random);
-            for _ in 0..random.random_range(0..=options.most_distractors) {
+            for _ in 0..random.random_range(0..=options.max_distractors) {
                 self.distract(&mut canvas, random);
             }
             if !empty {
-                for _ in 0..random.random_range(1..=options.most_pasted.max(1)) {
+                for _ in 0..random.random_range(1..=options.max_pasted.max(1)) {
                     self.paste_object(&mut canvas, random);
                     if random.random::<f32>() < 0.25 {
                         self.distract(&mut canvas, random);
@@ -297,7 +305,7 @@ impl SceneSource {
         };
         self.color.apply(&mut canvas.image, random);
         let annotation = self.annotation(&mut canvas);
-        SceneSample { rgb: canvas.image.data, annotation }
+        TrainingImage { rgb: canvas.image.data, annotation }
     }
 
     fn background(&self, random: &mut Random) -> Canvas {
@@ -369,7 +377,7 @@ impl SceneSource {
         }
         let class = random.random_range(0..self.objects.len());
         let object = &self.objects[class];
-        let can_render = object.drawn.colored || self.options.random_color_chance > 0.0;
+        let can_render = object.drawn.colored || self.options.random_color_probability > 0.0;
         let render =
             object.cutouts.is_empty() || (can_render && random.random::<f32>() < self.options.render_share);
         let drawn = if render { self.render(object, random) } else { self.cut(object, random) };
@@ -383,7 +391,7 @@ impl SceneSource {
         canvas.instances.push((class, pixels));
     }
 
-    /// Where a picture's corner comes to lie: its middle is in the image.
+    /// Where an image's corner comes to lie: its middle is in the image.
     fn corner(&self, patch: &Patch, random: &mut Random) -> [i64; 2] {
         let side = self.options.size as f32;
         [patch.width, patch.height].map(|length| {
@@ -425,7 +433,7 @@ impl SceneSource {
             distortion: None,
         };
         let random_colors =
-            !object.drawn.colored || random.random::<f32>() < self.options.random_color_chance;
+            !object.drawn.colored || random.random::<f32>() < self.options.random_color_probability;
         let (mut patch, cover) = if random_colors {
             color_patch(&randomly_colored(&object.drawn.mesh, random), &camera, &pose, random)
         } else {
@@ -440,7 +448,7 @@ impl SceneSource {
         let side = self.options.size;
         let longest = uniform(random, [0.06, 0.5]) * side as f32;
         let feather = uniform(random, [0.4, 1.2]);
-        if random.random::<f32>() < self.options.solid_share {
+        if random.random::<f32>() < self.options.solid_fraction {
             let (patch, cover) = self.solid(longest, random);
             let corner = self.corner(&patch, random);
             canvas.paste(&patch, &cover, corner, feather, 0);
@@ -472,7 +480,7 @@ impl SceneSource {
     fn solid(&self, longest: f32, random: &mut Random) -> (Patch, Coverage) {
         let mesh = random_solid(&self.backgrounds, &self.palette, random);
         let distance = f64::from(uniform(random, [4.0, 10.0]));
-        let turn = random_turn(random);
+        let turn = random_rotation(random);
         let pose = Pose::new(turn.rotation(), Vec3::new(0.0, 0.0, distance));
         // A cube of side 1 fits into a ball of diameter 1.74; it is nearer than its middle.
         let size = (1.9 * longest).ceil().max(8.0) as usize;
@@ -507,7 +515,7 @@ impl SceneSource {
         let mut numbers = vec![0u8; 256];
         let mut instances = vec![];
         for (index, ((class, whole), (pixels, corners))) in canvas.instances.iter().zip(&seen).enumerate() {
-            let learnt = *pixels >= LEAST_PIXELS && *pixels as f32 >= self.options.least_visible * whole;
+            let learnt = *pixels >= MIN_PIXELS && *pixels as f32 >= self.options.min_visibility * whole;
             numbers[index + 1] = if learnt {
                 let corners = corners.map(|v| v as f32);
                 instances.push(Instance { class: *class, corners });
@@ -521,7 +529,7 @@ impl SceneSource {
     }
 }
 
-/// A cut-out as a small picture about itself.
+/// A cut-out as a small image about itself.
 fn draw(cutout: &Cutout, longest: f32, turn: f32) -> (Patch, Coverage) {
     let (width, height) = cutout.size();
     let scale = longest / width.max(height) as f32;
@@ -571,8 +579,8 @@ impl Prepared {
         object: TrainingObject,
         real: &[PosedImage],
         cut: &[PosedImage],
-        options: &SceneOptions,
-    ) -> Result<Self, SceneError> {
+        options: &TrainingImageOptions,
+    ) -> Result<Self, TrainingImageError> {
         let TrainingObject { id, mesh, info, .. } = object;
         let faces = if is_textured(&mesh) { usize::MAX } else { FACES };
         let drawn = PreparedMesh::new(&mesh, faces, EXTREMES);
@@ -587,9 +595,9 @@ impl Prepared {
             })
             .collect();
         if cutouts.is_empty()
-            && !(drawn.colored || options.random_color_chance > 0.0 && !mesh.faces().is_empty())
+            && !(drawn.colored || options.random_color_probability > 0.0 && !mesh.faces().is_empty())
         {
-            return Err(SceneError::NoPictures { id });
+            return Err(TrainingImageError::NoPictures { id });
         }
         let poses: Vec<Pose> = mine().map(|c| *c.camera_from_object()).collect();
         // Without images of its own: those of the others.
@@ -618,9 +626,9 @@ impl Prepared {
     }
 }
 
-impl std::fmt::Debug for SceneSource {
+impl std::fmt::Debug for TrainingImageSource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("SceneSource")
+        f.debug_struct("TrainingImageSource")
             .field("objects", &self.objects.len())
             .field("photographs", &self.photographs.len())
             .field("options", &self.options)
@@ -628,24 +636,25 @@ impl std::fmt::Debug for SceneSource {
     }
 }
 
-impl SceneOptions {
+impl TrainingImageOptions {
     /// Tests every field.
     ///
     /// # Errors
-    /// [`SceneError::Option`].
-    pub fn check(&self) -> Result<(), SceneError> {
-        let wrong = |field, expected, found: String| Err(SceneError::Option { field, expected, found });
+    /// [`TrainingImageError::Option`].
+    pub fn check(&self) -> Result<(), TrainingImageError> {
+        let wrong =
+            |field, expected, found: String| Err(TrainingImageError::Option { field, expected, found });
         if !self.size.is_multiple_of(32) || !(64..=1024).contains(&self.size) {
             return wrong("size", "a multiple of 32 from 64 to 1024 pixels", self.size.to_string());
         }
         for (field, share) in [
             ("photograph_share", self.photograph_share),
-            ("empty_share", self.empty_share),
+            ("empty_fraction", self.empty_fraction),
             ("render_share", self.render_share),
-            ("solid_share", self.solid_share),
-            ("least_visible", self.least_visible),
-            ("random_color_chance", self.random_color_chance),
-            ("near_real_share", self.near_real_share),
+            ("solid_fraction", self.solid_fraction),
+            ("least_visible", self.min_visibility),
+            ("random_color_probability", self.random_color_probability),
+            ("near_real_fraction", self.near_real_fraction),
         ] {
             if !(0.0..=1.0).contains(&share) {
                 return wrong(field, "0 to 1", share.to_string());

@@ -6,7 +6,7 @@
 use crate::network::{DetectorConfig, MASK_STRIDE};
 
 /// Locations of an object on a level, at most.
-const MOST_LOCATIONS: usize = 9;
+const MAX_LOCATIONS: usize = 9;
 /// Locations of an object whose mask is learnt.
 const MASK_LOCATIONS: usize = 3;
 /// Pixel label of what is neither background nor to be learnt.
@@ -50,7 +50,7 @@ pub struct MaskTarget {
     pub corner: [usize; 2],
     /// Columns and rows.
     pub size: [usize; 2],
-    /// Share of each block of pixels that shows the object.
+    /// Fraction of each block of pixels that shows the object.
     pub share: Vec<f32>,
 }
 
@@ -144,7 +144,7 @@ impl Targets {
                     }
                 }
                 locations.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-                for (distance, location) in locations.into_iter().take(MOST_LOCATIONS) {
+                for (distance, location) in locations.into_iter().take(MAX_LOCATIONS) {
                     taken[location] = true;
                     ignored[location] = false;
                     of_instance[index].push((distance, targets.positives.len()));
@@ -163,7 +163,7 @@ impl Targets {
     }
 }
 
-/// Share of blocks that show the object, from two blocks outside its box on.
+/// Fraction of blocks that show the object, from two blocks outside its box on.
 fn mask_target(annotation: &Annotation, index: usize) -> MaskTarget {
     let [width, height] = annotation.size;
     let [left, top, right, bottom] = annotation.instances[index].corners;

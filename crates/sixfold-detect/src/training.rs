@@ -2,7 +2,7 @@
 
 use crate::loss::{LossWeights, RawOutput, loss};
 use crate::network::{Detector, DetectorConfig, DetectorOutput, MASK_STRIDE};
-use crate::samples::{SceneOptions, SceneSource};
+use crate::samples::{TrainingImageOptions, TrainingImageSource};
 use crate::targets::Targets;
 use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
@@ -147,10 +147,10 @@ impl DetectorTraining {
 }
 
 impl Training for DetectorTraining {
-    type Samples = SceneSource;
+    type Samples = TrainingImageSource;
     type Batch = Vec<TrainingImage>;
 
-    fn plan(&self, source: &SceneSource) -> Result<Plan, TrainError> {
+    fn plan(&self, source: &TrainingImageSource) -> Result<Plan, TrainError> {
         let options = &self.options;
         options.check()?;
         let (side, alignment) = (source.options().size, self.config.alignment());
@@ -167,7 +167,7 @@ impl Training for DetectorTraining {
         Plan::new(&options.common, options.batch, self.pace, &settings)
     }
 
-    fn batches<'a>(&self, source: &'a SceneSource) -> Batches<'a, Self::Batch> {
+    fn batches<'a>(&self, source: &'a TrainingImageSource) -> Batches<'a, Self::Batch> {
         let (config, options) = (self.config.clone(), self.options.clone());
         Box::new(move |step| make_batch(source, &config, &options, step))
     }
@@ -228,7 +228,7 @@ impl Training for DetectorTraining {
 
 /// The images of a step.
 fn make_batch(
-    source: &SceneSource,
+    source: &TrainingImageSource,
     config: &DetectorConfig,
     options: &DetectorTrainingOptions,
     step: u64,
@@ -251,12 +251,12 @@ struct Settings<'a> {
     #[serde(flatten)]
     training: &'a DetectorTrainingOptions,
     network: &'a DetectorConfig,
-    samples: &'a SceneOptions,
+    samples: &'a TrainingImageOptions,
     photographs: usize,
 }
 
 /// Milliseconds that one training image takes to be made, over so many, on all threads (for benchmarks).
-pub fn sample_time(source: &SceneSource, count: u64) -> f64 {
+pub fn sample_time(source: &TrainingImageSource, count: u64) -> f64 {
     let start = std::time::Instant::now();
     (0..count).into_par_iter().for_each(|n| drop(source.sample(0, n)));
     1000.0 * start.elapsed().as_secs_f64() / count as f64

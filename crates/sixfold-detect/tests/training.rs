@@ -1,4 +1,4 @@
-//! A detector learns two made-up objects from renders, and a training that is interrupted and goes on ends with the same
+//! A detector learns two synthetic objects from renders, and a training that is interrupted and continues ends with the same
 //! numbers as one that is not.
 
 use std::path::Path;
@@ -9,7 +9,7 @@ use sixfold_data::TrainingObject;
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::model::{ClassEntry, DetectorModel, DetectorUse, ModelError};
 use sixfold_detect::network::{DetectorConfig, Encoder};
-use sixfold_detect::samples::{SceneOptions, SceneSource};
+use sixfold_detect::samples::{TrainingImageOptions, TrainingImageSource};
 use sixfold_detect::training::{DetectorTraining, DetectorTrainingOptions};
 use sixfold_geometry::{Image, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
@@ -43,16 +43,16 @@ fn object(id: u32, pyramid: bool, color: [u8; 3]) -> TrainingObject {
     TrainingObject::new(id, mesh, info)
 }
 
-fn source(size: usize) -> SceneSource {
+fn source(size: usize) -> TrainingImageSource {
     let objects = vec![object(3, true, [220, 60, 40]), object(8, false, [40, 90, 220])];
-    let options = SceneOptions {
+    let options = TrainingImageOptions {
         size,
         scale: [0.3, 0.6],
-        most_pasted: 3,
-        most_distractors: 1,
-        ..SceneOptions::default()
+        max_pasted: 3,
+        max_distractors: 1,
+        ..TrainingImageOptions::default()
     };
-    SceneSource::new(objects, &[], &[], Backgrounds::procedural(), options).unwrap()
+    TrainingImageSource::new(objects, &[], &[], Backgrounds::procedural(), options).unwrap()
 }
 
 /// Trains in `folder`, stopping after step `stop_at`; the weight file's path when it finished.
@@ -177,12 +177,12 @@ fn samples_are_a_function_of_their_number() {
     let bare = object(3, true, [0; 3]);
     let plain = Mesh::new(bare.mesh.vertices().to_vec(), bare.mesh.faces().to_vec()).unwrap();
     let grey = TrainingObject { mesh: plain, ..bare };
-    let options = SceneOptions { size: 64, ..SceneOptions::default() };
-    let error =
-        SceneSource::new(vec![grey], &[], &[], Backgrounds::procedural(), options.clone()).unwrap_err();
+    let options = TrainingImageOptions { size: 64, ..TrainingImageOptions::default() };
+    let error = TrainingImageSource::new(vec![grey], &[], &[], Backgrounds::procedural(), options.clone())
+        .unwrap_err();
     assert!(error.to_string().contains("object 3"), "{error}");
-    let wrong = SceneOptions { size: 50, ..options };
+    let wrong = TrainingImageOptions { size: 50, ..options };
     let objects = vec![object(3, true, [9; 3])];
-    let error = SceneSource::new(objects, &[], &[], Backgrounds::procedural(), wrong).unwrap_err();
+    let error = TrainingImageSource::new(objects, &[], &[], Backgrounds::procedural(), wrong).unwrap_err();
     assert!(error.to_string().contains("size: found 50"), "{error}");
 }

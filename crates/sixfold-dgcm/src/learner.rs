@@ -35,7 +35,7 @@ pub struct LearnerOptions {
 pub type PartOf<'a> = dyn Fn(&Grasp) -> Option<&'static str> + 'a;
 
 /// An object in front of the robot.
-pub struct Lesson<'a> {
+pub struct GraspTask<'a> {
     /// What the camera sees of it.
     pub view: &'a GraspView,
     /// How grasps are planned by geometry.
@@ -106,27 +106,27 @@ impl Learner<'_> {
     /// [`LearnError`]; what was tried before is kept.
     pub fn learn<T>(
         &mut self,
-        lesson: &Lesson<'_>,
+        task: &GraspTask<'_>,
         try_grasp: &mut TryGrasp<'_, T>,
     ) -> Result<Learned<T>, LearnError> {
-        let mut geometry = antipodal_grasps(lesson.view, self.gripper, &lesson.planner)?;
-        if let (Some(part_of), Some(part)) = (lesson.part_of, &self.options.part) {
+        let mut geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
+        if let (Some(part_of), Some(part)) = (task.part_of, &self.options.part) {
             geometry.retain(|grasp| part_of(grasp) == Some(part.as_str()));
         }
-        let fitter = GraspFitter::new(lesson.view, self.gripper, &lesson.planner)?;
+        let fitter = GraspFitter::new(task.view, self.gripper, &task.planner)?;
         self.memory.refresh()?;
         let (nearest, found) = self.ask_experience(&fitter)?;
-        let ranked = self.rank(&geometry, found.as_ref(), &fitter, lesson.part_of.is_some());
+        let ranked = self.rank(&geometry, found.as_ref(), &fitter, task.part_of.is_some());
         let from_experience = found.is_some();
         let mut learned = Learned { nearest, from_experience, last: None, held: false, stored: None };
         let mut left = 0;
         for (number, candidate) in ranked.iter().take(self.options.tries).enumerate() {
-            let (held, ending) = self.execute(lesson, &fitter, candidate, number, try_grasp)?;
+            let (held, ending) = self.execute(task, &fitter, candidate, number, try_grasp)?;
             learned.last = Some((number, ending));
             left = number + 1;
             if held {
                 learned.held = true;
-                learned.stored = self.remember(lesson, &candidate.grasp)?;
+                learned.stored = self.remember(task, &candidate.grasp)?;
                 break;
             }
         }
@@ -135,7 +135,7 @@ impl Learner<'_> {
         let count = self.options.explore.min(others.len());
         for k in 0..count {
             let number = k * others.len() / count;
-            self.execute(lesson, &fitter, &others[number], left + number, try_grasp)?;
+            self.execute(task, &fitter, &others[number], left + number, try_grasp)?;
         }
         Ok(learned)
     }
@@ -180,7 +180,7 @@ impl Learner<'_> {
     /// Has one grasp tried and keeps what came of it.
     fn execute<T>(
         &mut self,
-        lesson: &Lesson<'_>,
+        task: &GraspTask<'_>,
         fitter: &GraspFitter<'_>,
         candidate: &Ranked,
         rank: usize,
@@ -193,18 +193,18 @@ impl Learner<'_> {
             transferred: candidate.kind == Kind::Experience,
             held,
             gripper: self.gripper.name.clone(),
-            object: lesson.object.to_owned(),
-            time: (lesson.now)(),
-            provenance: format!("{}, rank {rank}", lesson.provenance),
+            object: task.object.to_owned(),
+            time: (task.now)(),
+            provenance: format!("{}, rank {rank}", task.provenance),
         };
         self.memory.store().add_attempt(&tried)?;
         Ok((held, ending))
     }
 
     /// Stores a grasp that held; nothing where the object cannot be cut out.
-    fn remember(&mut self, lesson: &Lesson<'_>, grasp: &Grasp) -> Result<Option<i64>, LearnError> {
-        let Ok(crop) = Crop::of_view(lesson.view, self.network.crop_options()) else { return Ok(None) };
-        let part = match lesson.part_of {
+    fn remember(&mut self, task: &GraspTask<'_>, grasp: &Grasp) -> Result<Option<i64>, LearnError> {
+        let Ok(crop) = Crop::of_view(task.view, self.network.crop_options()) else { return Ok(None) };
+        let part = match task.part_of {
             Some(part_of) => part_of(grasp),
             None => self.options.part.as_deref(),
         };
@@ -213,10 +213,10 @@ impl Learner<'_> {
             crop,
             grasp,
             self.gripper,
-            lesson.object,
+            task.object,
             part,
-            (lesson.now)(),
-            lesson.provenance,
+            (task.now)(),
+            task.provenance,
         );
         let (id, _) = self.memory.store().add(&experience)?;
         self.memory.refresh()?;

@@ -42,7 +42,7 @@ pub struct DgcmModel {
     device: Device,
 }
 
-/// What the network says of an input, kept for several experiences.
+/// What the network predicts for an input, kept for several experiences.
 #[derive(Debug, Clone)]
 pub struct InputCode {
     encoded: Encoded,

@@ -1,10 +1,10 @@
-//! What has come of the grasps that were tried: the chance that the next one holds.
+//! What has come of the grasps that were tried: the probability that the next one holds.
 //!
 //! The dissertation stores successes only ("unsuccessful grasp attempts do not provide any information for replicating past
 //! experience", section 6.2.1), and ranks by how near an experience is. Failures do say something: how much worse than the
-//! planner believes a grasp on the edge of its friction cone is, or one far from the object's middle, with this hand and
+//! planner believes a grasp on the edge of its friction cone is, or one far from the object's centre, with this hand and
 //! these pads. So every attempt is kept with a dozen numbers that were known before, and a logistic regression with a normal
-//! prior (Cox 1958; MAP by Newton's method) foretells the next one. The prior is what simulated attempts taught: without an
+//! prior (Cox 1958; MAP by Newton's method) predicts the next one. The prior is what simulated attempts taught: without an
 //! attempt of its own, a hand ranks by the quality of the contacts and the agreement with experience, as section 6.3.2 does,
 //! and keeps away from the table.
 
@@ -16,8 +16,8 @@ use sixfold_grasp::GraspDescription;
 const NUMBERS: usize = 17;
 type Numbers = SVector<f64, NUMBERS>;
 
-/// Weights without any attempt, in the order of [`numbers`]: what 1322 simulated attempts at made-up objects taught a hand
-/// that is off by 5 mm and 3 degrees (`sixfold grasp learn --families all --members 5 --tries 2 --explore 8 --near 0 --hard`,
+/// Weights without any attempt, in the order of [`numbers`]: what 1322 simulated attempts at synthetic objects taught a hand
+/// with an error of 5 mm and 3 degrees (`sixfold grasp learn --families all --members 5 --tries 2 --explore 8 --near 0 --hard`,
 /// then [`OutcomeModel::learn`]), rounded. Those attempts had no experience to agree with: its weight is a choice.
 const PRIOR: [f64; NUMBERS] =
     [0.15, 0.1, -0.2, 0.25, 0.25, 0.55, 0.2, -0.1, 0.75, 0.35, 0.4, 1.0, 0.0, 0.0, -0.6, 0.9, 0.65];
@@ -27,9 +27,9 @@ const PRECISION_OF_CONSTANT: f64 = 0.01;
 
 /// Room over the table counts by its logarithm between these, metres: the first millimetres are worth most.
 const ROOM: (f64, f64) = (0.003, 0.1);
-/// And once more below this, metres: a hand that is off by millimetres meets the table.
+/// And once more below this, metres: a hand with an error of millimetres meets the table.
 const SCARCE: f64 = 0.01;
-/// With the object's middle this far off along the closing direction, metres, something at its side is held: from where on, and where surely.
+/// With the object's centre this far off along the closing direction, metres, something at its side is held: from where on, and where surely.
 const WALL: (f64, f64) = (0.015, 0.035);
 
 /// What is known of a grasp, each number in about -1 to 1.
@@ -38,7 +38,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
     let both_sides = |v: f64| 2.0 * v - 1.0;
     let room = d.table_room.unwrap_or(ROOM.1);
     let overlap = both_sides(d.overlap.clamp(0.0, 0.05) / 0.05);
-    // A wall or a handle at the object's side is held otherwise than the object about its middle.
+    // A wall or a handle at the object's side is held otherwise than the object about its centre.
     let wall = ((d.lever - WALL.0) / (WALL.1 - WALL.0)).clamp(0.0, 1.0);
     Numbers::from([
         1.0,
@@ -62,7 +62,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
     ])
 }
 
-/// The chance that a grasp holds, from the attempts so far.
+/// The probability that a grasp holds, from the attempts so far.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutcomeModel {
     weights: Numbers,
@@ -135,8 +135,8 @@ impl OutcomeModel {
         model
     }
 
-    /// The chance that a grasp holds, 0 to 1.
-    pub fn promise(&self, description: &GraspDescription, share: f64, transferred: bool) -> f64 {
+    /// The probability that a grasp holds, 0 to 1.
+    pub fn success_probability(&self, description: &GraspDescription, share: f64, transferred: bool) -> f64 {
         sigmoid(self.weights.dot(&numbers(description, share, transferred)))
     }
 }
@@ -166,14 +166,14 @@ mod tests {
     #[test]
     fn without_attempts_quality_agreement_and_room_decide() {
         let model = OutcomeModel::learn(&[], "jaws");
-        let of = |alignment, share| model.promise(&description(alignment, 0.0), share, false);
+        let of = |alignment, share| model.success_probability(&description(alignment, 0.0), share, false);
         assert!(of(0.9, 0.0) > of(0.5, 0.0));
         assert!(of(0.5, 0.9) > of(0.5, 0.1));
         // What simulated attempts taught beforehand: a lever is worse than none, and so is a table under the fingers.
-        assert!(model.promise(&description(0.5, 0.05), 0.0, false) < of(0.5, 0.0));
+        assert!(model.success_probability(&description(0.5, 0.05), 0.0, false) < of(0.5, 0.0));
         let above = |room: f64| {
             let d = GraspDescription { table_room: Some(room), ..description(0.5, 0.0) };
-            model.promise(&d, 0.0, false)
+            model.success_probability(&d, 0.0, false)
         };
         assert!(above(0.004) + 0.15 < above(0.012), "{} {}", above(0.004), above(0.012));
         assert!(
@@ -194,14 +194,14 @@ mod tests {
             })
             .collect();
         let model = OutcomeModel::learn(&attempts, "jaws");
-        let off = model.promise(&description(0.95, 0.05), 0.0, false);
-        let near = model.promise(&description(0.5, 0.005), 0.0, false);
+        let off = model.success_probability(&description(0.95, 0.05), 0.0, false);
+        let near = model.success_probability(&description(0.5, 0.005), 0.0, false);
         assert!(off < 0.45 && near > 0.8, "{off} {near}");
         assert_eq!(model.attempts, 200);
         assert_eq!(OutcomeModel::learn(&attempts, "other"), OutcomeModel::default());
         // Nothing but successes does not make everything certain.
         let good: Vec<Attempt> = (0..50).map(|_| attempt(description(0.7, 0.0), true)).collect();
-        let sure = OutcomeModel::learn(&good, "jaws").promise(&description(0.7, 0.0), 0.0, false);
+        let sure = OutcomeModel::learn(&good, "jaws").success_probability(&description(0.7, 0.0), 0.0, false);
         assert!(sure > 0.9 && sure < 0.9999, "{sure}");
     }
 
@@ -218,8 +218,8 @@ mod tests {
             (0..120).map(|k| four[k % 4]).map(|(wall, deep)| attempt(of(wall, deep), wall == deep)).collect();
         let model = OutcomeModel::learn(&attempts, "jaws");
         for (wall, deep) in four {
-            let promise = model.promise(&of(wall, deep), 0.0, false);
-            assert_eq!(promise > 0.5, wall == deep, "{wall} {deep} {promise}");
+            let success_probability = model.success_probability(&of(wall, deep), 0.0, false);
+            assert_eq!(success_probability > 0.5, wall == deep, "{wall} {deep} {success_probability}");
         }
     }
 

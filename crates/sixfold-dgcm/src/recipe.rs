@@ -12,7 +12,7 @@ use sixfold_nn::weights::ModelCard;
 
 use crate::model::DgcmModel;
 use crate::networks::{CompactConfig, Network, PaperConfig};
-use crate::samples::{Pool, PoolOptions};
+use crate::samples::{GraspPoolOptions, Pool};
 use crate::training::{DgcmTraining, DgcmTrainingOptions};
 use sixfold_experience::CropOptions;
 
@@ -117,7 +117,7 @@ impl Recipe for DgcmRecipe {
     type Data = ();
     type Samples = Pool;
     type Training = DgcmTraining;
-    type Context = PoolOptions;
+    type Context = GraspPoolOptions;
     type Report = ();
 
     fn steps(&self) -> u64 {
@@ -141,7 +141,11 @@ impl Recipe for DgcmRecipe {
         self.options().check()
     }
 
-    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<DgcmTraining, PoolOptions>, TrainError> {
+    fn prepare(
+        &self,
+        _: (),
+        _: &mut Session<'_>,
+    ) -> Result<Prepared<DgcmTraining, GraspPoolOptions>, TrainError> {
         let device = Device::flex().autodiff();
         let network = match (self.network, &self.encoder) {
             (DgcmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
@@ -152,11 +156,11 @@ impl Recipe for DgcmRecipe {
             }
         };
         let options = self.options();
-        let pool = PoolOptions {
+        let pool = GraspPoolOptions {
             views: self.views,
             crop: self.network.crop(),
             seed: self.seed,
-            ..PoolOptions::default()
+            ..GraspPoolOptions::default()
         };
         let mut card = ModelCard::new("", "DGCM-Net, grasps from experience");
         card.data = format!(
@@ -167,7 +171,11 @@ impl Recipe for DgcmRecipe {
         Ok(Prepared { training: DgcmTraining::new(network, options, device), card, context: pool })
     }
 
-    fn samples(&self, pool: &mut PoolOptions, session: &mut Session<'_>) -> Result<Option<Pool>, TrainError> {
+    fn samples(
+        &self,
+        pool: &mut GraspPoolOptions,
+        session: &mut Session<'_>,
+    ) -> Result<Option<Pool>, TrainError> {
         session.note(&format!("making {} views", self.views));
         let events = Mutex::new(&mut *session.events);
         let pool = Pool::new(pool, |done| {
@@ -180,7 +188,7 @@ impl Recipe for DgcmRecipe {
 
     fn finish(
         &self,
-        Prepared { training, card, context: pool }: Prepared<DgcmTraining, PoolOptions>,
+        Prepared { training, card, context: pool }: Prepared<DgcmTraining, GraspPoolOptions>,
         session: &mut Session<'_>,
     ) -> Result<Option<()>, TrainError> {
         let model = DgcmModel::new(training.into_network(), pool.crop, card);

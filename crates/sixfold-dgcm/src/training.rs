@@ -9,7 +9,7 @@ use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
 use crate::networks::Network;
-use crate::samples::{Pair, PairOptions, Pool, PoolOptions};
+use crate::samples::{GraspPoolOptions, Pair, PairOptions, Pool};
 use sixfold_synth::shapes::Family;
 
 /// How to train. All of it decides about the result.
@@ -24,9 +24,9 @@ pub struct DgcmTrainingOptions {
     pub negatives: usize,
     /// Weight of the coordinates in equation 6.4.
     pub lambda: f64,
-    /// Weight of equation 6.2 for all pairs of views in a batch that show different families, beside the drawn pairs.
+    /// Weight of equation 6.2 for all pairs of views in a batch that show different families, beside the rendered pairs.
     pub cross_pairs: f64,
-    /// How pairs are drawn.
+    /// How pairs are sampled.
     pub samples: PairOptions,
 }
 
@@ -215,7 +215,7 @@ impl Training for DgcmTraining {
 struct Settings<'a> {
     #[serde(flatten)]
     training: &'a DgcmTrainingOptions,
-    pool: &'a PoolOptions,
+    pool: &'a GraspPoolOptions,
     architecture: &'static str,
     margin: f64,
 }
@@ -230,7 +230,7 @@ mod tests {
 
     #[test]
     fn it_learns_and_goes_on_where_it_stopped() {
-        let pool = Pool::new(&PoolOptions { views: 64, ..PoolOptions::default() }, |_| ());
+        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, |_| ());
         let device = Device::flex().autodiff();
         let default = DgcmTrainingOptions::default();
         let common = TrainingOptions { steps: 16, warm_up: 2, ..default.common.clone() };

@@ -6,19 +6,19 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::outcome::OutcomeModel;
-use sixfold_dgcm::transfer::{Hypothesis, Memory, ProposeOptions, propose, rank_on_part};
+use sixfold_dgcm::transfer::{AlignmentHypothesis, Memory, ProposeOptions, propose, rank_on_part};
 use sixfold_experience::{Crop, Experience, ExperienceStore, SqliteStore};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, ViewOptions,
-    antipodal_grasps, gripper_pose, middle_between_pads,
+    antipodal_grasps, centre_between_pads, gripper_pose,
 };
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::shapes::{Family, Member, member};
 
-/// A made-up mug on a table, 0.7 m from a camera that looks down by 40 degrees.
+/// A synthetic mug on a table, 0.7 m from a camera that looks down by 40 degrees.
 struct Seen {
     mug: Member,
     view: GraspView,
@@ -38,7 +38,7 @@ fn seen(seed: u64, yaw: f64) -> Seen {
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
     let camera_from_object = camera_from_world * Pose::new(turn, Vec3::zeros());
     let drawn = |objects: &[SceneObject<'_>]| {
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         frame.render(objects, &RenderOptions::default());
         frame.depth()
     };
@@ -51,9 +51,9 @@ fn seen(seed: u64, yaw: f64) -> Seen {
 }
 
 impl Seen {
-    /// The part in the middle between the pads of a grasp.
+    /// The part in the centre between the pads of a grasp.
     fn part_of(&self, grasp: &Grasp) -> &'static str {
-        let middle = middle_between_pads(&grasp.camera_from_gripper);
+        let middle = centre_between_pads(&grasp.camera_from_gripper);
         self.mug.part_at(&self.camera_from_object.inverse().transform_point(&middle))
     }
 
@@ -106,7 +106,7 @@ fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
         let right: f64 = found.crop.pixels().filter(|&i| on_handle(i)).map(|i| found.held_before[i]).sum();
         assert!(all > 5.0 && right > 0.6 * all, "{there} to {here}: {right} of {all}");
         // The transferred grasp closes along the way around the mug, as the taught one does.
-        let upright = found.proposals.iter().find(|p| p.hypothesis == Hypothesis::Upright);
+        let upright = found.proposals.iter().find(|p| p.hypothesis == AlignmentHypothesis::Upright);
         if let Some(p) = upright {
             let wanted = now.handle_grasp();
             let turned = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);

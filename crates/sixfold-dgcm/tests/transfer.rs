@@ -1,14 +1,14 @@
 //! The geometry of the transfer, without a network: coordinates that are right by construction.
 
-use sixfold_dgcm::transfer::{AlignOptions, Hypothesis, transfer};
+use sixfold_dgcm::transfer::{AlignmentHypothesis, ExperienceAlignmentOptions, transfer};
 use sixfold_experience::{Crop, CropOptions, region};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, IndexedCloud, Mask, Mat3, PointCloud, Pose, Vec3};
 use sixfold_grasp::{Gripper, gripper_pose};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
-/// A box on a table seen from 45 degrees above, turned about the upright axis.
+/// A box on a table seen from 45 degrees above, rotated about the upright axis.
 struct Seen {
     crop: Crop,
     camera_from_object: Pose,
@@ -36,7 +36,7 @@ fn seen(size: Vec3, yaw: f64) -> Seen {
     let camera_from_object = world_from_camera.inverse() * Pose::new(turn, Vec3::zeros());
     let mesh = cuboid(&size);
     let objects = [SceneObject { mesh: &mesh, camera_from_object }];
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let depth = frame.depth();
     let mask = Mask::from_fn(640, 480, |x, y| depth[(x, y)] > 0.0);
@@ -81,7 +81,7 @@ fn grasp(seen: &Seen) -> Pose {
 }
 
 /// Distance and angle between the transferred grasp and the one it should be, best hypothesis first.
-fn errors(input: &Seen, experience: &Seen) -> Vec<(Hypothesis, f64, f64)> {
+fn errors(input: &Seen, experience: &Seen) -> Vec<(AlignmentHypothesis, f64, f64)> {
     let gripper = Gripper::built_in("jaws-140").unwrap();
     let taught = grasp(experience);
     let region = region(&experience.crop, &taught, 0.1, &gripper);
@@ -92,7 +92,7 @@ fn errors(input: &Seen, experience: &Seen) -> Vec<(Hypothesis, f64, f64)> {
         &coordinates(input, experience),
         &experience.crop,
         &region,
-        &AlignOptions::default(),
+        &ExperienceAlignmentOptions::default(),
     );
     let wanted = grasp(input);
     let half = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
@@ -129,11 +129,19 @@ fn without_coordinates_only_the_viewpoint_is_trusted() {
     let a = seen(Vec3::new(0.14, 0.06, 0.08), 0.3);
     let nothing = vec![[9.0; 3]; a.crop.mask.len()];
     let region = a.crop.mask.clone();
-    let found = transfer(&a.crop, &cloud(&a.crop), &nothing, &a.crop, &region, &AlignOptions::default());
-    assert!(found.iter().all(|t| t.hypothesis == Hypothesis::SameSide), "{found:?}");
+    let found = transfer(
+        &a.crop,
+        &cloud(&a.crop),
+        &nothing,
+        &a.crop,
+        &region,
+        &ExperienceAlignmentOptions::default(),
+    );
+    assert!(found.iter().all(|t| t.hypothesis == AlignmentHypothesis::SameSide), "{found:?}");
     assert_eq!(found.len(), 1);
     assert!(found[0].camera_from_experience.distance_to(&Pose::identity()) < 1e-3);
     let empty = vec![false; region.len()];
-    let found = transfer(&a.crop, &cloud(&a.crop), &nothing, &a.crop, &empty, &AlignOptions::default());
+    let found =
+        transfer(&a.crop, &cloud(&a.crop), &nothing, &a.crop, &empty, &ExperienceAlignmentOptions::default());
     assert!(found.is_empty());
 }

@@ -35,7 +35,7 @@ pub struct Cache {
 }
 
 impl Cache {
-    /// Bytes that a cache holds at most unless told otherwise: some hundred objects with templates and descriptors.
+    /// Bytes that a cache holds at most unless set otherwise: some hundred objects with templates and descriptors.
     pub const LIMIT: u64 = 1 << 30;
 
     /// A cache that keeps nothing.

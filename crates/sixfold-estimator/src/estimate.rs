@@ -48,6 +48,6 @@ impl PoseEstimate {
 
     /// The fraction of the object that is seen, where verification says it.
     pub fn visibility(&self) -> Option<f64> {
-        self.verification.map(|v| v.visible_share())
+        self.verification.map(|v| v.visible_fraction())
     }
 }

@@ -8,7 +8,7 @@ use sixfold_grasp::{AntipodalQuality, GraspDescription};
 pub struct Attempt {
     /// What was known of it before.
     pub description: GraspDescription,
-    /// The share of experience that agreed with it, 0 to 1.
+    /// The fraction of experience that agreed with it, 0 to 1.
     pub share: f64,
     /// It was transferred from experience; else the planner proposed it.
     pub transferred: bool,

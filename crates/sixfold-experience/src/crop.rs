@@ -48,7 +48,7 @@ pub struct CropOptions {
     pub size: f64,
     /// Half width of the window from which normals are computed, pixels of the depth image.
     pub normal_radius: usize,
-    /// Share of points left out at the ends of each axis for the VD-NOC; 0 for equation 6.1 as it stands.
+    /// Fraction of points left out at the ends of each axis for the VD-NOC; 0 for equation 6.1 as it stands.
     pub trim: f64,
     /// Fewest pixels of an object.
     pub min_pixels: usize,
@@ -148,7 +148,7 @@ impl Crop {
         let mut seen = vec![];
         for (i, (u, v)) in (0..options.side).flat_map(|v| (0..options.side).map(move |u| (u, v))).enumerate()
         {
-            // The middle of the crop's pixel in the depth image; the nearest pixel there.
+            // The centre of the crop's pixel in the depth image; the nearest pixel there.
             let x = (rect.x + (u as f64 + 0.5) * step - 0.5).round();
             let y = (rect.y + (v as f64 + 0.5) * step - 0.5).round();
             if x < 0.0 || y < 0.0 || x >= size.0 as f64 || y >= size.1 as f64 {

@@ -1,4 +1,4 @@
-//! In-plane copies: a crop as the camera would see it, had it been turned about its optical axis (dissertation, section
+//! In-plane copies: a crop as the camera would see it, had it been rotated about its optical axis (dissertation, section
 //! 6.3.1). That is exact, for a turn about the optical axis moves no viewpoint.
 
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
@@ -6,21 +6,21 @@ use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
 use crate::Crop;
 
-/// The camera's turn: takes points of the old camera's frame to the turned one's.
+/// The camera's rotation: takes points of the old camera's frame to the turned one's.
 pub fn turn(angle: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle), Vec3::zeros())
 }
 
 impl Crop {
-    /// The crop turned about its middle by `angle` radians (positive: from x to y), with points, normals and VD-NOC of the
-    /// turned camera. `trim` as in [`crate::CropOptions`].
+    /// The crop rotated about its centre by `angle` radians (positive: from x to y), with points, normals and VD-NOC of the
+    /// rotated camera. `trim` as in [`crate::CropOptions`].
     pub fn turned(&self, angle: f64, trim: f64) -> Crop {
         let pose = turn(angle);
         let middle = 0.5 * (self.side as f64 - 1.0);
         let (sin, cos) = angle.sin_cos();
         let rotate = |p: Vec2| Vec2::new(cos * p.x - sin * p.y, sin * p.x + cos * p.y);
         let back = |p: Vec2| Vec2::new(cos * p.x + sin * p.y, -sin * p.x + cos * p.y);
-        // The principal point turns about the crop's middle. Both focal lengths are alike but for sensors with pixels that
+        // The principal point turns about the crop's centre. Both focal lengths are alike but for sensors with pixels that
         // are not square.
         let principal = rotate(Vec2::new(self.camera.cx - middle, self.camera.cy - middle));
         let camera = Camera { cx: principal.x + middle, cy: principal.y + middle, ..self.camera };

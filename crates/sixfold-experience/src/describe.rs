@@ -1,4 +1,4 @@
-//! An experience for people: its numbers without the images, and a picture.
+//! An experience for people: its numbers without the images, and an image.
 
 use serde::Serialize;
 use sixfold_geometry::{Image, RgbImage};

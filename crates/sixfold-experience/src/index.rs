@@ -23,7 +23,7 @@ const BLOCK: usize = 2048;
 pub struct Match {
     /// Number of the experience.
     pub experience: i64,
-    /// The copy's turn about the optical axis, radians.
+    /// The copy's rotation about the optical axis, radians.
     pub angle: f64,
     /// Euclidean distance of the features.
     pub distance: f64,

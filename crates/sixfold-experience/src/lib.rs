@@ -4,7 +4,7 @@
 //! from ([`FeatureExtractor`]) the store does not know.
 //!
 //! [`ExperienceStore`] is what a store can do. `SqliteStore` is one in a single file, `PostgresStore` (feature `postgres`) one on
-//! a server for several robots, `OutboxStore` a robot's own copy of that one, which goes on when the server is away.
+//! a server for several robots, `OutboxStore` a robot's own copy of that one, which continues when the server is away.
 //! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
 //! memory, asks the store only for what has changed, and finds the nearest exactly.
 
@@ -43,7 +43,7 @@ pub use describe::Description;
 pub use experience::{COPIES, Copy, Experience, FeatureExtractor, Stored, region};
 pub use index::{FeatureIndex, Match};
 #[cfg(feature = "sqlite")]
-pub use outbox::{Listener, Notice, OutboxOptions, OutboxStore};
+pub use outbox::{Notice, NoticeListener, OutboxOptions, OutboxStore};
 pub use place::StorePlace;
 #[cfg(feature = "sqlite")]
 pub use sqlite::SqliteStore;
@@ -98,7 +98,7 @@ pub enum StoreError {
     },
     /// There is no room.
     #[error(
-        "{}: the disk is full: the last experience was not stored, all earlier ones are safe; make room and go on", file.display()
+        "{}: the disk is full: the last experience was not stored, all earlier ones are safe; make room and continue", file.display()
     )]
     Full {
         /// The file.
@@ -227,7 +227,7 @@ pub struct Position {
 pub struct StoredFeature {
     /// Number of the experience.
     pub experience: i64,
-    /// The copy's turn about the optical axis, radians; 0 for the experience itself.
+    /// The copy's rotation about the optical axis, radians; 0 for the experience itself.
     pub angle: f64,
     /// The network that made it: features of different networks cannot be compared.
     pub network: String,

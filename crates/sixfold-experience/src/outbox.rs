@@ -1,4 +1,4 @@
-//! A robot's own copy of a fleet's store, which goes on when the server is away.
+//! A robot's own copy of a fleet's store, which continues when the server is away.
 //!
 //! The copy is an ordinary store file. Everything is read from it, and whatever is added is in it, on the disk, before anything
 //! else happens; its numbers never change. At every contact three things follow, each of which may be cut off anywhere and done
@@ -131,13 +131,13 @@ impl Default for OutboxOptions {
 }
 
 /// Called with every [`Notice`].
-pub type Listener = Box<dyn Fn(&Notice) + Send>;
+pub type NoticeListener = Box<dyn Fn(&Notice) + Send>;
 
 /// A copy of a remote store in a file, and the outbox for what was added to it.
 pub struct OutboxStore {
     copy: RefCell<SqliteStore>,
     remote: RefCell<Box<dyn ExperienceStore + Send>>,
-    listener: Listener,
+    listener: NoticeListener,
     retry: Duration,
     /// The remote store is away, and left alone until then.
     away: Cell<Option<Instant>>,
@@ -159,12 +159,12 @@ impl OutboxStore {
     ///
     /// # Errors
     /// [`StoreError`] for a file that is no store or belongs to another server, and for a server that answers but will not do;
-    /// not for one that is away ([`StoreError::is_passing`]): `listener` hears of that.
+    /// not for one that is away ([`StoreError::is_passing`]): `listener` is notified of that.
     pub fn create(
         file: &Path,
         remote: Box<dyn ExperienceStore + Send>,
         options: &OutboxOptions,
-        listener: Listener,
+        listener: NoticeListener,
     ) -> Result<OutboxStore, StoreError> {
         let copy = SqliteStore::create(file)?;
         copy.run(TABLES)?;

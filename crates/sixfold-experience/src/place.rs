@@ -94,8 +94,8 @@ impl StorePlace {
         }
     }
 
-    /// A store for somebody who must go on when a server is away: a file as it is, a server through an `OutboxStore` whose
-    /// file `outbox` is. `notice` hears what the user should know.
+    /// A store for somebody who must continue when a server is away: a file as it is, a server through an `OutboxStore` whose
+    /// file `outbox` is. `notice` receives what the user should know.
     ///
     /// # Errors
     /// [`StoreError`], but none because a server cannot be reached.

@@ -17,7 +17,7 @@ impl Extent {
     /// Half extents are at least this, metres: what is seen as a plane has no thickness to divide by.
     const LEAST: f64 = 0.002;
 
-    /// The extent of points in metres. `trim` is the share of points that is left out at both ends of each axis (flying
+    /// The extent of points in metres. `trim` is the fraction of points that is left out at both ends of each axis (flying
     /// pixels): 0 for equation 6.1 as it stands. `None` without points.
     pub fn of(points: &[Vec3], trim: f64) -> Option<Extent> {
         if points.is_empty() {

@@ -1,4 +1,4 @@
-//! The store's promise: what `add` has returned for is there, whenever the writer is killed, and readers go on meanwhile.
+//! The store's promise: what `add` has returned for is there, whenever the writer is killed, and readers continue meanwhile.
 //!
 //! `SIXFOLD_KILLS=1000 cargo test --workspace --release --test kill -- --nocapture` kills a writer a thousand times.
 #![cfg(feature = "sqlite")]
@@ -118,7 +118,7 @@ fn two_processes_read_while_one_writes() {
     SqliteStore::create(&file).unwrap();
     let mut writer = process("write", &file);
     let mut readers = [process("read", &file), process("read", &file)];
-    // Both readers hear of new experiences while the writer goes on.
+    // Both readers hear of new experiences while the writer continues.
     for reader in &mut readers {
         let lines = BufReader::new(reader.stdout.take().unwrap()).lines();
         let mut counts: Vec<i64> = vec![];
@@ -130,7 +130,7 @@ fn two_processes_read_while_one_writes() {
             }
         }
         assert!(counts.len() > 4 && counts.is_sorted(), "{counts:?}");
-        assert!(writer.try_wait().unwrap().is_none(), "the writer goes on");
+        assert!(writer.try_wait().unwrap().is_none(), "the writer continues");
     }
     for mut child in readers.into_iter().chain([writer]) {
         let _ = child.kill();

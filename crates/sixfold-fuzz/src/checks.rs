@@ -200,7 +200,7 @@ pub(crate) fn weights(bytes: &[u8]) {
     });
 }
 
-/// A damaged description is made anew: the object is described all the same.
+/// A damaged description is made again: the object is described all the same.
 pub(crate) fn ppf(bytes: &[u8]) {
     with_file("object.sixfold-ppf", bytes, |path| {
         let described = ObjectModel::cached(path, &seeds::tetrahedron(), &[], &seeds::coarse());

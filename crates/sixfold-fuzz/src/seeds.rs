@@ -34,7 +34,7 @@ pub(crate) fn tetrahedron() -> Mesh {
     Mesh::new(corners, vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).expect("a tetrahedron is a mesh")
 }
 
-/// Coarse descriptions: quick to make anew.
+/// Coarse descriptions: quick to make again.
 pub(crate) fn coarse() -> ModelOptions {
     ModelOptions { sampling_step: 0.2, ..ModelOptions::default() }
 }

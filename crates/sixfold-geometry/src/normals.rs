@@ -13,7 +13,7 @@ use crate::{Camera, DepthImage, Image, NormalImage, OptionError, Vec3};
 pub struct NormalOptions {
     /// Half width of the window in pixels.
     pub radius: usize,
-    /// A neighbour counts when its depth differs by less than this share of the depth.
+    /// A neighbour counts when its depth differs by less than this fraction of the depth.
     pub max_relative_step: f64,
 }
 

@@ -37,7 +37,7 @@ pub struct PlaneOptions {
     pub threshold: f64,
     /// Number of random samples.
     pub iterations: usize,
-    /// The plane must hold at least this share of the points.
+    /// The plane must hold at least this fraction of the points.
     pub min_share: f64,
     /// Normals, where the cloud has them, must agree within this angle, radians.
     pub max_angle: f64,
@@ -65,7 +65,7 @@ impl PlaneOptions {
 }
 
 /// The plane that holds most of the cloud's points, its normal turned to the origin (the camera);
-/// `None` when no plane holds the asked share.
+/// `None` when no plane holds the asked fraction.
 pub fn dominant_plane(cloud: &PointCloud, options: &PlaneOptions, seed: u64) -> Option<Plane> {
     let n = cloud.len();
     if n < 3 {

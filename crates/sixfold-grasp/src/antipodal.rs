@@ -49,7 +49,7 @@ pub struct AntipodalOptions {
     pub clearance: f64,
     /// As much more room where a contact is assumed and not seen, or half of it, if there is any, metres: an object is seldom
     /// as symmetric as it looks.
-    pub doubt: f64,
+    pub contact_clearance: f64,
     /// Points this near to the outermost ones belong to the contact, metres.
     pub contact_depth: f64,
     /// Largest angle of the approach from straight down, radians. Without a table: from the viewing direction.
@@ -69,7 +69,7 @@ impl Default for AntipodalOptions {
             closings: 3,
             approaches: 7,
             clearance: 0.012,
-            doubt: 0.015,
+            contact_clearance: 0.015,
             contact_depth: 0.004,
             max_tilt: FRAC_PI_2,
             completion: Some(CompletionOptions::default()),
@@ -96,7 +96,7 @@ impl AntipodalOptions {
         }
         for (field, found, low, high, expected) in [
             ("clearance", self.clearance, 0.0, 0.1, "0 to 0.1 m"),
-            ("doubt", self.doubt, 0.0, 0.1, "0 to 0.1 m"),
+            ("doubt", self.contact_clearance, 0.0, 0.1, "0 to 0.1 m"),
             ("contact_depth", self.contact_depth, 1e-4, 0.05, "0.0001 to 0.05 m"),
             ("max_tilt", self.max_tilt, 0.0, std::f64::consts::PI, "0 to pi radians"),
         ] {
@@ -331,7 +331,9 @@ impl<'a> Planner<'a> {
 
     /// The opening with room for what is assumed wrongly, if the fingers stand free then with nothing else between them.
     fn widened(&self, pose: &Pose, opening: f64, width: f64) -> f64 {
-        let wider = |share: f64| (opening + 2.0 * share * self.options.doubt).min(self.gripper.max_opening);
+        let wider = |share: f64| {
+            (opening + 2.0 * share * self.options.contact_clearance).min(self.gripper.max_opening)
+        };
         let fits = |wider: &f64| {
             let extent = self.extent(&self.between(pose, *wider));
             extent.is_some_and(|(low, high)| high - low < width + 0.002)
@@ -401,7 +403,7 @@ impl<'a> Planner<'a> {
         }
         let middle: Vec3 =
             between.iter().map(|(i, _)| self.object.cloud.points[*i]).sum::<Vec3>() / between.len() as f64;
-        // The horizontal distance from the middle of what is held to the line of gravity through the object's middle,
+        // The horizontal distance from the middle of what is held to the line of gravity through the object's centre,
         // less what lies along the closing axis, about which the pads' friction does not have to hold.
         let lever = self.centre - middle;
         let lever = lever - self.down * lever.dot(&self.down);

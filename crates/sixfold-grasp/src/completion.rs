@@ -22,10 +22,10 @@ pub struct CompletionOptions {
     pub shifts: i32,
     /// A mirrored point this far in front of what was measured contradicts it, metres.
     pub tolerance: f64,
-    /// Largest share of mirrored points that may contradict the image.
+    /// Largest fraction of mirrored points that may contradict the image.
     pub max_contradiction: f64,
-    /// Least agreement of a second plane: the share of mirrored points that were seen (less where they
-    /// are off), plus half the share of hidden ones.
+    /// Least agreement of a second plane: the fraction of mirrored points that were seen (less where they
+    /// are off), plus half the fraction of hidden ones.
     pub min_agreement: f64,
 }
 

@@ -1,4 +1,4 @@
-//! What is known of a grasp before it is tried, in numbers from which its outcome can be foretold.
+//! What is known of a grasp before it is tried, in numbers from which its outcome can be predicted.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::Vec3;
@@ -12,10 +12,10 @@ pub struct GraspDescription {
     pub quality: AntipodalQuality,
     /// How far the pads reach over the object along the approach, metres.
     pub overlap: f64,
-    /// Horizontal distance of the object's middle from the middle between the pads along the closing direction, metres: the
+    /// Horizontal distance of the object's centre from the centre between the pads along the closing direction, metres: the
     /// lever that pulls the object out of one pad.
     pub lever: f64,
-    /// Height of what is between the pads over the object's middle, metres.
+    /// Height of what is between the pads over the object's centre, metres.
     pub above_middle: f64,
     /// Distance of the gripper's lowest corner from the table, metres; `None` where no table is known.
     pub table_room: Option<f64>,
@@ -35,7 +35,7 @@ impl GraspFitter<'_> {
             quality: grasp.quality,
             overlap: -between.iter().map(|(_, q)| q.z).fold(0.0, f64::min),
             lever: level.dot(&grasp.closing()).abs(),
-            // Upwards the middle of what is held lies this far from the object's middle.
+            // Upwards the middle of what is held lies this far from the object's centre.
             above_middle: if between.is_empty() { 0.0 } else { -up },
             table_room: planner.scene.table_room(planner.gripper, &grasp.camera_from_gripper, grasp.opening),
         }

@@ -1,8 +1,8 @@
-//! Pictures of grasps: the gripper's boxes over the image, with their outlines, hidden parts fainter.
+//! Images of grasps: the gripper's boxes over the image, with their outlines, hidden parts fainter.
 
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage};
 use sixfold_mesh::MeshError;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::Gripper;
 
@@ -34,7 +34,7 @@ pub fn draw_grasps(
 ) -> Result<RgbImage, MeshError> {
     assert_eq!(image.size(), (camera.width, camera.height), "image of another size than the camera");
     let mut out = image.clone();
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     for grasp in grasps {
         let mesh = gripper.mesh(grasp.opening)?;
         let objects = [SceneObject { mesh: &mesh, camera_from_object: grasp.camera_from_gripper }];

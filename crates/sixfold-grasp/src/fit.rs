@@ -131,9 +131,9 @@ mod tests {
         let seen = opening(&both, all).unwrap();
         assert!((seen - 0.02 - 2.0 * options.clearance).abs() < 1e-6, "{seen}");
         let assumed = opening(&half, half.object.len()).unwrap();
-        assert!((assumed - seen - 2.0 * options.doubt).abs() < 1e-6, "{assumed} {seen}");
+        assert!((assumed - seen - 2.0 * options.contact_clearance).abs() < 1e-6, "{assumed} {seen}");
         // Something stands where the finger would be then, or even with half of that room.
-        for (place, more) in [(-0.044, options.doubt), (-0.0385, 0.0)] {
+        for (place, more) in [(-0.044, options.contact_clearance), (-0.0385, 0.0)] {
             let mut narrow = wall(true);
             for k in 0..=10 {
                 narrow.obstacles.points.push(Vec3::new(0.0, place, 0.6 - 0.004 * f64::from(k)));

@@ -12,10 +12,10 @@ pub struct AntipodalQuality {
     pub alignment: f64,
     /// How much surface each pad meets: 1 from half a pad's width times 15 mm.
     pub support: f64,
-    /// How near the closing axis passes to the object's middle: `exp(-distance / 5 cm)`, the distance measured
+    /// How near the closing axis passes to the object's centre: `exp(-distance / 5 cm)`, the distance measured
     /// horizontally, as gravity's lever is.
     pub centring: f64,
-    /// Share of the contact points that were seen; the rest was assumed (see `complete_by_mirrors`).
+    /// Fraction of the contact points that were seen; the rest was assumed (see `complete_by_mirrors`).
     pub observed: f64,
 }
 
@@ -69,7 +69,7 @@ pub(crate) fn half_turn() -> Pose {
 }
 
 /// The point that a gripper at this pose holds: a centimetre behind the tips, midway between the pads.
-pub fn middle_between_pads(camera_from_gripper: &Pose) -> Vec3 {
+pub fn centre_between_pads(camera_from_gripper: &Pose) -> Vec3 {
     camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
 }
 

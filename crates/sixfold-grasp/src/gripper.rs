@@ -150,7 +150,7 @@ impl Gripper {
         [finger(-half - self.finger_thickness, -half), finger(half, half + self.finger_thickness), palm]
     }
 
-    /// The gripper as a mesh in its own frame, for pictures. The palm is drawn a third as high as it is, so that it hides
+    /// The gripper as a mesh in its own frame, for images. The palm is drawn a third as high as it is, so that it hides
     /// less.
     ///
     /// # Errors

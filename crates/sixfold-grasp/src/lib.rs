@@ -2,7 +2,7 @@
 //!
 //! The gripper's frame, everywhere in Sixfold: the origin lies midway between the two finger tips, `z` is the approach
 //! direction (from the palm to the tips and on to the object), `x` the closing direction (from one finger to the
-//! other), `y = z × x` runs across the fingers. Turned by half a turn about `z`, the gripper is the same gripper.
+//! other), `y = z × x` runs across the fingers. Rotated by half a turn about `z`, the gripper is the same gripper.
 //! Lengths are in metres, forces in newtons.
 //!
 //! A depth image becomes a [`GraspView`] (the object's cloud, what else is there, the table). [`antipodal_grasps`] proposes
@@ -37,7 +37,7 @@ pub use completion::{CompletedObject, CompletionOptions, assume_walls, complete_
 pub use describe::GraspDescription;
 pub use draw::{DrawnGrasp, draw_grasps};
 pub use fit::GraspFitter;
-pub use grasp::{AntipodalQuality, Grasp, gripper_pose, middle_between_pads};
+pub use grasp::{AntipodalQuality, Grasp, centre_between_pads, gripper_pose};
 pub use gripper::{Gripper, GripperBox};
 pub use gripper_file::{GripperError, parse_gripper, read_gripper};
 pub use view::{GraspView, ViewError, ViewOptions, find_objects};

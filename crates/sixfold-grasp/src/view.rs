@@ -41,7 +41,7 @@ pub enum ViewError {
         "no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object"
     )]
     NoTable {
-        /// Least share of the points, in per cent.
+        /// Minimum fraction of the points, in per cent.
         share: f64,
     },
     /// The mask has no pixel.
@@ -86,7 +86,7 @@ pub struct ViewOptions {
     pub table_margin: f64,
     /// Neighbouring pixels further apart than this do not belong to the same object, metres.
     pub gap: f64,
-    /// Least number of measured pixels of an object.
+    /// Minimum number of measured pixels of an object.
     pub min_pixels: usize,
     /// What lies within this distance around the object's box is kept as obstacle, metres.
     pub surroundings: f64,

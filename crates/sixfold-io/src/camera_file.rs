@@ -65,7 +65,7 @@ impl CameraFile {
     ///
     /// # Errors
     /// [`CameraFileError::Content`] where the file states another size, or where the optical axis would lie far from the
-    /// image's middle: intrinsics of another resolution.
+    /// image's centre: intrinsics of another resolution.
     pub fn for_image(&self, width: usize, height: usize, file: &Path) -> Result<Camera, CameraFileError> {
         let mut camera = self.camera;
         if !self.sized {

@@ -78,7 +78,7 @@ impl<'a> ImageFile<'a> {
     /// [`ImageFileError`] naming the file.
     pub fn depth(&self, metres_per_unit: f64) -> Result<DepthImage, ImageFileError> {
         let DynamicImage::ImageLuma16(pixels) = self.decode()? else {
-            return Err(self.error("a depth image has one channel of 16 bits; this is a picture of depth"));
+            return Err(self.error("a depth image has one channel of 16 bits; this is an image of depth"));
         };
         let (width, height) = (pixels.width() as usize, pixels.height() as usize);
         let data = pixels.as_raw().iter().map(|&v| (f64::from(v) * metres_per_unit) as f32).collect();

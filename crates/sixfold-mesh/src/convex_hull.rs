@@ -9,7 +9,7 @@ use sixfold_geometry::{Vec3, sphere_directions};
 
 use crate::mesh::{Mesh, MeshError};
 
-/// Points nearer to a face than this share of the extent lie on it. Much larger, and points left out beside thin shapes would be
+/// Points nearer to a face than this fraction of the extent lie on it. Much larger, and points left out beside thin shapes would be
 /// further than that outside of later, narrow faces.
 const TOLERANCE: f64 = 1e-9;
 

@@ -78,7 +78,7 @@ impl Bounds {
 
 struct Node {
     bounds: Bounds,
-    /// The middle of the box.
+    /// The centre of the box.
     middle: Vec3,
     /// The distance of the farthest point from the middle, rounded up.
     radius: f64,

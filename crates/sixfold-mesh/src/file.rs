@@ -75,7 +75,7 @@ fn read_beside(folder: &Path, name: &str) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Tests that a mesh read with `unit` has a diameter between 5 mm and 5 m; the error says in which unit it
+/// Tests that a mesh read with `unit` has a diameter between 5 mm and 5 m; the error states in which unit it
 /// would have a sensible one.
 ///
 /// # Errors

@@ -97,7 +97,7 @@ fn checked_document(json: &[u8]) -> Result<Document, String> {
         if image.uri.is_none() && image.buffer_view.is_none() {
             return Err(format!("images[{index}] without uri and bufferView"));
         }
-        // Pictures are told apart by their first bytes, but the crate asks for a type.
+        // Images are distinguished by their first bytes, but the crate asks for a type.
         image.mime_type.get_or_insert_with(|| gltf::json::image::MimeType("image/png".to_owned()));
     }
     Document::from_json(root).map_err(|error| error.to_string())

@@ -308,7 +308,7 @@ mod tests {
             let moved = turn.transform_point(&Vec3::new(1.005, 0.0, 0.0));
             assert!((moved - Vec3::new(0.005 + angle.cos(), angle.sin(), 0.0)).norm() < 1e-12);
         }
-        // Both kinds: each discrete one with each turn, the turn applied last.
+        // Both kinds: each discrete one with each rotation, the turn applied last.
         let mut both = infos.0[&10].clone();
         both.symmetries_continuous = infos.0[&2].symmetries_continuous.clone();
         let poses = both.symmetry_poses(1.0);

@@ -25,7 +25,7 @@ struct Corner {
 }
 
 #[derive(Debug, Clone, Default)]
-struct Material {
+struct ObjMaterial {
     color: Option<[u8; 3]>,
     /// The name of the texture and the line that gives it.
     texture: Option<(String, String)>,
@@ -111,7 +111,7 @@ pub fn parse_obj(
     let mut colors: Vec<Option<[u8; 3]>> = Vec::new();
     let mut texcoords: Vec<[f32; 2]> = Vec::new();
     let mut normals: Vec<Vec3> = Vec::new();
-    let mut library: HashMap<String, Material> = HashMap::new();
+    let mut library: HashMap<String, ObjMaterial> = HashMap::new();
     let mut has_library = false;
     let mut names: Vec<String> = vec![String::new()];
     let mut material = 0;
@@ -232,7 +232,7 @@ fn read_library(
     rest: &str,
     at: &Line<'_>,
     resources: Resources<'_>,
-    library: &mut HashMap<String, Material>,
+    library: &mut HashMap<String, ObjMaterial>,
 ) -> Result<(), MeshFileError> {
     let named = |name: &str, error: std::io::Error| MeshFileError::Named {
         file: at.file.to_owned(),
@@ -258,7 +258,7 @@ fn read_library(
 fn parse_library(
     bytes: &[u8],
     file: &str,
-    library: &mut HashMap<String, Material>,
+    library: &mut HashMap<String, ObjMaterial>,
 ) -> Result<(), MeshFileError> {
     let text = String::from_utf8_lossy(bytes);
     let mut current: Option<String> = None;
@@ -268,7 +268,7 @@ fn parse_library(
         let (keyword, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
         let rest = rest.trim();
         if keyword == "newmtl" {
-            library.insert(rest.to_owned(), Material::default());
+            library.insert(rest.to_owned(), ObjMaterial::default());
             current = Some(rest.to_owned());
             continue;
         }

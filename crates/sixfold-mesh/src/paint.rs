@@ -7,15 +7,15 @@ use crate::mesh::Parts;
 
 /// Rows of repeated edge between the textures of an atlas, against bleeding when they are interpolated.
 const GUTTER: usize = 2;
-/// Most pixels of an atlas.
-const MOST_PIXELS: usize = 1 << 28;
+/// Maximum number of pixels of an atlas.
+const MAX_PIXELS: usize = 1 << 28;
 
 /// What a material gives to a surface.
 #[derive(Debug, Clone)]
 pub(crate) enum Paint {
     /// One colour, sRGB.
     Color([u8; 3]),
-    /// A picture to be looked up by texture coordinates.
+    /// An image to be looked up by texture coordinates.
     Texture(RgbImage),
 }
 
@@ -89,8 +89,8 @@ fn stack(
         tops[index] = height + GUTTER;
         height += size(paint).1 + 2 * GUTTER;
     }
-    if width * height > MOST_PIXELS {
-        let expected = format!("at most {MOST_PIXELS} pixels in all");
+    if width * height > MAX_PIXELS {
+        let expected = format!("at most {MAX_PIXELS} pixels in all");
         return Err(MeshFileError::field(file, "textures", expected, format!("{width} x {height}")));
     }
     let mut atlas = RgbImage::filled(width, height, [0; 3]);
@@ -112,7 +112,7 @@ fn stack(
     for (face, &paint) in parts.faces.iter().zip(face_paints) {
         let corners = face.map(|v| source[v as usize]);
         let turn = [0, 1].map(|k| corners.iter().map(|uv| uv[k]).fold(f32::INFINITY, f32::min).floor());
-        // A face that touches 1 from below starts at zero after no turn.
+        // A face that touches 1 from below starts at zero after no rotation.
         let (w, h) = size(&paints[paint]);
         for (&v, uv) in face.iter().zip(corners) {
             if std::mem::replace(&mut moved[v as usize], true) {

@@ -1,6 +1,6 @@
 //! PLY, the Polygon File Format (Turk 1994): ascii and binary of both byte orders.
 //!
-//! Our own parser, because the crates looked at keep every row of every element as a value of its own (with
+//! Our own parser, because the crates considered keep every row of every element as a value of its own (with
 //! its property names compared as strings) and take an element's count at its word: `element x 4000000000`
 //! without properties needs no bytes in a binary file and grows a crate's array until memory is gone. Here a
 //! count is tested against the bytes that are left before anything is allocated, rows go straight into the

@@ -16,7 +16,7 @@ use crate::measure::position_key;
 /// How much more the plane on an open border weighs than a face.
 const BORDER_WEIGHT: f64 = 100.0;
 /// Least cosine between a face's normal before and after a collapse.
-const LEAST_COSINE: f64 = 0.2;
+const MIN_COSINE: f64 = 0.2;
 
 /// The quadric `x^T A x + 2 b^T x + c`: a weighted sum of squared distances to planes.
 #[derive(Debug, Clone, Copy)]
@@ -87,7 +87,7 @@ struct Collapser {
 ///
 /// Vertices at the same place are joined first and faces without area dropped. Each new vertex has the colour
 /// of the nearest old one (with a texture: the texture's colour there), normals when the mesh had them
-/// (computed anew), and no texture.
+/// (recomputed), and no texture.
 pub fn simplify(mesh: &Mesh, target_faces: usize) -> Mesh {
     if mesh.faces().len() <= target_faces {
         return mesh.clone();
@@ -251,7 +251,7 @@ impl Collapser {
                 let after = normal(face.map(|v| if v == vertex { *target } else { self.points[v as usize] }));
                 let product = before.norm() * after.norm();
                 // A face without area has no side to turn.
-                if before.norm() > 0.0 && before.dot(&after) <= LEAST_COSINE * product {
+                if before.norm() > 0.0 && before.dot(&after) <= MIN_COSINE * product {
                     return false;
                 }
             }

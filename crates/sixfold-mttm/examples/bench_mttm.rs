@@ -1,6 +1,6 @@
 //! Template matching on frames of a BOP dataset, with ablations and times:
 //! `cargo run --release -p sixfold-mttm --example bench_mttm -- DATASET TARGETS.json EVERY [WEIGHTS]`. WEIGHTS adds the network.
-//! Every EVERY-th image of the targets. Prints for each object the share of targets whose mask overlaps the visible truth by more
+//! Every EVERY-th image of the targets. Prints for each object the fraction of targets whose mask overlaps the visible truth by more
 //! than half, and whose pose is right within a tenth of the diameter (ADD, ADI for symmetric objects).
 
 use std::collections::BTreeMap;

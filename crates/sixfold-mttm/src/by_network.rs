@@ -32,7 +32,7 @@ const HYPOTHESES: usize = 2;
 const AT_A_TIME: usize = 32;
 /// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
 /// hand; not swept.
-const LEAST_TRUST: f64 = 0.1;
+const MIN_TRUST: f64 = 0.1;
 
 /// Between those bounds, of the sampled regions one in [`ONE_IN`] less [`LESS`] is compared: the more there is in the scene, the more
 /// looks like the object at first sight. Chosen by hand; not swept.
@@ -118,7 +118,7 @@ pub(crate) fn first_matching(
     order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
     order.truncate(LAID.0 * looked_at / LAID.1);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
-        // Where the network sees the middle of the object.
+        // Where the network sees the centre of the object.
         let centred: Vec<Roi> = order
             .iter()
             .map(|&k| {
@@ -244,5 +244,5 @@ fn start(
 }
 
 fn trust(says: &PairSays) -> f64 {
-    LEAST_TRUST + (1.0 - LEAST_TRUST) * f64::from(says.matching)
+    MIN_TRUST + (1.0 - MIN_TRUST) * f64::from(says.matching)
 }

@@ -86,7 +86,7 @@ pub enum StoreError {
         source: io::Error,
     },
     /// Not a file of templates, or damaged.
-    #[error("{}: {what}; make the templates anew", path.display())]
+    #[error("{}: {what}; make the templates again", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -95,7 +95,7 @@ pub enum StoreError {
     },
     /// Of another version.
     #[error(
-        "{}: written by another version of sixfold: found format {found}, expected {expected}; make the templates anew",
+        "{}: written by another version of sixfold: found format {found}, expected {expected}; make the templates again",
         path.display()
     )]
     Version {

@@ -236,7 +236,7 @@ pub(crate) struct Placed {
     pub support: f64,
 }
 
-/// A scene in which several objects are searched: what the network says of its regions is kept for objects of about the same
+/// A scene in which several objects are searched: what the network predicts for its regions is kept for objects of about the same
 /// size.
 #[derive(Debug)]
 pub struct Search<'a> {
@@ -266,7 +266,7 @@ pub fn estimate(
     Search::new(scene).estimate(object, options)
 }
 
-/// As [`estimate`], with what the network says of the image's regions kept in `regions`.
+/// As [`estimate`], with what the network predicts for the image's regions kept in `regions`.
 pub(crate) fn search(
     scene: &DepthRegion,
     regions: &RegionCache,
@@ -309,7 +309,7 @@ pub(crate) fn search(
     // A stable sort: equal ones stay in the order of their regions.
     hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
     stages.rematching = lap();
-    let estimates = judge_all(scene, object, &hypotheses, options);
+    let estimates = verify_all(scene, object, &hypotheses, options);
     stages.verification = lap();
     (estimates, stages)
 }
@@ -471,7 +471,7 @@ fn second_matching(
 }
 
 /// The last word, by the mesh where there is one, and no two estimates of the same pixels.
-fn judge_all(
+fn verify_all(
     scene: &DepthRegion,
     object: &KnownObject,
     hypotheses: &[Placed],

@@ -1,4 +1,4 @@
-//! Templates drawn from a mesh.
+//! Templates rendered from a mesh.
 
 use std::path::Path;
 
@@ -7,14 +7,14 @@ use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
 use sixfold_io::Fnv1a;
 use sixfold_mesh::{Mesh, simplify};
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::error::{StoreError, TemplateError};
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 use crate::views::{view_directions, view_rotation};
 
 /// More faces than this are finer than a template's pixels; chosen by hand, not swept.
-const MOST_FACES: usize = 12_000;
+const MAX_FACES: usize = 12_000;
 /// Times that a view is centred on the middle of what it shows: the perspective changes what is seen a little each time. Chosen by hand;
 /// not swept.
 const CENTRINGS: usize = 3;
@@ -33,8 +33,8 @@ impl ObjectTemplates {
         let diameter = mesh.diameter();
         let size = options.margin * diameter;
         let simple;
-        let mesh = if mesh.faces().len() > MOST_FACES {
-            simple = simplify(mesh, MOST_FACES);
+        let mesh = if mesh.faces().len() > MAX_FACES {
+            simple = simplify(mesh, MAX_FACES);
             &simple
         } else {
             mesh
@@ -94,7 +94,7 @@ fn draw(mesh: &Mesh, direction: &Vec3, size: f64, distance: f64) -> Option<Templ
     draw_rotated(mesh, view_rotation(direction), size, distance)
 }
 
-/// The view in which the object is turned by `rotation` (view from object).
+/// The view in which the object is rotated by `rotation` (view from object).
 pub(crate) fn draw_rotated(
     mesh: &Mesh,
     rotation: UnitQuaternion<f64>,
@@ -102,9 +102,9 @@ pub(crate) fn draw_rotated(
     distance: f64,
 ) -> Option<Template> {
     let camera = patch_camera(size, distance);
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     let (low, high) = mesh.bounding_box();
-    // The middle of the box on the axis at first, then the middle of what is seen.
+    // The centre of the box on the axis at first, then the middle of what is seen.
     let mut pose = Pose::new(rotation, Vec3::z() * distance - rotation * ((low + high) * 0.5));
     for _ in 0..CENTRINGS {
         frame.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
@@ -155,7 +155,7 @@ mod tests {
                 let surface = off(p.x, 0.06).min(off(p.y, 0.08)).min(off(p.z, 0.10));
                 assert!(surface < 2e-4, "{p:?}");
             }
-            // The reference point is seen and lies in the middle of the patch.
+            // The reference point is seen and lies in the centre of the patch.
             assert!(t.relative_depth(SIDE / 2, SIDE / 2).is_some_and(|z| z.abs() < 0.01));
         }
     }

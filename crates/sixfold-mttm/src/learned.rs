@@ -17,7 +17,7 @@ use crate::patch::{Patch, REACH, TemplateSurface};
 use crate::regions::shared_diameter;
 use crate::template::ObjectTemplates;
 
-/// The network, and every template at every turn as it describes it.
+/// The network, and every template at every rotation as it describes it.
 #[derive(Debug, Clone)]
 pub struct Learned {
     model: Arc<MttmModel>,
@@ -76,7 +76,7 @@ impl Learned {
         self.size
     }
 
-    /// A template at a turn.
+    /// A template at a rotation.
     pub fn patch(&self, entry: Entry) -> Patch {
         self.surfaces[entry.template].patch(entry.turn, self.size, self.model.side())
     }
@@ -180,7 +180,7 @@ mod tests {
         let (other, note) = Learned::cached(&path, learned_from(2).0, &object, &entries);
         assert!(note.is_none());
         assert_ne!(first.descriptors, other.descriptors);
-        // A damaged file is said and made anew.
+        // A damaged file is reported and made again.
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         let (_, note) = Learned::cached(&path, learned_from(2).0, &object, &entries);

@@ -58,4 +58,4 @@ pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, St
 pub use estimator::{MttmEstimator, MttmObject, TEMPLATES_FILE};
 pub use from_depth::DepthView;
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
-pub use views::{Coverage, view_directions, view_rotation};
+pub use views::{ViewCoverage, view_directions, view_rotation};

@@ -20,7 +20,7 @@ const POINTS: usize = 64;
 /// How agreement is counted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MatchOptions {
-    /// Depths agree within this share of the diameter.
+    /// Depths agree within this fraction of the diameter.
     pub depth: f64,
     /// Smallest and largest tolerance, metres.
     pub limits: (f64, f64),
@@ -65,7 +65,7 @@ impl MatchOptions {
     }
 }
 
-/// A view at a turn in the image plane.
+/// A view at a rotation in the image plane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
     /// Number of the template.
@@ -107,7 +107,7 @@ pub struct Matcher {
 type Block = Vec<[[f32; LANES]; 4]>;
 
 impl Matcher {
-    /// Makes the templates ready, each at all of its turns.
+    /// Makes the templates ready, each at all of its rotations.
     pub fn new(object: &ObjectTemplates, options: &MatchOptions) -> Matcher {
         let turns = object.turns();
         let per_template: Vec<Vec<(Entry, Vec<Point>)>> = object
@@ -285,7 +285,7 @@ mod tests {
     use crate::template::{Source, TemplateOptions};
     use sixfold_geometry::Pose;
 
-    /// A roof whose ridge runs across the patch, seen from above: no turn but half a turn looks the same.
+    /// A roof whose ridge runs across the patch, seen from above: no rotation but half a turn looks the same.
     fn roof() -> ObjectTemplates {
         let depth = (0..SIDE * SIDE)
             .map(|i| {
@@ -304,7 +304,7 @@ mod tests {
         }
     }
 
-    /// The roof's cells turned by an angle.
+    /// The roof's cells rotated by an angle.
     fn cells(turn: f64) -> Vec<Cell> {
         let mut cells = vec![[0.2, 0.0, 0.0, -1.0]; GRID * GRID];
         for p in turned(&all_points(), turn) {

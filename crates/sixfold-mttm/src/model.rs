@@ -45,14 +45,14 @@ pub enum ModelError {
 /// A descriptor: regions and templates of the same object in about the same pose have near ones (Euclidean).
 pub type Descriptor = [f32; DESCRIPTOR];
 
-/// What the network says of a region and a template.
+/// What the network predicts for a region and a template.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairSays {
     /// How likely each of 14 x 14 cells of the region is the object's, row by row.
     pub mask: Vec<f32>,
     /// Region from template.
     pub rotation: UnitQuaternion<f64>,
-    /// Where the template's reference point lies, from the region's centre, as a share of the patch's size.
+    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch's size.
     pub offset: [f64; 3],
     /// How likely both show the same object in about the same pose.
     pub matching: f32,
@@ -201,7 +201,7 @@ impl MttmModel {
         parts.concat()
     }
 
-    /// What the network says of pairs of a region and a template, each the same row of both.
+    /// What the network predicts for pairs of a region and a template, each the same row of both.
     pub fn compare(&self, regions: &Encoded, templates: &Encoded) -> Vec<PairSays> {
         let compared = self.network.compare(regions.maps.clone(), templates.maps.clone());
         let masks = numbers(sigmoid(compared.mask));
@@ -236,7 +236,7 @@ impl MttmModel {
     }
 }
 
-/// The share of every one of 14 x 14 cells in which a patch has anything: for a template, the object.
+/// The fraction of every one of 14 x 14 cells in which a patch has anything: for a template, the object.
 pub fn template_mask(patch: &Patch) -> Vec<f32> {
     let (side, step) = (patch.side, patch.side / MAP);
     let known = &patch.values[4 * side * side..];

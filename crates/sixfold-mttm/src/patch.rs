@@ -1,7 +1,7 @@
 //! What the network sees: a region of a scene, or a template, as normals and depth on a grid of fixed metric size.
 //!
 //! Five planes: the normal in the region's frame (dissertation, section 5.2.2), the depth along the region's axis relative to its
-//! centre as a share of half the patch, from -1 to 1, and whether anything was measured. Where nothing was, all are zero.
+//! centre as a fraction of half the patch, from -1 to 1, and whether anything was measured. Where nothing was, all are zero.
 
 use sixfold_align::DepthRegion;
 
@@ -10,7 +10,7 @@ use crate::template::{SIDE, Template};
 
 /// Planes of a patch.
 pub const PLANES: usize = 5;
-/// Side of the network's patch as a share of the object's diameter.
+/// Side of the network's patch as a fraction of the object's diameter.
 pub const REACH: f64 = 1.2;
 
 /// A patch as planes, row by row: `5 x side x side`.
@@ -62,7 +62,7 @@ impl Patch {
     }
 }
 
-/// A template made ready to be drawn as patches at any turn.
+/// A template made ready to be rendered as patches at any rotation.
 #[derive(Debug, Clone)]
 pub struct TemplateSurface {
     /// Normal and relative depth (metres) of every pixel of the template that has both.
@@ -83,7 +83,7 @@ impl TemplateSurface {
         TemplateSurface { pixels, pixel_size: template_size / SIDE as f64 }
     }
 
-    /// The template turned by `turn` radians in the image plane (region from view), as a patch of `size` metres: the object
+    /// The template rotated by `turn` radians in the image plane (region from view), as a patch of `size` metres: the object
     /// alone.
     pub fn patch(&self, turn: f64, size: f64, side: usize) -> Patch {
         let mut patch = Patch::empty(side);

@@ -12,7 +12,7 @@ pub const UPPER: f64 = 0.5;
 
 /// Equation 5.1 for two views of one object from the same distance: the mean difference of depth over the pixels that
 /// show it in one of them, where the background has depth 0; 0 below [`LOWER`], 1 above [`UPPER`].
-pub fn looks(a: &Template, b: &Template) -> f64 {
+pub fn appearance_distance(a: &Template, b: &Template) -> f64 {
     let (mut sum, mut pixels) = (0.0, 0usize);
     for y in 0..SIDE {
         for x in 0..SIDE {
@@ -35,7 +35,7 @@ pub fn looks(a: &Template, b: &Template) -> f64 {
 /// they look.
 pub fn pose_distance(a: (&UnitQuaternion<f64>, &Template), b: (&UnitQuaternion<f64>, &Template)) -> f64 {
     let dot = a.0.coords.dot(&b.0.coords).abs().min(1.0);
-    dot.acos() * looks(a.1, b.1)
+    dot.acos() * appearance_distance(a.1, b.1)
 }
 
 #[cfg(test)]

@@ -8,23 +8,23 @@ use sixfold_geometry::stats::upper_median;
 use crate::loss::squared_distance;
 use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
-use crate::samples::{Augmentation, Batch, BatchOptions, Pool};
+use crate::samples::{Augmentation, Batch, PairBatchOptions, Pool};
 
-/// What a network achieves on regions with templates of about the right pose. Medians and shares.
+/// What a network achieves on regions with templates of about the right pose. Medians and fractions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
     /// Regions looked at.
     pub regions: usize,
-    /// Share of them whose own template is nearer than 39 templates of other objects and poses.
+    /// Fraction of them whose own template is nearer than 39 templates of other objects and poses.
     pub nearest: f64,
-    /// Share of the masks with an intersection over union above one half.
+    /// Fraction of the masks with an intersection over union above one half.
     pub masks: f64,
     /// Median angle between template and object, and what is left of it with the rotation applied, radians.
     pub rotation: [f64; 2],
-    /// Median distance of the region's centre from the template's reference point, and of the predicted place, shares of the
+    /// Median distance of the region's centre from the template's reference point, and of the predicted place, fractions of the
     /// patch.
     pub offset: [f64; 2],
-    /// Share of pairs told right: own template, template of another object or pose.
+    /// Fraction of pairs classified correctly: own template, template of another object or pose.
     pub matching: f64,
 }
 
@@ -36,9 +36,9 @@ impl Quality {
             ("masks with an intersection over union above 0.5", self.masks),
             ("median rotation from the template, degrees", self.rotation[0].to_degrees()),
             ("the same after the predicted rotation, degrees", self.rotation[1].to_degrees()),
-            ("median distance of the reference point, share of the patch", self.offset[0]),
+            ("median distance of the reference point, fraction of the patch", self.offset[0]),
             ("the same after the predicted offset", self.offset[1]),
-            ("pairs told right", self.matching),
+            ("pairs classified correctly", self.matching),
         ]
     }
 }
@@ -47,7 +47,7 @@ impl Quality {
 pub fn quality(network: &Network, pool: &Pool) -> Quality {
     let device = Device::flex();
     let augmentation = Augmentation { hidden: 0.0, lost: 0.0, ..Augmentation::default() };
-    let options = BatchOptions { anchors: 40, without_object: 0, augmentation };
+    let options = PairBatchOptions { anchors: 40, without_object: 0, augmentation };
     let steps = (pool.with_object().len() / options.anchors).max(1);
     let (mut nearest, mut masks, mut matching) = (0usize, 0usize, 0usize);
     let mut rotation = [vec![], vec![]];

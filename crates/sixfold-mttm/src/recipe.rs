@@ -1,4 +1,4 @@
-//! A whole training: nothing but a seed in, a network for template matching out. Made-up objects fall on a table, depth cameras
+//! A whole training: nothing but a seed in, a network for template matching out. Synthetic objects fall on a table, depth cameras
 //! look at them, and the network learns to match regions with templates. Interrupted at any time, it is resumed.
 
 use std::path::PathBuf;
@@ -22,7 +22,7 @@ use sixfold_synth::shapes::{Family, member, toy};
 use crate::model::MttmModel;
 use crate::network::{CompactConfig, Network, PaperConfig};
 use crate::quality::{Quality, quality};
-use crate::samples::{Arrangement, Batch, BatchOptions, Pool, PoolOptions, preview};
+use crate::samples::{Arrangement, Batch, DepthPoolOptions, PairBatchOptions, Pool, preview};
 use crate::training::{MttmTraining, MttmTrainingOptions};
 
 /// Objects of a scene, fewest and most.
@@ -85,7 +85,7 @@ pub struct MttmRecipe {
     pub anchors: Option<usize>,
     /// Highest learning rate.
     pub learning_rate: Option<f64>,
-    /// Made-up objects: half of them household shapes, half of them toys.
+    /// Synthetic objects: half of them household shapes, half of them toys.
     pub objects: usize,
     /// Scenes in which they fall on a table, made at the start; each is seen by five cameras.
     pub scenes: usize,
@@ -120,7 +120,10 @@ impl MttmRecipe {
         let default = self.network.options();
         MttmTrainingOptions {
             common: default.common.with(self.steps, self.learning_rate, self.seed),
-            batch: BatchOptions { anchors: self.anchors.unwrap_or(default.batch.anchors), ..default.batch },
+            batch: PairBatchOptions {
+                anchors: self.anchors.unwrap_or(default.batch.anchors),
+                ..default.batch
+            },
             ..default
         }
     }
@@ -130,7 +133,7 @@ impl Recipe for MttmRecipe {
     type Data = ();
     type Samples = Pool;
     type Training = MttmTraining;
-    type Context = PoolOptions;
+    type Context = DepthPoolOptions;
     type Report = Quality;
 
     fn steps(&self) -> u64 {
@@ -156,7 +159,11 @@ impl Recipe for MttmRecipe {
         self.options().check()
     }
 
-    fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<MttmTraining, PoolOptions>, TrainError> {
+    fn prepare(
+        &self,
+        _: (),
+        _: &mut Session<'_>,
+    ) -> Result<Prepared<MttmTraining, DepthPoolOptions>, TrainError> {
         let device = Device::flex().autodiff();
         let network = match (self.network, &self.encoder) {
             (MttmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
@@ -166,11 +173,11 @@ impl Recipe for MttmRecipe {
                 Network::Paper(network.map_err(TrainError::about("encoder"))?)
             }
         };
-        let pool = PoolOptions { seed: self.seed, ..PoolOptions::for_side(network.side()) };
+        let pool = DepthPoolOptions { seed: self.seed, ..DepthPoolOptions::for_side(network.side()) };
         let mut card =
             ModelCard::new("", "Multi-task template matching, objects never trained on in depth images");
         card.data = format!(
-            "{} scenes of {} made-up objects (household shapes by a procedure, and toys grown of simple solids) that fell on a table, each \
+            "{} scenes of {} synthetic objects (household shapes by a procedure, and toys grown of simple solids) that fell on a table, each \
              seen by {} simulated depth cameras; no scanned object and no photograph",
             self.scenes, self.objects, pool.views
         );
@@ -181,7 +188,7 @@ impl Recipe for MttmRecipe {
 
     fn samples(
         &self,
-        options: &mut PoolOptions,
+        options: &mut DepthPoolOptions,
         session: &mut Session<'_>,
     ) -> Result<Option<Pool>, TrainError> {
         let events = &mut *session.events;
@@ -199,13 +206,13 @@ impl Recipe for MttmRecipe {
     /// Measures how well the model matches objects and scenes that the training never saw.
     fn finish(
         &self,
-        Prepared { training, mut card, context: pool }: Prepared<MttmTraining, PoolOptions>,
+        Prepared { training, mut card, context: pool }: Prepared<MttmTraining, DepthPoolOptions>,
         session: &mut Session<'_>,
     ) -> Result<Option<Quality>, TrainError> {
         let network = training.into_network();
         let path = session.model();
         MttmModel::new(network.clone(), card.clone()).save(&path).map_err(TrainError::method)?;
-        let test = PoolOptions { seed: self.seed ^ 0x7e57, ..pool };
+        let test = DepthPoolOptions { seed: self.seed ^ 0x7e57, ..pool };
         let objects = (self.objects / TEST_OBJECTS.0).max(TEST_OBJECTS.1);
         let scenes = (self.scenes / TEST_SCENES.0).max(TEST_SCENES.1);
         let events = &mut *session.events;
@@ -223,7 +230,7 @@ impl Recipe for MttmRecipe {
 fn make_pool(
     objects: usize,
     scenes: usize,
-    options: &PoolOptions,
+    options: &DepthPoolOptions,
     stop: &AtomicBool,
     made: &mut Made<'_>,
 ) -> Result<Option<Pool>, TrainError> {
@@ -236,8 +243,8 @@ fn make_pool(
                 0 => member(Family::ALL[number / 2 % Family::ALL.len()], &mut random).map(|m| m.mesh),
                 _ => toy(&mut random),
             };
-            let mesh = mesh.map_err(TrainError::about("a made-up object"))?;
-            let hull = ConvexParts::of_convex(&mesh).map_err(TrainError::about("a made-up object"))?;
+            let mesh = mesh.map_err(TrainError::about("a synthetic object"))?;
+            let hull = ConvexParts::of_convex(&mesh).map_err(TrainError::about("a synthetic object"))?;
             Ok((mesh, hull))
         })
         .collect::<Result<_, _>>()?;

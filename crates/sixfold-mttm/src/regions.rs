@@ -1,4 +1,4 @@
-//! What the network says of a scene's regions, kept for all objects of about the same size: they are described once.
+//! What the network predicts for a scene's regions, kept for all objects of about the same size: they are described once.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,14 +11,14 @@ use crate::model::{Descriptor, Encoded};
 use crate::patch::{Patch, REACH};
 use crate::roi::{ProposalOptions, Roi, propose};
 
-/// Distance of sampled centres as a share of the diameter. The network was trained with regions that are off by half of it, and
+/// Distance of sampled centres as a fraction of the diameter. The network was trained with regions that are off by half of it, and
 /// says how far they are off. Chosen by hand; not swept.
 const STEP: f64 = 0.3;
 /// Most regions that are described; chosen by hand for the time that it takes, not swept.
 const MOST: usize = 3000;
 /// A region is worth describing when so many of its cells show something about as far away as its centre. Chosen by hand;
 /// not swept.
-const LEAST_CELLS: f32 = 0.08;
+const MIN_CELLS: f32 = 0.08;
 /// Regions that go through the network at a time; of no influence on the result.
 const AT_A_TIME: usize = 64;
 /// Objects whose diameters differ by less than this factor share regions; chosen by hand, not swept.
@@ -53,7 +53,7 @@ impl Regions {
         let seen: Vec<(Roi, Patch)> = sampled
             .par_iter()
             .map(|roi| (*roi, Patch::of_scene(scene, roi, size, side, |_| true)))
-            .filter(|(_, patch)| share_at_centre(patch) >= LEAST_CELLS)
+            .filter(|(_, patch)| share_at_centre(patch) >= MIN_CELLS)
             .collect();
         let encoded: Vec<Encoded> = seen
             .par_chunks(AT_A_TIME)
@@ -78,7 +78,7 @@ impl Regions {
     }
 }
 
-/// The share of a patch's cells that show something within a quarter of its size of the centre.
+/// The fraction of a patch's cells that show something within a quarter of its size of the centre.
 fn share_at_centre(patch: &Patch) -> f32 {
     let pixels = patch.side * patch.side;
     let (depth, known) = (&patch.values[3 * pixels..4 * pixels], &patch.values[4 * pixels..]);

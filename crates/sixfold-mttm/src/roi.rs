@@ -83,9 +83,9 @@ impl Roi {
 /// How regions are sampled.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProposalOptions {
-    /// Distance between centres as a share of the object's diameter (the dissertation takes 20 pixels for all objects).
+    /// Distance between centres as a fraction of the object's diameter (the dissertation takes 20 pixels for all objects).
     pub step: f64,
-    /// Depths further apart than this share of the diameter are told apart.
+    /// Depths further apart than this fraction of the diameter are distinguished.
     pub layer: f64,
     /// Most regions; beyond it the step grows.
     pub most: usize,
@@ -126,7 +126,7 @@ impl ProposalOptions {
     }
 }
 
-/// Regions whose centres lie on a grid of the image, wherever something off the table is near. An object's middle may be hidden
+/// Regions whose centres lie on a grid of the image, wherever something off the table is near. An object's centre may be hidden
 /// by another thing: each place has a centre for every depth that occurs around it, not only for the one seen there.
 pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) -> Vec<Roi> {
     let camera = scene.camera();

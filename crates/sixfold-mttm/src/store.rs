@@ -14,7 +14,7 @@ use sixfold_io::{fnv1a, write_atomically_with};
 
 use crate::error::StoreError;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
-use crate::views::Coverage;
+use crate::views::ViewCoverage;
 
 const MAGIC: &[u8; 8] = b"SIXFTPL\0";
 const VERSION: u32 = 1;
@@ -45,8 +45,8 @@ impl ObjectTemplates {
             Source::Depth => 2,
         });
         out.push(match self.options.coverage {
-            Coverage::Above => 0,
-            Coverage::Around => 1,
+            ViewCoverage::Above => 0,
+            ViewCoverage::Around => 1,
         });
         out.extend_from_slice(&(SIDE as u16).to_le_bytes());
         out.extend_from_slice(&self.made_from.to_le_bytes());
@@ -130,7 +130,7 @@ impl Reader<'_> {
     fn templates(&mut self) -> Option<ObjectTemplates> {
         let [source, coverage] = self.take()?;
         let source = [Source::Mesh, Source::PosedDepth, Source::Depth].get(usize::from(source)).copied()?;
-        let coverage = [Coverage::Above, Coverage::Around].get(usize::from(coverage)).copied()?;
+        let coverage = [ViewCoverage::Above, ViewCoverage::Around].get(usize::from(coverage)).copied()?;
         if usize::from(u16::from_le_bytes(self.take()?)) != SIDE {
             return None;
         }

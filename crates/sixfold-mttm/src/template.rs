@@ -9,7 +9,7 @@ use sixfold_geometry::{
     Camera, DepthImage, NormalOptions, OptionError, PointCloud, Pose, Vec2, Vec3, normals_from_depth,
 };
 
-use crate::views::Coverage;
+use crate::views::ViewCoverage;
 
 /// Pixels along a side of a template; chosen by hand, not swept.
 pub const SIDE: usize = 64;
@@ -23,11 +23,11 @@ const NORMAL_REACH: f64 = 0.008;
 /// How templates are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TemplateOptions {
-    /// From which sides a mesh is drawn.
-    pub coverage: Coverage,
-    /// Side of a patch as a share of the object's diameter (largest extent, where the object is known from depth images).
+    /// From which sides a mesh is rendered.
+    pub coverage: ViewCoverage,
+    /// Side of a patch as a fraction of the object's diameter (largest extent, where the object is known from depth images).
     pub margin: f64,
-    /// Distance from which a mesh is drawn, metres.
+    /// Distance from which a mesh is rendered, metres.
     pub distance: f64,
 }
 
@@ -40,7 +40,7 @@ const DISTANCE: f64 = 0.8;
 
 impl Default for TemplateOptions {
     fn default() -> Self {
-        TemplateOptions { coverage: Coverage::Above, margin: MARGIN, distance: DISTANCE }
+        TemplateOptions { coverage: ViewCoverage::Above, margin: MARGIN, distance: DISTANCE }
     }
 }
 
@@ -103,7 +103,7 @@ impl ObjectTemplates {
         match self.source {
             Source::Mesh => self.options.coverage.turns(),
             // A photographed view may be met with the camera held in any way, but seldom upside down.
-            Source::PosedDepth | Source::Depth => Coverage::Above.turns(),
+            Source::PosedDepth | Source::Depth => ViewCoverage::Above.turns(),
         }
     }
 }

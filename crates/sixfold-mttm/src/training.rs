@@ -10,7 +10,7 @@ use sixfold_nn::training::{Batches, Losses, Plan, Training};
 use crate::loss::{GAMMA, column, cross_loss, distance_loss, mask_loss, pair_loss, triplet_loss};
 use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
-use crate::samples::{Batch, BatchOptions, Pool, PoolOptions};
+use crate::samples::{Batch, DepthPoolOptions, PairBatchOptions, Pool};
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -19,7 +19,7 @@ pub struct MttmTrainingOptions {
     #[serde(flatten)]
     pub common: TrainingOptions,
     /// What is in a step.
-    pub batch: BatchOptions,
+    pub batch: PairBatchOptions,
     /// Weight of the positive templates of all other objects in the batch as negative ones (equation 5.3).
     pub cross: f64,
     /// Weight of the loss of the place of the reference point, and of the loss of matching; 0 for the dissertation's.
@@ -39,7 +39,7 @@ impl Default for MttmTrainingOptions {
                 max_grad_norm: Some(5.0),
                 seed: 0,
             },
-            batch: BatchOptions::default(),
+            batch: PairBatchOptions::default(),
             cross: 1.0,
             offset: 4.0,
             matching: 0.5,
@@ -52,7 +52,7 @@ impl MttmTrainingOptions {
     pub fn paper() -> Self {
         MttmTrainingOptions {
             common: TrainingOptions { steps: 100_000, learning_rate: 1e-4, ..Self::default().common },
-            batch: BatchOptions { anchors: 16, without_object: 0, ..BatchOptions::default() },
+            batch: PairBatchOptions { anchors: 16, without_object: 0, ..PairBatchOptions::default() },
             cross: 0.0,
             offset: 0.0,
             matching: 0.0,
@@ -229,7 +229,7 @@ impl Training for MttmTraining {
 struct Settings<'a> {
     #[serde(flatten)]
     training: &'a MttmTrainingOptions,
-    pool: &'a PoolOptions,
+    pool: &'a DepthPoolOptions,
     anchors: usize,
     architecture: &'static str,
     gamma: f64,
@@ -262,7 +262,7 @@ mod tests {
                 (k as usize, Pose::from_translation(place))
             })
             .collect();
-        let options = PoolOptions { views: 3, ..PoolOptions::for_side(CompactConfig::SIDE) };
+        let options = DepthPoolOptions { views: 3, ..DepthPoolOptions::for_side(CompactConfig::SIDE) };
         let stop = AtomicBool::new(false);
         Pool::new(&meshes, &[arrangement.clone(), arrangement], &options, &stop, || ()).unwrap()
     }
@@ -273,7 +273,7 @@ mod tests {
         assert!(pool.with_object().len() >= 12, "{}", pool.with_object().len());
         assert!(!pool.without_object().is_empty());
         let device = Device::flex().autodiff();
-        let batch = BatchOptions { anchors: 6, without_object: 2, ..BatchOptions::default() };
+        let batch = PairBatchOptions { anchors: 6, without_object: 2, ..PairBatchOptions::default() };
         let default = MttmTrainingOptions::default();
         let common = TrainingOptions { steps: 24, warm_up: 2, ..default.common.clone() };
         let options = MttmTrainingOptions { common, batch, ..default };
@@ -301,7 +301,7 @@ mod tests {
     #[test]
     fn batches_are_a_function_of_seed_and_step() {
         let pool = pool();
-        let batch = |step| Batch::of_step(&pool, &BatchOptions::default(), 7, step);
+        let batch = |step| Batch::of_step(&pool, &PairBatchOptions::default(), 7, step);
         assert_eq!(batch(3), batch(3));
         assert_ne!(batch(3), batch(4));
         // What is said of a pair holds in its numbers: the object's cells are known in region and template.

@@ -10,7 +10,7 @@ use sixfold_geometry::{Mat3, Vec3};
 /// From which sides an object is seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Coverage {
+pub enum ViewCoverage {
     /// From above, the camera held upright within 45 degrees: 305 directions with 7 turns, 2135 templates (dissertation: 301
     /// and 2107). For objects that stand on a table with their z axis up.
     Above,
@@ -18,12 +18,12 @@ pub enum Coverage {
     Around,
 }
 
-impl Coverage {
+impl ViewCoverage {
     /// Turns in the image plane, radians.
     pub fn turns(self) -> Vec<f64> {
         let (count, first) = match self {
-            Coverage::Above => (7, -45.0),
-            Coverage::Around => (24, -180.0),
+            ViewCoverage::Above => (7, -45.0),
+            ViewCoverage::Around => (24, -180.0),
         };
         (0..count).map(|k| (first + 15.0 * f64::from(k)).to_radians()).collect()
     }
@@ -31,15 +31,15 @@ impl Coverage {
     /// As it is typed.
     pub fn name(self) -> &'static str {
         match self {
-            Coverage::Above => "above",
-            Coverage::Around => "around",
+            ViewCoverage::Above => "above",
+            ViewCoverage::Around => "around",
         }
     }
 }
 
 /// Unit vectors from the object to the camera: the corners of an icosahedron divided three times, all 642 or the 305 that
 /// lie above the horizon (the dissertation has 301; how its icosahedron stands is not said).
-pub fn view_directions(coverage: Coverage) -> Vec<Vec3> {
+pub fn view_directions(coverage: ViewCoverage) -> Vec<Vec3> {
     let phi = (1.0 + 5f64.sqrt()) / 2.0;
     let mut corners: Vec<Vec3> = vec![];
     for (a, b) in [(1.0, phi), (-1.0, phi), (1.0, -phi), (-1.0, -phi)] {
@@ -78,8 +78,8 @@ pub fn view_directions(coverage: Coverage) -> Vec<Vec3> {
         faces = finer;
     }
     match coverage {
-        Coverage::Above => corners.into_iter().filter(|d| d.z > 1e-9).collect(),
-        Coverage::Around => corners,
+        ViewCoverage::Above => corners.into_iter().filter(|d| d.z > 1e-9).collect(),
+        ViewCoverage::Around => corners,
     }
 }
 
@@ -101,9 +101,9 @@ mod tests {
 
     #[test]
     fn views_are_dense_and_as_many_as_said() {
-        assert_eq!(view_directions(Coverage::Around).len(), 642);
-        let above = view_directions(Coverage::Above);
-        assert_eq!(above.len() * Coverage::Above.turns().len(), 2135);
+        assert_eq!(view_directions(ViewCoverage::Around).len(), 642);
+        let above = view_directions(ViewCoverage::Above);
+        assert_eq!(above.len() * ViewCoverage::Above.turns().len(), 2135);
         // No direction from above is further than 6 degrees from one of them.
         for d in sixfold_geometry::sphere_directions(500).iter().filter(|d| d.z > 0.1) {
             let best = above.iter().map(|v| v.dot(d)).fold(-1.0, f64::max);
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn the_object_stands_upright_in_the_view() {
-        for d in view_directions(Coverage::Around) {
+        for d in view_directions(ViewCoverage::Around) {
             let r = view_rotation(&d);
             // The camera lies where the direction says, on the view's negative z axis.
             assert!((r * d + Vec3::z()).norm() < 1e-9);

@@ -14,7 +14,7 @@ use sixfold_io::{read_depth, read_mask};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{
-    Coverage, DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, Search, TemplateOptions,
+    DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, Search, TemplateOptions, ViewCoverage,
 };
 
 fn data() -> Option<PathBuf> {
@@ -39,7 +39,7 @@ fn error(points: &[Vec3], estimated: &Pose, truth: &Pose, symmetric: bool) -> f6
     points.iter().enumerate().map(one).sum::<f64>() / points.len() as f64
 }
 
-fn known(mesh: &Mesh, coverage: Coverage, network: &Arc<MttmModel>) -> KnownObject {
+fn known(mesh: &Mesh, coverage: ViewCoverage, network: &Arc<MttmModel>) -> KnownObject {
     let options = TemplateOptions { coverage, ..TemplateOptions::default() };
     let templates = ObjectTemplates::from_mesh(mesh, &options).unwrap();
     let model = verification_mesh(mesh).unwrap();
@@ -67,7 +67,7 @@ fn objects_of_lmo_frame_3_in_clutter() {
     for id in [5, 6, 8, 9, 11, 12, 1, 10] {
         let mesh = dataset.model(id, Models::Rendering).unwrap();
         let info = &infos.0[&id];
-        let object = known(&mesh, Coverage::Above, &network);
+        let object = known(&mesh, ViewCoverage::Above, &network);
         let truth =
             frame.image(3).unwrap().ground_truth.iter().find(|g| g.obj_id == id).unwrap().camera_from_object;
         for (k, matched_by) in ways.into_iter().enumerate() {
@@ -114,7 +114,7 @@ fn objects_of_two_ycbv_frames() {
             let points =
                 read_mesh(data.join(format!("ycbv_keyframe_poses/points/{name}/points.xyz")), Unit::Metre)
                     .unwrap();
-            let object = known(&points.surfels().unwrap(), Coverage::Around, &network);
+            let object = known(&points.surfels().unwrap(), ViewCoverage::Around, &network);
             let (found, _) = search.estimate(&object, &MttmOptions::default());
             let off = found.first().map_or(f64::INFINITY, |e| {
                 error(points.vertices(), &e.camera_from_object, &g.camera_from_object, true)
@@ -140,7 +140,7 @@ fn the_object_of_the_tyol_frame() {
     let scene =
         DepthRegion::from_depth(&depth, &frames.camera(10).unwrap(), None, &DepthOptions::default()).unwrap();
     let mesh = read_mesh(data.join("tyol_frame/obj.ply"), Unit::Millimetre).unwrap();
-    let object = known(&mesh, Coverage::Around, &network());
+    let object = known(&mesh, ViewCoverage::Around, &network());
     let options = MttmOptions { max_instances: 5, ..MttmOptions::default() };
     let (found, _) = Search::new(&scene).estimate(&object, &options);
     let truth = frames.image(10).unwrap().ground_truth[0].camera_from_object;
@@ -161,7 +161,7 @@ fn cups_in_bins() {
     let camera = Camera::new(550.0, 540.0, 316.0, 244.0, 640, 480).unwrap();
     let folder = data.join("icbin_frames");
     let mesh = read_mesh(folder.join("2/model.ply"), Unit::Millimetre).unwrap();
-    let object = known(&mesh, Coverage::Around, &network());
+    let object = known(&mesh, ViewCoverage::Around, &network());
     let mut best = [0f64; 3];
     for bin in 1..=3 {
         let depth = read_depth(&folder.join(format!("{bin}/depth/0000.png")), 1e-3).unwrap();

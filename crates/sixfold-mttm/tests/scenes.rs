@@ -16,7 +16,7 @@ use sixfold_mttm::{
     DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateOptions,
     estimate,
 };
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 fn camera() -> Camera {
     Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap()
@@ -57,7 +57,7 @@ fn look(objects: &[(&Mesh, Pose)], seed: u64) -> (DepthImage, Mask) {
         .chain([(&table, on_table(0.0, 0.0, 0.0))])
         .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
         .collect();
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     frame.render(&objects, &RenderOptions::default());
     let depth = simulate_depth(&frame.depth(), &frame.normals(&objects), &DepthSensor::xtion(), seed);
     (depth, frame.mask(0))
@@ -133,7 +133,7 @@ fn the_best_match_has_the_turn_of_the_image() {
         let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let roi = Roi { centre: Vec3::new(0.0, 0.0, 0.8) };
         let truth = Pose::new(turned, roi.centre) * templates.templates[number].view_from_object;
-        let mut frame = Frame::new(&camera());
+        let mut frame = VisibilityBuffer::new(&camera());
         frame.render(&[SceneObject { mesh: &mesh, camera_from_object: truth }], &RenderOptions::default());
         let cells = roi.cells(&prepared(&frame.depth()), templates.size, |_| true);
         let entry = matcher.entries()[matcher.ranked(&[cells])[0].0.entry];
@@ -144,7 +144,7 @@ fn the_best_match_has_the_turn_of_the_image() {
     }
 }
 
-/// Before any alignment: the network's word on a region beside the object's middle, paired with the nearest of its templates.
+/// Before any alignment: the network's word on a region beside the object's centre, paired with the nearest of its templates.
 #[test]
 fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
     let mesh = part();
@@ -183,7 +183,7 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
         sorted[sorted.len() / 2]
     };
     println!("{places:.2?} {turns:.2?} {sure:.2?}");
-    // Shares of what is off without the prediction.
+    // Fractions of what is off without the prediction.
     assert!(median(&places) < 0.6, "{places:.2?}");
     assert!(median(&turns) < 0.9, "{turns:.2?}");
     assert!(sure.iter().filter(|s| **s > 0.3).count() >= 10, "{sure:.2?}");
@@ -233,7 +233,7 @@ fn a_template_that_reaches_into_the_table_is_no_match() {
 fn a_hidden_half_does_not_shift_the_pose() {
     let truth = on_table(0.0, 0.0, 0.3);
     let screen = cuboid([-0.05, -0.01, 0.0], [0.05, 0.01, 0.2]);
-    // Nearer to the camera and to the right of the object's middle.
+    // Nearer to the camera and to the right of the object's centre.
     let before = on_table(0.06, -0.085, 0.0);
     let (depth, visible) = look(&[(&part(), truth), (&screen, before)], 5);
     let (_, whole) = look(&[(&part(), truth)], 5);

@@ -57,7 +57,7 @@ pub enum CheckpointError {
         reason: String,
     },
     /// Checkpoints are there, but none of them is whole.
-    #[error("{}: expected a whole checkpoint, found only broken ones ({}); remove them to start anew", folder.display(),
+    #[error("{}: expected a whole checkpoint, found only broken ones ({}); remove them to start again", folder.display(),
         reasons.join("; "))]
     NoneWhole {
         /// The folder.
@@ -66,7 +66,7 @@ pub enum CheckpointError {
         reasons: Vec<String>,
     },
     /// The checkpoint is whole, but a part that was asked for is not in it or does not fit.
-    #[error("{}: {section}: expected {expected}, found {found}; go on with the same options as before, or start anew in \
+    #[error("{}: {section}: expected {expected}, found {found}; continue with the same options as before, or start again in \
         another folder", file.display())]
     Section {
         /// The file.

@@ -26,7 +26,7 @@ pub enum TrainError {
     Weights(#[from] WeightsError),
     /// The folder holds a training with other options.
     #[error(
-        "{}: holds a training with other options ({difference}); go on with the same ones, or start anew in another folder",
+        "{}: holds a training with other options ({difference}); continue with the same ones, or start again in another folder",
         folder.display()
     )]
     OtherTraining {

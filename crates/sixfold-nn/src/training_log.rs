@@ -335,7 +335,7 @@ mod tests {
         let records = read_training_log(&path).unwrap();
         assert_eq!(records.iter().map(|r| r.step).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7]);
         fill(&path, 1..=1, 0);
-        assert_eq!(read_training_log(&path).unwrap().len(), 1, "a training begun anew");
+        assert_eq!(read_training_log(&path).unwrap().len(), 1, "a training that was restarted");
     }
 
     #[test]

@@ -39,7 +39,7 @@ pub struct ModelCard {
     pub title: String,
     /// What it was trained on, for people.
     pub data: String,
-    /// The frames of a dataset that it was trained on, in order, those of trainings that it goes on from included; empty for
+    /// The frames of a dataset that it was trained on, in order, those of trainings that it continues from included; empty for
     /// a training without any, `None` where nobody said. Scores on these frames are worth nothing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub training_frames: Option<Vec<FrameId>>,
@@ -74,7 +74,7 @@ impl ModelCard {
     }
 }
 
-/// What a card says of the frames of a training: these, and those of the weights that it goes on from. `None` where the card
+/// What a card says of the frames of a training: these, and those of the weights that it continues from. `None` where the card
 /// of those does not say.
 ///
 /// # Errors

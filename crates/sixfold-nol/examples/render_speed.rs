@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use sixfold_nol::model::NolModel;
 use sixfold_nol::quality::{QualityOptions, quality};
-use sixfold_nol::samples::{SampleOptions, make_sample};
+use sixfold_nol::samples::{ViewSampleOptions, make_sample};
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())?,
         None => Backgrounds::procedural(),
     };
-    let options = SampleOptions::default();
+    let options = ViewSampleOptions::default();
     for sources in [1, 6, 16] {
         let sample = make_sample(&textures, &options, 256, sources, 1, 0);
         let began = Instant::now();

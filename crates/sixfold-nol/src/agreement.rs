@@ -18,10 +18,10 @@ const BLUR: f32 = 2.0;
 /// Difference in colour (root of the mean square over channels, 0 to 1) from which a photograph shows something else.
 const OTHER: f32 = 0.13;
 /// Fewer photographs' weight of opinion does not outvote one.
-const LEAST_OPINION: f32 = 1.2;
+const MIN_OPINION: f32 = 1.2;
 
 /// Takes what does not agree with the other sources out of the visible parts of `sources`, whose poses should be good already.
-/// Returns the share of each source's visible points that was taken out.
+/// Returns the fraction of each source's visible points that was taken out.
 pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f64> {
     let surface = mesh.sample_surface(POINTS, 1);
     let normals = outwards(mesh, &surface.normals);
@@ -61,7 +61,7 @@ pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f6
             let mut votes = vec![[0.0f32; 2]; side * side];
             let reach = (side as f32 / 40.0).ceil() as isize;
             for (i, (point, normal)) in surface.points.iter().zip(&normals).enumerate() {
-                if lit[k].weights[i] <= 0.0 || known[i] < LEAST_OPINION {
+                if lit[k].weights[i] <= 0.0 || known[i] < MIN_OPINION {
                     continue;
                 }
                 let Some(([x, y], _)) = source.see(point, normal) else { continue };

@@ -6,7 +6,7 @@ use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 
 use super::*;
 use crate::network::{CompactConfig, IntegratorKind};
@@ -45,7 +45,7 @@ fn camera() -> Camera {
     Camera::new(500.0, 500.0, 159.5, 119.5, 320, 240).unwrap()
 }
 
-/// The box turned by an angle about the image's vertical axis, tilted towards the camera, at half a metre.
+/// The box rotated by an angle about the image's vertical axis, tilted towards the camera, at half a metre.
 fn pose(angle: f64) -> Pose {
     let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), angle);
     let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 0.5);
@@ -55,7 +55,7 @@ fn pose(angle: f64) -> Pose {
 /// What a camera without noise sees in even light.
 fn photograph(mesh: &Mesh, angle: f64, mask: Option<Mask>) -> PosedImage {
     let (camera, pose) = (camera(), pose(angle));
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     let objects = [SceneObject { mesh, camera_from_object: pose }];
     frame.render(&objects, &RenderOptions::default());
     let lights = [Light::Ambient { color: [1.0; 3] }];
@@ -73,7 +73,7 @@ fn model(integrator: IntegratorKind) -> NolModel {
     NolModel::new(Network::Compact(network), parts, ModelCard::new("", "test"))
 }
 
-/// Mean difference of colours to the truth where something is seen, and the share that is.
+/// Mean difference of colours to the truth where something is seen, and the fraction that is.
 fn off(rendering: &Rendering, mesh: &Mesh, target: &TargetSurface, angle: f64) -> (f32, f32) {
     let truth = photograph(mesh, angle, None);
     let (mut sum, mut count) = (0.0, 0);

@@ -1,4 +1,4 @@
-//! A picture of what the training has come to, drawn with every checkpoint.
+//! An image of what the training has come to, drawn with every checkpoint.
 
 use std::path::Path;
 
@@ -6,28 +6,28 @@ use burn::tensor::{Device, Tensor};
 use sixfold_synth::augment::Backgrounds;
 
 use crate::network::{COLOURS, Network};
-use crate::samples::{Batch, SampleOptions, make_sample};
+use crate::samples::{Batch, ViewSampleOptions, make_sample};
 use crate::training::pass;
 
-/// Rows of the picture, and sources in each.
+/// Rows of the image, and sources in each.
 const ROWS: u64 = 5;
 const SOURCES: usize = 5;
 const SIDE: usize = 128;
 
-/// The same made-up objects every time.
+/// The same synthetic objects every time.
 pub(crate) struct Preview {
     batch: Batch,
 }
 
 impl Preview {
-    pub fn new(textures: &Backgrounds, options: &SampleOptions, seed: u64) -> Self {
+    pub fn new(textures: &Backgrounds, options: &ViewSampleOptions, seed: u64) -> Self {
         // Numbers that no training comes to.
         let sample = |row| make_sample(textures, options, SIDE, SOURCES, seed, u64::MAX - row);
         let samples: Vec<_> = (0..ROWS).map(sample).collect();
         Preview { batch: Batch::of_samples(&samples) }
     }
 
-    /// Draws sources, the true target, the sources' average, X^D and X^phi into `folder`. A picture that cannot be written is no
+    /// Draws sources, the true target, the sources' average, X^D and X^phi into `folder`. An image that cannot be written is no
     /// reason to stop a training.
     pub fn draw(&self, network: &Network, folder: &Path) {
         let passed = pass(network, self.batch.clone(), &Device::flex());
@@ -61,11 +61,11 @@ impl Preview {
         }
         let (width, height) = ((columns * SIDE) as u32, (rows * SIDE) as u32);
         let file = folder.join("preview.png");
-        // The first picture comes before the first checkpoint, which makes the folder.
+        // The first image comes before the first checkpoint, which makes the folder.
         let saved = std::fs::create_dir_all(folder).map_err(image::ImageError::IoError).and_then(|()| {
             image::save_buffer(&file, &picture, width, height, image::ExtendedColorType::Rgb8)
         });
-        // A folder that cannot take the picture cannot take the checkpoint after it either, whose error is reported.
+        // A folder that cannot take the image cannot take the checkpoint after it either, whose error is reported.
         let _ = saved;
     }
 }

@@ -3,7 +3,7 @@
 
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 /// The places of the surface that a new view shows.
 #[derive(Debug, Clone)]
@@ -23,7 +23,7 @@ pub struct TargetSurface {
 impl TargetSurface {
     /// Draws the mesh at a pose.
     pub fn new(mesh: &Mesh, camera: &Camera, camera_from_object: &Pose) -> Self {
-        let mut frame = Frame::new(camera);
+        let mut frame = VisibilityBuffer::new(camera);
         let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
         frame.render(&objects, &RenderOptions::default());
         let coordinates = frame.object_coordinates(&objects);

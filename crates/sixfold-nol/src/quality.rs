@@ -1,4 +1,4 @@
-//! How well a model renders made-up objects that it was not trained on, beside plain averaging of the same sources.
+//! How well a model renders synthetic objects that it was not trained on, beside plain averaging of the same sources.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use sixfold_synth::augment::Backgrounds;
 use crate::loss::{Perceptual, image_loss, psnr, squared_error};
 use crate::model::NolModel;
 use crate::network::COLOURS;
-use crate::samples::{Batch, SampleOptions, make_sample};
+use crate::samples::{Batch, ViewSampleOptions, make_sample};
 
 /// What to measure on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,7 +34,7 @@ impl Default for QualityOptions {
 
 /// Means over the objects, where any source sees something.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Likeness {
+pub struct TruthSimilarity {
     /// Peak signal-to-noise ratio, decibels. It forgives blur.
     pub psnr: f64,
     /// Difference of features, as in equation 4.1 for the compact network. It does not.
@@ -45,13 +45,13 @@ pub struct Likeness {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Quality {
     /// X^D, with poses off as table 4.1 has it.
-    pub rough: Likeness,
+    pub rough: TruthSimilarity,
     /// The sources' average there.
-    pub rough_average: Likeness,
+    pub rough_average: TruthSimilarity,
     /// X^D with exact poses.
-    pub exact: Likeness,
+    pub exact: TruthSimilarity,
     /// The sources' average there.
-    pub exact_average: Likeness,
+    pub exact_average: TruthSimilarity,
 }
 
 impl Quality {
@@ -81,14 +81,14 @@ impl Quality {
 pub fn quality(
     model: &NolModel,
     textures: &Backgrounds,
-    samples: &SampleOptions,
+    samples: &ViewSampleOptions,
     options: &QualityOptions,
 ) -> Result<Quality, WeightsError> {
     let perceptual = Perceptual::Lite0(Box::new(imagenet_encoder(&Device::flex())?));
-    let rough = SampleOptions { good_poses: 0.0, ..*samples };
-    let exact = SampleOptions { translation: 0.0, rotation: 0.0, ..*samples };
+    let rough = ViewSampleOptions { good_poses: 0.0, ..*samples };
+    let exact = ViewSampleOptions { translation: 0.0, rotation: 0.0, ..*samples };
     let [rough, exact] = [rough, exact].map(|samples| {
-        let mut means = [Likeness::default(); 2];
+        let mut means = [TruthSimilarity::default(); 2];
         for number in 0..options.objects {
             let found = compare(model, textures, &samples, options, number, &perceptual);
             for (mean, one) in means.iter_mut().zip(found) {
@@ -105,11 +105,11 @@ pub fn quality(
 fn compare(
     model: &NolModel,
     textures: &Backgrounds,
-    samples: &SampleOptions,
+    samples: &ViewSampleOptions,
     options: &QualityOptions,
     number: u64,
     perceptual: &Perceptual,
-) -> [Likeness; 2] {
+) -> [TruthSimilarity; 2] {
     let sample = make_sample(textures, samples, options.side, options.sources, options.seed, number);
     let features = model.encode(&sample.sources);
     let rendering = model.render(&sample.surface, &sample.sources, &features);
@@ -129,6 +129,6 @@ fn compare(
         let image = tensor(image, COLOURS);
         let error = squared_error(image.clone(), truth.clone(), mask.clone()).into_scalar::<f32>();
         let (_, features) = image_loss(image, truth.clone(), mask.clone(), perceptual);
-        Likeness { psnr: psnr(f64::from(error)), features: f64::from(features.into_scalar::<f32>()) }
+        TruthSimilarity { psnr: psnr(f64::from(error)), features: f64::from(features.into_scalar::<f32>()) }
     })
 }

@@ -130,12 +130,12 @@ impl Recipe for NolRecipe {
         let textures = match &self.backgrounds {
             Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())
                 .map_err(TrainError::about("backgrounds"))?
-                .with_procedural_share(PROCEDURAL_FRACTION),
+                .with_procedural_fraction(PROCEDURAL_FRACTION),
             None => Backgrounds::procedural(),
         };
         let mut card = ModelCard::new("", "Neural Object Learning, new views from few photographs");
         card.data = format!(
-            "made-up household shapes (procedural families, alone and grown together) with textures from {}; no scanned object",
+            "synthetic household shapes (procedural families, alone and grown together) with textures from {}; no scanned object",
             match textures.images() {
                 0 => "noise".to_owned(),
                 n => format!("{n} photographs and noise"),
@@ -165,7 +165,7 @@ impl Recipe for NolRecipe {
         let path = session.model();
         let mut model = NolModel::new(training.into_network(), self.parts, card);
         model.save(&path).map_err(TrainError::method)?;
-        session.note("measuring the model on made-up objects");
+        session.note("measuring the model on synthetic objects");
         let quality = quality(&model, &textures, &self.options().samples, &QualityOptions::default())
             .map_err(TrainError::method)?;
         model.card_mut().scores = quality.scores();

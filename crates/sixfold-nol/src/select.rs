@@ -12,7 +12,7 @@ use sixfold_geometry::{Pose, Vec3};
 use crate::source::SourceView;
 
 /// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times
-/// the share of its mask there; 0 where it does not.
+/// the fraction of its mask there; 0 where it does not.
 pub fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> Vec<f32> {
     let side = source.side();
     points
@@ -29,14 +29,14 @@ pub fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> V
 
 /// Chooses photographs one by one, each time the one that adds most: the sum over points of `tanh(1.5 s)`, where `s` is how well
 /// the chosen ones show a point together (the author's code; the text counts points that were not seen). Ends after `most`, or
-/// when the best one adds less than `least_gain` points.
+/// when the best one adds less than `min_gain` points.
 ///
 /// `shown` has [`shown_points`] of every photograph; `only` says which points count, all if `None`.
 pub fn choose_by_surface(
     shown: &[Vec<f32>],
     only: Option<&[bool]>,
     most: usize,
-    least_gain: f64,
+    min_gain: f64,
 ) -> Vec<usize> {
     let points = shown.first().map_or(0, Vec::len);
     let counts = |i: usize| only.is_none_or(|only| only[i]);
@@ -57,7 +57,7 @@ pub fn choose_by_surface(
             _ => Some(next),
         });
         let Some((k, gain)) = best else { break };
-        if gain < least_gain || gain <= 0.0 {
+        if gain < min_gain || gain <= 0.0 {
             break;
         }
         sums.iter_mut().zip(&shown[k]).for_each(|(sum, new)| *sum += new);
@@ -90,8 +90,8 @@ pub fn choose_by_pose(camera_from_object: &[Pose], apart: [f64; 2], most: usize,
     chosen
 }
 
-/// Share of the surface (evenly spread points) that no photograph shows, 0 to 1.
-pub fn unseen_share(shown: &[Vec<f32>]) -> f64 {
+/// Fraction of the surface (evenly spread points) that no photograph shows, 0 to 1.
+pub fn unseen_fraction(shown: &[Vec<f32>]) -> f64 {
     let points = shown.first().map_or(0, Vec::len);
     if points == 0 {
         return 1.0;
@@ -114,9 +114,9 @@ mod tests {
         assert_eq!(choose_by_surface(&shown, Some(&[false, false, false, true]), 3, 0.0), vec![2]);
         // A gain of less than half a point is not worth a photograph.
         assert_eq!(choose_by_surface(&shown, None, 3, 0.5), vec![0, 2]);
-        assert_eq!(unseen_share(&shown), 0.0);
-        assert_eq!(unseen_share(&shown[..2]), 0.25);
-        assert_eq!(unseen_share(&[]), 1.0);
+        assert_eq!(unseen_fraction(&shown), 0.0);
+        assert_eq!(unseen_fraction(&shown[..2]), 0.25);
+        assert_eq!(unseen_fraction(&[]), 1.0);
         assert!(choose_by_surface(&[], None, 3, 0.0).is_empty());
     }
 

@@ -122,7 +122,7 @@ pub fn in_light_of(image: &Patch, truth: &Patch, mask: &Mask) -> Patch {
         }
         let (mx, my) = (s[1] / s[0], s[2] / s[0]);
         let variance = s[3] / s[0] - mx * mx;
-        // One colour alone says nothing of the gain; a negative one would be another picture.
+        // One colour alone says nothing of the gain; a negative one would be another image.
         let gain = if variance > 1e-8 { ((s[4] / s[0] - mx * my) / variance).max(0.0) } else { 1.0 };
         let offset = my - gain * mx;
         for v in &mut lit.data[c * area..(c + 1) * area] {
@@ -144,7 +144,7 @@ pub fn without_border(mask: &Mask, reach: usize) -> Mask {
     })
 }
 
-/// The image moved by whole pixels, up to `reach` along both axes, to where it is most like the truth in the pixels of a mask that
+/// The image moved by whole pixels, up to `reach` along both axes, to where it is most similar to the ground truth in the pixels of a mask that
 /// keeps as far from the image's border ([`without_border`]). Poses of photographs are annotated within a few
 /// pixels; renderings can then be compared by what they show.
 pub fn in_place_of(image: &Patch, truth: &Patch, mask: &Mask, reach: usize) -> Patch {
@@ -184,7 +184,7 @@ pub fn in_place_of(image: &Patch, truth: &Patch, mask: &Mask, reach: usize) -> P
 
 /// Compares renderings with photographs.
 #[derive(Debug)]
-pub struct Judge {
+pub struct ImageSimilarity {
     encoder: Lite0,
     device: Device,
 }
@@ -205,14 +205,14 @@ struct Map {
     values: Vec<f32>,
 }
 
-impl Judge {
+impl ImageSimilarity {
     /// With the EfficientNet-Lite0 encoder (trained on ImageNet) from within the program.
     ///
     /// # Errors
     /// [`WeightsError`] if the program carries another encoder than its own version's.
     pub fn new() -> Result<Self, WeightsError> {
         let device = Device::flex();
-        Ok(Judge { encoder: imagenet_encoder(&device)?, device })
+        Ok(ImageSimilarity { encoder: imagenet_encoder(&device)?, device })
     }
 
     /// What renderings are to be compared with: a photograph, in the pixels of a mask of its size.
@@ -281,7 +281,7 @@ impl Judge {
     }
 }
 
-/// Share of the mask in every cell of a coarser grid.
+/// Fraction of the mask in every cell of a coarser grid.
 fn cover(mask: &Mask, [rows, columns]: [usize; 2]) -> Vec<f64> {
     let (width, height) = mask.size();
     let mut inside = vec![0.0; rows * columns];
@@ -366,7 +366,7 @@ mod tests {
 
     #[test]
     fn the_perceptual_distance_sees_blur_and_not_what_lies_beside() {
-        let judge = Judge::new().unwrap();
+        let judge = ImageSimilarity::new().unwrap();
         let mask = Mask::from_fn(32, 32, |x, y| (8..24).contains(&x) && (8..24).contains(&y));
         let board = patch(|x, y| if (x / 4 + y / 4) % 2 == 0 { 0.8 } else { 0.2 });
         let truth = judge.truth(&board, &mask);

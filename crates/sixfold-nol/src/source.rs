@@ -6,7 +6,7 @@ use crate::window::object_window;
 use sixfold_data::{PosedImage, PosedImageError};
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::{Coverage, Patch};
 
 /// Colour where the crop reaches out of the image.
@@ -67,12 +67,12 @@ impl SourceView {
             depth: vec![],
             behind: (BEHIND * (high - low).norm()) as f32,
         };
-        view.set_pose(mesh, pose, &mut Frame::new(&camera));
+        view.set_pose(mesh, pose, &mut VisibilityBuffer::new(&camera));
         view
     }
 
-    /// Share of the mesh's silhouette at the present pose that the mask leaves visible, 0 to 1.
-    pub fn visible_share(&self) -> f64 {
+    /// Fraction of the mesh's silhouette at the present pose that the mask leaves visible, 0 to 1.
+    pub fn visible_fraction(&self) -> f64 {
         let (mut all, mut seen) = (0usize, 0usize);
         for (z, visible) in self.depth.iter().zip(&self.visible.data) {
             all += usize::from(*z > 0.0);
@@ -97,7 +97,7 @@ impl SourceView {
     }
 
     /// Another pose for the same crop.
-    pub fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut Frame) {
+    pub fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut VisibilityBuffer) {
         self.camera_from_object = camera_from_object;
         frame.set_camera(&self.camera);
         frame.render(&[SceneObject { mesh, camera_from_object }], &RenderOptions::default());

@@ -11,7 +11,7 @@ use crate::features::SourceFeatures;
 use crate::maps::Maps;
 use crate::model::NolModel;
 use crate::projection::TargetSurface;
-use crate::select::{choose_by_surface, shown_points, unseen_share};
+use crate::select::{choose_by_surface, shown_points, unseen_fraction};
 use crate::source::SourceView;
 use crate::surface::outwards;
 
@@ -40,8 +40,8 @@ pub struct NewView {
 }
 
 impl NewView {
-    /// Share of the object's pixels that no source shows, 0 to 1.
-    pub fn unseen_share(&self) -> f64 {
+    /// Fraction of the object's pixels that no source shows, 0 to 1.
+    pub fn unseen_fraction(&self) -> f64 {
         let count = |mask: &Mask| mask.as_slice().iter().filter(|v| **v).count() as f64;
         count(&self.unseen) / count(&self.mask).max(1.0)
     }
@@ -50,7 +50,7 @@ impl NewView {
 /// Points of the surface by which sources are chosen.
 const POINTS: usize = 3000;
 /// A source that adds fewer points to a view is left out of it.
-const LEAST_GAIN: f64 = 1.0;
+const MIN_GAIN: f64 = 1.0;
 
 /// Makes views of one object.
 #[derive(Debug)]
@@ -89,7 +89,7 @@ impl<'a> ViewMaker<'a> {
         let normals = outwards(mesh, &surface.normals);
         let shown: Vec<Vec<f32>> =
             sources.par_iter().map(|s| shown_points(s, &surface.points, &normals)).collect();
-        if unseen_share(&shown) >= 1.0 {
+        if unseen_fraction(&shown) >= 1.0 {
             let found = "masks that leave nothing of it".to_owned();
             return Err(wrong("sources", "photographs that show the object at their poses", found));
         }
@@ -132,9 +132,9 @@ impl<'a> ViewMaker<'a> {
         sum.map(|v| v / weight.max(1e-6))
     }
 
-    /// Share of the surface that no source shows, 0 to 1.
-    pub fn unseen_share(&self) -> f64 {
-        unseen_share(&self.shown)
+    /// Fraction of the surface that no source shows, 0 to 1.
+    pub fn unseen_fraction(&self) -> f64 {
+        unseen_fraction(&self.shown)
     }
 
     /// The sources.
@@ -188,7 +188,7 @@ impl<'a> ViewMaker<'a> {
             .zip(&self.normals)
             .map(|(point, normal)| view.see(point, normal).is_some())
             .collect();
-        choose_by_surface(&self.shown, Some(&only), self.per_view, LEAST_GAIN)
+        choose_by_surface(&self.shown, Some(&only), self.per_view, MIN_GAIN)
     }
 
     /// Colours without a network: of the most direct source, or of all in equal parts.

@@ -15,7 +15,7 @@ use sixfold_synth::augment::Backgrounds;
 use crate::loss::{Perceptual, WEIGHTS, image_loss, smooth_loss, squared_error};
 use crate::network::{Blend, COLOURS, Network, Parts};
 use crate::preview::Preview;
-use crate::samples::{Batch, BatchOptions, SampleOptions};
+use crate::samples::{Batch, ViewBatchOptions, ViewSampleOptions};
 
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,9 +26,9 @@ pub struct NolTrainingOptions {
     /// Weights of colours, features and smoothness.
     pub weights: [f64; 3],
     /// How samples are made.
-    pub samples: SampleOptions,
+    pub samples: ViewSampleOptions,
     /// How many in a step.
-    pub batch: BatchOptions,
+    pub batch: ViewBatchOptions,
 }
 
 impl Default for NolTrainingOptions {
@@ -43,8 +43,13 @@ impl Default for NolTrainingOptions {
                 seed: 0,
             },
             weights: WEIGHTS,
-            samples: SampleOptions::default(),
-            batch: BatchOptions { sides: vec![96, 128, 160], most_sources: 8, sources: 10, most_samples: 4 },
+            samples: ViewSampleOptions::default(),
+            batch: ViewBatchOptions {
+                sides: vec![96, 128, 160],
+                max_sources: 8,
+                sources: 10,
+                max_samples: 4,
+            },
         }
     }
 }
@@ -55,7 +60,7 @@ impl NolTrainingOptions {
         let default = Self::default();
         NolTrainingOptions {
             common: TrainingOptions { steps: 350_000, learning_rate: 1e-3, ..default.common },
-            batch: BatchOptions { sides: vec![256], most_sources: 8, sources: 8, most_samples: 1 },
+            batch: ViewBatchOptions { sides: vec![256], max_sources: 8, sources: 8, max_samples: 1 },
             ..default
         }
     }
@@ -71,8 +76,8 @@ impl NolTrainingOptions {
         let expected = "multiples of 16 from 32 to 1024 pixels";
         let all = !sides.is_empty() && sides.iter().all(fits);
         OptionError::unless(all, "batch.sides", format!("{sides:?}"), expected)?;
-        let sources = self.batch.most_sources;
-        OptionError::unless((1..=16).contains(&sources), "batch.most_sources", sources, "1 to 16")?;
+        let sources = self.batch.max_sources;
+        OptionError::unless((1..=16).contains(&sources), "batch.max_sources", sources, "1 to 16")?;
         self.weights.iter().try_for_each(|weight| OptionError::unless_weight("weights", *weight))
     }
 }
@@ -233,7 +238,7 @@ mod tests {
         let default = NolTrainingOptions::default();
         NolTrainingOptions {
             common: TrainingOptions { steps, warm_up: 2, ..default.common },
-            batch: BatchOptions { sides: vec![48, 64], most_sources: 3, sources: 4, most_samples: 2 },
+            batch: ViewBatchOptions { sides: vec![48, 64], max_sources: 3, sources: 4, max_samples: 2 },
             ..default
         }
     }
@@ -292,7 +297,7 @@ mod tests {
         assert_eq!(numbers(&straight), numbers(&resumed));
         assert!(b.join("preview.png").exists());
         let wrong = NolTrainingOptions {
-            batch: BatchOptions { sides: vec![50], ..options.batch.clone() },
+            batch: ViewBatchOptions { sides: vec![50], ..options.batch.clone() },
             ..options.clone()
         };
         assert!(wrong.check().unwrap_err().to_string().contains("batch.sides"));

@@ -27,7 +27,7 @@ pub struct ViewGrid {
     pub turns: usize,
     /// Side of the images, pixels.
     pub size: usize,
-    /// Seed of turns and distances.
+    /// Seed of rotations and distances.
     pub seed: u64,
 }
 
@@ -175,7 +175,7 @@ mod tests {
                 );
             }
         }
-        // Upright: the object's z axis points up in the image, turned by the roll.
+        // Upright: the object's z axis points up in the image, rotated by the roll.
         let pose = looking_at(&centre, &Aim { azimuth: 0.4, elevation: 0.6, turn: 0 }, 0.7, 0.0);
         let up = pose.transform_direction(&Vec3::z());
         assert!(up.x.abs() < 1e-9 && up.y < 0.0);

@@ -1,9 +1,9 @@
 //! Time per box of each part of an estimate: DATASET TARGETS.json WEIGHTS.
 use sixfold_align::outline::outline_mesh;
 use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
-use sixfold_pix2pose::estimate::{EstimateError, EstimateOptions, estimate};
+use sixfold_pix2pose::estimate::{EstimateError, Pix2PoseOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
-use sixfold_pix2pose::refine::{RefineOptions, refine};
+use sixfold_pix2pose::refine::{OutlineRefinementOptions, refine};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let mut clock =
                 |part: usize, began: Instant| times[part].push(1e3 * began.elapsed().as_secs_f64());
             let began = Instant::now();
-            let one = EstimateOptions { two_stages: false, ..EstimateOptions::default() };
+            let one = Pix2PoseOptions { two_stages: false, ..Pix2PoseOptions::default() };
             match estimate(&model, &image, &camera, truth.obj_id, &region, &one) {
                 // A sliver at the border of the image.
                 Err(EstimateError::Box(_)) => continue,
@@ -64,12 +64,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             clock(0, began);
             let began = Instant::now();
             let found =
-                estimate(&model, &image, &camera, truth.obj_id, &region, &EstimateOptions::default())?;
+                estimate(&model, &image, &camera, truth.obj_id, &region, &Pix2PoseOptions::default())?;
             clock(1, began);
             let Some(found) = found else { continue };
             for (part, mesh) in [(2, mesh), (3, small)] {
                 let began = Instant::now();
-                refine(&image, &camera, mesh, &found, &RefineOptions::default());
+                refine(&image, &camera, mesh, &found, &OutlineRefinementOptions::default());
                 clock(part, began);
             }
         }

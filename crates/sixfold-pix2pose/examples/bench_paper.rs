@@ -1,7 +1,7 @@
 //! The dissertation's network with PnP, for `benches/pix2pose_vs_onnxruntime.py`: `bench_paper FOLDER CALLS`.
 //!
 //! Writes to FOLDER the weights (`paper.safetensors`, random ones: time does not depend on their values), the inputs of three
-//! crops and what the network says of them (`input.f32`, `output.f32`: coordinates and error), and the correspondences of one crop
+//! crops and what the network predicts for them (`input.f32`, `output.f32`: coordinates and error), and the correspondences of one crop
 //! (`correspondences.f64`: fx, fy, cx, cy, the pose by rows, then X Y Z x y each). Prints milliseconds of every call as JSON.
 
 use std::error::Error;
@@ -20,10 +20,10 @@ use sixfold_pix2pose::object::ObjectEntry;
 use sixfold_render::BoundingBoxScale;
 
 const CROPS: usize = 3;
-/// Half the axes of the made-up object, metres.
+/// Half the axes of the synthetic object, metres.
 const HALF: [f64; 3] = [0.05, 0.04, 0.03];
 
-/// Pictures of soft stripes.
+/// Images of soft stripes.
 fn crops() -> Vec<f32> {
     let value = |i: usize| {
         let (x, y) = ((i % SIDE) as f32, (i / SIDE % SIDE) as f32);

@@ -3,9 +3,9 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
 use sixfold_geometry::{Pose, Rect, Vec3};
-use sixfold_pix2pose::estimate::{Found, Hypothesis, View};
+use sixfold_pix2pose::estimate::{Found, ThresholdHypothesis, View};
 use sixfold_pix2pose::model::Prediction;
-use sixfold_pix2pose::refine::{RefineOptions, refine};
+use sixfold_pix2pose::refine::{OutlineRefinementOptions, refine};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         meshes.insert(*id, dataset.model(*id, Models::Rendering)?);
     }
     let scale: f64 = arguments.get(2).map_or(1.0, |s| s.parse().unwrap());
-    let options = RefineOptions::default();
+    let options = OutlineRefinementOptions::default();
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut normal =
         move || rng.random_range(-1.0..1.0f64) + rng.random_range(-1.0..1.0) + rng.random_range(-1.0..1.0);
@@ -77,7 +77,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 prediction: Prediction { side: n, coordinates: vec![], error: vec![], visible },
             };
             let found = Found {
-                hypotheses: vec![Hypothesis {
+                hypotheses: vec![ThresholdHypothesis {
                     camera_from_object: initial,
                     threshold: 0.2,
                     inliers: 1,

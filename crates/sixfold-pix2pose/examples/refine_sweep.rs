@@ -8,9 +8,9 @@ use sixfold_bop::{
 };
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
 use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
-use sixfold_pix2pose::estimate::{EstimateOptions, Found, estimate};
+use sixfold_pix2pose::estimate::{Found, Pix2PoseOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
-use sixfold_pix2pose::refine::{RefineOptions, refine};
+use sixfold_pix2pose::refine::{OutlineRefinementOptions, refine};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -55,15 +55,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let (true, Some(region)) = (ids.contains(&truth.obj_id), visible.info.bbox_visib) else {
                 continue;
             };
-            let options = EstimateOptions::default();
+            let options = Pix2PoseOptions::default();
             if let Some(found) = estimate(&model, &image, &camera, truth.obj_id, &region, &options)? {
                 let (object, truth, image) = (truth.obj_id, truth.camera_from_object, image.clone());
                 cases.push(Case { object, image, camera, truth, region, found });
             }
         }
     }
-    let base = RefineOptions::default();
-    let with = |change: &dyn Fn(&mut RefineOptions)| {
+    let base = OutlineRefinementOptions::default();
+    let with = |change: &dyn Fn(&mut OutlineRefinementOptions)| {
         let mut options = base.clone();
         change(&mut options);
         options
@@ -121,7 +121,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     {
         let options = AlignOptions {
             looks,
-            refine: RefineOptions { shape, line, ..base.clone() },
+            refine: OutlineRefinementOptions { shape, line, ..base.clone() },
             ..AlignOptions::default()
         };
         let errors: Vec<_> = cases

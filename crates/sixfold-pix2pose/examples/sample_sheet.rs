@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scene = dataset.scene(scene_id)?;
     let frames: Vec<FrameId> = match images.strip_prefix('/') {
         Some(step) => {
-            // Only frames whose picture is there count.
+            // Only frames whose image is there count.
             let there = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
             there.step_by(step.parse::<usize>()?.max(1)).map(|im_id| FrameId { scene_id, im_id }).collect()
         }
@@ -57,7 +57,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let backgrounds = match rest.first().filter(|folder| *folder != "-") {
         Some(folder) => {
-            Backgrounds::from_folder(folder, &PhotographOptions::default())?.with_procedural_share(0.1)
+            Backgrounds::from_folder(folder, &PhotographOptions::default())?.with_procedural_fraction(0.1)
         }
         None => Backgrounds::procedural(),
     };
@@ -71,8 +71,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     if close {
         options.color = ColorAugmentation::none();
         options.render_color = ColorAugmentation::none();
-        options.occlusion_chance = 0.0;
-        options.second_stage_share = 0.0;
+        options.occlusion_probability = 0.0;
+        options.second_stage_fraction = 0.0;
     }
     let started = Instant::now();
     let source = SampleSource::new(objects, real, backgrounds, options)?;

@@ -5,10 +5,10 @@
 //! further look into the box of the aligned pose can be asked for. Where boxes are poor it helps (LM-O, boxes moved and scaled by
 //! up to 20 %: recall of ADD(-S) 0.48 against 0.44); in good ones it takes twice the time for no better poses.
 
-use crate::estimate::{EstimateError, EstimateOptions, Found, estimate};
+use crate::estimate::{EstimateError, Found, Pix2PoseOptions, estimate};
 use crate::model::Pix2PoseModel;
 use crate::object::Correction;
-use crate::refine::{RefineOptions, refine};
+use crate::refine::{OutlineRefinementOptions, refine};
 use sixfold_data::PosedImage;
 use sixfold_geometry::stats::upper_median;
 use sixfold_geometry::{Camera, OptionError, Pose, Rect, RgbImage, Vec2};
@@ -19,9 +19,9 @@ use std::collections::BTreeMap;
 #[derive(Debug, Clone, PartialEq)]
 pub struct AlignOptions {
     /// Both passes and PnP.
-    pub estimate: EstimateOptions,
+    pub estimate: Pix2PoseOptions,
     /// The alignment.
-    pub refine: RefineOptions,
+    pub refine: OutlineRefinementOptions,
     /// Most looks: each but the first is into the box of the pose before, and none follows one that found the same box.
     pub looks: usize,
     /// Take out what the model's object is known to be off by.
@@ -31,8 +31,8 @@ pub struct AlignOptions {
 impl Default for AlignOptions {
     fn default() -> Self {
         Self {
-            estimate: EstimateOptions::default(),
-            refine: RefineOptions::default(),
+            estimate: Pix2PoseOptions::default(),
+            refine: OutlineRefinementOptions::default(),
             looks: 1,
             correct: true,
         }
@@ -134,14 +134,14 @@ fn same(a: &Rect, b: &Rect) -> bool {
 }
 
 /// Fewer photographs say nothing of the shift, and fewer of an object nothing of its distance.
-const LEAST_PHOTOGRAPHS: usize = 5;
+const MIN_PHOTOGRAPHS: usize = 5;
 /// Poses turned further from the truth than this are wrong, not off.
 const SAME_ROTATION: f64 = 0.26;
-/// Steps of a continuous symmetry, as a share of the diameter.
+/// Steps of a continuous symmetry, as a fraction of the diameter.
 const SYMMETRY_STEP: f64 = 0.1;
 
-/// What aligned poses are off by on posed photographs, object by object. The shift is one for all, for it lies in camera and
-/// annotations; distances are drawn towards zero as far as their scatter does not tell them from it (empirical Bayes, James
+/// What aligned poses are off by on posed images, object by object. The shift is one for all, for it lies in camera and
+/// annotations; distances are shrunk towards zero as far as their scatter does not tell them from it (empirical Bayes, James
 /// and Stein 1961). `objects` are meshes as [`sixfold_align::outline::outline_mesh`] makes them, with their symmetries.
 ///
 /// # Errors
@@ -185,7 +185,7 @@ pub fn measure_corrections(
 
 /// What is known from the `shifts` of all photographs (pixels) and the relative errors of every object's distance.
 fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32, Correction> {
-    let shift = if shifts.len() < LEAST_PHOTOGRAPHS {
+    let shift = if shifts.len() < MIN_PHOTOGRAPHS {
         [0.0; 2]
     } else {
         [0, 1].map(|axis| median(&mut shifts.iter().map(|s| s[axis]).collect::<Vec<_>>()))
@@ -194,7 +194,7 @@ fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32
     // Median, and the square of its standard error.
     let measured: BTreeMap<u32, (f64, f64)> = depths
         .into_iter()
-        .filter(|(_, values)| values.len() >= LEAST_PHOTOGRAPHS)
+        .filter(|(_, values)| values.len() >= MIN_PHOTOGRAPHS)
         .map(|(id, mut values)| {
             let middle = median(&mut values);
             let mut away: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
@@ -234,7 +234,7 @@ mod tests {
         let known = BTreeMap::from([
             (1, around(0.02, 0.001)),
             (2, around(0.02, 0.06)),
-            (3, vec![0.5; LEAST_PHOTOGRAPHS - 1]),
+            (3, vec![0.5; MIN_PHOTOGRAPHS - 1]),
         ]);
         let found = corrections(&shifts, known.clone());
         // The outlier is outvoted, and the shift is the same for all.
@@ -244,7 +244,7 @@ mod tests {
         assert!((0.001..0.015).contains(&found[&2].depth), "{found:?}");
         assert_eq!(found[&3].depth, 0.0);
         // Too few photographs say nothing of the shift either.
-        let few = corrections(&shifts[..LEAST_PHOTOGRAPHS - 1], known);
+        let few = corrections(&shifts[..MIN_PHOTOGRAPHS - 1], known);
         assert!(few.values().all(|c| c.shift == [0.0; 2]), "{few:?}");
         assert_eq!(few[&1].depth, found[&1].depth);
     }
@@ -255,13 +255,13 @@ mod tests {
         assert_eq!(options.check(), Ok(()));
         let named = |options: AlignOptions| options.check().unwrap_err().option;
         assert_eq!(named(AlignOptions { looks: 0, ..options.clone() }), "looks");
-        let estimate = EstimateOptions { thresholds: vec![0.1, f32::NAN], ..options.estimate.clone() };
+        let estimate = Pix2PoseOptions { thresholds: vec![0.1, f32::NAN], ..options.estimate.clone() };
         assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "thresholds");
-        let estimate = EstimateOptions { crop_factor: f64::NAN, ..options.estimate.clone() };
+        let estimate = Pix2PoseOptions { crop_factor: f64::NAN, ..options.estimate.clone() };
         assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "crop_factor");
-        let refine = RefineOptions { edges: f64::NAN, ..options.refine.clone() };
+        let refine = OutlineRefinementOptions { edges: f64::NAN, ..options.refine.clone() };
         assert_eq!(named(AlignOptions { refine, ..options.clone() }), "refine.edges");
-        let refine = RefineOptions { first_pass: 1.5, ..options.refine.clone() };
+        let refine = OutlineRefinementOptions { first_pass: 1.5, ..options.refine.clone() };
         assert_eq!(named(AlignOptions { refine, ..options }), "refine.first_pass");
     }
 

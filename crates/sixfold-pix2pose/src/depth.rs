@@ -58,7 +58,7 @@ fn visible(found: &Found, x: usize, y: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::{Hypothesis, View};
+    use crate::estimate::{ThresholdHypothesis, View};
     use crate::model::Prediction;
     use sixfold_geometry::nalgebra::UnitQuaternion;
     use sixfold_geometry::{Rect, RgbImage, Vec3};
@@ -102,7 +102,7 @@ mod tests {
             },
         };
         let found = Found {
-            hypotheses: vec![Hypothesis {
+            hypotheses: vec![ThresholdHypothesis {
                 camera_from_object: start,
                 threshold: 0.3,
                 inliers: 1,

@@ -15,7 +15,7 @@ use sixfold_synth::augment::{Patch, Window};
 
 /// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EstimateOptions {
+pub struct Pix2PoseOptions {
     /// Outlier thresholds on the expected error; empty for those of the model's object.
     pub thresholds: Vec<f32>,
     /// Two passes; otherwise poses come from the first.
@@ -30,7 +30,7 @@ pub struct EstimateOptions {
     pub quirks: Quirks,
 }
 
-impl Default for EstimateOptions {
+impl Default for Pix2PoseOptions {
     fn default() -> Self {
         Self {
             thresholds: Vec::new(),
@@ -43,7 +43,7 @@ impl Default for EstimateOptions {
     }
 }
 
-impl EstimateOptions {
+impl Pix2PoseOptions {
     /// Checks every field.
     ///
     /// # Errors
@@ -118,7 +118,7 @@ pub enum EstimateError {
 
 /// A pose with what speaks for it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Hypothesis {
+pub struct ThresholdHypothesis {
     /// The pose, metres.
     pub camera_from_object: Pose,
     /// The outlier threshold of its second pass.
@@ -133,7 +133,7 @@ pub struct Hypothesis {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
     /// Best first, never empty.
-    pub hypotheses: Vec<Hypothesis>,
+    pub hypotheses: Vec<ThresholdHypothesis>,
     /// What the network saw and said last, for the best hypothesis.
     pub view: View,
     /// The same with the background left in: where the object's border is, a crop without background cannot tell.
@@ -158,7 +158,7 @@ pub struct View {
 }
 
 /// Least pixels of an object after the first pass.
-const LEAST_PIXELS: usize = 10;
+const MIN_PIXELS: usize = 10;
 /// A visible pixel has at least this probability.
 const VISIBLE: f32 = 0.5;
 
@@ -173,7 +173,7 @@ pub fn estimate(
     camera: &Camera,
     object_id: u32,
     region: &Rect,
-    options: &EstimateOptions,
+    options: &Pix2PoseOptions,
 ) -> Result<Option<Found>, EstimateError> {
     let (index, object) = model.object(object_id)?;
     check(image, camera, region)?;
@@ -183,7 +183,7 @@ pub fn estimate(
     let Some(first) = model.predict(index, &crop.pixels).pop() else { return Ok(None) };
     let mask = object_mask(&first, f32::INFINITY);
     let visible = mask.iter().filter(|m| **m).count();
-    if visible < LEAST_PIXELS {
+    if visible < MIN_PIXELS {
         return Ok(None);
     }
     let thresholds = if options.thresholds.is_empty() { &object.thresholds } else { &options.thresholds };
@@ -199,7 +199,7 @@ pub fn estimate(
     let mut candidates: Vec<(f32, Crop)> = Vec::new();
     for &threshold in thresholds {
         let mask = object_mask(&first, threshold);
-        if mask.iter().filter(|m| **m).count() >= LEAST_PIXELS {
+        if mask.iter().filter(|m| **m).count() >= MIN_PIXELS {
             let mask = grown(&mask, first.side);
             candidates.push((threshold, scaled.without_background(&crop.window, &mask, first.side)));
         }
@@ -267,7 +267,7 @@ fn view(crop: &Crop, prediction: &Prediction) -> View {
 }
 
 /// The window about the object's pixels: their box and the crop factor, no larger than before.
-fn recentred(window: &Window, mask: &[bool], side: usize, options: &EstimateOptions) -> Window {
+fn recentred(window: &Window, mask: &[bool], side: usize, options: &Pix2PoseOptions) -> Window {
     let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
     for index in (0..mask.len()).filter(|i| mask[*i]) {
         let pixel = Vec2::new((index % side) as f64, (index / side) as f64);
@@ -345,14 +345,14 @@ impl Crop {
 struct Context<'a> {
     camera: &'a Camera,
     object: &'a ObjectEntry,
-    options: &'a EstimateOptions,
+    options: &'a Pix2PoseOptions,
     /// Pixels of the object in the first pass.
     visible: usize,
 }
 
 /// A hypothesis with its correspondences and how far its centre lies from the mask's, image pixels.
 struct Candidate {
-    hypothesis: Hypothesis,
+    hypothesis: ThresholdHypothesis,
     object_points: Vec<Vec3>,
     image_points: Vec<Vec2>,
     off_centre: f64,
@@ -427,7 +427,7 @@ impl Context<'_> {
         let centre = self.camera.project(&report.camera_from_object.transform_point(&scale.centre))?;
         let score = (inliers as f64 / self.visible.max(object_points.len()) as f64).min(1.0);
         Some(Candidate {
-            hypothesis: Hypothesis {
+            hypothesis: ThresholdHypothesis {
                 camera_from_object: report.camera_from_object,
                 threshold,
                 inliers,

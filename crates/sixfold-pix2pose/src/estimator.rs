@@ -256,7 +256,7 @@ fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
         std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
     };
     let window = &posed.found.view.window;
-    let hypothesis = |h: &crate::estimate::Hypothesis| {
+    let hypothesis = |h: &crate::estimate::ThresholdHypothesis| {
         json!({
             "camera_from_object": rows(&h.camera_from_object),
             "confidence": h.score,

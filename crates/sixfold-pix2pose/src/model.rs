@@ -106,7 +106,7 @@ pub struct Pix2PoseModel {
     device: Device,
 }
 
-/// What the network says of one crop, `side x side` pixels each.
+/// What the network predicts for one crop, `side x side` pixels each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prediction {
     /// Pixels along a side.

@@ -1,4 +1,4 @@
-//! What a network has to know of an object: how its coordinates are normalised and under which turns it looks the same.
+//! What a network has to know of an object: how its coordinates are normalised and under which rotations it looks the same.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec2, Vec3};
@@ -23,7 +23,7 @@ pub struct ObjectEntry {
     pub correction: Correction,
 }
 
-/// Corners of mesh and model may differ by this share of the diameter: BOP's meshes for evaluation are simplified.
+/// Corners of mesh and model may differ by this fraction of the diameter: BOP's meshes for evaluation are simplified.
 const SAME_BOX: f64 = 0.05;
 
 /// A mesh that is not the one of the training.
@@ -92,7 +92,7 @@ impl ObjectEntry {
 pub struct Correction {
     /// Of the object's place in the image, pixels.
     pub shift: [f64; 2],
-    /// Of its distance, as a share of it.
+    /// Of its distance, as a fraction of it.
     pub depth: f64,
 }
 

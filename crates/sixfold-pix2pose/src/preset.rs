@@ -23,7 +23,7 @@ pub enum Preset {
     Tless,
 }
 
-/// Under which turns an object looks the same.
+/// Under which rotations an object looks the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turns {
     None,
@@ -33,7 +33,7 @@ enum Turns {
     HalfZ,
     /// Quarters of a turn about z.
     QuarterZ,
-    /// Any turn about z.
+    /// Any rotation about z.
     AnyZ,
 }
 
@@ -94,7 +94,7 @@ impl Preset {
         Some(vec![one])
     }
 
-    /// Smallest and largest share of an object that occluders hide in training (table 3.3). The entries to BOP have no range
+    /// Smallest and largest fraction of an object that occluders hide in training (table 3.3). The entries to BOP have no range
     /// of their own; theirs is that of the datasets with occlusion.
     pub fn occlusion(self) -> [f32; 2] {
         match self {
@@ -104,7 +104,7 @@ impl Preset {
     }
 
     /// What is known of an object, with the pool of symmetric poses of appendix A.1 in place of the stated ones. The pool's
-    /// turns are about axes through the middle of the object's box. [`Preset::Bop`] leaves the stated ones.
+    /// turns are about axes through the centre of the object's box. [`Preset::Bop`] leaves the stated ones.
     pub fn with_pool(self, id: u32, info: &ModelInfo) -> ModelInfo {
         let turns = match (self, id) {
             (Preset::Bop, _) => return info.clone(),
@@ -146,7 +146,7 @@ mod tests {
         }
     }
 
-    /// Appendix A.1 and tables A.2.1 to A.2.3, typed once more: id, fold of the symmetry (0: any turn, -2: half a turn about
+    /// Appendix A.1 and tables A.2.1 to A.2.3, typed once more: id, fold of the symmetry (0: any rotation, -2: half a turn about
     /// y), threshold in tenths.
     const LINEMOD: &str =
         "1 1 1, 2 1 2, 4 1 2, 5 1 2, 6 1 2, 8 1 2, 9 1 1, 10 2 2, 11 2 2, 12 1 2, 13 1 2, 14 1 2, 15 1 2";

@@ -83,15 +83,15 @@ pub struct Pix2PoseRecipe {
     pub encoder: Option<PathBuf>,
     /// Stages of the ImageNet encoder that stay as they are, of five.
     pub frozen_stages: usize,
-    /// Share of renders among the images, 0 to 1.
+    /// Fraction of renders among the images, 0 to 1.
     pub render_share: f32,
-    /// Share of renders whose pose lies near one of a photograph, 0 to 1.
+    /// Fraction of renders whose pose lies near one of a photograph, 0 to 1.
     pub near_photographs: f32,
-    /// Largest turn of photographs in the image plane, radians.
+    /// Largest rotation of photographs in the image plane, radians.
     pub rotation: f32,
     /// Side of the network's input in pixels, a multiple of 32.
     pub size: usize,
-    /// Go on from the weights of another training instead of ImageNet's.
+    /// Continue from the weights of another training instead of ImageNet's.
     pub init: Option<PathBuf>,
     /// Draw the meshes in their own colours; otherwise in random ones.
     pub mesh_colors: bool,
@@ -104,7 +104,7 @@ pub struct Pix2PoseRecipe {
     /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as they
     /// are stated, the thresholds of its BOP entries.
     pub preset: Option<Preset>,
-    /// Folder of photographs for backgrounds; made-up textures without.
+    /// Folder of photographs for backgrounds; procedural textures without.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
     pub seed: u64,
@@ -124,7 +124,7 @@ impl Default for Pix2PoseRecipe {
             encoder: None,
             frozen_stages: Pix2PoseTrainingOptions::default().frozen_stages,
             render_share: samples.render_share,
-            near_photographs: samples.near_real_share,
+            near_photographs: samples.near_real_fraction,
             rotation: samples.rotation,
             size: samples.size,
             init: None,
@@ -190,9 +190,9 @@ impl Pix2PoseRecipe {
             size: sizes.input,
             target_size: Some(sizes.output),
             render_share: self.render_share,
-            near_real_share: self.near_photographs,
+            near_real_fraction: self.near_photographs,
             rotation: self.rotation,
-            random_color_chance: if self.mesh_colors { 0.0 } else { 1.0 },
+            random_color_probability: if self.mesh_colors { 0.0 } else { 1.0 },
             view_limits: self.view_limits,
             occlusion: self.preset.map_or(default.occlusion, Preset::occlusion),
             seed: self.seed,
@@ -325,7 +325,7 @@ impl Recipe for Pix2PoseRecipe {
         OptionError::unless_fraction("render_share", self.render_share)?;
         OptionError::unless_fraction("near_photographs", self.near_photographs)?;
         OptionError::unless(self.per_object != Some(0), "per_object", 0, "1 or more")?;
-        let expected = "1 or more, or weights to begin with, whose alignment is then measured anew";
+        let expected = "1 or more, or weights to begin with, whose alignment is then measured again";
         OptionError::unless(self.steps != Some(0) || self.init.is_some(), "steps", 0, expected)?;
         if self.network == NetworkKind::Compact {
             let common = TrainingOptions { steps: self.steps().max(1), ..self.compact_options().common };

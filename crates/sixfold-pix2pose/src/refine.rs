@@ -9,16 +9,16 @@
 //!
 //! It goes beyond the dissertation, whose poses from colour end with PnP, and needs no colours of the mesh.
 
-use crate::estimate::{Found, Hypothesis, View};
+use crate::estimate::{Found, ThresholdHypothesis, View};
 use crate::samples::second_stage::GREY;
-use sixfold_align::outline::{LEAST_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
+use sixfold_align::outline::{MIN_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
 use sixfold_geometry::{Camera, Mat3, NormalEquations, OptionError, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::{Patch, Window};
 
 /// How poses are aligned.
 #[derive(Debug, Clone, PartialEq)]
-pub struct RefineOptions {
+pub struct OutlineRefinementOptions {
     /// How far from the outline the border is looked for, crop pixels, from coarse to fine.
     pub reaches: Vec<f64>,
     /// Most steps at each reach.
@@ -37,7 +37,7 @@ pub struct RefineOptions {
     /// Lines count less the further their border is from the outline, in units of this many deviations of all lines
     /// (Tukey's biweight); 0 for all lines alike.
     pub robust: f64,
-    /// Share of the first pass in where the object is seen; the rest is the second's. They err apart.
+    /// Fraction of the first pass in where the object is seen; the rest is the second's. They err apart.
     pub first_pass: f32,
     /// Weight of colour against the network in telling object from background.
     pub color: f32,
@@ -45,7 +45,7 @@ pub struct RefineOptions {
     pub edges: f64,
 }
 
-impl Default for RefineOptions {
+impl Default for OutlineRefinementOptions {
     fn default() -> Self {
         Self {
             reaches: vec![8.0, 5.0, 3.0],
@@ -66,7 +66,7 @@ impl Default for RefineOptions {
 /// Shortest crop in which an outline can be looked for at all, pixels.
 const MIN_CROP: usize = 16;
 
-impl RefineOptions {
+impl OutlineRefinementOptions {
     /// Checks every field.
     ///
     /// # Errors
@@ -111,9 +111,9 @@ pub fn refine(
     camera: &Camera,
     mesh: &Mesh,
     found: &Found,
-    options: &RefineOptions,
+    options: &OutlineRefinementOptions,
 ) -> Refined {
-    let Some(Hypothesis { camera_from_object, .. }) = found.hypotheses.first() else {
+    let Some(ThresholdHypothesis { camera_from_object, .. }) = found.hypotheses.first() else {
         return Refined { camera_from_object: Pose::identity(), lines: 0, distance: 0.0, improved: false };
     };
     let unchanged =
@@ -174,7 +174,7 @@ pub fn refine(
     }
     let last = options.reaches.last().copied().unwrap_or(3.0);
     let lines = aligner.outline.lines(last, &pose);
-    if lines.len() < LEAST_LINES || !pose.translation().iter().all(|t| t.is_finite()) {
+    if lines.len() < MIN_LINES || !pose.translation().iter().all(|t| t.is_finite()) {
         return unchanged;
     }
     let distance = lines.iter().map(|l| l.offset.abs()).sum::<f64>() / lines.len() as f64;
@@ -191,17 +191,17 @@ struct Aligner<'a> {
     camera: &'a Camera,
     outline: Outline<'a>,
     crop: Camera,
-    /// The object's centre, about which it is turned.
+    /// The object's centre, about which it is rotated.
     centre: Vec3,
     correspondences: Vec<(Vec3, Vec2)>,
-    options: &'a RefineOptions,
+    options: &'a OutlineRefinementOptions,
 }
 
 impl Aligner<'_> {
     /// The next pose, and how far the outline moved in crop pixels.
     fn step(&mut self, reach: f64, pose: &Pose) -> Option<(Pose, f64)> {
         let lines = self.outline.lines(reach, pose);
-        if lines.len() < LEAST_LINES {
+        if lines.len() < MIN_LINES {
             return None;
         }
         let centre = pose.transform_point(&self.centre);
@@ -284,9 +284,9 @@ mod tests {
     use crate::model::Prediction;
     use sixfold_geometry::Rect;
     use sixfold_geometry::nalgebra::UnitQuaternion;
-    use sixfold_render::{Frame, RenderOptions, SceneObject};
+    use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
-    /// A box with a tower on one corner: no turn maps it onto itself.
+    /// A box with a tower on one corner: no rotation maps it onto itself.
     fn part() -> Mesh {
         let cuboid = |low: [f64; 3], high: [f64; 3], first: u32| {
             let corner =
@@ -307,12 +307,12 @@ mod tests {
         Mesh::new(vertices, faces).unwrap()
     }
 
-    /// Errors in metres before and after alignment of a part at 0.8 m, a share of whose columns is covered.
+    /// Errors in metres before and after alignment of a part at 0.8 m, a fraction of whose columns is covered.
     fn errors(covered: f64) -> [f64; 2] {
         let mesh = part();
         let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
         let truth = Pose::new(UnitQuaternion::from_euler_angles(2.2, 0.5, 0.3), Vec3::new(0.01, 0.0, 0.8));
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         frame.render(&[SceneObject { mesh: &mesh, camera_from_object: truth }], &RenderOptions::default());
         let silhouette = frame.mask(0);
         let columns: Vec<usize> = (0..320).filter(|x| (0..240).any(|y| silhouette[(*x, y)])).collect();
@@ -346,7 +346,7 @@ mod tests {
         let prediction = Prediction { side, coordinates: vec![], error: vec![], visible };
         let view = View { window, input: image.clone(), prediction };
         let found = Found {
-            hypotheses: vec![Hypothesis {
+            hypotheses: vec![ThresholdHypothesis {
                 camera_from_object: start,
                 threshold: 0.3,
                 inliers: 1,
@@ -358,7 +358,7 @@ mod tests {
             object_points: vec![],
             image_points: vec![],
         };
-        let refined = refine(&image, &camera, &mesh, &found, &RefineOptions::default());
+        let refined = refine(&image, &camera, &mesh, &found, &OutlineRefinementOptions::default());
         [start, refined.camera_from_object].map(|pose| {
             let vertices = mesh.vertices();
             let distance = |p: &Vec3| (pose.transform_point(p) - truth.transform_point(p)).norm();

@@ -51,7 +51,7 @@ fn source() -> (SampleSource, Vec<SymmetryMap>) {
     let scale = BoundingBoxScale::of_corners(&low, &high);
     let info = ModelInfo::of_mesh(&mesh);
     let pool = SymmetryMap::pool(&info, &scale);
-    let options = SampleOptions { random_color_chance: 1.0, ..SampleOptions::default() };
+    let options = SampleOptions { random_color_probability: 1.0, ..SampleOptions::default() };
     let objects = vec![TrainingObject { id: 1, mesh, info, scale }];
     (SampleSource::new(objects, vec![], Backgrounds::procedural(), options).unwrap(), pool)
 }

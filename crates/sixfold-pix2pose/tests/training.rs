@@ -1,4 +1,4 @@
-//! A training that is interrupted and goes on ends with the same numbers as one that is not.
+//! A training that is interrupted and continues ends with the same numbers as one that is not.
 
 use burn::tensor::Device;
 use sixfold_data::TrainingObject;
@@ -33,7 +33,7 @@ fn source() -> (SampleSource, Vec<Vec<SymmetryMap>>) {
     let options = SampleOptions {
         size: 64,
         target_size: Some(32),
-        random_color_chance: 1.0,
+        random_color_probability: 1.0,
         ..SampleOptions::default()
     };
     (SampleSource::new(objects, vec![], Backgrounds::procedural(), options).unwrap(), pools)

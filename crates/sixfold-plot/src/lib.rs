@@ -1,6 +1,6 @@
 //! Lines, text and axes drawn with nothing but pixels: no font file, no system library.
 //!
-//! [`Canvas`] draws at three times the size and averages down, so lines are smooth. Coordinates are picture pixels, x to
+//! [`Canvas`] draws at three times the size and averages down, so lines are smooth. Coordinates are image pixels, x to
 //! the right and y down from the top left corner.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
@@ -38,7 +38,7 @@ pub const COLORS: [[u8; 3]; 12] = [
     [150, 150, 150],
 ];
 
-/// A picture under construction.
+/// An image under construction.
 pub struct Canvas {
     width: usize,
     height: usize,
@@ -46,7 +46,7 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// An empty picture of `width` x `height` pixels.
+    /// An empty image of `width` x `height` pixels.
     pub fn new(width: usize, height: usize) -> Self {
         let large = Image::filled(width * OVERSAMPLING, height * OVERSAMPLING, PAPER);
         Canvas { width, height, large }
@@ -94,7 +94,7 @@ impl Canvas {
         }
     }
 
-    /// Text with its top left corner at `(x, y)`; a glyph's pixel is `size` picture pixels, a glyph 5 x 7 of them.
+    /// Text with its top left corner at `(x, y)`; a glyph's pixel is `size` image pixels, a glyph 5 x 7 of them.
     /// Characters outside ASCII leave a gap.
     pub fn text(&mut self, x: f64, y: f64, size: f64, text: &str, color: [u8; 3]) {
         for (i, c) in text.chars().enumerate() {
@@ -122,7 +122,7 @@ impl Canvas {
         }
     }
 
-    /// The picture.
+    /// The image.
     pub fn finish(self) -> RgbImage {
         Image::from_fn(self.width, self.height, |x, y| {
             let mut sum = [0usize; 3];
@@ -139,7 +139,7 @@ impl Canvas {
     }
 }
 
-/// Width of a text in picture pixels.
+/// Width of a text in image pixels.
 pub fn text_width(text: &str, size: f64) -> f64 {
     size * (6.0 * text.chars().count() as f64 - 1.0).max(0.0)
 }

@@ -9,7 +9,7 @@ use crate::voting::Hypothesis;
 /// When two poses are one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClusterOptions {
-    /// Largest distance of the object's centres, as a share of its diameter.
+    /// Largest distance of the object's centres, as a fraction of its diameter.
     pub distance: f64,
     /// Largest rotation between them, radians.
     pub angle: f64,

@@ -29,7 +29,7 @@ pub struct PpfOptions {
     pub verified: usize,
     /// How much the votes say beside the verification, as an exponent from 0 (nothing) to 1.
     pub vote_power: f64,
-    /// Most instances of the object returned, 1 or more.
+    /// Maximum number of instances of the object returned, 1 or more.
     pub max_instances: usize,
     /// Estimates whose [`PpfEstimate::confidence`] (0 to 1) is lower are not returned.
     pub min_score: f64,
@@ -130,7 +130,7 @@ pub struct PpfEstimate {
     pub score: VerificationScore,
     /// Votes of the hypothesis it came from.
     pub votes: f32,
-    /// What decides between estimates, in `0..=1`: [`VerificationScore::ranking`] times the share of the most votes, to the
+    /// What decides between estimates, in `0..=1`: [`VerificationScore::ranking`] times the fraction of the most votes, to the
     /// power [`PpfOptions::vote_power`].
     pub confidence: f64,
 }

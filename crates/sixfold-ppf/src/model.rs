@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use sixfold_align::verification_mesh;
 use sixfold_geometry::{Camera, OptionError, PointCloud, Pose, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use thiserror::Error;
 
 use crate::V3;
@@ -47,7 +47,7 @@ pub enum ModelError {
 /// How an object is described.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ModelOptions {
-    /// Distance between samples as a share of the diameter; also the step of the feature's distance
+    /// Distance between samples as a fraction of the diameter; also the step of the feature's distance
     /// (Drost et al. 2010: 0.05).
     pub sampling_step: f64,
     /// Number of steps of each of the feature's angles over half a turn.
@@ -237,7 +237,7 @@ impl ObjectModel {
         };
         let mut dense = PointCloud::default();
         let mut views = Vec::with_capacity(VIEWS);
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         let flat =
             verification_mesh(mesh).map_err(|_| ModelError::NoSurface { faces: mesh.faces().len() })?;
         for direction in &directions {

@@ -17,7 +17,7 @@ use crate::model::{Description, ModelError, ModelOptions, ObjectModel};
 const MAGIC: &[u8; 8] = b"SIXFPPF\0";
 const VERSION: u32 = 1;
 
-/// Why a stored description was not taken; it is then computed anew.
+/// Why a stored description was not taken; it is then recomputed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ModelFileError {

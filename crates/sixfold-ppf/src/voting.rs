@@ -1,8 +1,8 @@
-//! Voting for poses: every scene reference point asks which model point it is and how the model is turned
+//! Voting for poses: every scene reference point asks which model point it is and how the model is rotated
 //! about its normal (Drost et al. 2010, section 3.4).
 //!
 //! With the improvements of Hinterstoisser et al. (2016) and Vidal et al. (2018): a feature near the border of its
-//! bin also votes from the neighbouring bins, and a feature votes only once per reference point and turn, so
+//! bin also votes from the neighbouring bins, and a feature votes only once per reference point and rotation, so
 //! that large flat regions do not shout down the rest.
 
 use std::f32::consts::PI;
@@ -30,12 +30,12 @@ pub struct VotingOptions {
     pub reference_stride: usize,
     /// At most this many reference points; the stride grows to keep it.
     pub max_references: usize,
-    /// Share of a bin at each border from which the neighbouring bin votes too; 0 for none.
+    /// Fraction of a bin at each border from which the neighbouring bin votes too; 0 for none.
     pub bin_margin: f32,
     /// Most peaks taken from one reference point.
     pub peaks_per_reference: usize,
-    /// A peak needs this share of the reference point's best.
-    pub peak_share: f32,
+    /// A peak needs this fraction of the reference point's best.
+    pub peak_fraction: f32,
 }
 
 /// Every so many-th scene point is a reference point (Drost et al. 2010: every fifth).
@@ -64,7 +64,7 @@ impl Default for VotingOptions {
             max_references: MAX_REFERENCES,
             bin_margin: BIN_MARGIN,
             peaks_per_reference: PEAKS_PER_REFERENCE,
-            peak_share: PEAK_SHARE,
+            peak_fraction: PEAK_SHARE,
         }
     }
 }
@@ -79,11 +79,11 @@ impl VotingOptions {
         OptionError::unless_some("voting.max_references", self.max_references)?;
         OptionError::unless_within("voting.bin_margin", self.bin_margin, 0.0..=0.5, "0 to 0.5")?;
         OptionError::unless_some("voting.peaks_per_reference", self.peaks_per_reference)?;
-        OptionError::unless_within("voting.peak_share", self.peak_share, 0.0..=1.0, "0 to 1")
+        OptionError::unless_within("voting.peak_fraction", self.peak_fraction, 0.0..=1.0, "0 to 1")
     }
 }
 
-/// Steps of the turn about the normal, 11.25 degrees each: Hinterstoisser et al. (2016) and Vidal et al. (2018) keep the votes that
+/// Steps of the rotation about the normal, 11.25 degrees each: Hinterstoisser et al. (2016) and Vidal et al. (2018) keep the votes that
 /// were cast in the 32 bits of a word, one for each step, and so does this.
 const TURNS: usize = 32;
 
@@ -186,7 +186,7 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
 
 /// The accumulator of one reference point.
 struct Counter {
-    /// Votes per model point and turn.
+    /// Votes per model point and rotation.
     votes: Vec<u16>,
     /// Per feature row, the turns that have voted, one bit each.
     voted: Vec<u32>,
@@ -255,7 +255,7 @@ impl Counter {
                             }
                             voted[row] |= bit;
                             for &entry in &table.entries[start..end] {
-                                // Scene turn minus model turn, in 256ths, to one of 32 bins.
+                                // Scene rotation minus model rotation, in 256ths, to one of 32 bins.
                                 let difference = turn.wrapping_sub(entry as u8);
                                 let slot = (entry >> 8) as usize * TURNS + (difference >> 3) as usize;
                                 votes[slot] = votes[slot].saturating_add(1);
@@ -272,7 +272,7 @@ impl Counter {
         let mut best: Vec<(u32, usize, usize)> = Vec::with_capacity(options.peaks_per_reference + 1);
         let mut most = 0u32;
         for (reference, turns) in self.votes.chunks_exact(TURNS).enumerate() {
-            // The best turn of each model point.
+            // The best rotation of each model point.
             let (turn, sum) = (0..TURNS)
                 .map(|t| {
                     let sum = 2 * u32::from(turns[t])
@@ -282,7 +282,7 @@ impl Counter {
                 })
                 .max_by_key(|&(t, sum)| (sum, std::cmp::Reverse(t)))
                 .unwrap_or((0, 0));
-            if sum == 0 || (sum as f32) < options.peak_share * most as f32 {
+            if sum == 0 || (sum as f32) < options.peak_fraction * most as f32 {
                 continue;
             }
             most = most.max(sum);
@@ -293,7 +293,7 @@ impl Counter {
             }
         }
         for (sum, reference, turn) in best {
-            if sum as f32 >= options.peak_share * most as f32 {
+            if sum as f32 >= options.peak_fraction * most as f32 {
                 let turns = &self.votes[reference * TURNS..(reference + 1) * TURNS];
                 let left = f32::from(turns[(turn + TURNS - 1) % TURNS]);
                 let right = f32::from(turns[(turn + 1) % TURNS]);
@@ -305,7 +305,7 @@ impl Counter {
     }
 }
 
-/// The pose that lays the model's point and frame onto the scene's, turned about the common normal
+/// The pose that lays the model's point and frame onto the scene's, rotated about the common normal
 /// (Drost et al. 2010, equation 3).
 fn pose_of(p: &V3, scene: &[V3; 3], q: &V3, model: &[V3; 3], turn: f32) -> Pose {
     let rows = |f: &[V3; 3]| Matrix3::from_rows(&[f[0].transpose(), f[1].transpose(), f[2].transpose()]);
@@ -326,7 +326,7 @@ mod tests {
     use sixfold_geometry::Vec3;
     use sixfold_mesh::Mesh;
 
-    /// Scattered points with random normals: every feature is rare, no reflection and no turn looks alike.
+    /// Scattered points with random normals: every feature is rare, no reflection and no rotation looks alike.
     fn scattered() -> ObjectModel {
         let mut random = ChaCha8Rng::seed_from_u64(4);
         let mut draw = || Vec3::from_fn(|_, _| random.random_range(-1.0..1.0));

@@ -157,7 +157,7 @@ fn four_cups_in_each_bin_that_holds_cups() {
     let camera = Camera::new(550.0, 540.0, 316.0, 244.0, 640, 480).unwrap();
     let folder = data.join("icbin_frames");
     let mesh = read_mesh(folder.join("2/model.ply"), Unit::Millimetre).unwrap();
-    // There is no ground truth. The overlays of bins 2 and 3 were looked at: their best eight poses all lie on cups.
+    // There is no ground truth. The overlays of bins 2 and 3 were inspected: their best eight poses all lie on cups.
     // Bin 1 holds juice cartons and no cup; agreement in depth alone would accept some there, so the confidence counts.
     const SURE: f64 = 0.4;
     for bin in 1..=3 {
@@ -173,7 +173,7 @@ fn four_cups_in_each_bin_that_holds_cups() {
                         "{:.2} (S_D {:.2}, seen {:.2})",
                         e.confidence,
                         e.score.depth,
-                        e.score.visible_share()
+                        e.score.visible_fraction()
                     )
                 })
                 .collect();

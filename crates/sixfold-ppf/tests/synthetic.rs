@@ -6,7 +6,7 @@ use sixfold_mesh::Mesh;
 use sixfold_ppf::clustering::{ClusterOptions, cluster};
 use sixfold_ppf::voting::{Hypothesis, VotingOptions, vote};
 use sixfold_ppf::{ModelError, ModelFileError, ModelOptions, ObjectModel, PpfOptions, estimate};
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 fn camera() -> Camera {
     Camera::new(450.0, 450.0, 199.5, 149.5, 400, 300).unwrap()
@@ -67,7 +67,7 @@ fn depth_of(objects: &[(&Mesh, Pose)], noise: Option<u64>) -> DepthImage {
     let mut scene: Vec<SceneObject> =
         objects.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
     scene.push(SceneObject { mesh: &table, camera_from_object: camera_from_table() });
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     frame.render(&scene, &RenderOptions::default());
     match noise {
         None => frame.depth(),
@@ -190,7 +190,7 @@ fn what_hides_an_object_has_an_outline() {
         Verifier::default().score(&scene, &block, pose, 0.01, options)
     };
     // Sunk into the table, its top a little askew in the table's plane: one edge of it agrees, the rest would lie below
-    // a table that goes on smoothly.
+    // a table that continues smoothly.
     let askew = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.35, 0.0].into());
     let sunk = on_table(0.0, 0.0, 0.0) * askew * Pose::from_translation(Vec3::new(0.04, 0.0, -0.1));
     let empty = depth_of(&[], None);

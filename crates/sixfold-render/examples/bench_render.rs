@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Canvas, Frame, RenderOptions, SceneObject};
+use sixfold_render::{Canvas, RenderOptions, SceneObject, VisibilityBuffer};
 
 fn bumpy_sphere(rows: u32, columns: u32) -> Mesh {
     let mut vertices = vec![];
@@ -37,7 +37,7 @@ fn bumpy_sphere(rows: u32, columns: u32) -> Mesh {
 fn main() {
     let camera = Camera::new(572.4, 573.6, 325.3, 242.0, 640, 480).expect("a valid camera");
     let mesh = bumpy_sphere(100, 100);
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     let mut depth_ms = vec![];
     let mut both_ms = vec![];
     let mut fresh_ms = vec![];

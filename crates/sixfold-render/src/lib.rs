@@ -16,7 +16,7 @@ mod shadow;
 mod table;
 
 pub use outputs::{BoundingBoxScale, Surface};
-pub use raster::{Canvas, Culling, Frame, RenderOptions, SceneObject, render_depth};
+pub use raster::{Canvas, Culling, RenderOptions, SceneObject, VisibilityBuffer, render_depth};
 pub use sensor::{DepthSensor, Draws, simulate_depth};
 pub use shade::{Light, Material, shade};
 pub use table::{plane_mesh, support_plane};

@@ -3,12 +3,12 @@
 use nalgebra::Vector3;
 use sixfold_geometry::{Image, NormalImage, PointImage, Vec2, Vec3};
 
-use crate::raster::{Canvas, Frame, SceneObject, face_in_camera};
+use crate::raster::{Canvas, SceneObject, VisibilityBuffer, face_in_camera};
 
 /// What one pixel sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
-    /// Number of the object in the list given to [`Frame::render`].
+    /// Number of the object in the list given to [`VisibilityBuffer::render`].
     pub object: u32,
     /// Number of the face in that object's mesh.
     pub face: u32,
@@ -48,7 +48,7 @@ impl BoundingBoxScale {
     }
 }
 
-impl Frame {
+impl VisibilityBuffer {
     /// Calls `f` with pixel number, depth-scaled point in the camera frame (metres) and surface of every
     /// covered pixel. `objects` are those the frame was rendered from.
     pub(crate) fn for_surfaces(
@@ -102,7 +102,7 @@ impl Frame {
         out.into_image()
     }
 
-    /// As [`Frame::object_coordinates`], into an image that is used again and again; make it with NaN as its empty pixel.
+    /// As [`VisibilityBuffer::object_coordinates`], into an image that is used again and again; make it with NaN as its empty pixel.
     pub fn object_coordinates_into(&self, objects: &[SceneObject<'_>], out: &mut Canvas<[f32; 3]>) {
         // object = R^T (z K^-1 (x, y, 1) - t): linear in the pixel, so no barycentrics are needed.
         let maps: Vec<_> = objects
@@ -138,7 +138,7 @@ impl Frame {
         }
     }
 
-    /// As [`Frame::object_coordinates`], normalised to -1..1 by one box per object; NaN where nothing is seen.
+    /// As [`VisibilityBuffer::object_coordinates`], normalised to -1..1 by one box per object; NaN where nothing is seen.
     pub fn normalised_coordinates(
         &self,
         objects: &[SceneObject<'_>],

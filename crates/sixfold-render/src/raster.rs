@@ -55,16 +55,16 @@ pub struct SceneObject<'a> {
     pub camera_from_object: Pose,
 }
 
-/// The visibility buffer of one image, to be used again and again: [`Frame::render`] clears only what
+/// The visibility buffer of one image, to be used again and again: [`VisibilityBuffer::render`] clears only what
 /// the last image covered.
 #[derive(Debug, Clone)]
-pub struct Frame {
+pub struct VisibilityBuffer {
     pub(crate) camera: Camera,
     width: usize,
     height: usize,
-    /// 1/z, 0 where nothing was drawn.
+    /// 1/z, 0 where nothing was rendered.
     inverse_depth: Vec<f32>,
-    /// Triangle number over all objects in turn, [`NOTHING`] where nothing was drawn.
+    /// Triangle number over all objects in turn, [`NOTHING`] where nothing was rendered.
     triangle: Vec<u32>,
     /// First triangle number of each object, and the end.
     starts: Vec<u32>,
@@ -129,7 +129,7 @@ fn sub(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
-/// An image that is drawn into again and again: only what the last drawing covered is cleared, and its memory stays,
+/// An image that is rendered into again and again: only what the last drawing covered is cleared, and its memory stays,
 /// which for a small object in a large image is most of the cost.
 #[derive(Debug, Clone)]
 pub struct Canvas<T> {
@@ -140,7 +140,7 @@ pub struct Canvas<T> {
 }
 
 impl<T: Copy> Canvas<T> {
-    /// An image in which every pixel is `empty`. [`Frame::depth_into`] and its like change its size to theirs.
+    /// An image in which every pixel is `empty`. [`VisibilityBuffer::depth_into`] and its like change its size to theirs.
     pub fn new(width: usize, height: usize, empty: T) -> Canvas<T> {
         Canvas { image: Image::filled(width, height, empty), empty, drawn: [0; 4] }
     }
@@ -176,11 +176,11 @@ impl<T: Copy> Canvas<T> {
     }
 }
 
-impl Frame {
+impl VisibilityBuffer {
     /// An empty buffer for images of `camera`'s size.
-    pub fn new(camera: &Camera) -> Frame {
+    pub fn new(camera: &Camera) -> VisibilityBuffer {
         let pixels = camera.width * camera.height;
-        Frame {
+        VisibilityBuffer {
             camera: camera.without_distortion(),
             width: camera.width,
             height: camera.height,
@@ -311,13 +311,13 @@ impl Frame {
         &self.camera
     }
 
-    /// `[x0, y0, x1, y1]`, half open: a rectangle outside which nothing was drawn.
+    /// `[x0, y0, x1, y1]`, half open: a rectangle outside which nothing was rendered.
     pub fn covered(&self) -> [usize; 4] {
         let [x0, y0, x1, y1] = self.dirty;
         if x1 <= x0 || y1 <= y0 { [0; 4] } else { self.dirty }
     }
 
-    /// 1/depth per pixel in 1/metres, row by row; 0 where nothing was drawn.
+    /// 1/depth per pixel in 1/metres, row by row; 0 where nothing was rendered.
     pub fn inverse_depth(&self) -> &[f32] {
         &self.inverse_depth
     }
@@ -332,14 +332,14 @@ impl Frame {
         Some((object, (number - self.starts[object]) as usize))
     }
 
-    /// Depth in metres, 0 where nothing was drawn.
+    /// Depth in metres, 0 where nothing was rendered.
     pub fn depth(&self) -> DepthImage {
         let mut depth = Canvas::new(self.width, self.height, 0.0);
         self.depth_into(&mut depth);
         depth.into_image()
     }
 
-    /// As [`Frame::depth`], into an image that is used again and again.
+    /// As [`VisibilityBuffer::depth`], into an image that is used again and again.
     pub fn depth_into(&self, depth: &mut Canvas<f32>) {
         let [x0, y0, x1, y1] = self.covered();
         let pixels = depth.begin(self.width, self.height, [x0, y0, x1, y1]);
@@ -372,7 +372,7 @@ impl Frame {
     }
 
     /// The tight box around what was drawn, in BOP's terms: `x, y` of the first pixel, width and height
-    /// in pixels. `None` when nothing was drawn.
+    /// in pixels. `None` when nothing was rendered.
     pub fn bounding_box(&self) -> Option<Rect> {
         let (mut x0, mut y0, mut x1, mut y1) = (usize::MAX, usize::MAX, 0, 0);
         self.for_covered(|index| {
@@ -684,9 +684,9 @@ fn clip_triangle(camera: &Camera, near: f64, c: [&Corner; 3], number: u32, out: 
     }
 }
 
-/// Depth in metres of one mesh at one pose, 0 where it is not seen: the short form of [`Frame`].
+/// Depth in metres of one mesh at one pose, 0 where it is not seen: the short form of [`VisibilityBuffer`].
 pub fn render_depth(mesh: &Mesh, camera_from_object: &Pose, camera: &Camera) -> DepthImage {
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     let object = SceneObject { mesh, camera_from_object: *camera_from_object };
     frame.render(&[object], &RenderOptions::default());
     frame.depth()

@@ -10,8 +10,8 @@ fn mesh(vertices: &[[f64; 3]], faces: &[[u32; 3]]) -> Mesh {
     Mesh::new(vertices.iter().map(|v| Vec3::from(*v)).collect(), faces.to_vec()).unwrap()
 }
 
-fn render(meshes: &[&Mesh], options: &RenderOptions) -> Frame {
-    let mut frame = Frame::new(&camera());
+fn render(meshes: &[&Mesh], options: &RenderOptions) -> VisibilityBuffer {
+    let mut frame = VisibilityBuffer::new(&camera());
     let objects: Vec<_> =
         meshes.iter().map(|mesh| SceneObject { mesh, camera_from_object: Pose::identity() }).collect();
     frame.render(&objects, options);
@@ -159,7 +159,7 @@ fn one_thread_and_many_give_the_same_bytes() {
 #[test]
 fn a_used_frame_gives_what_a_new_one_gives() {
     let mesh = sphere();
-    let mut used = Frame::new(&camera());
+    let mut used = VisibilityBuffer::new(&camera());
     let near =
         SceneObject { mesh: &mesh, camera_from_object: Pose::from_translation(Vec3::new(0.0, 0.0, -0.3)) };
     used.render(&[near], &RenderOptions::default());
@@ -187,7 +187,7 @@ fn coordinates_normals_and_barycentrics_agree_with_depth() {
     let mesh = sphere();
     let pose = Pose::exp(&[0.01, 0.02, 0.03, 0.2, -0.1, 0.05].into());
     let objects = [SceneObject { mesh: &mesh, camera_from_object: pose }];
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     frame.render(&objects, &RenderOptions::default());
     let coordinates = frame.object_coordinates(&objects);
     let normals = frame.normals(&objects);
@@ -239,7 +239,7 @@ proptest! {
     #[test]
     fn wild_poses_never_panic(t in prop::array::uniform6(-3.0..3.0f64), scale in -6i32..6) {
         let mesh = sphere();
-        let mut frame = Frame::new(&camera());
+        let mut frame = VisibilityBuffer::new(&camera());
         let twist = nalgebra::Vector6::from(t) * 10f64.powi(scale);
         let objects = [SceneObject { mesh: &mesh, camera_from_object: Pose::exp(&twist) }];
         frame.render(&objects, &RenderOptions::default());
@@ -252,7 +252,7 @@ proptest! {
 #[test]
 fn a_used_canvas_gives_what_a_new_image_gives() {
     let mesh = sphere();
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     let mut depth = Canvas::new(1, 1, 0.0);
     let mut points = Canvas::new(1, 1, [f32::NAN; 3]);
     for t in [[0.0; 3], [0.05, -0.03, -0.2], [0.01, 0.01, 0.5], [50.0, 0.0, 0.0], [-0.1, 0.05, -0.1]] {
@@ -281,7 +281,7 @@ fn faces_of_extreme_size_have_weights_and_finite_normals() {
                 let mesh = mesh(&corners, &[[0, 1, 2]]);
                 let mesh = mesh.with_colors(vec![[255, 0, 0], [0, 255, 0], [0, 0, 255]]).unwrap();
                 let objects = [SceneObject { mesh: &mesh, camera_from_object: Pose::identity() }];
-                let mut frame = Frame::new(&camera);
+                let mut frame = VisibilityBuffer::new(&camera);
                 frame.render(&objects, &RenderOptions::default());
                 for surface in frame.surfaces(&objects).as_slice().iter().flatten() {
                     let weights = surface.barycentric;

@@ -42,7 +42,7 @@ pub struct DepthSensor {
     pub disparity_step: f64,
     /// Surfaces tilted more than this from the view direction (radians) return nothing.
     pub grazing_angle: f64,
-    /// Chance that a pixel on a depth edge returns nothing.
+    /// Probability that a pixel on a depth edge returns nothing.
     pub edge_loss: f64,
     /// Nearest and farthest depth that is measured, metres.
     pub range: (f64, f64),
@@ -240,9 +240,9 @@ impl Draws {
     }
 }
 
-/// The normal distribution's quantiles at the middles of 4096 equal shares.
+/// The normal distribution's quantiles at the midpoints of 4096 equal parts.
 static QUANTILES: LazyLock<Vec<f32>> = LazyLock::new(|| {
-    // The distribution function by the midpoint rule in small steps; each quantile where it passes its share.
+    // The distribution function by the midpoint rule in small steps; each quantile where it passes its fraction.
     let (mut x, mut below) = (-8.0f64, 0.0f64);
     let step = 1e-4;
     (0..4096)

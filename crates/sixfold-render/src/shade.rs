@@ -5,7 +5,7 @@
 use sixfold_geometry::{Image, RgbImage, Vec3};
 
 use crate::outputs::surface_normal;
-use crate::raster::{Frame, SceneObject};
+use crate::raster::{SceneObject, VisibilityBuffer};
 
 /// A light, placed in the camera frame. Colours are linear, 1 is full white.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,7 +63,7 @@ impl Default for Material {
 /// # Panics
 /// When `background` has another size than the frame.
 pub fn shade(
-    frame: &Frame,
+    frame: &VisibilityBuffer,
     objects: &[SceneObject<'_>],
     lights: &[Light],
     material: &Material,

@@ -1,4 +1,4 @@
-//! Why a run cannot go on.
+//! Why a run cannot continue.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use sixfold_estimator::{CacheError, EstimatorError};
 use sixfold_geometry::CameraError;
 use thiserror::Error;
 
-/// Why a run cannot go on.
+/// Why a run cannot continue.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {

@@ -1,4 +1,4 @@
-//! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, pictures, and the
+//! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
 //! arguments, stores and scenes that both take.
 
 #[cfg(feature = "networks")]

@@ -71,7 +71,7 @@ pub fn go_on_with(file: &Path, options: &Value) -> Result<()> {
     let differs = |key: &&String| before.get(key.as_str()) != options.get(key.as_str());
     if let Some(key) = options.as_object().into_iter().flat_map(|o| o.keys()).find(differs) {
         bail!(
-            "{}: made with another {key} (there {}, now {}); give the same options to go on, or another --out",
+            "{}: made with another {key} (there {}, now {}); give the same options to continue, or another --out",
             file.display(),
             before[key],
             options[key]

@@ -1,9 +1,9 @@
-//! Pictures of poses: the object's silhouette, tinted surface and axes over the image.
+//! Images of poses: the object's silhouette, tinted surface and axes over the image.
 
 use sixfold_geometry::{Camera, DepthImage, Image, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_plot::text_dots;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 /// Colours that differ on screens and for most eyes (Okabe and Ito 2008).
 const COLORS: [[u8; 3]; 8] = [
@@ -22,7 +22,7 @@ pub fn color(index: usize) -> [u8; 3] {
     COLORS[index % COLORS.len()]
 }
 
-/// Depth as a picture, near light and far dark; black where nothing was measured.
+/// Depth as an image, near light and far dark; black where nothing was measured.
 pub fn depth_picture(depth: &DepthImage) -> RgbImage {
     let mut valid: Vec<f32> = depth.as_slice().iter().copied().filter(|&z| z > 0.0).collect();
     valid.sort_by(f32::total_cmp);
@@ -38,7 +38,7 @@ pub fn depth_picture(depth: &DepthImage) -> RgbImage {
     })
 }
 
-/// Two depth images as one picture, left and right in the same shades.
+/// Two depth images as one image, left and right in the same shades.
 pub fn side_by_side(left: &DepthImage, right: &DepthImage) -> RgbImage {
     let gap = 4;
     let start = left.width() + gap;
@@ -78,7 +78,7 @@ pub struct Drawn<'a> {
 /// Draws poses over an image of the camera's size.
 pub fn draw(image: &RgbImage, camera: &Camera, poses: &[Drawn<'_>]) -> RgbImage {
     let mut out = image.clone();
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     // Far ones first, so that what is in front is drawn last.
     let mut order: Vec<&Drawn<'_>> = poses.iter().collect();
     order.sort_by(|a, b| {
@@ -166,7 +166,7 @@ pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3])
     }
 }
 
-/// Unit normals as the usual picture: x, y, z from -1..1 to red, green, blue; black where unknown.
+/// Unit normals as the usual image: x, y, z from -1..1 to red, green, blue; black where unknown.
 pub fn normal_picture(normals: &Image<[f32; 3]>) -> RgbImage {
     normals.map(
         |n| {
@@ -175,7 +175,7 @@ pub fn normal_picture(normals: &Image<[f32; 3]>) -> RgbImage {
     )
 }
 
-/// Normalised object coordinates as a picture: -1..1 to 0..255 per axis; black where nothing is seen.
+/// Normalised object coordinates as an image: -1..1 to 0..255 per axis; black where nothing is seen.
 pub fn coordinate_picture(coordinates: &Image<[f32; 3]>) -> RgbImage {
     coordinates
         .map(|c| if c[0].is_nan() { [0; 3] } else { c.map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8) })

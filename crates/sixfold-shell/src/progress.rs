@@ -24,7 +24,7 @@ pub fn interrupted() -> &'static AtomicBool {
     &INTERRUPTED
 }
 
-/// An error once the user has asked to stop; `how` says how to go on.
+/// An error once the user has asked to stop; `how` says how to continue.
 pub fn check_interrupt(how: &str) -> Result<()> {
     if INTERRUPTED.load(Ordering::SeqCst) {
         bail!("interrupted; {how}");

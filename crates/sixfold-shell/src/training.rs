@@ -21,7 +21,7 @@ use crate::progress::{Progress, interrupted};
 /// What a training learns from.
 #[derive(Debug, Args)]
 pub struct MaterialArguments {
-    /// BOP dataset folder with models and posed photographs
+    /// BOP dataset folder with models and posed images
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
     /// Split of the dataset
@@ -42,7 +42,7 @@ pub struct MaterialArguments {
     /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// Folder of photographs for backgrounds (default: made-up textures)
+    /// Folder of photographs for backgrounds (default: procedural textures)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
     /// Folder of stored objects
@@ -176,7 +176,7 @@ pub fn train_in<R: Recipe>(
             bail!("interrupted; nothing was trained yet; run the same command again")
         }
         Ok(Outcome::Interrupted { step }) => {
-            bail!("interrupted after step {step}, which is kept; run the same command again to go on")
+            bail!("interrupted after step {step}, which is kept; run the same command again to continue")
         }
         Err(TrainError::Option(error)) => Err(by_flag(&error)),
         Err(error) => Err(error.into()),

@@ -14,13 +14,13 @@ use sixfold_render::DepthSensor;
 
 use crate::{
     ConvexParts, Outcome, SimulatedView, SimulationError, TrialOptions, TrialReport, ViewPoint,
-    settle_in_middle, simulate_view, try_grasp,
+    settle_at_centre, simulate_view, try_grasp,
 };
 
-/// What is drawn anew in every attempt, and with what it is tried.
+/// What is sampled again in every attempt, and with what it is tried.
 #[derive(Debug, Clone, Copy)]
 pub struct AttemptOptions {
-    /// Let the object fall in any orientation; otherwise it stands with its own z axis up, turned about it.
+    /// Let the object fall in any orientation; otherwise it stands with its own z axis up, rotated about it.
     pub any_orientation: bool,
     /// The camera's elevation above the table, smallest and largest, radians.
     pub elevation: (f64, f64),
@@ -56,7 +56,7 @@ impl Default for AttemptOptions {
 /// How an attempt ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Ending {
+pub enum AttemptOutcome {
     /// The object did not come to rest on the table: not an attempt of the planner.
     NoRest,
     /// Nothing was found on the table.
@@ -67,10 +67,10 @@ pub enum Ending {
     Tried(Outcome),
 }
 
-impl Ending {
+impl AttemptOutcome {
     /// Whether the object was held.
     pub fn is_success(self) -> bool {
-        self == Ending::Tried(Outcome::Held)
+        self == AttemptOutcome::Tried(Outcome::Held)
     }
 }
 
@@ -78,7 +78,7 @@ impl Ending {
 #[derive(Debug, Clone)]
 pub struct Attempt {
     /// How it ended.
-    pub ending: Ending,
+    pub ending: AttemptOutcome,
     /// Where the object lay.
     pub world_from_object: Pose,
     /// What was seen.
@@ -96,9 +96,9 @@ pub struct Attempt {
 /// An object at rest on the table, and what a depth camera sees of it: where an attempt starts.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// [`Ending::NoRest`] or [`Ending::NotSeen`] when there is nothing to grasp; [`Ending::NoProposal`] as long as nothing was
+    /// [`AttemptOutcome::NoRest`] or [`AttemptOutcome::NotSeen`] when there is nothing to grasp; [`AttemptOutcome::NoProposal`] as long as nothing was
     /// proposed.
-    pub ending: Ending,
+    pub ending: AttemptOutcome,
     /// Where the object lies.
     pub world_from_object: Pose,
     /// What the camera sees.
@@ -111,7 +111,7 @@ pub struct Scene {
     pub seconds: f64,
 }
 
-/// The scene of attempt `number`: pose, view point and noise are drawn from `seed` and `number` alone.
+/// The scene of attempt `number`: pose, view point and noise are sampled from `seed` and `number` alone.
 pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u64, number: u64) -> Scene {
     let mut random = stream(seed, number);
     let yaw = random.random_range(-std::f64::consts::PI..std::f64::consts::PI);
@@ -130,19 +130,19 @@ pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u
     let offset = Vec3::new(draw((-0.05, 0.05)), draw((-0.05, 0.05)), 0.0);
     let noise: u64 = random.random();
     let mut result = Scene {
-        ending: Ending::NoRest,
+        ending: AttemptOutcome::NoRest,
         world_from_object: start,
         seen: None,
         view: None,
         noise,
         seconds: 0.0,
     };
-    let Some(rest) = settle_in_middle(mesh, parts, &start) else { return result };
+    let Some(rest) = settle_at_centre(mesh, parts, &start) else { return result };
     let (low, high) = mesh.transformed(&rest).bounding_box();
     result.world_from_object = rest;
     let point =
         ViewPoint { azimuth, elevation, distance, target: offset + Vec3::z() * (0.5 * (high.z - low.z)) };
-    result.ending = Ending::NotSeen;
+    result.ending = AttemptOutcome::NotSeen;
     let Ok(seen) = simulate_view(mesh, &rest, &point, options.sensor.as_ref(), noise) else {
         return result;
     };
@@ -154,12 +154,12 @@ pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u
     result.seconds = began.elapsed().as_secs_f64();
     result.seen = Some(seen);
     if result.view.is_some() {
-        result.ending = Ending::NoProposal;
+        result.ending = AttemptOutcome::NoProposal;
     }
     result
 }
 
-/// Makes attempt `number` with the geometric planner: pose, view point and noise are drawn from `seed` and `number` alone.
+/// Makes attempt `number` with the geometric planner: pose, view point and noise are sampled from `seed` and `number` alone.
 ///
 /// # Errors
 /// [`SimulationError`] for options out of range.
@@ -200,6 +200,6 @@ pub fn attempt(
     let report = try_grasp(parts, &rest, gripper, &world_from_gripper, grasp.opening, &options.trial)?;
     result.trial_seconds = began.elapsed().as_secs_f64();
     result.report = Some(report);
-    result.ending = Ending::Tried(report.outcome);
+    result.ending = AttemptOutcome::Tried(report.outcome);
     Ok(result)
 }

@@ -33,12 +33,12 @@ mod trial;
 mod view;
 mod world;
 
-pub use attempt::{Attempt, AttemptOptions, Ending, Scene, attempt, scene};
+pub use attempt::{Attempt, AttemptOptions, AttemptOutcome, Scene, attempt, scene};
 pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
 pub use pile::{PileOptions, drop_objects};
-pub use settle::{settle, settle_in_middle};
-pub use statistics::{wilson_interval, wilson_interval_of_share};
+pub use settle::{settle, settle_at_centre};
+pub use statistics::{wilson_interval, wilson_interval_of_fraction};
 pub use tabletop::{Tabletop, TabletopImage, TabletopOptions};
 pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};
 pub use view::{SimulatedView, ViewPoint, simulate_view};

@@ -18,7 +18,7 @@ pub struct PartsOptions {
     pub voxel: f64,
     /// Most parts.
     pub max_parts: usize,
-    /// A part is cut further when its hull holds this much more volume than it, as a share of the whole object's hull.
+    /// A part is cut further when its hull holds this much more volume than it, as a fraction of the whole object's hull.
     pub concavity: f64,
     /// Faces are reduced to this number first.
     pub max_faces: usize,

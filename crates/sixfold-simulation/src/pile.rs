@@ -14,9 +14,9 @@ use crate::{ConvexParts, SimulationError};
 
 /// Time step, seconds; twice that of grasps, as nothing is held here.
 const STEP: f64 = 0.004;
-/// Steps between two looks at what still moves: 0.1 s.
+/// Steps between two passes at what still moves: 0.1 s.
 const STEPS: usize = 25;
-/// What moves less than this between two looks rests: metres and radians.
+/// What moves less than this between two passes rests: metres and radians.
 const REST: (f64, f64) = (0.0005, 0.005);
 /// Looks after which what still moves is taken away, and after which all is over.
 const PATIENCE: (usize, usize) = (30, 40);
@@ -34,9 +34,9 @@ pub struct PileOptions {
     pub radius: f64,
     /// Objects whose middle comes further than this from the origin are taken away, metres.
     pub reach: f64,
-    /// Share of the objects that start upright (their z axis up) and turned about it; the others start in any orientation.
+    /// Fraction of the objects that start upright (their z axis up) and rotated about it; the others start in any orientation.
     pub upright: f64,
-    /// Share of the objects that fall wherever they fall; the others look for a free place (and may find none).
+    /// Fraction of the objects that fall wherever they fall; the others look for a free place (and may find none).
     pub stacked: f64,
 }
 
@@ -55,8 +55,8 @@ impl PileOptions {
         check_ranges(&[
             ("radius", self.radius, 0.0, 0.8, "0 to 0.8 m"),
             ("reach", self.reach, self.radius.max(0.01), 0.9, "from radius to 0.9 m"),
-            ("upright", self.upright, 0.0, 1.0, "a share from 0 to 1"),
-            ("stacked", self.stacked, 0.0, 1.0, "a share from 0 to 1"),
+            ("upright", self.upright, 0.0, 1.0, "a fraction from 0 to 1"),
+            ("stacked", self.stacked, 0.0, 1.0, "a fraction from 0 to 1"),
         ])
     }
 }
@@ -67,12 +67,12 @@ struct Dropped {
     upright: bool,
     parts: ConvexParts,
     rotation: UnitQuaternion<f64>,
-    /// Middle of its box in its own frame, and the distance of its farthest corner from there.
+    /// Centre of its box in its own frame, and the distance of its farthest corner from there.
     middle: Vec3,
     radius: f64,
-    /// Distance of the farthest corner from the upright axis through the middle, as it is turned.
+    /// Distance of the farthest corner from the upright axis through the middle, as it is rotated.
     width: f64,
-    /// How far the lowest corner lies below the middle, as it is turned.
+    /// How far the lowest corner lies below the middle, as it is rotated.
     below: f64,
 }
 
@@ -169,7 +169,7 @@ pub fn drop_objects(
     poses
 }
 
-/// Where an object's middle starts: a free place on the table if it wants one and finds it, otherwise over what is there.
+/// Where an object's centre starts: a free place on the table if it wants one and finds it, otherwise over what is there.
 fn choose_place(
     object: &Dropped,
     placed: &[(Vec3, f64, f64)],
@@ -186,7 +186,7 @@ fn choose_place(
         for (other, radius, width) in placed {
             let apart = (other.xy() - spot.xy()).norm();
             let (reach, near) = (object.radius + radius + HEIGHT, object.width + width + HEIGHT);
-            // Side by side as they are turned, or one above the other as balls.
+            // Side by side as they are rotated, or one above the other as balls.
             if apart < near {
                 height = height.max(other.z + (reach * reach - apart * apart).max(0.0).sqrt());
             }

@@ -40,7 +40,7 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
 
 /// As [`settle`], with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
 /// it rolled.
-pub fn settle_in_middle(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
+pub fn settle_at_centre(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     let rest = settle(parts, world_from_object)?;
     let (low, high) = mesh.transformed(&rest).bounding_box();
     let middle = (low + high) * 0.5;

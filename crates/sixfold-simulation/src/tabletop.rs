@@ -11,7 +11,7 @@ use sixfold_geometry::random::{Random, stream};
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, MeshError};
 use sixfold_render::{
-    DepthSensor, Frame, Light, Material, RenderOptions, SceneObject, shade, simulate_depth,
+    DepthSensor, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade, simulate_depth,
 };
 
 use crate::parts::ConvexParts;
@@ -118,7 +118,7 @@ impl Tabletop {
             .chain([(&self.table, *camera_from_world)])
             .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
             .collect();
-        let mut frame = Frame::new(camera);
+        let mut frame = VisibilityBuffer::new(camera);
         frame.render(&objects, &RenderOptions::default());
         let ideal = frame.depth();
         let depth = match sensor {

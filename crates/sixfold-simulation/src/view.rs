@@ -2,7 +2,7 @@
 
 use sixfold_geometry::{Camera, CameraError, DepthImage, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 /// Where a camera stands that looks at the table's origin.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,7 +64,7 @@ pub fn simulate_view(
     let table = Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok();
     let mut objects = vec![SceneObject { mesh, camera_from_object: camera_from_world * *world_from_object }];
     objects.extend(table.as_ref().map(|mesh| SceneObject { mesh, camera_from_object: camera_from_world }));
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let ideal = frame.depth();
     let depth = match sensor {

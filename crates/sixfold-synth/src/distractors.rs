@@ -13,7 +13,7 @@ use sixfold_mesh::Mesh;
 use crate::augment::{Backgrounds, procedural_texture};
 use crate::{profiles, randomly_colored};
 
-/// Corners around a turned solid.
+/// Corners around a lathed solid.
 const AROUND: u32 = 24;
 /// Side of a texture, pixels.
 const TEXTURE: usize = 96;
@@ -29,7 +29,7 @@ pub fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Ra
                 return mesh;
             }
             let shift = Vec3::from_fn(|_, _| between(random, -0.4, 0.4));
-            mesh.transformed(&Pose::new(random_turn(random).rotation(), shift))
+            mesh.transformed(&Pose::new(random_rotation(random).rotation(), shift))
                 .scaled(between(random, 0.4, 1.0))
         })
         .collect();
@@ -41,7 +41,7 @@ pub fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Ra
 }
 
 /// A rotation, each as likely as any other (Shoemake 1992).
-pub fn random_turn(random: &mut Random) -> Pose {
+pub fn random_rotation(random: &mut Random) -> Pose {
     let [u, v, w] = [0; 3].map(|_| between(random, 0.0, 1.0));
     let about = |angle: f64, axis: Vec3| {
         Pose::exp(&[0.0, 0.0, 0.0, angle * axis.x, angle * axis.y, angle * axis.z].into())
@@ -135,7 +135,7 @@ fn cuboid(random: &mut Random) -> Mesh {
     given(given(given(Mesh::new(vertices, faces)).with_normals(normals)).with_texture(texcoords, one_texel()))
 }
 
-/// What is turned about an axis: can, cup, bowl, bottle or pebble; some cups with a handle.
+/// What is rotated about an axis: can, cup, bowl, bottle or pebble; some cups with a handle.
 fn household(random: &mut Random) -> Mesh {
     let radius = between(random, 0.2, 0.55);
     let wall = 0.04;
@@ -185,7 +185,7 @@ fn household(random: &mut Random) -> Mesh {
     }
 }
 
-/// A profile of (radius, height) from the axis back to the axis, turned about z. Each band has normals of its own: edges of
+/// A profile of (radius, height) from the axis back to the axis, rotated about z. Each band has normals of its own: edges of
 /// cans are sharp.
 fn turned(profile: &[(f64, f64)]) -> Mesh {
     let (mut vertices, mut normals, mut texcoords, mut faces) = (vec![], vec![], vec![], vec![]);
@@ -302,10 +302,10 @@ mod tests {
     fn rotations_point_everywhere() {
         let mut random = stream(9, 0);
         let mean: Vec3 =
-            (0..4000).map(|_| random_turn(&mut random).transform_direction(&Vec3::x())).sum::<Vec3>()
+            (0..4000).map(|_| random_rotation(&mut random).transform_direction(&Vec3::x())).sum::<Vec3>()
                 / 4000.0;
         let spread: f64 = (0..4000)
-            .map(|_| (random_turn(&mut random).transform_direction(&Vec3::x())).z.powi(2))
+            .map(|_| (random_rotation(&mut random).transform_direction(&Vec3::x())).z.powi(2))
             .sum::<f64>()
             / 4000.0;
         assert!(mean.norm() < 0.05 && (spread - 1.0 / 3.0).abs() < 0.03, "{mean:?} {spread}");

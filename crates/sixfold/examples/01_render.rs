@@ -1,4 +1,4 @@
-//! Lesson 1: a mesh, a camera and a pose become a depth image and a colour image:
+//! GraspTask 1: a mesh, a camera and a pose become a depth image and a colour image:
 //! `cargo run -p sixfold --example 01_render -- FOLDER`.
 
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! Lesson 2: the pose of a known object in a real depth image, without training:
+//! GraspTask 2: the pose of a known object in a real depth image, without training:
 //! `cargo run --release -p sixfold --example 02_pose_from_depth`.
 
 use sixfold::bop::Models;

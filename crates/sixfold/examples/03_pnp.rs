@@ -1,4 +1,4 @@
-//! Lesson 3: a pose from points of an object and their pixels, a quarter of them wrong:
+//! GraspTask 3: a pose from points of an object and their pixels, a quarter of them wrong:
 //! `cargo run -p sixfold --example 03_pnp`.
 
 use sixfold::geometry::{PnpOptions, Vec2, pnp_ransac};

@@ -1,4 +1,4 @@
-//! Lesson 4: a rough pose aligned with a noisy depth image by point-to-plane ICP:
+//! GraspTask 4: a rough pose aligned with a noisy depth image by point-to-plane ICP:
 //! `cargo run -p sixfold --example 04_icp`.
 
 use sixfold::geometry::{DepthTarget, IcpOptions, NormalOptions, PointCloud, icp, normals_from_depth};

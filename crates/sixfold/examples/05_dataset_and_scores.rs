@@ -1,4 +1,4 @@
-//! Lesson 5: a method on all targets of a BOP dataset, its result file, and the scores:
+//! GraspTask 5: a method on all targets of a BOP dataset, its result file, and the scores:
 //! `cargo run --release -p sixfold --example 05_dataset_and_scores -- [DATASET [RESULTS.csv]]`.
 //! A run that was stopped resumes where it was.
 

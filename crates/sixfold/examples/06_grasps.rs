@@ -1,4 +1,4 @@
-//! Lesson 6: grasps from one depth image of a mug on a table, and what becomes of the best one in a physics engine:
+//! GraspTask 6: grasps from one depth image of a mug on a table, and what becomes of the best one in a physics engine:
 //! `cargo run --release -p sixfold --example 06_grasps`.
 
 use sixfold::grasp::{

@@ -1,4 +1,4 @@
-"""Sixfold: known objects in images, where they are and how they are turned.
+"""Sixfold: known objects in images, where they are and how they are rotated.
 
 numpy arrays in, poses out. Lengths are in metres, angles in radians. A pose is a (4, 4) float64 matrix
 ``camera_from_object`` that takes points of the object's frame to the camera's: OpenCV's, x right, y down, z forward.

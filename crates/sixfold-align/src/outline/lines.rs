@@ -4,11 +4,11 @@
 
 use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Patch;
 
 /// Fewer lines do not hold a pose: twice its six degrees of freedom.
-pub const LEAST_LINES: usize = 12;
+pub const MIN_LINES: usize = 12;
 
 /// Faces of a mesh that is drawn for its outline alone; chosen by hand, not swept.
 const OUTLINE_FACES: usize = 4000;
@@ -80,7 +80,7 @@ pub struct Line {
 #[derive(Debug)]
 pub struct Outline<'a> {
     mesh: &'a Mesh,
-    frame: Frame,
+    frame: VisibilityBuffer,
     crop: Camera,
     odds: Vec<f32>,
     /// Change of colour along x and y at every pixel, and its weight.
@@ -96,7 +96,7 @@ impl<'a> Outline<'a> {
     /// When `odds` has not as many numbers as the crop has pixels.
     pub fn new(mesh: &'a Mesh, crop: &Camera, odds: Vec<f32>) -> Self {
         assert_eq!(odds.len(), crop.width * crop.height, "one number per pixel of a square crop");
-        Outline { mesh, frame: Frame::new(crop), crop: *crop, odds, edges: None, side: crop.width }
+        Outline { mesh, frame: VisibilityBuffer::new(crop), crop: *crop, odds, edges: None, side: crop.width }
     }
 
     /// The same where borders are rather there where colours change: `weight` is what the log likelihood of a border gains at a

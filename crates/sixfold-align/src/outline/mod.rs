@@ -9,5 +9,5 @@
 mod lines;
 mod odds;
 
-pub use lines::{LEAST_LINES, Line, Outline, add_lines, motion, outline_mesh, sample, tukey};
+pub use lines::{Line, MIN_LINES, Outline, add_lines, motion, outline_mesh, sample, tukey};
 pub use odds::{color_odds, log_odds};

@@ -61,14 +61,14 @@ mod tests {
         ModelPoints::new(&[Vec3::new(0.1, 0.0, 0.0), Vec3::new(-0.1, 0.0, 0.0)]).unwrap()
     }
 
-    fn turned_about_z(angle: f64) -> Pose {
+    fn rotated_about_z(angle: f64) -> Pose {
         Pose::new(UnitQuaternion::from_scaled_axis(Vec3::z() * angle), Vec3::new(0.0, 0.0, 1.0))
     }
 
     #[test]
     fn a_half_turn_of_a_dumbbell_by_hand() {
         let points = dumbbell();
-        let (e, g) = (turned_about_z(std::f64::consts::PI), turned_about_z(0.0));
+        let (e, g) = (rotated_about_z(std::f64::consts::PI), rotated_about_z(0.0));
         let half_turn =
             Pose::new(UnitQuaternion::from_scaled_axis(Vec3::z() * std::f64::consts::PI), Vec3::zeros());
         assert!((add(&points, e, g) - 0.2).abs() < 1e-12);
@@ -82,7 +82,7 @@ mod tests {
     fn a_quarter_turn_of_a_dumbbell_by_hand() {
         // Each end moves along the chord of a quarter circle of radius 0.1 m, to either end of the other pose.
         let points = dumbbell();
-        let (e, g) = (turned_about_z(std::f64::consts::FRAC_PI_2), turned_about_z(0.0));
+        let (e, g) = (rotated_about_z(std::f64::consts::FRAC_PI_2), rotated_about_z(0.0));
         let chord = 0.1 * 2f64.sqrt();
         assert!((add(&points, e, g) - chord).abs() < 1e-12);
         assert!((adi(&points, e, g) - chord).abs() < 1e-12);
@@ -90,10 +90,10 @@ mod tests {
 
     #[test]
     fn the_mean_and_the_largest_differ_where_they_should() {
-        // The estimate is 30 mm off in x and turned by a half: ends move by 0.2 - 0.03 and 0.2 + 0.03.
+        // The estimate is 30 mm off in x and rotated by a half: ends move by 0.2 - 0.03 and 0.2 + 0.03.
         let points = dumbbell();
-        let g = turned_about_z(0.0);
-        let e = turned_about_z(std::f64::consts::PI).with_translation(Vec3::new(0.03, 0.0, 1.0));
+        let g = rotated_about_z(0.0);
+        let e = rotated_about_z(std::f64::consts::PI).with_translation(Vec3::new(0.03, 0.0, 1.0));
         assert!((mssd(&points, e, g, &[Pose::identity()]) - 0.23).abs() < 1e-12);
         assert!((add(&points, e, g) - 0.2).abs() < 1e-12);
         assert!((adi(&points, e, g) - 0.03).abs() < 1e-12);
@@ -103,7 +103,7 @@ mod tests {
     fn numbers_that_are_not_quite_a_rotation_are_taken_as_they_are() {
         // A rotation a thousandth too large moves the end at 0.1 m by 0.1 mm; symmetric or not, all say so.
         let points = dumbbell();
-        let g = Placement::from(turned_about_z(0.0));
+        let g = Placement::from(rotated_about_z(0.0));
         let e = Placement { rotation: g.rotation * 1.001, ..g };
         for error in [mssd(&points, e, g, &[Pose::identity()]), add(&points, e, g), adi(&points, e, g)] {
             assert!((error - 1e-4).abs() < 1e-12, "{error}");

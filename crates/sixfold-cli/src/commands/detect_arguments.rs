@@ -1,4 +1,4 @@
-//! What `sixfold detect` is told.
+//! Arguments of `sixfold detect`.
 
 use std::path::PathBuf;
 
@@ -28,7 +28,7 @@ pub(crate) struct DetectArguments {
     /// Result: a JSON file of COCO detections for a dataset, a folder for images
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
-    /// Folder for overlay pictures of a dataset's images
+    /// Folder for overlays of a dataset's images
     #[arg(long, value_name = "DIR", requires = "dataset")]
     pub overlays: Option<PathBuf>,
     /// Only these of the detector's objects (default: all)
@@ -39,7 +39,7 @@ pub(crate) struct DetectArguments {
     #[arg(long, value_name = "SCORE")]
     pub threshold: Option<f32>,
     /// Of two boxes of an object that overlap more than this (intersection over union), leave the worse one out
-    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub overlap: f32,
     /// Most detections of each object in an image, the best ones
     #[arg(long, value_name = "N", default_value = "100")]

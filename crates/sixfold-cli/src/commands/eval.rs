@@ -1,4 +1,4 @@
-//! `sixfold eval`: scores on the screen, curves as a picture, JSON for scripts.
+//! `sixfold eval`: scores on the screen, curves as a figure, JSON for scripts.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -52,7 +52,7 @@ pub(crate) struct EvalArguments {
     /// Leave out VSD, which renders every pose
     #[arg(long)]
     pub no_vsd: bool,
-    /// Picture of the recall curves
+    /// Plot of the recall curves
     #[arg(long, value_name = "FILE.png")]
     pub curves: Option<PathBuf>,
     #[command(flatten)]
@@ -195,9 +195,9 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
         && truth.truth.annotations.iter().any(|a| a.segmentation.is_some());
     let masks = with_masks.then(|| evaluate_coco(&truth.truth, &read.detections, IouType::Mask));
     let known = truth.visible.len() == truth.truth.annotations.len();
-    let least_visible: &[f64] = if known { &[0.1, 0.4] } else { &[] };
+    let min_visibility: &[f64] = if known { &[0.1, 0.4] } else { &[] };
     let found: Vec<_> =
-        least_visible.iter().map(|v| found_at_half(&truth, &read.detections, a.min_score, *v)).collect();
+        min_visibility.iter().map(|v| found_at_half(&truth, &read.detections, a.min_score, *v)).collect();
     let value = serde_json::json!({
         "images": truth.truth.images.len(),
         "box": boxes,

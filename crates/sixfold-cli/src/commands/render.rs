@@ -1,4 +1,4 @@
-//! `sixfold render`: what the renderer sees of one object, as pictures.
+//! `sixfold render`: what the renderer sees of one object, as images.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,9 @@ use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
 use sixfold_mesh::{Mesh, Unit};
-use sixfold_render::{BoundingBoxScale, Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{
+    BoundingBoxScale, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade,
+};
 
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, pose_rows, report};
@@ -27,10 +29,10 @@ pub(crate) struct RenderArguments {
     #[arg(long, value_name = "FILE")]
     pub camera: Option<PathBuf>,
     /// Pose camera_from_object: tx,ty,tz,rx,ry,rz (metres, rotation vector in radians) or 16 numbers of a 4x4 matrix
-    /// row by row (default: fills the picture, seen from above)
+    /// row by row (default: fills the image, seen from above)
     #[arg(long, value_name = "NUMBERS", value_delimiter = ',', allow_hyphen_values = true)]
     pub pose: Option<Vec<f64>>,
-    /// Folder for the pictures
+    /// Folder for the images
     #[arg(long, value_name = "DIR", default_value = "out/render")]
     pub out: PathBuf,
     /// Folder of stored objects
@@ -46,7 +48,7 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
         Some(path) => {
             let file = CameraFile::read(path)?;
             if !file.sized {
-                bail!("{}: fields width and height are missing: how large is the picture?", path.display());
+                bail!("{}: fields width and height are missing: how large is the image?", path.display());
             }
             file.camera.without_distortion()
         }
@@ -65,7 +67,7 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
         Some(n) => bail!("--pose: found {} numbers, expected 6 or 16", n.len()),
     };
     let objects = [SceneObject { mesh: &object.mesh, camera_from_object: pose }];
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
     let (low, high) = object.mesh.bounding_box();
     let scale = BoundingBoxScale::of_corners(&low, &high);
@@ -108,7 +110,7 @@ fn default_camera(width: usize, height: usize) -> Camera {
     }
 }
 
-/// From above and in front, so near that the object fills most of the picture.
+/// From above and in front, so near that the object fills most of the image.
 fn default_pose(mesh: &Mesh, camera: &Camera) -> Pose {
     let (low, high) = mesh.bounding_box();
     let radius = (high - low).norm() / 2.0;
@@ -121,11 +123,11 @@ fn default_pose(mesh: &Mesh, camera: &Camera) -> Pose {
     Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * centre)
 }
 
-/// A picture of the object on its own.
+/// An image of the object on its own.
 pub(super) fn portrait(mesh: &Mesh) -> RgbImage {
     let camera = default_camera(480, 480);
     let objects = [SceneObject { mesh, camera_from_object: default_pose(mesh, &camera) }];
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let white = RgbImage::filled(480, 480, [255; 3]);
     shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&white))

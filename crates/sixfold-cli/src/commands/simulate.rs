@@ -13,7 +13,7 @@ use sixfold_geometry::{Camera, DepthImage, Pose};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_render::{
-    DepthSensor, Frame, RenderOptions, SceneObject, plane_mesh, simulate_depth, support_plane,
+    DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, plane_mesh, simulate_depth, support_plane,
 };
 
 use sixfold_shell::Outcome;
@@ -63,7 +63,7 @@ pub(crate) struct SimulateArguments {
     /// Copy the colour images too
     #[arg(long)]
     pub rgb: bool,
-    /// Folder for pictures of ideal and simulated depth side by side
+    /// Folder for images of ideal and simulated depth side by side
     #[arg(long, value_name = "DIR")]
     pub pictures: Option<PathBuf>,
     /// Simulate only these image ids
@@ -165,7 +165,7 @@ fn measured(
     if let Some(mesh) = &table {
         objects.push(SceneObject { mesh, camera_from_object: Pose::identity() });
     }
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
     let ideal = frame.depth();
     let depth = match a.sensor.model() {

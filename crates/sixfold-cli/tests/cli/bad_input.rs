@@ -85,7 +85,7 @@ fn truncated_images() {
     for name in ["depth.png", "rgb.png"] {
         estimate_fails(|dir| truncate(&dir.join(name), 0.5), "", &[name]);
         estimate_fails(|dir| truncate(&dir.join(name), 0.0), "", &[name]);
-        estimate_fails(|dir| std::fs::write(dir.join(name), "no picture").unwrap(), "", &[name]);
+        estimate_fails(|dir| std::fs::write(dir.join(name), "no image").unwrap(), "", &[name]);
     }
 }
 
@@ -218,7 +218,7 @@ fn broken_object_in_the_store() {
     truncate(&dir.join("sixfold-objects/part/mesh.ply"), 0.5);
     fails(dir, "render --object part", &["mesh.ply"]);
 
-    // A broken description is only a copy: it is made anew, with a note.
+    // A broken description is only a copy: it is made again, with a note.
     sixfold(dir, "object add part part.ply --unit mm --replace").expect(0);
     truncate(&dir.join("sixfold-objects/part/ppf.bin"), 0.5);
     let run = sixfold(dir, "estimate --depth depth.png --camera camera.json --object part").expect(0);

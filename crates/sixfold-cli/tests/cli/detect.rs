@@ -41,7 +41,7 @@ fn a_detector_is_trained_and_used() {
         "{card}"
     );
 
-    // One image: the object, its box, its mask, a picture.
+    // One image: the object, its box, its mask, an image.
     let rgb = "--rgb tiny/test/000007/rgb/000004.png";
     let json =
         sixfold(tiny.path(), &detect(&format!("{rgb} --threshold 0.05 --per-object 1 --out one --json")));

@@ -28,7 +28,7 @@ fn finds_the_pose_and_draws_it() {
         serde_json::from_slice(&std::fs::read(case.path().join("out/poses.json")).unwrap()).unwrap();
     assert_eq!(kept, json);
 
-    // The overlay colours the object where it stands and leaves the rest of the picture alone.
+    // The overlay colours the object where it stands and leaves the rest of the image alone.
     let overlay = image::open(case.path().join("out/overlay.png")).unwrap().to_rgb8();
     assert_eq!(overlay.dimensions(), (WIDTH as u32, HEIGHT as u32));
     let middle = camera().project(&case.truth.transform_point(&part().vertices()[0])).unwrap();
@@ -41,8 +41,10 @@ fn finds_the_pose_and_draws_it() {
     assert!(changed.iter().all(|(x, y)| (x - middle.x).hypot(y - middle.y) < 120.0));
     // The description was kept in the cache, and nothing beside the mesh.
     assert!(cached(case.path(), "ppf.bin").is_file());
-    let mut beside: Vec<_> =
-        std::fs::read_dir(case.path()).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    let mut beside: Vec<_> = std::fs::read_dir(case.path())
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .collect();
     beside.sort();
     assert_eq!(beside, ["cache-of-tests", "camera.json", "depth.png", "out", "part.ply", "rgb.png"]);
 }

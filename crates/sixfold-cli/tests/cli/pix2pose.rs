@@ -1,4 +1,4 @@
-//! Pix2Pose from the command line: training, weights, poses from colour; on pictures that the tests render.
+//! Pix2Pose from the command line: training, weights, poses from colour; on images that the tests render.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use sixfold_pix2pose::model::Pix2PoseModel;
 
 use crate::support::*;
 
-/// Trains object 1 on the three pictures of the tiny dataset, a small network for so many steps.
+/// Trains object 1 on the three images of the tiny dataset, a small network for so many steps.
 fn train(steps: usize) -> String {
     format!(
         "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-share 0 --steps {steps} --out trained"
@@ -18,7 +18,7 @@ fn train(steps: usize) -> String {
 
 const WEIGHTS: &str = "trained/model.safetensors";
 
-/// The picture, camera, mesh and box of object 1 in image 4.
+/// The image, camera, mesh and box of object 1 in image 4.
 fn one_image(tiny: &Tiny) -> String {
     let truth = tiny.truth_of(4, 1);
     let corners: Vec<_> =
@@ -61,7 +61,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     let grey = vec![0.5; 3 * 64 * 64];
     assert_eq!(both[0].predict(0, &grey), both[1].predict(0, &grey));
 
-    // One image: pose, all hypotheses, both pictures.
+    // One image: pose, all hypotheses, both images.
     let run = sixfold(tiny.path(), &format!("{} --out one --json", one_image(&tiny))).expect(0);
     let json = run.json();
     assert_eq!(json, json_of(&tiny.path().join("one/poses.json")));
@@ -75,7 +75,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     assert!(!inliers.is_empty() && inliers.is_sorted_by(|a, b| a >= b), "{inliers:?}");
     let overlay = image::open(tiny.path().join("one/overlay.png")).unwrap().to_rgb8();
     assert_eq!(overlay.dimensions(), (WIDTH as u32, HEIGHT as u32));
-    assert!(overlay.pixels().any(|p| p.0[0].abs_diff(p.0[2]) > 60), "nothing is drawn");
+    assert!(overlay.pixels().any(|p| p.0[0].abs_diff(p.0[2]) > 60), "nothing is rendered");
     let seen = image::open(tiny.path().join("one/coordinates.png")).unwrap().to_rgb8();
     assert_eq!(seen.height(), 256);
     // The second of the four is coloured where the object is.
@@ -151,7 +151,7 @@ fn a_training_goes_on_and_is_not_mixed_with_another() {
     assert!(std::fs::read(tiny.path().join(WEIGHTS)).unwrap() == model);
     let json = sixfold(tiny.path(), &format!("{} --export --json", train(3))).expect(0).json();
     assert_eq!((&json["steps"], &json["seconds"]), (&3.into(), &Value::Null));
-    // The card says what the network has not seen the mesh of.
+    // The card states what the network has not seen the mesh of.
     sixfold(tiny.path(), &train(1).replace("--out trained", "--out hull --convex-hull")).expect(0);
     let card = std::fs::read_to_string(tiny.path().join("hull/model.md")).unwrap();
     assert!(card.contains("convex hulls"), "{card}");
@@ -279,7 +279,7 @@ fn bad_boxes_weights_and_objects() {
     fails(tiny.path(), &boxed.replace("--method pix2pose", ""), &["--method pix2pose"]);
     fails(tiny.path(), &format!("{boxed} --icp"), &["--icp", "--depth"]);
 
-    // A picture of another size than the camera file says.
+    // An image of another size than the camera file says.
     let camera_file = tiny.path().join("tiny/camera.json");
     let camera: Value = json_of(&camera_file);
     let small = sixfold_geometry::RgbImage::filled(160, 120, [90; 3]);

@@ -7,10 +7,10 @@ use sixfold_bop::{BopDataset, Estimate, MaskKind, Models, write_results};
 
 use crate::support::*;
 
-/// Two scenes of two small images with made-up objects.
+/// Two scenes of two small images with synthetic objects.
 const SMALL: &str = "simulate-scenes --families can,box --toys 2 --scenes 2 --views 2 --objects-per-scene 3,5 --camera camera.json";
 
-/// All files below a folder but its pictures of everything.
+/// All files below a folder but its images of everything.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut all = BTreeMap::new();
     let mut open = vec![folder.to_path_buf()];

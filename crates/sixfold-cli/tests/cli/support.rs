@@ -8,7 +8,7 @@ use sixfold_bop::{GroundTruth, NewImage, SceneWriter, Target, TargetObject, writ
 use sixfold_geometry::nalgebra::{Matrix4, UnitQuaternion};
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
-use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use tempfile::TempDir;
 
 pub const WIDTH: usize = 320;
@@ -130,7 +130,7 @@ pub fn other_part() -> Mesh {
     Mesh::new(vertices, faces).unwrap()
 }
 
-/// On the table: `x` and `y` metres from its middle, turned by `yaw`; the camera looks down at it from 0.6 m.
+/// On the table: `x` and `y` metres from its middle, rotated by `yaw`; the camera looks down at it from 0.6 m.
 pub fn on_table(x: f64, y: f64, yaw: f64) -> Pose {
     let table = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), 140f64.to_radians());
     let turn = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), yaw);
@@ -152,7 +152,7 @@ pub fn depth_of(objects: &[(&Mesh, Pose)]) -> DepthImage {
         .chain([(&table, on_table(0.0, 0.0, 0.0))])
         .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
         .collect();
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     frame.render(&objects, &RenderOptions::default());
     frame.depth()
 }
@@ -166,7 +166,7 @@ pub fn picture_of(objects: &[(&Mesh, Pose)]) -> RgbImage {
         .chain([(&table, on_table(0.0, 0.0, 0.0))])
         .map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object })
         .collect();
-    let mut frame = Frame::new(&camera());
+    let mut frame = VisibilityBuffer::new(&camera());
     frame.render(&objects, &RenderOptions::default());
     shade(&frame, &objects, &Light::default_set(), &Material::default(), None)
 }
@@ -317,7 +317,7 @@ pub fn replace(file: &Path, from: &str, to: &str) {
     std::fs::write(file, text.replacen(from, to, 1)).unwrap();
 }
 
-/// Cuts a file to this share of its length.
+/// Cuts a file to this fraction of its length.
 pub fn truncate(file: &Path, share: f64) {
     let bytes = std::fs::read(file).unwrap();
     std::fs::write(file, &bytes[..(share * bytes.len() as f64) as usize]).unwrap();

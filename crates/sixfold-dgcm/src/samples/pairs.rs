@@ -13,14 +13,14 @@ use sixfold_synth::shapes::Family;
 
 use super::pool::{Pool, View};
 
-/// How pairs are drawn and augmented.
+/// How pairs are sampled and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PairOptions {
-    /// Two views whose share of common visible vertices is above this are a positive pair.
+    /// Two views whose fraction of common visible vertices is above this are a positive pair.
     pub shared: f64,
-    /// Share of negative pairs that are of one family.
+    /// Fraction of negative pairs that are of one family.
     pub same_family: f64,
-    /// Largest share of the object's box that is hidden by a block (table 6.1).
+    /// Largest fraction of the object's box that is hidden by a block (table 6.1).
     pub occlusion: f64,
     /// Standard deviation of the noise on normals and VD-NOC (table 6.1).
     pub noise: f32,
@@ -126,7 +126,7 @@ impl Pool {
     }
 }
 
-/// Which pixels a block hides: it comes from one side of the object's box and takes a share of it.
+/// Which pixels a block hides: it comes from one side of the object's box and takes a fraction of it.
 fn block(
     view: &View,
     side: usize,
@@ -156,11 +156,11 @@ fn block(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::samples::PoolOptions;
+    use crate::samples::GraspPoolOptions;
     use rand::SeedableRng;
 
     fn pool() -> Pool {
-        Pool::new(&PoolOptions { views: 96, ..PoolOptions::default() }, |_| ())
+        Pool::new(&GraspPoolOptions { views: 96, ..GraspPoolOptions::default() }, |_| ())
     }
 
     #[test]

@@ -10,14 +10,14 @@ use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 use sixfold_experience::{Crop, CropOptions, Extent};
 use sixfold_synth::shapes::{Family, Rest, member};
 
 /// How views are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct PoolOptions {
+pub struct GraspPoolOptions {
     /// Views in the pool.
     pub views: usize,
     /// Views of each member of a family.
@@ -26,7 +26,7 @@ pub struct PoolOptions {
     pub distance: (f64, f64),
     /// The camera's angle above the table, smallest and largest, radians.
     pub elevation: (f64, f64),
-    /// Largest turn of the image, radians: half the step of the in-plane copies and a little.
+    /// Largest rotation of the image, radians: half the step of the in-plane copies and a little.
     pub roll: f64,
     /// Up to this height above the table nothing of the object is in the mask, metres: that is lost with the table.
     pub lost_above_table: f64,
@@ -36,9 +36,9 @@ pub struct PoolOptions {
     pub seed: u64,
 }
 
-impl Default for PoolOptions {
+impl Default for GraspPoolOptions {
     fn default() -> Self {
-        PoolOptions {
+        GraspPoolOptions {
             views: 6000,
             views_per_member: 4,
             distance: (0.6, 1.3),
@@ -83,7 +83,7 @@ pub struct View {
 }
 
 impl View {
-    /// What two views share of their visible vertices, 0 to 1 (Dice's coefficient).
+    /// What two views have in common of their visible vertices, 0 to 1 (Dice's coefficient).
     pub fn shared(&self, other: &View) -> f64 {
         let count = |bits: &[u64]| bits.iter().map(|b| b.count_ones()).sum::<u32>();
         let common: u32 = self.visible.iter().zip(&other.visible).map(|(a, b)| (a & b).count_ones()).sum();
@@ -107,12 +107,12 @@ pub struct Pool {
     groups: Vec<Vec<usize>>,
     /// The group of every view.
     group_of: Vec<usize>,
-    options: PoolOptions,
+    options: GraspPoolOptions,
 }
 
 impl Pool {
-    /// Makes the views, the same for the same options at any number of threads. `done` hears how many there are so far.
-    pub fn new(options: &PoolOptions, done: impl Fn(usize) + Sync) -> Pool {
+    /// Makes the views, the same for the same options at any number of threads. `done` receives how many there are so far.
+    pub fn new(options: &GraspPoolOptions, done: impl Fn(usize) + Sync) -> Pool {
         let members = options.views.div_ceil(options.views_per_member.max(1));
         let count = std::sync::atomic::AtomicUsize::new(0);
         let made: Vec<Vec<View>> = (0..members)
@@ -147,7 +147,7 @@ impl Pool {
     }
 
     /// How they were made.
-    pub fn options(&self) -> &PoolOptions {
+    pub fn options(&self) -> &GraspPoolOptions {
         &self.options
     }
 
@@ -157,7 +157,7 @@ impl Pool {
     }
 }
 
-fn views_of_member(options: &PoolOptions, number: u64) -> Vec<View> {
+fn views_of_member(options: &GraspPoolOptions, number: u64) -> Vec<View> {
     let mut random = stream(options.seed, number);
     let family = Family::ALL[(number % Family::ALL.len() as u64) as usize];
     let rests = family.rests();
@@ -175,12 +175,12 @@ fn views_of_member(options: &PoolOptions, number: u64) -> Vec<View> {
     views
 }
 
-/// One view with everything drawn anew; `None` when too little is seen.
+/// One view with everything sampled again; `None` when too little is seen.
 fn view(
     family: Family,
     rest: Rest,
     mesh: &Arc<Mesh>,
-    options: &PoolOptions,
+    options: &GraspPoolOptions,
     random: &mut impl Rng,
 ) -> Option<View> {
     let mut draw = |low: f64, high: f64| low + (high - low) * random.random::<f64>();
@@ -203,13 +203,13 @@ fn view(
     let camera_from_world = camera_from_world(elevation, distance, roll, &target);
     let camera_from_object = camera_from_world * world_from_object;
 
-    // Only the part of the image around the object is drawn.
+    // Only the part of the image around the object is rendered.
     const FOCAL: f64 = 575.0;
     let side = ((options.crop.size + 0.14) * FOCAL / distance).ceil() as usize;
     let centre = 0.5 * (side as f64 - 1.0);
     let camera = Camera::new(FOCAL, FOCAL, centre, centre, side, side).ok()?;
     let objects = [SceneObject { mesh, camera_from_object }];
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions { parallel: false, ..RenderOptions::default() });
     let surfaces = frame.surfaces(&objects);
     let ideal = frame.depth();
@@ -254,7 +254,7 @@ fn view(
     })
 }
 
-/// A camera in front of the y axis' negative side that looks at `target`, its image turned by `roll`.
+/// A camera in front of the y axis' negative side that looks at `target`, its image rotated by `roll`.
 fn camera_from_world(elevation: f64, distance: f64, roll: f64, target: &Vec3) -> Pose {
     let back = Vec3::new(0.0, -elevation.cos(), elevation.sin());
     let (right, z) = (Vec3::x(), -back);

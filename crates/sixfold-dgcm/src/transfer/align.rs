@@ -14,7 +14,7 @@ use sixfold_experience::{Crop, Extent};
 
 /// How an experience is aligned.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AlignOptions {
+pub struct ExperienceAlignmentOptions {
     /// Largest distance of a pixel's VD-NOC from those of the experience's region: theta_c.
     pub threshold: f64,
     /// Fewest pixels of a region.
@@ -27,9 +27,9 @@ pub struct AlignOptions {
     pub icp_angle: f64,
 }
 
-impl Default for AlignOptions {
+impl Default for ExperienceAlignmentOptions {
     fn default() -> Self {
-        AlignOptions {
+        ExperienceAlignmentOptions {
             threshold: 0.3,
             min_pixels: 20,
             max_residual: 0.3,
@@ -39,7 +39,7 @@ impl Default for AlignOptions {
     }
 }
 
-impl AlignOptions {
+impl ExperienceAlignmentOptions {
     /// Checks every field.
     ///
     /// # Errors
@@ -56,25 +56,25 @@ impl AlignOptions {
 /// What is assumed when two extents differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Hypothesis {
+pub enum AlignmentHypothesis {
     /// The object is another size: equation 6.5.
     Scaled,
-    /// The object is turned.
+    /// The object is rotated.
     Turned,
     /// The object is seen from the same side: its own VD-NOC are taken, and nothing is turned before ICP.
     SameSide,
-    /// The object stands upright, turned about the vertical and stretched: found by its shape, without the network.
+    /// The object stands upright, rotated about the vertical and stretched: found by its shape, without the network.
     Upright,
 }
 
-impl Hypothesis {
+impl AlignmentHypothesis {
     /// Its name in files.
     pub fn name(self) -> &'static str {
         match self {
-            Hypothesis::Scaled => "scaled",
-            Hypothesis::Turned => "turned",
-            Hypothesis::SameSide => "same_side",
-            Hypothesis::Upright => "upright",
+            AlignmentHypothesis::Scaled => "scaled",
+            AlignmentHypothesis::Turned => "turned",
+            AlignmentHypothesis::SameSide => "same_side",
+            AlignmentHypothesis::Upright => "upright",
         }
     }
 }
@@ -85,7 +85,7 @@ pub struct Transferred {
     /// Takes points of the experience's camera to the camera of what is seen.
     pub camera_from_experience: Pose,
     /// What was assumed.
-    pub hypothesis: Hypothesis,
+    pub hypothesis: AlignmentHypothesis,
     /// Pixels of the region here.
     pub pixels: usize,
     /// Root mean square of the point-to-plane distances after ICP, metres; `None` where ICP was not used: it found too little, or
@@ -104,7 +104,7 @@ pub fn transfer(
     coordinates: &[[f32; 3]],
     experience: &Crop,
     region: &[bool],
-    options: &AlignOptions,
+    options: &ExperienceAlignmentOptions,
 ) -> Vec<Transferred> {
     let wanted: Vec<usize> =
         (0..region.len().min(experience.mask.len())).filter(|&i| region[i] && experience.mask[i]).collect();
@@ -116,8 +116,10 @@ pub fn transfer(
     let anchors: Vec<Vec3> = wanted.iter().step_by(stride).map(|&i| noc(&experience.vd_noc[i])).collect();
     let experience_points: Vec<Vec3> = wanted.iter().map(|&i| experience.point(i)).collect();
     let mut found: Vec<Transferred> = vec![];
-    for hypothesis in [Hypothesis::Scaled, Hypothesis::Turned, Hypothesis::SameSide] {
-        let own = hypothesis == Hypothesis::SameSide;
+    for hypothesis in
+        [AlignmentHypothesis::Scaled, AlignmentHypothesis::Turned, AlignmentHypothesis::SameSide]
+    {
+        let own = hypothesis == AlignmentHypothesis::SameSide;
         let coordinates = if own { &input.vd_noc } else { coordinates };
         let here = pixels_near(input, coordinates, &anchors, options.threshold);
         if here.len() < options.min_pixels {
@@ -168,26 +170,28 @@ pub(super) fn pixels_near(
 /// The rotation from the experience's camera to the object's under a hypothesis; `None` where the coordinates do not agree
 /// with any rotation.
 fn rotation(
-    hypothesis: Hypothesis,
+    hypothesis: AlignmentHypothesis,
     restored: &[Vec3],
     points: &[Vec3],
     experience: &Crop,
     input: &Crop,
-    options: &AlignOptions,
+    options: &ExperienceAlignmentOptions,
 ) -> Option<Pose> {
     let normalised = |points: &[Vec3], extent: &Extent| -> Vec<Vec3> {
         points.iter().map(|p| (p - extent.centre).component_div(&extent.half)).collect()
     };
     let (source, target) = match hypothesis {
-        Hypothesis::SameSide | Hypothesis::Upright => return Some(Pose::identity()),
-        Hypothesis::Scaled => (normalised(restored, &experience.extent), normalised(points, &input.extent)),
-        Hypothesis::Turned => (restored.to_vec(), points.to_vec()),
+        AlignmentHypothesis::SameSide | AlignmentHypothesis::Upright => return Some(Pose::identity()),
+        AlignmentHypothesis::Scaled => {
+            (normalised(restored, &experience.extent), normalised(points, &input.extent))
+        }
+        AlignmentHypothesis::Turned => (restored.to_vec(), points.to_vec()),
     };
     let pose = kabsch(&source, &target, None).ok()?;
     let squares: f64 =
         source.iter().zip(&target).map(|(s, t)| (pose.transform_point(s) - t).norm_squared()).sum();
     let residual = (squares / source.len() as f64).sqrt();
-    let unit = if hypothesis == Hypothesis::Turned { input.extent.half.mean() } else { 1.0 };
+    let unit = if hypothesis == AlignmentHypothesis::Turned { input.extent.half.mean() } else { 1.0 };
     (residual <= options.max_residual * unit).then(|| pose.with_translation(Vec3::zeros()))
 }
 
@@ -197,7 +201,7 @@ fn refine(
     wanted: &[usize],
     cloud: &IndexedCloud,
     start: &Pose,
-    options: &AlignOptions,
+    options: &ExperienceAlignmentOptions,
 ) -> (Pose, Option<f64>) {
     let stride = wanted.len().div_ceil(250);
     let chosen: Vec<usize> = wanted.iter().step_by(stride).copied().collect();

@@ -32,7 +32,7 @@ pub struct Ranked {
     pub score: f64,
     /// Quality of its contacts over the best one's, 0 to 1.
     pub geometry: f64,
-    /// The share of experience that agrees with it, 0 to 1.
+    /// The fraction of experience that agrees with it, 0 to 1.
     pub experience: f64,
     /// The number of the proposal it is, for grasps from experience.
     pub proposal: Option<usize>,
@@ -41,14 +41,14 @@ pub struct Ranked {
 }
 
 impl Ranked {
-    /// The chance to hold of a grasp of this origin.
-    fn promise(&self, grasp: &Grasp, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) -> f64 {
-        outcomes.promise(&fitter.describe(grasp), self.experience, self.kind == Kind::Experience)
+    /// The success probability of a grasp of this origin.
+    fn success_probability(&self, grasp: &Grasp, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) -> f64 {
+        outcomes.success_probability(&fitter.describe(grasp), self.experience, self.kind == Kind::Experience)
     }
 }
 
 /// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees), by the mean of their quality and of the
-/// share of experience that agrees. Without experience that is the order of the planner's clusters, without geometry that of
+/// fraction of experience that agrees. Without experience that is the order of the planner's clusters, without geometry that of
 /// summed scores of equation 6.6 (section 6.3.2).
 pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, experience, clusters);
@@ -71,7 +71,7 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
 
 /// Ranks the planner's grasps as the dissertation does (section 6.3.2): by the mean of quality and agreement, and nothing
 /// but experience's own proposals is left out. For comparison: where all of the planner's grasps are bad, so is the best.
-pub fn rank_as_printed(
+pub fn rank_as_published(
     geometry: &[Grasp],
     experience: &[Proposal],
     clusters: &ClusterOptions,
@@ -84,7 +84,7 @@ pub fn rank_as_printed(
     joined(candidates, clusters).0
 }
 
-/// Ranks grasps of both kinds by their chance to hold, best first, one of each cluster. The score is that chance. With a
+/// Ranks grasps of both kinds by their success probability, best first, one of each cluster. The score is that probability. With a
 /// model that has seen no attempt, what simulated attempts taught beforehand decides.
 pub fn rank_by_outcome(
     geometry: &[Grasp],
@@ -95,7 +95,7 @@ pub fn rank_by_outcome(
 ) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, experience, clusters);
     for c in &mut candidates {
-        c.score = c.promise(&c.grasp, fitter, outcomes);
+        c.score = c.success_probability(&c.grasp, fitter, outcomes);
     }
     let (mut chosen, _) = joined(candidates, clusters);
     let few = chosen.len().min(REFINED);
@@ -120,7 +120,7 @@ pub fn rank_on_part(
     let mut candidates = candidates(geometry, &experience.proposals, clusters);
     for c in &mut candidates {
         let least = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
-        c.score = c.promise(&c.grasp, fitter, outcomes)
+        c.score = c.success_probability(&c.grasp, fitter, outcomes)
             * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
     }
     candidates.retain(|c| c.score > 0.0);
@@ -130,7 +130,7 @@ pub fn rank_on_part(
 /// How many of the best are refined.
 const REFINED: usize = 6;
 
-/// Moves a grasp by small steps while that raises its chance to hold: forth and back, along the pads, and turned about each of
+/// Moves a grasp by small steps while that raises its chance to hold: forth and back, along the pads, and rotated about each of
 /// its axes. When none does, the steps are halved, once.
 fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
     const ROUNDS: usize = 5;
@@ -145,7 +145,7 @@ fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
             twist[axis] = sign * if axis < 3 { STEP } else { turn };
             let moved = start * Pose::exp(&twist.into());
             let Some(grasp) = fitter.fit(&moved, c.grasp.opening) else { continue };
-            let score = c.promise(&grasp, fitter, outcomes);
+            let score = c.success_probability(&grasp, fitter, outcomes);
             if score > c.score + 1e-6 {
                 c.score = score;
                 better = Some(grasp);
@@ -164,7 +164,7 @@ fn near(a: &Grasp, b: &Grasp, clusters: &ClusterOptions) -> bool {
     distance <= clusters.distance && angle <= clusters.angle
 }
 
-/// All grasps with quality and the share of experience that agrees, without a score.
+/// All grasps with quality and the fraction of experience that agrees, without a score.
 fn candidates(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let all: f64 = experience.iter().map(|p| p.score).sum();
     let best = geometry
@@ -216,7 +216,7 @@ fn joined(mut candidates: Vec<Ranked>, clusters: &ClusterOptions) -> (Vec<Ranked
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transfer::Hypothesis;
+    use crate::transfer::AlignmentHypothesis;
     use sixfold_experience::{Attempt, Crop, CropOptions, Match};
     use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
     use sixfold_grasp::{
@@ -231,7 +231,14 @@ mod tests {
 
     fn proposal(x: f64, score: f64) -> Proposal {
         let from = Match { experience: 1, angle: 0.0, distance: -score.ln() };
-        Proposal { grasp: grasp(x, 0.5), score, from, hypothesis: Hypothesis::Scaled, moved: 0.0, firm: true }
+        Proposal {
+            grasp: grasp(x, 0.5),
+            score,
+            from,
+            hypothesis: AlignmentHypothesis::Scaled,
+            moved: 0.0,
+            firm: true,
+        }
     }
 
     #[test]
@@ -316,7 +323,7 @@ mod tests {
             "it reaches deeper: {taught:?}"
         );
         let outcomes = OutcomeModel::learn(&attempts, &gripper.name);
-        let unmoved = outcomes.promise(&fitter.describe(&middle), 0.0, false);
+        let unmoved = outcomes.success_probability(&fitter.describe(&middle), 0.0, false);
         assert!(taught[0].score > 1.5 * unmoved, "{} {unmoved}", taught[0].score);
         assert!(taught.is_sorted_by(|a, b| a.score >= b.score));
         // What was moved is still a grasp that the planner would make.
@@ -345,7 +352,7 @@ mod tests {
         let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
         let found =
             Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before, middles: vec![] };
-        // The middle of the bar is where it holds best, and its left end is what was asked for.
+        // The centre of the bar is where it holds best, and its left end is what was asked for.
         let ranked = rank_on_part(
             &[at(0.0), at(-0.09)],
             &found,
@@ -363,7 +370,7 @@ mod tests {
     fn as_printed_only_the_planner_proposes() {
         let geometry = [grasp(0.0, 0.5), grasp(0.3, 0.45)];
         let found = [proposal(0.29, 0.6), proposal(-0.4, 0.9)];
-        let ranked = rank_as_printed(&geometry, &found, &ClusterOptions::default());
+        let ranked = rank_as_published(&geometry, &found, &ClusterOptions::default());
         assert!(ranked.iter().all(|r| r.kind == Kind::Geometry && r.proposal.is_none()));
         assert!(ranked[0].grasp.camera_from_gripper.translation().x > 0.2, "experience agrees with it");
     }

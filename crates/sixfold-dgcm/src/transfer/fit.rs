@@ -130,7 +130,7 @@ impl Shape {
         self.index([cell.x as i64, cell.y as i64, cell.z as i64]).map_or(0.0, |i| f64::from(self.cells[i]))
     }
 
-    /// The middle of the box around points, seen from above.
+    /// The centre of the box around points, seen from above.
     pub fn middle(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
         let (mut low, mut high) = (Vec3::repeat(f64::MAX), Vec3::repeat(f64::MIN));
         for p in points {

@@ -8,7 +8,7 @@ mod propose;
 mod shapes;
 mod upright;
 
-pub use align::{AlignOptions, Hypothesis, Transferred, transfer};
-pub use combine::{Kind, Ranked, rank, rank_as_printed, rank_by_outcome, rank_on_part};
+pub use align::{AlignmentHypothesis, ExperienceAlignmentOptions, Transferred, transfer};
+pub use combine::{Kind, Ranked, rank, rank_as_published, rank_by_outcome, rank_on_part};
 pub use memory::Memory;
 pub use propose::{Proposal, Proposals, ProposeError, ProposeOptions, propose};

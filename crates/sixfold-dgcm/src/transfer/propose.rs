@@ -6,11 +6,13 @@ use rayon::prelude::*;
 use sixfold_experience::{Crop, CropError, Match, StoreError, Summary, turn};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{IcpError, IndexedCloud, OptionError, Pose, Vec3};
-use sixfold_grasp::{Grasp, GraspFitter, Gripper, middle_between_pads};
+use sixfold_grasp::{Grasp, GraspFitter, Gripper, centre_between_pads};
 use thiserror::Error;
 
 use super::Memory;
-use super::align::{AlignOptions, Hypothesis, Transferred, noc, pixels_near, transfer};
+use super::align::{
+    AlignmentHypothesis, ExperienceAlignmentOptions, Transferred, noc, pixels_near, transfer,
+};
 use crate::model::DgcmModel;
 
 /// Why nothing can be proposed.
@@ -37,7 +39,7 @@ pub struct ProposeOptions {
     /// Nearest features that are tried (dissertation: 10).
     pub neighbours: usize,
     /// How they are aligned.
-    pub align: AlignOptions,
+    pub align: ExperienceAlignmentOptions,
     /// Only experiences on parts of this name.
     pub part: Option<String>,
     /// Only the experiences with these numbers.
@@ -50,7 +52,7 @@ impl Default for ProposeOptions {
     fn default() -> Self {
         ProposeOptions {
             neighbours: 10,
-            align: AlignOptions::default(),
+            align: ExperienceAlignmentOptions::default(),
             part: None,
             only: None,
             without_object: None,
@@ -79,7 +81,7 @@ pub struct Proposal {
     /// The experience.
     pub from: Match,
     /// What was assumed about its size.
-    pub hypothesis: Hypothesis,
+    pub hypothesis: AlignmentHypothesis,
     /// How far the grasp was moved from where the transfer had put it, metres.
     pub moved: f64,
     /// The contacts are inside their friction cones as far as they are known.
@@ -95,7 +97,7 @@ pub struct Proposals {
     pub crop: Crop,
     /// The grasps, those of the nearest experience first.
     pub proposals: Vec<Proposal>,
-    /// For every pixel of the crop the share of experience (weighted by equation 6.6) that was held there, 0 to 1: where on this
+    /// For every pixel of the crop the fraction of experience (weighted by equation 6.6) that was held there, 0 to 1: where on this
     /// object the counterparts of what lay between the pads are.
     pub held_before: Vec<f64>,
     /// Where on this object the middles between the pads of experience are, camera frame, with their weights; empty where shapes
@@ -116,13 +118,13 @@ impl Proposals {
         if weights <= 0.0 {
             return same;
         }
-        let middle = middle_between_pads(&grasp.camera_from_gripper);
+        let middle = centre_between_pads(&grasp.camera_from_gripper);
         let near = |m: &(Vec3, f64)| m.1 * (-0.5 * (m.0 - middle).norm_squared() / (MIDDLES * MIDDLES)).exp();
         same * self.middles.iter().map(near).sum::<f64>() / weights
     }
 }
 
-/// The middle between the pads may be this far from where it was in experience (standard deviation), metres.
+/// The centre between the pads may be this far from where it was in experience (standard deviation), metres.
 const MIDDLES: f64 = 0.02;
 
 /// A grasp that holds fewer pixels holds nothing that can be told.
@@ -221,7 +223,7 @@ pub fn propose(
         .zip(&coordinates)
         .map(|((from, stored, copy), coordinates)| {
             let e = &stored.experience;
-            let region = turned_region(&e.region, copy);
+            let region = rotated_region(&e.region, copy);
             let turned_grasp = turn(from.angle) * e.camera_from_gripper;
             let aligned = transfer(&crop, &cloud, coordinates, copy, &region, &options.align);
             aligned
@@ -247,7 +249,7 @@ pub fn propose(
 }
 
 /// The region of an experience in its in-plane copy, whose pixels know where they come from.
-fn turned_region(region: &[bool], copy: &Crop) -> Vec<bool> {
+fn rotated_region(region: &[bool], copy: &Crop) -> Vec<bool> {
     (0..copy.mask.len())
         .map(|i| copy.mask[i] && region.get(copy.source[i] as usize).copied().unwrap_or(false))
         .collect()
@@ -261,7 +263,7 @@ pub(super) struct Source<'a> {
     pub width: f64,
 }
 
-/// The transferred grasp at its stand-off, at the nearest place where the gripper is free: shifted and turned by a little,
+/// The transferred grasp at its stand-off, at the nearest place where the gripper is free: shifted and rotated by a little,
 /// or drawn back. The grasp, how far it was moved, and whether its contacts are inside their friction cones.
 pub(super) fn place(
     fitter: &GraspFitter<'_>,
@@ -353,7 +355,7 @@ mod tests {
         assert_eq!(options.check(), Ok(()));
         let none = ProposeOptions { neighbours: 0, ..options.clone() };
         assert_eq!(none.check().unwrap_err().option, "neighbours");
-        let align = AlignOptions { threshold: f64::NAN, ..options.align };
+        let align = ExperienceAlignmentOptions { threshold: f64::NAN, ..options.align };
         assert_eq!(ProposeOptions { align, ..options }.check().unwrap_err().option, "align.threshold");
     }
 
@@ -388,7 +390,7 @@ mod tests {
             let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
             Grasp { camera_from_gripper: pose, opening: 0.06, width: 0.04, quality }
         };
-        let middle = middle_between_pads(&grasp(-0.04).camera_from_gripper);
+        let middle = centre_between_pads(&grasp(-0.04).camera_from_gripper);
         let middles = vec![(middle + Vec3::z() * 0.015, 0.75), (middle + Vec3::x() * 0.3, 0.25)];
         let found = Proposals { middles, ..found };
         let share = 0.75 * (-0.5f64 * (0.015f64 / MIDDLES).powi(2)).exp();

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use sixfold_experience::{Match, StoreError, Stored};
 use sixfold_geometry::Vec3;
-use sixfold_grasp::{Grasp, GraspFitter, middle_between_pads};
+use sixfold_grasp::{Grasp, GraspFitter, centre_between_pads};
 
 use super::Memory;
-use super::align::{Hypothesis, Transferred};
+use super::align::{AlignmentHypothesis, Transferred};
 use super::fit::Shape;
 use super::propose::{FEWEST_HELD, Proposal, Proposals, Source, between_pads, place};
 use super::upright::upright;
@@ -33,7 +33,7 @@ struct Counterpart {
     transferred: Transferred,
     /// What was held, in this camera's frame.
     held: Vec<Vec3>,
-    /// The middle between the pads, in this camera's frame.
+    /// The centre between the pads, in this camera's frame.
     middle: Vec3,
 }
 
@@ -94,7 +94,7 @@ impl Proposals {
             }
             if let Some((grasp, moved, firm)) = placed {
                 let score = (-c.from.distance).exp() * weight;
-                let hypothesis = Hypothesis::Upright;
+                let hypothesis = AlignmentHypothesis::Upright;
                 self.proposals.push(Proposal { grasp, score, from: c.from, hypothesis, moved, firm });
             }
         }
@@ -113,7 +113,7 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
     let stride = held.len().div_ceil(HELD).max(1);
     let held: Vec<Vec3> = held.iter().step_by(stride).map(|&i| e.crop.point(i)).collect();
     let on_table: Vec<Vec3> = held.iter().map(|p| there.table_from_camera.transform_point(p)).collect();
-    let tips = middle_between_pads(&e.camera_from_gripper);
+    let tips = centre_between_pads(&e.camera_from_gripper);
     // What is to be held again.
     let middle = if held.is_empty() { tips } else { held.iter().sum::<Vec3>() / held.len() as f64 };
     upright(here, &there, &on_table)
@@ -123,7 +123,7 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
             let to = u.map_camera(&middle, &there, here);
             let transferred = Transferred {
                 camera_from_experience: rotation.with_translation(to - rotation.transform_point(&middle)),
-                hypothesis: Hypothesis::Upright,
+                hypothesis: AlignmentHypothesis::Upright,
                 pixels: held.len(),
                 rms: None,
                 scale: Vec3::repeat(u.stretch[0]),

@@ -1,4 +1,4 @@
-//! An experience on an upright object, found again by its shape: turned about the vertical, moved over the table and
+//! An experience on an upright object, found again by its shape: rotated about the vertical, moved over the table and
 //! stretched until each view explains the other ([`super::fit`]). Beyond the dissertation: the network's coordinates find a
 //! large part, but a handle is a few pixels of them.
 
@@ -17,7 +17,7 @@ const STRETCHES: [f64; 3] = [0.76, 1.0, 1.3];
 const MOVES: i64 = 3;
 /// How many of the first search are looked at more closely.
 const CLOSER: usize = 8;
-/// Alignments turned by less than this are the same, radians.
+/// Alignments rotated by less than this are the same, radians.
 const SAME: f64 = 0.6;
 /// What a turn by 180 degrees costs: of a round thing the same side is taken.
 const TURNED: f64 = 0.01;
@@ -50,7 +50,7 @@ impl Upright {
         Vec3::new(x / self.stretch[0], y / self.stretch[0], p.z / self.stretch[1])
     }
 
-    /// The turn from the experience's camera to this one's.
+    /// The rotation from the experience's camera to this one's.
     pub fn rotation(&self, there: &Shape, here: &Shape) -> Pose {
         let turn = Pose::new(UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw), Vec3::zeros());
         let whole = here.table_from_camera.inverse() * turn * there.table_from_camera;
@@ -140,7 +140,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
         }
     }
     first.sort_by(|a, b| b.fit.total_cmp(&a.fit));
-    // Of every turn the best, of those the best ones.
+    // Of every rotation the best, of those the best ones.
     let mut starts: Vec<Upright> = vec![];
     for tried in first {
         if starts.iter().all(|s| s.yaw != tried.yaw) {
@@ -196,13 +196,13 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::{Camera, Mask, Mat3, Plane};
-    use sixfold_render::{Frame, RenderOptions, SceneObject};
+    use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
     use sixfold_synth::shapes::{Family, Member, member};
 
     use super::*;
     use sixfold_experience::{Crop, CropOptions};
 
-    /// A made-up object on a table, 0.7 m from a camera that looks down by 40 degrees.
+    /// A synthetic object on a table, 0.7 m from a camera that looks down by 40 degrees.
     struct Seen {
         member: Member,
         crop: Crop,
@@ -218,7 +218,7 @@ mod tests {
         let camera_from_world = Pose::from_parts(&axes, -z * 0.7).unwrap().inverse();
         let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
         let camera_from_object = camera_from_world * Pose::new(turn, Vec3::zeros());
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         frame.render(&[SceneObject { mesh: &member.mesh, camera_from_object }], &RenderOptions::default());
         let depth = frame.depth();
         let mask = Mask::from_fn(640, 480, |x, y| depth[(x, y)] > 0.0);
@@ -234,7 +234,7 @@ mod tests {
         }
     }
 
-    /// The best place of one view's handle in another, and the share of it that is on that one's handle.
+    /// The best place of one view's handle in another, and the fraction of it that is on that one's handle.
     fn handle_found(here: &Seen, there: &Seen) -> (Upright, f64) {
         let on_handle: Vec<Vec3> = there
             .crop
@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn of_a_round_thing_the_same_side_is_taken() {
-        // Some made-up cans are oval.
+        // Some synthetic cans are oval.
         let is_round = |s: &Seen| {
             let of = |k: usize| s.member.mesh.vertices().iter().map(|p| p[k]).fold(f64::MIN, f64::max);
             (of(0) - of(1)).abs() < 1e-4
@@ -307,7 +307,7 @@ mod tests {
         let ones = || vec![1.0; shape.points.len()];
         let mut pair =
             Pair { here: &shape, there: &shape, held: &[], telling_here: ones(), telling_there: ones() };
-        // Turned about the mug's own axis.
+        // Rotated about the mug's own axis.
         let axis = shape.table_from_camera.transform_point(&mug.camera_from_object.translation());
         let anywhere: Vec<Upright> = (0..TURNS)
             .map(|k| {

@@ -11,7 +11,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{
-    Memory, ProposeOptions, Ranked, propose, rank, rank_as_printed, rank_by_outcome,
+    Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_outcome,
 };
 use sixfold_experience::StorePlace;
 use sixfold_grasp::{
@@ -20,19 +20,19 @@ use sixfold_grasp::{
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{
-    AttemptOptions, ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval_of_share,
+    AttemptOptions, AttemptOutcome, ConvexParts, PartsOptions, scene, try_grasp, wilson_interval_of_fraction,
 };
 
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, memory, model};
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
-use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, ending_name, hardness};
+use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Pictures of this many scenes of each object are kept.
+/// Images of this many scenes of each object are kept.
 const PICTURES: u64 = 2;
 /// The methods, in the order of the table.
 pub(crate) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "outcomes", "both"];
@@ -52,14 +52,14 @@ pub(crate) struct CompareArguments {
     #[arg(long)]
     pub hard: bool,
     /// Try each grasp so many times, each time with another error of the hand (with --hard; an exact hand does the same again):
-    /// the share that holds depends less on luck
+    /// the fraction that holds depends less on luck
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
     #[command(flatten)]
     pub physics: PhysicsArguments,
     #[command(flatten)]
     pub network: NetworkArguments,
-    /// Folder for trials.jsonl (from which a stopped run goes on), table.json and pictures of the first scenes
+    /// Folder for trials.jsonl (from which a stopped run resumes), table.json and images of the first scenes
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Seed of poses, view points, noise and the planner
@@ -140,7 +140,7 @@ pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
     })
 }
 
-/// Compares, or goes on comparing.
+/// Compares, or continues comparing.
 pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     if a.trials == 0 {
         bail!("--trials: found 0, expected at least 1");
@@ -183,7 +183,7 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         }
         let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
         for number in missing {
-            check_interrupt("finished scenes are kept; run the same command again to go on")?;
+            check_interrupt("finished scenes are kept; run the same command again to continue")?;
             rows.retain(|r| r.object != *name || r.number != number);
             for row in scenes.rows(class, name, mesh, &parts, number, &mut memory)? {
                 journal.row(&row)?;
@@ -237,9 +237,9 @@ impl Scenes<'_> {
             object: name.to_owned(),
             number,
             method: String::new(),
-            ending: ending_name(scene.ending),
+            ending: outcome_name(scene.ending),
             held: 0,
-            counts: scene.ending != Ending::NoRest,
+            counts: scene.ending != AttemptOutcome::NoRest,
             nearest: None,
             candidates: (0, 0),
             transferred: false,
@@ -266,7 +266,7 @@ impl Scenes<'_> {
         let ranked = [
             rank(&geometry, &[], &clusters),
             rank(&[], &found.proposals, &clusters),
-            rank_as_printed(&geometry, &found.proposals, &clusters),
+            rank_as_published(&geometry, &found.proposals, &clusters),
             by_outcome(&[]),
             both,
         ];
@@ -294,11 +294,11 @@ impl Scenes<'_> {
                         best.grasp.opening,
                         &self.options.trial,
                     )?;
-                    let ending = Ending::Tried(tried.outcome);
+                    let ending = AttemptOutcome::Tried(tried.outcome);
                     row.held += usize::from(ending.is_success());
                     if k == 0 {
                         row.trial_seconds = began.elapsed().as_secs_f64();
-                        row.ending = ending_name(ending);
+                        row.ending = outcome_name(ending);
                     }
                 }
                 row.transferred = best.proposal.is_some();
@@ -341,7 +341,7 @@ fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
             let held: usize = mine.iter().map(|r| r.held).sum();
             trials = mine.len();
             rates[k] = held as f64 / (tries * trials).max(1) as f64;
-            intervals[k] = wilson_interval_of_share(rates[k], trials);
+            intervals[k] = wilson_interval_of_fraction(rates[k], trials);
         }
         Class { class: name.to_owned(), trials, rates, intervals }
     };

@@ -10,18 +10,18 @@ use serde::Serialize;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
 use sixfold_io::write_rgb;
 use sixfold_simulation::{
-    Attempt, AttemptOptions, ConvexParts, Ending, PartsOptions, TrialOptions, TrialReport, attempt,
+    Attempt, AttemptOptions, AttemptOutcome, ConvexParts, PartsOptions, TrialOptions, TrialReport, attempt,
     wilson_interval,
 };
 
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
-use sixfold_shell::grasp::trial::{PhysicsArguments, ending_name, physics};
+use sixfold_shell::grasp::trial::{PhysicsArguments, outcome_name, physics};
 use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Pictures of this many attempts on each object are kept.
+/// Images of this many attempts on each object are kept.
 const PICTURES: u64 = 2;
 
 #[derive(Debug, Args)]
@@ -39,7 +39,7 @@ pub(crate) struct MeasureArguments {
     pub no_noise: bool,
     #[command(flatten)]
     pub physics: PhysicsArguments,
-    /// Folder for trials.json (all poses and outcomes, the objects' convex parts) and pictures of the first attempts
+    /// Folder for trials.json (all poses and outcomes, the objects' convex parts) and images of the first attempts
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Seed of poses, view points, noise and the planner
@@ -134,7 +134,7 @@ struct Measured {
 #[derive(Serialize)]
 struct Tried {
     number: u64,
-    ending: Ending,
+    ending: AttemptOutcome,
     world_from_object: [[f64; 4]; 4],
     world_from_gripper: Option<[[f64; 4]; 4]>,
     opening: Option<f64>,
@@ -165,7 +165,7 @@ impl Tried {
 
     /// The object that did not come to rest was no attempt of the planner.
     fn counts(&self) -> bool {
-        self.ending != Ending::NoRest
+        self.ending != AttemptOutcome::NoRest
     }
 }
 
@@ -181,7 +181,7 @@ fn classes(measured: &[Measured]) -> Vec<Class> {
         let successes = counted.iter().filter(|t| t.ending.is_success()).count();
         let mut endings = BTreeMap::new();
         for t in tried {
-            *endings.entry(ending_name(t.ending)).or_default() += 1;
+            *endings.entry(outcome_name(t.ending)).or_default() += 1;
         }
         let median = |mut values: Vec<f64>| {
             values.sort_by(f64::total_cmp);

@@ -24,12 +24,12 @@ pub(crate) enum ReproduceCommand {
     /// Recall and AR of Pix2Pose per object, what each part of the method is worth, and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
-        Every row is kept; interrupted, it goes on when the same command is given again.")]
+        Every row is kept; interrupted, it continues when the same command is given again.")]
     Pix2pose(Box<pix2pose::ReproducePix2PoseArguments>),
     /// Masks and poses of template matching per object, with its ablations, point pair features, and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
-        Every image is kept; interrupted, it goes on when the same command is given again.")]
+        Every image is kept; interrupted, it continues when the same command is given again.")]
     Mttm(mttm::ReproduceMttmArguments),
     /// Poses and views of Neural Object Learning beside truth and real pixels, wrong meshes, another lamp, and times
     #[command(after_help = nol::arguments::AFTER_HELP)]
@@ -37,7 +37,7 @@ pub(crate) enum ReproduceCommand {
     /// Grasps from experience: table 6.2, figure 6.7, learning from nothing, handles
     #[command(after_help = "Example:\n  \
         sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
-        Every part is kept; interrupted, it goes on when the same command is given again.")]
+        Every part is kept; interrupted, it continues when the same command is given again.")]
     Dgcm(Box<dgcm::ReproduceDgcmArguments>),
 }
 

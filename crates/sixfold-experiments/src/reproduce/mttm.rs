@@ -1,7 +1,7 @@
 //! `sixfold reproduce mttm`: masks and poses of template matching per object, next to its ablations and to point pair features
 //! on the same images (dissertation, tables 5.1 and 5.2).
 //!
-//! Every image's outcomes are kept in `images/`, so an interrupted run goes on where it was.
+//! Every image's outcomes are kept in `images/`, so an interrupted run continues where it was.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -120,7 +120,7 @@ struct Outcomes {
     object: u32,
     /// Intersection over union of the mask and the visible truth, where there is a mask.
     iou: Option<f64>,
-    /// ADD (ADI for symmetric objects) as a share of the diameter; none when nothing was found.
+    /// ADD (ADI for symmetric objects) as a fraction of the diameter; none when nothing was found.
     error: Option<f64>,
     confidence: Option<f64>,
     /// Seconds until hypotheses, and in verification.
@@ -133,9 +133,9 @@ type Measured = BTreeMap<String, Vec<Outcomes>>;
 #[derive(Debug, Clone, Serialize)]
 struct Score {
     targets: usize,
-    /// Share of the targets whose mask overlaps the truth by more than half.
+    /// Fraction of the targets whose mask overlaps the truth by more than half.
     iou: Option<f64>,
-    /// Share of the targets within a tenth of the diameter.
+    /// Fraction of the targets within a tenth of the diameter.
     add_s: f64,
 }
 
@@ -202,7 +202,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
     let mut progress = Progress::new("images", images.len());
     let mut measured: Vec<Measured> = vec![];
     for ((scene_id, im_id), ids) in &images {
-        check_interrupt("the images done so far are kept; run the same command again to go on")?;
+        check_interrupt("the images done so far are kept; run the same command again to continue")?;
         let kept = a.out.join("images").join(format!("{scene_id:06}_{im_id:06}.json"));
         if let Ok(text) = std::fs::read_to_string(&kept) {
             measured.push(serde_json::from_str(&text).with_context(|| {
@@ -356,7 +356,7 @@ fn measure(
     Ok(measured)
 }
 
-/// ADD, or ADI for symmetric objects, over at most 1000 vertices, as a share of the diameter.
+/// ADD, or ADI for symmetric objects, over at most 1000 vertices, as a fraction of the diameter.
 fn pose_error(mesh: &Mesh, info: &ModelInfo, truth: &Pose, found: &Pose) -> f64 {
     let vertices = mesh.vertices();
     let points: Vec<Vec3> = vertices.iter().step_by(vertices.len().div_ceil(1000).max(1)).copied().collect();

@@ -11,15 +11,15 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     let reproduce = "reproduce nol --dataset tiny --frames frames.json --quick --json --out reproduced";
     let whole = sixfold(dir, reproduce).expect(0).json();
     let poses = whole["poses"].as_array().unwrap();
-    // The disturbed poses, the printed rule without a network, three of ours, and one begun at the annotated poses.
+    // The disturbed poses, the published rule without a network, three of ours, and one started at the annotated poses.
     assert_eq!(poses.len(), 6, "{whole}");
     let of = |k: usize, field: &str| poses[k]["all"][field].as_f64().unwrap();
     assert!(of(5, "millimetres") < of(4, "millimetres") && poses[5]["all"]["improved"].is_null(), "{whole}");
-    // The same disturbances on frames drawn anew, whose light and background are others.
+    // The same disturbances on frames rendered again, whose light and background are others.
     let drawn = whole["drawn_poses"].as_array().unwrap();
-    let of_drawn = |k: usize| drawn[k]["all"]["millimetres"].as_f64().unwrap();
-    assert_eq!(of_drawn(0), of(0, "millimetres"), "{whole}");
-    assert!(of_drawn(4) < of_drawn(0) && of_drawn(4) != of(4, "millimetres"), "{whole}");
+    let of_rendered = |k: usize| drawn[k]["all"]["millimetres"].as_f64().unwrap();
+    assert_eq!(of_rendered(0), of(0, "millimetres"), "{whole}");
+    assert!(of_rendered(4) < of_rendered(0) && of_rendered(4) != of(4, "millimetres"), "{whole}");
     assert_eq!(of(0, "sources"), 4.0);
     assert!(of(0, "millimetres") > 2.0 && of(0, "degrees") > 0.5, "{whole}");
     assert!(of(4, "millimetres") < of(0, "millimetres"), "{whole}");

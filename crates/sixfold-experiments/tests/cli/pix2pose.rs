@@ -1,4 +1,4 @@
-//! `sixfold reproduce pix2pose`, on pictures that the test renders.
+//! `sixfold reproduce pix2pose`, on images that the test renders.
 
 use std::sync::atomic::AtomicBool;
 
@@ -10,7 +10,7 @@ use crate::support::*;
 
 const WEIGHTS: &str = "trained/model.safetensors";
 
-/// Trains object 1 on the pictures of frames.json, a small network for three steps.
+/// Trains object 1 on the images of frames.json, a small network for three steps.
 fn train(tiny: &Tiny) {
     let frames = FrameSelection::File(tiny.path().join("frames.json"));
     let material = TrainingSet::of_dataset(&tiny.file(""), "test", &[1], &frames, MIN_VISIBILITY).unwrap();

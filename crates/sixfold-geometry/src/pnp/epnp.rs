@@ -10,7 +10,7 @@ use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen, Vector4};
 use super::{Model, PnpError, Prepared};
 use crate::{Camera, Mat3, Pose, Vec2, Vec3, pose::nearest_rotation};
 
-/// Points whose thickness is below this share of their extent are a plane.
+/// Points whose thickness is below this fraction of their extent are a plane.
 const PLANAR: f64 = 1e-4;
 
 /// The pose that EPnP finds for at least four correspondences without outliers: object points in metres, image points

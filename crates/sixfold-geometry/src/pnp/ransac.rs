@@ -201,7 +201,7 @@ impl Blocks {
         let inlier = (test.wrong() / test.good).ln();
         let outlier = ((1.0 - test.wrong()) / (1.0 - test.good)).ln();
         let decision = DECISION.ln();
-        // The padding adds its share of misses; take it off at once, or it would count against the bound.
+        // The padding adds its fraction of misses; take it off at once, or it would count against the bound.
         let padding = self.blocks.len() * BLOCK - self.count;
         let mut cost = -(padding as f32) * self.limit;
         let mut inliers = 0;

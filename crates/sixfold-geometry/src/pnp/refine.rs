@@ -12,7 +12,7 @@ pub struct RefineOptions {
     pub threshold_px: f64,
     /// Most steps.
     pub max_iterations: usize,
-    /// Ends when a step lowers the cost by less than this share.
+    /// Ends when a step lowers the cost by less than this fraction.
     pub convergence: f64,
 }
 

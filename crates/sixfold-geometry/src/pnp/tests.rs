@@ -16,7 +16,7 @@ struct Case {
     pixels: Vec<Vec2>,
 }
 
-/// A 5 cm object 0.6 to 1.4 m away; `noise` metres on the object points, a share of them replaced at random.
+/// A 5 cm object 0.6 to 1.4 m away; `noise` metres on the object points, a fraction of them replaced at random.
 fn case(seed: u64, n: usize, noise: f64, outliers: f64, flat: bool) -> Case {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut uniform = |a: f64, b: f64| random.random_range(a..b);

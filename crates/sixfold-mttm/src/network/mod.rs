@@ -19,7 +19,7 @@ pub const DESCRIPTOR: usize = 128;
 /// Side of a region's map (dissertation: 14).
 pub const MAP: usize = 14;
 
-/// What the network says of pairs.
+/// What the network predicts for pairs.
 #[derive(Debug, Clone)]
 pub struct Compared {
     /// Logit of every cell of the region being the object's: `batch x 1 x 14 x 14`.
@@ -27,7 +27,7 @@ pub struct Compared {
     /// The object's rotation in the region from that in the template, a quaternion w, x, y, z that is not yet normalised:
     /// `batch x 4`.
     pub rotation: Tensor<2>,
-    /// Where the template's reference point lies, from the region's centre, as a share of the patch: `batch x 3`.
+    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch: `batch x 3`.
     pub offset: Tensor<2>,
     /// Logit of the pair being a match: `batch x 1`.
     pub matching: Tensor<2>,

@@ -14,7 +14,7 @@ use crate::pose_distance::pose_distance;
 use crate::roi::{Cell, Roi, UNKNOWN};
 use crate::template::Template;
 
-/// Distance at which templates are drawn, metres; normals do not depend on it.
+/// Distance at which templates are rendered, metres; normals do not depend on it.
 const DISTANCE: f64 = 0.8;
 
 /// How regions and templates are made.
@@ -126,7 +126,7 @@ pub struct Anchor {
 
 /// A region with an object.
 ///
-/// `visible` are the object's pixels in the scene. `None` when the object cannot be drawn from there.
+/// `visible` are the object's pixels in the scene. `None` when the object cannot be rendered from there.
 pub(super) fn anchor(
     scene: &DepthRegion,
     (number, mesh): (usize, &Mesh),

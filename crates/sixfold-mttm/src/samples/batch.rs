@@ -1,4 +1,4 @@
-//! A step's numbers: regions, shifted, mirrored, turned and hidden in part, with their templates.
+//! A step's numbers: regions, shifted, mirrored, rotated and hidden in part, with their templates.
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
@@ -12,11 +12,11 @@ use crate::patch::PLANES;
 /// How regions are changed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Augmentation {
-    /// Largest shift of the centre across the region, as a share of the patch (dissertation: "randomly shifted").
+    /// Largest shift of the centre across the region, as a fraction of the patch (dissertation: "randomly shifted").
     pub shift: f64,
     /// And along its axis.
     pub depth: f64,
-    /// How often a patch and its templates are turned by a quarter, a half or three.
+    /// How often a patch and its templates are rotated by a quarter, a half or three.
     pub turned: f64,
     /// How often something stands in front.
     pub hidden: f64,
@@ -32,7 +32,7 @@ impl Default for Augmentation {
 
 /// What is in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct BatchOptions {
+pub struct PairBatchOptions {
     /// Regions with an object.
     pub anchors: usize,
     /// Regions without one.
@@ -41,9 +41,9 @@ pub struct BatchOptions {
     pub augmentation: Augmentation,
 }
 
-impl Default for BatchOptions {
+impl Default for PairBatchOptions {
     fn default() -> Self {
-        BatchOptions { anchors: 40, without_object: 8, augmentation: Augmentation::default() }
+        PairBatchOptions { anchors: 40, without_object: 8, augmentation: Augmentation::default() }
     }
 }
 
@@ -56,7 +56,7 @@ pub struct Batch {
     pub positives: Vec<f32>,
     /// See `positives`.
     pub negatives: Vec<f32>,
-    /// Share of every cell of the regions with an object that is the object's, `14 x 14`.
+    /// Fraction of every cell of the regions with an object that is the object's, `14 x 14`.
     pub region_masks: Vec<f32>,
     /// The same of both kinds of templates.
     pub positive_masks: Vec<f32>,
@@ -74,7 +74,7 @@ pub struct Batch {
 
 impl Batch {
     /// The numbers of a step: a function of pool, options, seed and step.
-    pub fn of_step(pool: &Pool, options: &BatchOptions, seed: u64, step: u64) -> Batch {
+    pub fn of_step(pool: &Pool, options: &PairBatchOptions, seed: u64, step: u64) -> Batch {
         let mut random = stream(seed, step);
         let mut batch = Batch::default();
         let side = pool.options().anchors.side;

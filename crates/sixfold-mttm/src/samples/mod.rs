@@ -1,5 +1,5 @@
-//! Training material (dissertation, sections 5.2.1, 5.2.3 and 5.3.1): cluttered scenes of made-up objects as depth cameras see
-//! them, cut into regions with their templates once, and augmented anew in every step.
+//! Training material (dissertation, sections 5.2.1, 5.2.3 and 5.3.1): cluttered scenes of synthetic objects as depth cameras see
+//! them, cut into regions with their templates once, and augmented again in every step.
 
 mod anchor;
 mod batch;
@@ -7,6 +7,6 @@ mod pool;
 mod preview;
 
 pub use anchor::{Anchor, AnchorOptions, SeenPatch};
-pub use batch::{Augmentation, Batch, BatchOptions};
-pub use pool::{Arrangement, Pool, PoolOptions};
+pub use batch::{Augmentation, Batch, PairBatchOptions};
+pub use pool::{Arrangement, DepthPoolOptions, Pool};
 pub use preview::preview;

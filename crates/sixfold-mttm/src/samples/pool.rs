@@ -11,7 +11,7 @@ use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{DepthSensor, Frame, RenderOptions, SceneObject, simulate_depth};
+use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 use super::anchor::{Anchor, AnchorOptions, anchor, without_object};
 
@@ -20,14 +20,14 @@ pub type Arrangement = Vec<(usize, Pose)>;
 
 /// How scenes are seen.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct PoolOptions {
+pub struct DepthPoolOptions {
     /// Cameras that look at each arrangement.
     pub views: usize,
     /// Distance of the camera, smallest and largest, metres.
     pub distance: (f64, f64),
     /// Its angle above the table, smallest and largest, radians.
     pub elevation: (f64, f64),
-    /// Largest turn of the image, radians.
+    /// Largest rotation of the image, radians.
     pub roll: f64,
     /// Objects of which less is visible are left out (dissertation: half).
     pub visible: f64,
@@ -39,10 +39,10 @@ pub struct PoolOptions {
     pub seed: u64,
 }
 
-impl PoolOptions {
+impl DepthPoolOptions {
     /// For patches of `side` pixels.
     pub fn for_side(side: usize) -> Self {
-        PoolOptions {
+        DepthPoolOptions {
             views: 5,
             distance: (0.55, 1.3),
             elevation: (20f64.to_radians(), 80f64.to_radians()),
@@ -58,21 +58,21 @@ impl PoolOptions {
 /// Regions with their templates.
 #[derive(Debug, Clone)]
 pub struct Pool {
-    options: PoolOptions,
+    options: DepthPoolOptions,
     with_object: Vec<Anchor>,
     without: Vec<Anchor>,
 }
 
 impl Pool {
     /// Draws every arrangement from all of its cameras and cuts the regions out. The same input gives the same pool at any
-    /// number of threads; `progress` hears of every arrangement done. `None` when `stop` was set meanwhile.
+    /// number of threads; `progress` is called for every arrangement done. `None` when `stop` was set meanwhile.
     ///
     /// # Panics
     /// For an arrangement with a number beyond the meshes.
     pub fn new(
         meshes: &[Mesh],
         arrangements: &[Arrangement],
-        options: &PoolOptions,
+        options: &DepthPoolOptions,
         stop: &AtomicBool,
         progress: impl Fn() + Sync,
     ) -> Option<Pool> {
@@ -98,7 +98,7 @@ impl Pool {
     }
 
     /// How it was made.
-    pub fn options(&self) -> &PoolOptions {
+    pub fn options(&self) -> &DepthPoolOptions {
         &self.options
     }
 
@@ -117,7 +117,7 @@ impl Pool {
 fn see(
     meshes: &[Mesh],
     arrangement: &Arrangement,
-    options: &PoolOptions,
+    options: &DepthPoolOptions,
     random: &mut ChaCha8Rng,
 ) -> Vec<Anchor> {
     let Ok(camera) = Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480) else { return vec![] };
@@ -146,7 +146,7 @@ fn see(
         })
         .collect();
     objects.push(SceneObject { mesh: &table, camera_from_object: camera_from_world });
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let ideal = frame.depth();
     let depth: DepthImage = match &sensor {
@@ -193,7 +193,7 @@ fn table(size: f64) -> Option<Mesh> {
     Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok()
 }
 
-/// Camera from world of a camera that looks at `target`, its image turned by `roll`.
+/// Camera from world of a camera that looks at `target`, its image rotated by `roll`.
 fn look_at(azimuth: f64, elevation: f64, distance: f64, roll: f64, target: &Vec3) -> Pose {
     let back = Vec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
     let right = Vec3::new(-azimuth.sin(), azimuth.cos(), 0.0);

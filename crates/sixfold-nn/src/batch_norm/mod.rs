@@ -27,7 +27,7 @@ pub struct BatchNormConfig {
     pub channels: usize,
     /// Added to the variance.
     pub epsilon: f64,
-    /// Share of a new batch in the running statistics.
+    /// Fraction of a new batch in the running statistics.
     pub momentum: f64,
 }
 

@@ -189,7 +189,7 @@ pub(super) fn depthwise_backward(
     let area = shape.kernel * shape.kernel;
     let (pixels, out_pixels) = (shape.pixels(), rows * columns);
     let mut dx = unwritten(if want_x { x.len() } else { 0 });
-    // With a stride of one the input gradient is a convolution of the gradient with the kernel turned round.
+    // With a stride of one the input gradient is a convolution of the gradient with the flipped kernel.
     let turned = spec.stride == 1 && spec.padding.iter().all(|p| *p < shape.kernel);
     let turned_spec =
         ConvSpec { padding: spec.padding.map(|p| (shape.kernel - 1).saturating_sub(p)), ..*spec };

@@ -4,12 +4,12 @@ use rayon::prelude::*;
 
 /// A pixel that is to be filled and where its value comes from.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
+pub struct SampledPixel {
     /// Number of the pixel, row by row.
     pub pixel: u32,
-    /// Column in the map as a share of its width: 0 at the left border of the first pixel, 1 at the right border of the last.
+    /// Column in the map as a fraction of its width: 0 at the left border of the first pixel, 1 at the right border of the last.
     pub x: f32,
-    /// Row in the map as a share of its height.
+    /// Row in the map as a fraction of its height.
     pub y: f32,
 }
 
@@ -19,11 +19,11 @@ pub struct Places {
     /// Rows and columns of the images that are made.
     pub size: [usize; 2],
     /// Places of every image.
-    pub images: Vec<Vec<Place>>,
+    pub images: Vec<Vec<SampledPixel>>,
 }
 
 /// The four neighbours of a place in a map of `height x width`, and their weights. Beyond the outer pixels' centres the map
-/// goes on as it ends.
+/// continues as it ends.
 #[inline]
 pub fn neighbours(x: f32, y: f32, [height, width]: [usize; 2]) -> ([usize; 4], [f32; 4]) {
     let u = (x * width as f32 - 0.5).clamp(0.0, (width - 1) as f32);
@@ -93,13 +93,16 @@ mod tests {
     fn pixel_centres_give_pixels_and_the_gradient_is_that_of_finite_differences() {
         let size = [3, 4];
         let map: Vec<f32> = (0..2 * 12).map(|i| (i as f32 * 0.7).sin()).collect();
-        let exact =
-            Places { size: [1, 2], images: vec![vec![Place { pixel: 1, x: 2.5 / 4.0, y: 1.5 / 3.0 }]] };
+        let exact = Places {
+            size: [1, 2],
+            images: vec![vec![SampledPixel { pixel: 1, x: 2.5 / 4.0, y: 1.5 / 3.0 }]],
+        };
         let out = gather_forward(&map, 2, size, &exact);
         assert_eq!(out[0], 0.0);
         assert!((out[1] - map[6]).abs() < 1e-6 && (out[3] - map[18]).abs() < 1e-6);
-        let images =
-            vec![(0..5).map(|i| Place { pixel: i, x: 0.21 * i as f32, y: 0.9 - 0.17 * i as f32 }).collect()];
+        let images = vec![
+            (0..5).map(|i| SampledPixel { pixel: i, x: 0.21 * i as f32, y: 0.9 - 0.17 * i as f32 }).collect(),
+        ];
         let places = Places { size: [2, 3], images };
         let weights: Vec<f32> = (0..12).map(|i| (i as f32 * 1.9).cos()).collect();
         let value = |map: &[f32]| -> f64 {

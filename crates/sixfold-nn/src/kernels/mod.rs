@@ -11,7 +11,7 @@ mod lstm;
 mod shared;
 mod upsample;
 
-pub use gather::{Place, Places, gather_backward, gather_forward, neighbours};
+pub use gather::{Places, SampledPixel, gather_backward, gather_forward, neighbours};
 pub use lstm::{lstm_backward, lstm_forward};
 pub use shared::{Activation, ConvSpec};
 pub use upsample::{upsample_2x, upsample_2x_backward};

@@ -11,9 +11,9 @@ use sixfold_mesh::Mesh;
 use super::appearance::{Common, Light, Shown, look};
 use super::arrangement::{Arrangement, Wanted};
 use super::common_error::Shared;
-use super::gauss_newton::SceneSource;
+use super::gauss_newton::PosedSource;
 use super::measure::{Terms, Working, off, prior, wanted_by};
-use super::options::{RefineOptions, SceneKind};
+use super::options::{PoseRefinementOptions, SceneKind};
 use super::stillness::{Joined, Places};
 use crate::maps::Maps;
 
@@ -46,11 +46,11 @@ pub(super) struct Standing {
 }
 
 /// Everything while its poses are made better.
-pub(super) struct Scene<'a, 'b> {
-    pub sources: &'a [SceneSource<'b>],
+pub(super) struct RefinementState<'a, 'b> {
+    pub sources: &'a [PosedSource<'b>],
     pub meshes: &'a [Mesh],
     pub objects: &'a [Object],
-    pub options: &'a RefineOptions,
+    pub options: &'a PoseRefinementOptions,
     pub working: Vec<Working<'a>>,
     pub progress: &'a mut dyn FnMut(f64) -> bool,
 }
@@ -60,7 +60,7 @@ const LEFT: f64 = 0.6;
 /// The level from which they are refined again in places.
 const AGAIN: usize = 1;
 
-impl Scene<'_, '_> {
+impl RefinementState<'_, '_> {
     /// Makes the poses better: in one arrangement if all objects stood still by their given poses; otherwise every source by
     /// itself, and then in the places where objects stood in some of the images by these better poses.
     pub fn refine(&mut self) -> Standing {
@@ -145,7 +145,7 @@ impl Scene<'_, '_> {
         Some((arrangement, (usual * 6.0 * pairs.len() as f64 / free).sqrt()))
     }
 
-    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` hears numbers in a range. `false`
+    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` receives numbers in a range. `false`
     /// when that stopped it.
     fn align(
         &mut self,
@@ -154,7 +154,7 @@ impl Scene<'_, '_> {
         first: usize,
         range: [f64; 2],
     ) -> bool {
-        let Scene { sources, objects, options, .. } = *self;
+        let RefinementState { sources, objects, options, .. } = *self;
         self.follow(arrangement);
         let first = first.min(options.blurs.len() - 1);
         let all = ((options.blurs.len() - first) * options.steps).max(1) as f64;
@@ -227,7 +227,7 @@ fn shared_motion(
     maps: &[Maps],
     reach: f64,
     blur: f32,
-    options: &RefineOptions,
+    options: &PoseRefinementOptions,
 ) -> Option<Pose> {
     if object.sources.len() < 3 {
         return None;

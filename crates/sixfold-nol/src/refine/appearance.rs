@@ -66,7 +66,7 @@ impl Light {
         Light { gain: vec![1.0; channels], offset: vec![0.0; channels] }
     }
 
-    /// Least squares of `common` on `shown`, drawn towards no change.
+    /// Least squares of `common` on `shown`, shrunk towards no change.
     pub fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
         let mut light = Light::neutral(channels);
         for c in 0..channels {

@@ -67,7 +67,7 @@ impl Arrangement {
         let size = 6 * (images + objects);
         let mut h = DMatrix::<f64>::zeros(size, size);
         let mut g = DVector::<f64>::zeros(size);
-        // Cameras turn about the middle of what their image shows: turns and shifts are then hardly coupled.
+        // Cameras turn about the centre of what their image shows: turns and shifts are then hardly coupled.
         let mut middles = vec![(Vec3::zeros(), 0.0); images];
         for (wanted, [image, _]) in wanted.iter().zip(&self.pairs) {
             middles[*image].0 += wanted.centre;
@@ -81,7 +81,7 @@ impl Arrangement {
         for (wanted, &[image, object]) in wanted.iter().zip(&self.pairs) {
             let (hessian, gradient) = wanted.equations.parts();
             let camera = &self.camera_from_scene[image];
-            // A turn of the camera about its middle carries the object's centre along.
+            // A turn of the camera about its centre carries the object's centre along.
             let mut by_camera = Matrix6::identity();
             let arm = (wanted.centre - middles[image]).cross_matrix();
             by_camera.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm);

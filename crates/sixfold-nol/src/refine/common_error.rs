@@ -3,7 +3,7 @@
 //! When every photograph compares itself with the others, nothing pulls on a motion of the object that is the same in all
 //! of them: the common colours slide over the surface along with it. Yet they fit worse then, because places off the true
 //! surface are seen by different photographs before different backgrounds (parallax). So the common motion is looked for by
-//! itself: the disagreement of all photographs, with their common colours made anew, as a parabola along each of six axes, and
+//! itself: the disagreement of all photographs, with their common colours made again, as a parabola along each of six axes, and
 //! with what outlines and given poses say about it.
 
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use sixfold_geometry::{Pose, Vec3};
 
 use super::appearance::{Common, Shown, look_at};
 use super::measure::Working;
-use super::options::RefineOptions;
+use super::options::PoseRefinementOptions;
 use crate::maps::Maps;
 
 /// One object's photographs while their common motion is looked for.
@@ -91,7 +91,7 @@ impl Shared<'_, '_> {
     }
 
     /// The motion that the photographs agree on best; `None` where they say nothing about it.
-    pub fn solve(&self, options: &RefineOptions) -> Option<Pose> {
+    pub fn solve(&self, options: &PoseRefinementOptions) -> Option<Pose> {
         let scale = options.colors * self.working.len() as f64;
         let (here, noise) = self.disagreement(&Vector6::zeros(), None);
         let mut h = Matrix6::zeros();

@@ -9,12 +9,12 @@ use rayon::prelude::*;
 use sixfold_align::outline::outline_mesh;
 use sixfold_data::PosedImage;
 use sixfold_mesh::Mesh;
-use sixfold_render::Frame;
+use sixfold_render::VisibilityBuffer;
 
-use super::alignment::{Object, Scene, shown};
+use super::alignment::{Object, RefinementState, shown};
 use super::appearance::Light;
 use super::measure::Working;
-use super::options::{RefineOptions, Refinement, SourceReport};
+use super::options::{PoseRefinementOptions, Refinement, SourceReport};
 use crate::error::NolError;
 use crate::maps::Maps;
 use crate::source::SourceView;
@@ -22,7 +22,7 @@ use crate::surface::outwards;
 
 /// One object in one image.
 #[derive(Debug, Clone, Copy)]
-pub struct SceneSource<'a> {
+pub struct PosedSource<'a> {
     /// Number of the object in the list of meshes.
     pub object: usize,
     /// Number of the image: sources of one image share its camera.
@@ -38,26 +38,26 @@ pub struct SceneSource<'a> {
 pub fn refine_poses(
     photographs: &[PosedImage],
     mesh: &Mesh,
-    options: &RefineOptions,
+    options: &PoseRefinementOptions,
     progress: impl FnMut(f64) -> bool,
 ) -> Result<Refinement, NolError> {
-    let sources: Vec<SceneSource<'_>> = photographs
+    let sources: Vec<PosedSource<'_>> = photographs
         .iter()
         .enumerate()
-        .map(|(image, photograph)| SceneSource { object: 0, image, photograph })
+        .map(|(image, photograph)| PosedSource { object: 0, image, photograph })
         .collect();
     refine_scene(&sources, std::slice::from_ref(mesh), options, progress)
 }
 
-/// Makes the poses of objects in photographs better. `progress` hears the share that is done, and stops the work by returning
+/// Makes the poses of objects in photographs better. `progress` receives the fraction that is done, and stops the work by returning
 /// `false` (the poses of that moment are the result).
 ///
 /// # Errors
 /// [`NolError`] for options out of range.
 pub fn refine_scene(
-    sources: &[SceneSource<'_>],
+    sources: &[PosedSource<'_>],
     meshes: &[Mesh],
-    options: &RefineOptions,
+    options: &PoseRefinementOptions,
     mut progress: impl FnMut(f64) -> bool,
 ) -> Result<Refinement, NolError> {
     options.check()?;
@@ -90,15 +90,16 @@ pub fn refine_scene(
             allowed: vec![],
             outline: None,
             light: Light::neutral(3),
-            frame: Frame::new(&view.camera),
+            frame: VisibilityBuffer::new(&view.camera),
             lines: 0,
             view,
         });
     }
     let before = differences(&mut working, &objects, options);
-    let mut scene = Scene { sources, meshes, objects: &objects, options, working, progress: &mut progress };
+    let mut scene =
+        RefinementState { sources, meshes, objects: &objects, options, working, progress: &mut progress };
     let standing = scene.refine();
-    let Scene { mut working, progress, .. } = scene;
+    let RefinementState { mut working, progress, .. } = scene;
     progress(1.0);
     let after = differences(&mut working, &objects, options);
     let mut reports: Vec<SourceReport> = working
@@ -123,7 +124,7 @@ fn drop_strangers(
     reports: &mut [SourceReport],
     working: &[Working<'_>],
     sources: &[usize],
-    options: &RefineOptions,
+    options: &PoseRefinementOptions,
 ) {
     let mut differences: Vec<f64> =
         sources.iter().map(|k| reports[*k].difference[1]).filter(|d| d.is_finite()).collect();
@@ -132,7 +133,7 @@ fn drop_strangers(
     }
     let middle = differences.len() / 2;
     let median = *differences.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let most = (options.most_different * median).max(LEAST_STRANGE);
+    let most = (options.max_different * median).max(MIN_STRANGE);
     for k in sources {
         let report = &mut reports[*k];
         if report.dropped.is_none() && report.difference[1] > most {
@@ -148,10 +149,10 @@ fn drop_strangers(
 }
 
 /// Differences in colour below this are light, not another object.
-const LEAST_STRANGE: f64 = 0.08;
+const MIN_STRANGE: f64 = 0.08;
 
 /// Mean difference of every source to the others of its object, in the finest blur.
-fn differences(working: &mut [Working<'_>], objects: &[Object], options: &RefineOptions) -> Vec<f64> {
+fn differences(working: &mut [Working<'_>], objects: &[Object], options: &PoseRefinementOptions) -> Vec<f64> {
     let blur = options.blurs.last().copied().unwrap_or(1.0);
     let maps: Vec<Maps> = working.par_iter().map(|w| Maps::of_patch(&w.view.patch, blur)).collect();
     working.par_iter_mut().for_each(|w| w.allow(blur));

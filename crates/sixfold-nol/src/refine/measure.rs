@@ -1,13 +1,13 @@
 //! What one photograph says about the pose of its object: colours against those of the others, the outline, the given pose.
 
-use sixfold_align::outline::{LEAST_LINES, Line, Outline, add_lines, motion, tukey};
+use sixfold_align::outline::{Line, MIN_LINES, Outline, add_lines, motion, tukey};
 use sixfold_geometry::{NormalEquations, Pose, Vec3};
-use sixfold_render::Frame;
+use sixfold_render::VisibilityBuffer;
 use sixfold_synth::augment::Coverage;
 
 use super::appearance::Light;
 use super::arrangement::Wanted;
-use super::options::{RefineOptions, SourceReport};
+use super::options::{PoseRefinementOptions, SourceReport};
 use crate::maps::Maps;
 use crate::source::SourceView;
 
@@ -21,7 +21,7 @@ pub(super) struct Working<'a> {
     pub allowed: Vec<f32>,
     pub outline: Option<Outline<'a>>,
     pub light: Light,
-    pub frame: Frame,
+    pub frame: VisibilityBuffer,
     pub lines: usize,
 }
 
@@ -55,7 +55,7 @@ fn size(offset: &[f64; 6], rough: [f64; 2]) -> f64 {
     (square / 6.0).sqrt()
 }
 
-/// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and turn are taken
+/// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and rotation are taken
 /// by themselves.
 fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], rough: [f64; 2]) {
     let trust = 1.0 / (1.0 + size(offset, rough).powi(2) / 6.0);
@@ -88,7 +88,7 @@ impl Working<'_> {
     }
 
     /// The colours to be compared.
-    pub fn maps(&self, blur: f32, options: &RefineOptions) -> Maps {
+    pub fn maps(&self, blur: f32, options: &PoseRefinementOptions) -> Maps {
         if options.wide <= 0.0 {
             return Maps::of_patch(&self.view.patch, blur);
         }
@@ -103,7 +103,7 @@ impl Working<'_> {
     }
 
     /// What the photograph says about its pose: colours and outline, as normal equations of a twist about the object's centre.
-    pub fn measure(&mut self, terms: &Terms<'_>, options: &RefineOptions) -> Wanted {
+    pub fn measure(&mut self, terms: &Terms<'_>, options: &PoseRefinementOptions) -> Wanted {
         let pose = self.pose;
         let centre = pose.transform_point(terms.centre);
         let mut equations = NormalEquations::default();
@@ -113,7 +113,7 @@ impl Working<'_> {
         let lines: Vec<Line> =
             self.outline.as_mut().map(|outline| outline.lines(terms.reach, &pose)).unwrap_or_default();
         self.lines = lines.len();
-        if lines.len() >= LEAST_LINES {
+        if lines.len() >= MIN_LINES {
             add_lines(&mut equations, &lines, &self.view.camera, &centre, terms.reach, options.line, 1.0);
         }
         add_given(&mut equations, &since(&self.given, &pose, terms.centre), options.rough);
@@ -121,11 +121,11 @@ impl Working<'_> {
     }
 
     /// Outline and given pose without the colours.
-    pub fn measure_anchors(&mut self, centre: &Vec3, reach: f64, options: &RefineOptions) -> Wanted {
+    pub fn measure_anchors(&mut self, centre: &Vec3, reach: f64, options: &PoseRefinementOptions) -> Wanted {
         let pose = self.pose;
         let mut wanted = wanted_by(&self.given, &pose, centre, options.rough);
         let lines = self.outline.as_mut().map(|outline| outline.lines(reach, &pose)).unwrap_or_default();
-        if lines.len() >= LEAST_LINES {
+        if lines.len() >= MIN_LINES {
             let camera = &self.view.camera;
             add_lines(&mut wanted.equations, &lines, camera, &wanted.centre, reach, options.line, 1.0);
         }
@@ -137,7 +137,7 @@ impl Working<'_> {
         equations: &mut NormalEquations,
         terms: &Terms<'_>,
         centre: &Vec3,
-        options: &RefineOptions,
+        options: &PoseRefinementOptions,
     ) {
         struct Row {
             jacobian: [f64; 6],
@@ -186,14 +186,19 @@ impl Working<'_> {
         }
     }
 
-    pub fn report(&self, centre: &Vec3, difference: [f64; 2], options: &RefineOptions) -> SourceReport {
+    pub fn report(
+        &self,
+        centre: &Vec3,
+        difference: [f64; 2],
+        options: &PoseRefinementOptions,
+    ) -> SourceReport {
         let pose = &self.pose;
         let offset = since(&self.given, pose, centre);
         let far = |range: std::ops::Range<usize>, deviation: f64| {
             offset[range].iter().map(|v| v * v).sum::<f64>().sqrt() / deviation
         };
         let (shift, turn) = (far(0..3, options.rough[0]), far(3..6, options.rough[1]));
-        let dropped = if shift > options.most_moved || turn > options.most_moved {
+        let dropped = if shift > options.max_moved || turn > options.max_moved {
             Some(format!(
                 "the pose that fits is {:.0} mm and {:.1} degrees from the given one",
                 shift * options.rough[0] * 1e3,
@@ -239,7 +244,7 @@ mod tests {
         let pose = moved([0.004, -0.002, 0.006, 0.02, 0.03, -0.01], given, about);
         let before = since(&given, &pose, &centre);
         assert!((before[3] - 0.02).abs() < 1e-9 && (before[5] + 0.01).abs() < 1e-9, "{before:?}");
-        let options = RefineOptions::default();
+        let options = PoseRefinementOptions::default();
         let mut equations = NormalEquations::default();
         add_given(&mut equations, &before, options.rough);
         let step = equations.solve(0.0).unwrap();

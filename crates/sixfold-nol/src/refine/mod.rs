@@ -2,7 +2,7 @@
 //!
 //! [`refine_scene`] is the default: robust Gauss-Newton on SE(3) over the difference between what one photograph shows
 //! on the surface and what the others show there, with the outline as a second measurement, and one camera for all objects of
-//! an image that stood still between some of the photographs. [`printed_rule`] is the dissertation's gradient step over the same
+//! an image that stood still between some of the photographs. [`published_rule`] is the dissertation's gradient step over the same
 //! difference.
 
 mod alignment;
@@ -12,14 +12,14 @@ mod common_error;
 mod gauss_newton;
 mod measure;
 mod options;
-mod printed;
-mod printed_poses;
+mod published;
+mod published_rule_poses;
 mod stillness;
 #[cfg(test)]
 pub(crate) mod tests;
 
 pub(crate) use appearance::{Common, Light, Shown, look};
-pub use gauss_newton::{SceneSource, refine_poses, refine_scene};
-pub use options::{RefineOptions, Refinement, SceneKind, SourceReport};
-pub use printed::{PrintedOptions, printed_rule};
-pub use printed_poses::printed_poses;
+pub use gauss_newton::{PosedSource, refine_poses, refine_scene};
+pub use options::{PoseRefinementOptions, Refinement, SceneKind, SourceReport};
+pub use published::{PublishedRuleOptions, published_rule};
+pub use published_rule_poses::published_rule_poses;

@@ -6,7 +6,7 @@ use crate::error::NolError;
 
 /// How poses are made better.
 #[derive(Debug, Clone, PartialEq)]
-pub struct RefineOptions {
+pub struct PoseRefinementOptions {
     /// Pixels along a side of the crops that are compared.
     pub side: usize,
     /// Points of the surface that are compared.
@@ -15,7 +15,7 @@ pub struct RefineOptions {
     pub blurs: Vec<f32>,
     /// How far from the outline the border is looked for at each blur, crop pixels.
     pub reaches: Vec<f64>,
-    /// Steps at each blur; the common appearance is made anew before each.
+    /// Steps at each blur; the common appearance is made again before each.
     pub steps: usize,
     /// Slow changes of colour are taken out: means over this many times the blur; 0 compares the colours as they are.
     pub wide: f32,
@@ -34,16 +34,16 @@ pub struct RefineOptions {
     /// Standard deviation of the given poses: metres along each axis, radians about each.
     pub rough: [f64; 2],
     /// A photograph whose pose moved by more than this many standard deviations is dropped.
-    pub most_moved: f64,
+    pub max_moved: f64,
     /// A photograph whose colours differ from the others' by more than this many times what is usual among them is dropped.
-    pub most_different: f64,
+    pub max_different: f64,
     /// Seed of the points.
     pub seed: u64,
 }
 
-impl Default for RefineOptions {
+impl Default for PoseRefinementOptions {
     fn default() -> Self {
-        RefineOptions {
+        PoseRefinementOptions {
             side: 128,
             points: 4000,
             blurs: vec![3.0, 2.0, 1.4, 1.0],
@@ -56,8 +56,8 @@ impl Default for RefineOptions {
             edges: 60.0,
             scene: SceneKind::Judge,
             rough: [0.006, 0.03],
-            most_moved: 6.0,
-            most_different: 3.5,
+            max_moved: 6.0,
+            max_different: 3.5,
             seed: 0,
         }
     }
@@ -83,7 +83,7 @@ pub struct SourceReport {
     pub camera_from_object: Pose,
     /// How far the object's origin moved, metres.
     pub moved: f64,
-    /// How far it was turned, radians.
+    /// How far it was rotated, radians.
     pub turned: f64,
     /// Mean difference in colour to the other photographs (0 to 1) before and after.
     pub difference: [f64; 2],
@@ -108,7 +108,7 @@ pub struct Refinement {
     pub disagreement: Option<f64>,
 }
 
-impl RefineOptions {
+impl PoseRefinementOptions {
     /// Tests every field.
     ///
     /// # Errors

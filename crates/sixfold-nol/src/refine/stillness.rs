@@ -1,7 +1,7 @@
 //! Which objects stayed where they were between which photographs, by rough poses alone.
 //!
-//! Objects that stayed moved alike in front of the camera from one image to another: the motion of one foretells the others'. In
-//! every pair of images the largest set of objects that foretell each other is taken to have stood still, and its mean motion says how
+//! Objects that stayed moved alike in front of the camera from one image to another: the motion of one predicts the others'. In
+//! every pair of images the largest set of objects that predict each other is taken to have stood still, and its mean motion says how
 //! far every object is from having done so. An object's images then fall into groups by the mean of these errors
 //! (average linkage, Sokal and Michener 1958; the rest is ours).
 
@@ -19,8 +19,8 @@ pub(super) struct Places {
     pub count: usize,
 }
 
-/// Mean of six squared errors, in units of their expected ones, up to which a pose was foretold: 99 of 100 that should be are.
-const FORETOLD: f64 = 2.8;
+/// Mean of six squared errors, in units of their expected ones, up to which a pose was predicted: 99 of 100 that should be are.
+const PREDICTED: f64 = 2.8;
 /// The same as the mean over all pairs of images of two groups of them, up to which an object stood alike in both.
 const ALIKE: f64 = 2.0;
 
@@ -35,7 +35,7 @@ impl Places {
             images.entry(*image).or_default().insert(*object, source);
         }
         let images: Vec<_> = images.into_values().collect();
-        let judge = Judge { given, centres, rough };
+        let judge = MotionTest { given, centres, rough };
         // How far every object is from having stood still, by the two sources.
         let mut errors: Vec<BTreeMap<(usize, usize), f64>> = vec![BTreeMap::new(); centres.len()];
         for (number, one) in images.iter().enumerate() {
@@ -61,7 +61,7 @@ impl Places {
     }
 }
 
-struct Judge<'a> {
+struct MotionTest<'a> {
     given: &'a [Pose],
     centres: &'a [Vec3],
     rough: [f64; 2],
@@ -74,7 +74,7 @@ struct Motion {
     to: Vec3,
 }
 
-impl Judge<'_> {
+impl MotionTest<'_> {
     fn centre(&self, object: usize, source: usize) -> Vec3 {
         self.given[source].transform_point(&self.centres[object])
     }
@@ -94,7 +94,7 @@ impl Judge<'_> {
         Motion { rotation, from, to }
     }
 
-    /// Mean of six squared errors of an object's pose as a motion that is the mean of `count` objects' foretells it, in units
+    /// Mean of six squared errors of an object's pose as a motion that is the mean of `count` objects' predicts it, in units
     /// of what rough poses explain.
     fn error(&self, motion: &Motion, count: usize, (object, k, l): Both) -> f64 {
         let arm = self.centre(object, l) - motion.from;
@@ -107,14 +107,14 @@ impl Judge<'_> {
         (shift.norm_squared() / expected[0] + turn.norm_squared() / expected[1]) / 6.0
     }
 
-    /// The motion of the most objects that foretell each other, and how many they are.
+    /// The motion of the most objects that predict each other, and how many they are.
     fn common_motion(&self, both: &[Both]) -> Option<(Motion, usize)> {
         let agree = |motion: &Motion, count: usize| -> Vec<Both> {
-            both.iter().filter(|b| self.error(motion, count, **b) < FORETOLD).copied().collect()
+            both.iter().filter(|b| self.error(motion, count, **b) < PREDICTED).copied().collect()
         };
         let sets = both.iter().map(|one| agree(&self.mean(&[*one]), 1));
         let mut best = sets.reduce(|best, set| if set.len() > best.len() { set } else { best })?;
-        // What they move on average foretells better than what one of them does.
+        // What they move on average predicts better than what one of them does.
         for _ in 0..3 {
             let better = agree(&self.mean(&best), best.len());
             if better.len() < 2 || better == best {
@@ -182,7 +182,7 @@ impl Joined {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::refine::RefineOptions;
+    use crate::refine::PoseRefinementOptions;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
     use sixfold_geometry::nalgebra::Vector6;
@@ -223,7 +223,7 @@ mod tests {
                 ));
             }
         }
-        let places = Places::new(&pairs, &given, &[Vec3::zeros(); 4], RefineOptions::default().rough);
+        let places = Places::new(&pairs, &given, &[Vec3::zeros(); 4], PoseRefinementOptions::default().rough);
         let of = |image: usize, object: usize| places.of_source[4 * image + object];
         for image in 1..6 {
             assert_eq!((of(image, 0), of(image, 2)), (of(0, 0), of(0, 2)), "{places:?}");
@@ -236,8 +236,12 @@ mod tests {
     #[test]
     fn an_object_alone_says_nothing() {
         let pairs = [[0, 0], [1, 0], [2, 0]];
-        let places =
-            Places::new(&pairs, &[Pose::identity(); 3], &[Vec3::zeros()], RefineOptions::default().rough);
+        let places = Places::new(
+            &pairs,
+            &[Pose::identity(); 3],
+            &[Vec3::zeros()],
+            PoseRefinementOptions::default().rough,
+        );
         assert_eq!(places.count, 3);
     }
 }

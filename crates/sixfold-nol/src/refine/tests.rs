@@ -8,7 +8,7 @@ use sixfold_data::PosedImage;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use super::*;
 
@@ -46,7 +46,7 @@ pub(crate) fn photographs(count: usize, reach: [f64; 2], seed: u64) -> (Mesh, Ve
             sixfold_geometry::Mat3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
         let mut draw = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
         let truth = Pose::from_parts(&rotation, Vec3::new(draw(0.05), draw(0.03), 0.7 + draw(0.1))).unwrap();
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         let objects = [SceneObject { mesh: &mesh, camera_from_object: truth }];
         frame.render(&objects, &RenderOptions::default());
         let seen = frame.object_coordinates(&objects);
@@ -79,9 +79,9 @@ fn rough_poses_of_a_painted_block_become_exact() {
     let given: Vec<Pose> = photographs.iter().map(|p| *p.camera_from_object()).collect();
     // As it is by default; with the outline, which is sharp here; with all of the paint, which is even here, and the error
     // that all poses share.
-    let default = RefineOptions::default();
-    let outline = RefineOptions { line: 0.3, ..default.clone() };
-    let paint = RefineOptions { wide: 0.0, shared: 2, colors: 40.0, ..default.clone() };
+    let default = PoseRefinementOptions::default();
+    let outline = PoseRefinementOptions { line: 0.3, ..default.clone() };
+    let paint = PoseRefinementOptions { wide: 0.0, shared: 2, colors: 40.0, ..default.clone() };
     for (options, most) in [(default, [0.0035, 0.015]), (outline, [0.002, 0.006]), (paint, [0.0015, 0.009])] {
         let refined = refine_poses(&photographs, &mesh, &options, |_| true).unwrap();
         let after: Vec<Pose> = refined.sources.iter().map(|s| s.camera_from_object).collect();
@@ -96,7 +96,7 @@ fn a_photograph_with_a_wrong_pose_is_dropped() {
     let wrong = photographs[4].camera_from_object();
     let moved = wrong.with_translation(wrong.translation() + Vec3::new(0.07, 0.03, 0.0));
     photographs[4] = photographs[4].with_pose(moved).unwrap();
-    let refined = refine_poses(&photographs, &mesh, &RefineOptions::default(), |_| true).unwrap();
+    let refined = refine_poses(&photographs, &mesh, &PoseRefinementOptions::default(), |_| true).unwrap();
     for (k, source) in refined.sources.iter().enumerate() {
         assert_eq!(source.dropped.is_some(), k == 4, "{k}: {source:?}");
     }
@@ -124,9 +124,9 @@ fn two_blocks(between: impl Fn(usize) -> Pose) -> (Mesh, Vec<Pose>, Vec<PosedIma
 }
 
 /// The sources of two objects, each in every image.
-fn sources<'a>(first: &'a [PosedImage], second: &'a [PosedImage]) -> Vec<SceneSource<'a>> {
+fn sources<'a>(first: &'a [PosedImage], second: &'a [PosedImage]) -> Vec<PosedSource<'a>> {
     let of = |object: usize, list: &'a [PosedImage]| {
-        list.iter().enumerate().map(move |(image, photograph)| SceneSource { object, image, photograph })
+        list.iter().enumerate().map(move |(image, photograph)| PosedSource { object, image, photograph })
     };
     of(0, first).chain(of(1, second)).collect()
 }
@@ -140,7 +140,7 @@ fn objects_that_stood_still_share_their_cameras() {
     let (mesh, truth, first, second) = two_blocks(|_| between(1.0, 0.15));
     let sources = sources(&first, &second);
     // The second block is painted nowhere: what is left is the common arrangement.
-    let options = RefineOptions { colors: 0.0, line: 0.0, ..RefineOptions::default() };
+    let options = PoseRefinementOptions { colors: 0.0, line: 0.0, ..PoseRefinementOptions::default() };
     let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, |_| true).unwrap();
     assert!(refined.still && refined.disagreement.unwrap() < 2.0, "{:?}", refined.disagreement);
     assert_eq!(refined.places, 2);
@@ -149,7 +149,7 @@ fn objects_that_stood_still_share_their_cameras() {
     let (before, after) = (errors(&given, &truth), errors(&after, &truth));
     assert!(after[0] < 0.85 * before[0] && after[1] < 0.85 * before[1], "{before:?} {after:?}");
     // Moved between photographs, nothing is shared: the given poses stay.
-    let options = RefineOptions { scene: SceneKind::Moving, ..options };
+    let options = PoseRefinementOptions { scene: SceneKind::Moving, ..options };
     let moving = refine_scene(&sources, &[block(), block()], &options, |_| true).unwrap();
     assert!(moving.sources.iter().zip(&given).all(|(s, g)| s.camera_from_object.distance_to(g) < 1e-6));
 }
@@ -159,7 +159,7 @@ fn objects_that_were_moved_once_share_their_cameras_before_and_after() {
     let (mesh, truth, first, second) =
         two_blocks(|image| if image < 5 { between(1.0, 0.15) } else { between(-0.4, -0.1) });
     let sources = sources(&first, &second);
-    let options = RefineOptions { colors: 0.0, line: 0.0, ..RefineOptions::default() };
+    let options = PoseRefinementOptions { colors: 0.0, line: 0.0, ..PoseRefinementOptions::default() };
     let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, |_| true).unwrap();
     // Who moved, nobody can say: both objects have a place before and one after.
     assert!(!refined.still && refined.disagreement.unwrap() > 2.0, "{:?}", refined.disagreement);
@@ -174,7 +174,8 @@ fn objects_that_were_moved_once_share_their_cameras_before_and_after() {
 fn the_printed_rule_lowers_the_errors_of_a_painted_block() {
     let (mesh, truth, photographs) = photographs(10, [0.004, 0.02], 5);
     let given: Vec<Pose> = photographs.iter().map(|p| *p.camera_from_object()).collect();
-    let after = printed_poses(&photographs, &mesh, None, 128, 6, &PrintedOptions::default()).unwrap();
+    let after =
+        published_rule_poses(&photographs, &mesh, None, 128, 6, &PublishedRuleOptions::default()).unwrap();
     let (before, after) = (errors(&given, &truth), errors(&after, &truth));
     println!("{before:.5?} {after:.5?}");
     // Little: its step is one for metres and radians.

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::random::stream;
-use sixfold_nn::kernels::{Place, Places, neighbours};
+use sixfold_nn::kernels::{Places, SampledPixel, neighbours};
 use sixfold_synth::augment::{Backgrounds, Patch};
 
-use super::view::{Sample, SampleOptions, make_sample};
+use super::view::{Sample, ViewSampleOptions, make_sample};
 use crate::network::COLOURS;
 use crate::projection::TargetSurface;
 use crate::source::SourceView;
@@ -55,7 +55,7 @@ pub(crate) fn order(looked: &[Looked]) -> Vec<usize> {
     order
 }
 
-/// A pixel of a crop as a share of its side, as [`Place`] has it.
+/// A pixel of a crop as a fraction of its side, as [`SampledPixel`] has it.
 pub(crate) fn share(pixel: f32, side: usize) -> f32 {
     (pixel + 0.5) / side as f32
 }
@@ -73,15 +73,17 @@ fn colour(patch: &Patch, [x, y]: [f32; 2]) -> [f32; COLOURS] {
 
 /// How many samples of which size there are in a step.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct BatchOptions {
+pub struct ViewBatchOptions {
     /// Sides of the crops, pixels; a step has one of them.
     pub sides: Vec<usize>,
     /// Most sources of a sample; a step has from 1 to this many, each as likely.
-    pub most_sources: usize,
+    #[serde(rename = "most_sources")]
+    pub max_sources: usize,
     /// Sources in a step at the smallest side; fewer at a larger one.
     pub sources: usize,
     /// Most samples in a step.
-    pub most_samples: usize,
+    #[serde(rename = "most_samples")]
+    pub max_samples: usize,
 }
 
 /// Some samples as the numbers of tensors; `K` sources, `B` samples, source by source.
@@ -109,21 +111,21 @@ impl Batch {
     /// The batch of a step.
     pub fn of_step(
         textures: &Backgrounds,
-        samples: &SampleOptions,
-        options: &BatchOptions,
+        samples: &ViewSampleOptions,
+        options: &ViewBatchOptions,
         seed: u64,
         step: u64,
     ) -> Batch {
         // Streams with odd numbers choose the batch, those with even ones make samples.
         let mut random = stream(seed, 2 * step + 1);
-        let sources = random.random_range(1..=options.most_sources.max(1));
+        let sources = random.random_range(1..=options.max_sources.max(1));
         let side = options.sides[random.random_range(0..options.sides.len())];
         let smallest = options.sides.iter().copied().min().unwrap_or(side);
         let budget = options.sources as f64 * (smallest as f64 / side as f64).powi(2);
-        let count = ((budget / sources as f64).round() as usize).clamp(1, options.most_samples.max(1));
+        let count = ((budget / sources as f64).round() as usize).clamp(1, options.max_samples.max(1));
         let made: Vec<Sample> = (0..count as u64)
             .map(|i| {
-                let number = 2 * (step * options.most_samples.max(1) as u64 + i);
+                let number = 2 * (step * options.max_samples.max(1) as u64 + i);
                 make_sample(textures, samples, side, sources, seed, number)
             })
             .collect();
@@ -168,7 +170,11 @@ impl Batch {
                 for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines)
                 {
                     let at = sample.surface.pixels[*point as usize];
-                    places.push(Place { pixel: at, x: share(pixel[0], side), y: share(pixel[1], side) });
+                    places.push(SampledPixel {
+                        pixel: at,
+                        x: share(pixel[0], side),
+                        y: share(pixel[1], side),
+                    });
                     let at = at as usize;
                     for (c, value) in colour(&source.patch, *pixel).into_iter().enumerate() {
                         batch.colours[(n * COLOURS + c) * pixels + at] = value;

@@ -1,4 +1,4 @@
-//! What the network learns from (dissertation, section 4.2.2): made-up objects with random textures, seen in cluttered images with
+//! What the network learns from (dissertation, section 4.2.2): synthetic objects with random textures, seen in cluttered images with
 //! poses that are off.
 //!
 //! The dissertation renders 1,000 sets of ten images of scanned objects before the training; here every sample is made when it is
@@ -8,7 +8,7 @@ mod batch;
 mod object;
 mod view;
 
-pub use batch::{Batch, BatchOptions, Looked, look_up};
+pub use batch::{Batch, Looked, ViewBatchOptions, look_up};
 pub(crate) use batch::{order, share};
 pub use object::PaintedObject;
-pub use view::{Sample, SampleOptions, make_sample};
+pub use view::{Sample, ViewSampleOptions, make_sample};

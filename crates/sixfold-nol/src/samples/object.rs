@@ -1,11 +1,11 @@
-//! A made-up object with a random surface, and what a camera sees of it under a lamp.
+//! A synthetic object with a random surface, and what a camera sees of it under a lamp.
 
 use rand::RngExt;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::random::Random;
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::{Backgrounds, Coverage, Patch, procedural_texture};
 use sixfold_synth::shapes::{Family, member};
 
@@ -44,7 +44,7 @@ pub(super) fn between(random: &mut Random, low: f64, high: f64) -> f64 {
 }
 
 /// A rotation, each as likely as any other.
-fn random_turn(random: &mut Random) -> UnitQuaternion<f64> {
+fn random_rotation(random: &mut Random) -> UnitQuaternion<f64> {
     let axis = random_direction(random);
     let turn =
         UnitQuaternion::from_axis_angle(&Vector3::z_axis(), between(random, 0.0, std::f64::consts::TAU));
@@ -77,7 +77,7 @@ impl PaintedObject {
         if random.random::<f32>() < 0.25 {
             let (low, high) = mesh.bounding_box();
             let shift = (high - low) * between(random, -0.3, 0.3);
-            let other = random_member(random).transformed(&Pose::new(random_turn(random), shift));
+            let other = random_member(random).transformed(&Pose::new(random_rotation(random), shift));
             if let Ok(both) = Mesh::merged(&[mesh.clone(), other]) {
                 mesh = both;
             }
@@ -112,7 +112,7 @@ impl PaintedObject {
         lamp: &Lamp,
         background: Patch,
     ) -> (Patch, Coverage) {
-        let mut frame = Frame::new(camera);
+        let mut frame = VisibilityBuffer::new(camera);
         let objects = [SceneObject { mesh: &self.mesh, camera_from_object: *camera_from_object }];
         frame.render(&objects, &RenderOptions::default());
         let (points, normals) = (frame.object_coordinates(&objects), frame.normals(&objects));
@@ -148,7 +148,7 @@ fn texture(textures: &Backgrounds, random: &mut Random) -> Patch {
     }
 }
 
-/// Bilinear; beyond its border the texture goes on mirrored.
+/// Bilinear; beyond its border the texture continues mirrored.
 fn sample_mirrored(texture: &Patch, x: f32, y: f32) -> [f32; 3] {
     let fold = |v: f32, n: usize| {
         let n = n as f32;

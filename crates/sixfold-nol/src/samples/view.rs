@@ -20,28 +20,28 @@ const TARGET_MARGIN: f64 = 1.1;
 
 /// How samples are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct SampleOptions {
+pub struct ViewSampleOptions {
     /// Longest side of an object, smallest and largest, metres.
     pub size: [f64; 2],
     /// Distance from camera to object, smallest and largest, metres.
     pub distance: [f64; 2],
     /// Poses of sources are off by up to this along every axis, metres (table 4.1).
     pub translation: f64,
-    /// And turned by up to this about every axis, radians (table 4.1).
+    /// And rotated by up to this about every axis, radians (table 4.1).
     pub rotation: f64,
-    /// In this share of the samples poses are good: off by 0 to 30 % of that, as refined ones are.
+    /// In this fraction of the samples poses are good: off by 0 to 30 % of that, as refined ones are.
     pub good_poses: f64,
-    /// Chance that something stands in front of the object in a source.
+    /// Probability that something stands in front of the object in a source.
     pub occluded: f64,
     /// Most of the object that it hides.
     pub occlusion: f32,
-    /// Chance that the source's mask leaves out what is hidden.
+    /// Probability that the source's mask leaves out what is hidden.
     pub mask_known: f64,
 }
 
-impl Default for SampleOptions {
+impl Default for ViewSampleOptions {
     fn default() -> Self {
-        SampleOptions {
+        ViewSampleOptions {
             size: [0.06, 0.3],
             distance: [0.4, 1.2],
             translation: 0.01,
@@ -68,7 +68,7 @@ pub struct Sample {
 /// The sample with this number and `sources` sources, all crops `side` pixels wide; the same for the same seed.
 pub fn make_sample(
     textures: &Backgrounds,
-    options: &SampleOptions,
+    options: &ViewSampleOptions,
     side: usize,
     sources: usize,
     seed: u64,
@@ -131,7 +131,7 @@ fn photographs_camera(random: &mut Random) -> Camera {
 }
 
 /// The pose of an object seen from a direction (object frame), somewhere in the image.
-fn seen_from(direction: &Vec3, options: &SampleOptions, random: &mut Random) -> Pose {
+fn seen_from(direction: &Vec3, options: &ViewSampleOptions, random: &mut Random) -> Pose {
     let z = -direction;
     let helper = if z.z.abs() < 0.95 { Vec3::z() } else { Vec3::x() };
     let x = z.cross(&helper).normalize();
@@ -145,7 +145,7 @@ fn seen_from(direction: &Vec3, options: &SampleOptions, random: &mut Random) -> 
 }
 
 /// A pose that is off as table 4.1 has it, in units of `share`.
-fn perturbed(pose: &Pose, options: &SampleOptions, share: f64, random: &mut Random) -> Pose {
+fn perturbed(pose: &Pose, options: &ViewSampleOptions, share: f64, random: &mut Random) -> Pose {
     let mut each = |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
     let (shift, angles) = (each(options.translation), each(options.rotation));
     let turn = UnitQuaternion::from_euler_angles(angles.x, angles.y, angles.z);
@@ -161,7 +161,7 @@ fn window_of(camera: &Camera, object: &PaintedObject, pose: &Pose, margin: f64) 
 fn source(
     object: &PaintedObject,
     textures: &Backgrounds,
-    options: &SampleOptions,
+    options: &ViewSampleOptions,
     camera: &Camera,
     pose: &Pose,
     off: f64,
@@ -200,7 +200,7 @@ mod tests {
     #[test]
     fn samples_keep_to_their_seed_and_sources_see_the_target() {
         let textures = Backgrounds::procedural();
-        let options = SampleOptions::default();
+        let options = ViewSampleOptions::default();
         let sample = |number| make_sample(&textures, &options, 64, 4, 3, number);
         let (a, b) = (sample(5), sample(5));
         assert_eq!(a.target, b.target);
@@ -222,8 +222,12 @@ mod tests {
     #[test]
     fn without_perturbation_sources_show_the_targets_colours() {
         let textures = Backgrounds::procedural();
-        let options =
-            SampleOptions { translation: 0.0, rotation: 0.0, occluded: 0.0, ..SampleOptions::default() };
+        let options = ViewSampleOptions {
+            translation: 0.0,
+            rotation: 0.0,
+            occluded: 0.0,
+            ..ViewSampleOptions::default()
+        };
         let mut off = vec![];
         for number in 0..8 {
             let s = make_sample(&textures, &options, 96, 1, 1, number);

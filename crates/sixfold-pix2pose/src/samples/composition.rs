@@ -1,4 +1,4 @@
-//! From an object's picture to an input image: background, clutter behind, occluders in front.
+//! From an object's image to an input image: background, clutter behind, occluders in front.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
@@ -18,9 +18,9 @@ pub(super) struct Composition {
 pub(super) struct Scenery<'a> {
     pub options: &'a SampleOptions,
     pub backgrounds: &'a Backgrounds,
-    /// Pictures of objects, with the index of the object.
+    /// Images of objects, with the index of the object.
     pub cutouts: &'a [(usize, Cutout)],
-    /// Which object the sample is of: its own pictures are not used.
+    /// Which object the sample is of: its own images are not used.
     pub object_index: usize,
 }
 
@@ -30,7 +30,7 @@ impl Scenery<'_> {
     }
 
     fn cutout(&self, random: &mut Random) -> Option<&Cutout> {
-        // A few draws find another object's picture where there is one.
+        // A few draws find another object's image where there is one.
         (0..6).find_map(|_| {
             let (object, cutout) = self.cutouts.get(random.random_range(0..self.cutouts.len().max(1)))?;
             (*object != self.object_index).then_some(cutout)
@@ -73,10 +73,10 @@ impl Scenery<'_> {
         Composition { image: photograph, visible }
     }
 
-    /// Hides a part of the object behind shapes or pictures of other objects.
+    /// Hides a part of the object behind shapes or images of other objects.
     pub fn occlude(&self, composition: &mut Composition, random: &mut Random) {
         let options = self.options;
-        if random.random::<f32>() >= options.occlusion_chance {
+        if random.random::<f32>() >= options.occlusion_probability {
             return;
         }
         let whole = uniform(random, options.occlusion);
@@ -84,7 +84,7 @@ impl Scenery<'_> {
         for _ in 0..parts {
             let fraction = whole / parts as f32;
             let drawn = match self.cutout(random) {
-                Some(cutout) if random.random::<f32>() < options.object_occluder_chance => {
+                Some(cutout) if random.random::<f32>() < options.object_occluder_probability => {
                     let longest = options.size as f32 * uniform(random, [0.35, 0.9]);
                     cutout.draw_over(&composition.visible, fraction, longest, random).map(
                         |(mut patch, cover)| {
@@ -121,7 +121,7 @@ impl Scenery<'_> {
 
     fn shape(&self, visible: &Coverage, fraction: f32, random: &mut Random) -> Option<(Patch, Coverage)> {
         let size = self.options.size;
-        // Centred on the object as often as at its rim: any pixel of the crop's middle part.
+        // Centred on the object as often as at its rim: any pixel of the crop's centre part.
         let centre = [0, 1].map(|_| uniform(random, [0.1, 0.9]) * size as f32);
         let cover = occluder_of_fraction(&Shape::random(random), centre, visible, fraction)?;
         Some((self.material(random), cover))

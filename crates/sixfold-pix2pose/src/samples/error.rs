@@ -27,7 +27,7 @@ pub enum SampleError {
     /// There is nothing to learn.
     #[error("no training object was given; give at least one mesh with its description")]
     NoObjects,
-    /// A mesh cannot be drawn.
+    /// A mesh cannot be rendered.
     #[error(
         "object {id}: its mesh has {vertices} vertices and no faces; training needs a surface, not a point cloud"
     )]
@@ -47,10 +47,10 @@ pub enum SampleError {
         /// What it held.
         found: String,
     },
-    /// No picture can be had of an object.
+    /// No image can be had of an object.
     #[error(
-        "object {id}: no photograph shows it and its mesh has neither colours nor texture; give posed photographs, a \
-         coloured mesh, or set random_color_chance above zero to train on random colours"
+        "object {id}: no photograph shows it and its mesh has neither colours nor texture; give posed images, a \
+         coloured mesh, or set random_color_probability above zero to train on random colours"
     )]
     NoPictures {
         /// The object.

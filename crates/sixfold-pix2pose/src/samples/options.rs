@@ -7,14 +7,14 @@ use sixfold_geometry::Camera;
 use sixfold_geometry::random::Random;
 use sixfold_synth::augment::ColorAugmentation;
 
-/// Sizes, shares and ranges. The defaults are for few real images of objects on a table, with occlusion.
+/// Sizes, fractions and ranges. The defaults are for few real images of objects on a table, with occlusion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleOptions {
     /// Side of the input image, pixels.
     pub size: usize,
     /// Side of coordinates and masks, pixels; `None` for the input's.
     pub target_size: Option<usize>,
-    /// Share of rendered samples of an object that has photographs and can be rendered, 0..1.
+    /// Fraction of rendered samples of an object that has photographs and can be rendered, 0..1.
     pub render_share: f32,
     /// Side of the crop over the longer side of the object's box (dissertation: 1.5).
     pub crop_factor: f64,
@@ -22,31 +22,31 @@ pub struct SampleOptions {
     pub centre_jitter: f64,
     /// The crop's side changes by up to this fraction.
     pub size_jitter: f64,
-    /// Chance that the box is that of the visible part; otherwise that of the whole object.
-    pub visible_box_chance: f32,
-    /// Chance that something hides one side of the object and the box is that of the rest: so detections see an object that is
+    /// Probability that the box is that of the visible part; otherwise that of the whole object.
+    pub visible_box_probability: f32,
+    /// Probability that something hides one side of the object and the box is that of the rest: so detections see an object that is
     /// partly hidden, larger in its crop than a whole one.
-    pub cut_chance: f32,
+    pub cut_probability: f32,
     /// How much of the box's side is cut off then, smallest and largest fraction.
     pub cut: [f32; 2],
-    /// Largest turn in the image plane to either side, radians (table 3.3: 45 degrees).
+    /// Largest rotation in the image plane to either side, radians (table 3.3: 45 degrees).
     pub rotation: f32,
-    /// Chance that a photograph keeps its own background.
-    pub keep_background_chance: f32,
-    /// Chance of an added occluder.
-    pub occlusion_chance: f32,
+    /// Probability that a photograph keeps its own background.
+    pub keep_background_probability: f32,
+    /// Probability of an added occluder.
+    pub occlusion_probability: f32,
     /// Fraction of the visible object that occluders hide (table 3.3).
     pub occlusion: [f32; 2],
-    /// Chance that an occluder is a picture of another object, where there are others.
-    pub object_occluder_chance: f32,
-    /// Most pictures of other objects pasted behind the object.
+    /// Probability that an occluder is an image of another object, where there are others.
+    pub object_occluder_probability: f32,
+    /// Most images of other objects pasted behind the object.
     pub clutter: u32,
     /// Factor on the brightness of an object cut from a photograph, against its new background.
     pub paste_gain: [f32; 2],
     /// Sigma of the blur along the border of a pasted object, pixels.
     pub border_blur: [f32; 2],
-    /// Share of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
-    pub second_stage_share: f32,
+    /// Fraction of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
+    pub second_stage_fraction: f32,
     /// `None` draws the stage of every sample by itself, which mixes both within a batch. `Some(n)` gives `n` consecutive
     /// sample numbers the same stage: the batch size makes whole batches alternate as in the dissertation.
     pub second_stage_block: Option<u64>,
@@ -54,26 +54,26 @@ pub struct SampleOptions {
     pub color: ColorAugmentation,
     /// Colours of a rendered object before it is pasted.
     pub render_color: ColorAugmentation,
-    /// Share of rendered poses that lie near one of a photograph; the others look from anywhere within `elevation`.
-    pub near_real_share: f32,
-    /// Largest turn about each axis away from a photograph's pose, radians.
+    /// Fraction of rendered poses that lie near one of a photograph; the others look from anywhere within `elevation`.
+    pub near_real_fraction: f32,
+    /// Largest rotation about each axis away from a photograph's pose, radians.
     pub pose_noise: f64,
     /// Elevation of the camera over the object's xy plane, radians: `[0, pi/2]` is the upper hemisphere.
     pub elevation: [f32; 2],
-    /// Largest turn about the view axis from upright for poses that are not near a photograph's, radians.
-    pub view_turn: f32,
+    /// Largest rotation about the view axis from upright for poses that are not near a photograph's, radians.
+    pub max_view_rotation: f32,
     /// Distance of rendered objects, metres; `None` takes the photographs' range (without any: 4 to 12 diameters).
     pub distance: Option<[f64; 2]>,
     /// Camera of rendered objects; `None` takes the photographs' (without any: 640x480, focal length 600).
     pub camera: Option<Camera>,
-    /// Chance that a rendered object has random colours instead of its mesh's (always, when the mesh has none).
-    pub random_color_chance: f32,
+    /// Probability that a rendered object has random colours instead of its mesh's (always, when the mesh has none).
+    pub random_color_probability: f32,
     /// Targets of an object with discrete symmetries are those of one side that stands for all (for comparison with the
     /// transformer loss).
     pub view_limits: bool,
     /// Meshes with more faces are simplified to about so many before they are drawn.
     pub faces: usize,
-    /// Seed of the pictures that are made once (renders used as occluders).
+    /// Seed of the images that are made once (renders used as occluders).
     pub seed: u64,
 }
 
@@ -87,28 +87,28 @@ impl Default for SampleOptions {
             crop_factor: 1.5,
             centre_jitter: 0.07,
             size_jitter: 0.2,
-            visible_box_chance: 0.5,
-            cut_chance: 0.3,
+            visible_box_probability: 0.5,
+            cut_probability: 0.3,
             cut: [0.1, 0.55],
             rotation: poses.rotation,
-            keep_background_chance: 0.5,
-            occlusion_chance: 0.7,
+            keep_background_probability: 0.5,
+            occlusion_probability: 0.7,
             occlusion: [0.04, 0.5],
-            object_occluder_chance: 0.5,
+            object_occluder_probability: 0.5,
             clutter: 3,
             paste_gain: [0.8, 1.2],
             border_blur: [0.4, 1.5],
-            second_stage_share: 0.5,
+            second_stage_fraction: 0.5,
             second_stage_block: None,
             color: image_color_augmentation(),
             render_color: ColorAugmentation::renders(),
-            near_real_share: poses.near_fraction,
+            near_real_fraction: poses.near_fraction,
             pose_noise: poses.noise,
             elevation: poses.elevation,
-            view_turn: poses.view_rotation,
+            max_view_rotation: poses.view_rotation,
             distance: None,
             camera: None,
-            random_color_chance: 0.0,
+            random_color_probability: 0.0,
             view_limits: false,
             faces: 6000,
             seed: 0,
@@ -125,17 +125,17 @@ impl SampleOptions {
     /// How poses of renders vary.
     pub(super) fn poses(&self) -> PoseVariation {
         PoseVariation {
-            near_fraction: self.near_real_share,
+            near_fraction: self.near_real_fraction,
             noise: self.pose_noise,
             rotation: self.rotation,
             elevation: self.elevation,
-            view_rotation: self.view_turn,
+            view_rotation: self.max_view_rotation,
         }
     }
 
     /// Whether sample `number` imitates the second stage.
     pub(super) fn is_second_stage(&self, number: u64, random: &mut Random) -> bool {
-        let share = f64::from(self.second_stage_share);
+        let share = f64::from(self.second_stage_fraction);
         let Some(block) = self.second_stage_block else { return random.random::<f64>() < share };
         let block = (number / block.max(1)) as f64;
         ((block + 1.0) * share).floor() > (block * share).floor()
@@ -155,14 +155,14 @@ impl SampleOptions {
         let probability = "a number between 0 and 1";
         for (field, value) in [
             ("render_share", self.render_share),
-            ("visible_box_chance", self.visible_box_chance),
-            ("cut_chance", self.cut_chance),
-            ("keep_background_chance", self.keep_background_chance),
-            ("occlusion_chance", self.occlusion_chance),
-            ("object_occluder_chance", self.object_occluder_chance),
-            ("second_stage_share", self.second_stage_share),
-            ("near_real_share", self.near_real_share),
-            ("random_color_chance", self.random_color_chance),
+            ("visible_box_probability", self.visible_box_probability),
+            ("cut_probability", self.cut_probability),
+            ("keep_background_probability", self.keep_background_probability),
+            ("occlusion_probability", self.occlusion_probability),
+            ("object_occluder_probability", self.object_occluder_probability),
+            ("second_stage_fraction", self.second_stage_fraction),
+            ("near_real_fraction", self.near_real_fraction),
+            ("random_color_probability", self.random_color_probability),
         ] {
             if !(0.0..=1.0).contains(&value) {
                 return wrong(field, value.to_string(), probability);
@@ -173,7 +173,13 @@ impl SampleOptions {
             ("centre_jitter", self.centre_jitter, 0.0, 0.5, "a fraction from 0 to 0.5"),
             ("size_jitter", self.size_jitter, 0.0, 0.9, "a fraction from 0 to 0.9"),
             ("rotation", f64::from(self.rotation), 0.0, 3.15, "an angle from 0 to pi, radians"),
-            ("view_turn", f64::from(self.view_turn), 0.0, 3.15, "an angle from 0 to pi, radians"),
+            (
+                "max_view_rotation",
+                f64::from(self.max_view_rotation),
+                0.0,
+                3.15,
+                "an angle from 0 to pi, radians",
+            ),
             ("pose_noise", self.pose_noise, 0.0, 3.15, "an angle from 0 to pi, radians"),
         ];
         for (field, value, low, high, expected) in numbers {

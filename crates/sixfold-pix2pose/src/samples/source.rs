@@ -6,7 +6,7 @@ use super::options::SampleOptions;
 use super::second_stage;
 use super::symmetry::canonical;
 use super::targets::targets;
-use super::window::{Extent, turned, turned_pixel, window_around};
+use super::window::{Extent, rotated_pixel, turned, window_around};
 use rand::RngExt;
 use sixfold_data::{
     DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors,
@@ -47,7 +47,7 @@ struct Prepared {
     id: u32,
     info: ModelInfo,
     scale: BoundingBoxScale,
-    /// What targets are drawn from.
+    /// What targets are sampled from.
     drawn: PreparedMesh,
     /// The textured mesh, where there is one: the simplified mesh has lost its texture.
     textured: Option<Mesh>,
@@ -66,7 +66,7 @@ pub struct SampleSource {
 }
 
 impl SampleSource {
-    /// Makes objects and photographs ready. Meshes are simplified and a few pictures of each object drawn, which takes
+    /// Makes objects and photographs ready. Meshes are simplified and a few images of each object drawn, which takes
     /// seconds for large meshes.
     ///
     /// # Errors
@@ -141,7 +141,7 @@ impl SampleSource {
         let options = &self.options;
         // Objects draw different samples under the same number.
         let mut random = stream(seed ^ (object_index as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15), number);
-        let can_render = object.drawn.colored || options.random_color_chance > 0.0;
+        let can_render = object.drawn.colored || options.random_color_probability > 0.0;
         let rendered =
             can_render && (object.real.is_empty() || random.random::<f32>() < options.render_share);
         let scenery =
@@ -180,9 +180,10 @@ impl SampleSource {
         let camera = crop.camera();
         let turn = f64::from(uniform(random, [-options.rotation, options.rotation]));
         let pose = turned(crop.camera_from_object(), turn);
-        let of_visible = || Extent::of(crop.outline().iter().map(|p| turned_pixel(camera, p, turn)));
+        let of_visible = || Extent::of(crop.outline().iter().map(|p| rotated_pixel(camera, p, turn)));
         let whole = object.extent(camera, &pose);
-        let extent = if random.random::<f32>() < options.visible_box_chance { of_visible() } else { None };
+        let extent =
+            if random.random::<f32>() < options.visible_box_probability { of_visible() } else { None };
         let extent =
             extent.or(whole).or_else(of_visible).unwrap_or(Extent::at(Vec2::new(camera.cx, camera.cy)));
         let (window, hidden) = self.window(extent, random);
@@ -196,7 +197,7 @@ impl SampleSource {
             &window.camera(camera, options.target()),
             &canonical(&pose, &object.info, options.view_limits),
         );
-        let composition = if random.random::<f32>() < options.keep_background_chance {
+        let composition = if random.random::<f32>() < options.keep_background_probability {
             scenery.keep(patch, &inside, visible, random)
         } else {
             gain(&mut patch, uniform(random, options.paste_gain));
@@ -224,7 +225,8 @@ impl SampleSource {
             &canonical(&pose, &object.info, options.view_limits),
         );
         let camera = window.camera(&object.camera, options.size);
-        let random_colors = !object.drawn.colored || random.random::<f32>() < options.random_color_chance;
+        let random_colors =
+            !object.drawn.colored || random.random::<f32>() < options.random_color_probability;
         let (mut patch, silhouette) = if random_colors {
             color_patch(&randomly_colored(&object.drawn.mesh, random), &camera, &pose, random)
         } else {
@@ -243,7 +245,7 @@ impl SampleSource {
     /// The crop's window about an object's box, and what it hides of the object.
     fn window(&self, extent: Extent, random: &mut Random) -> (Window, Option<Coverage>) {
         let options = &self.options;
-        if random.random::<f32>() >= options.cut_chance {
+        if random.random::<f32>() >= options.cut_probability {
             return (window_around(&extent, options, random), None);
         }
         let (rest, cut) = extent.cut(options, random);
@@ -304,7 +306,7 @@ impl Prepared {
             return Err(SampleError::Extent { id, field: "scale", found: format!("{scale:?}") });
         }
         let drawn = PreparedMesh::new(&mesh, options.faces, EXTREMES);
-        if !drawn.colored && real.is_empty() && options.random_color_chance <= 0.0 {
+        if !drawn.colored && real.is_empty() && options.random_color_probability <= 0.0 {
             return Err(SampleError::NoPictures { id });
         }
         Ok(Prepared {

@@ -1,5 +1,5 @@
-//! One pose for all that look alike: an object with a continuous symmetry is turned about its axis until the camera
-//! lies in a fixed direction, so that equal pictures have equal targets.
+//! One pose for all that look alike: an object with a continuous symmetry is rotated about its axis until the camera
+//! lies in a fixed direction, so that equal images have equal targets.
 //!
 //! The author sets the Euler angle about the axis to zero, which still depends on the view; turning towards the camera
 //! does not, and has no jump except where the camera looks along the axis.

@@ -2,7 +2,7 @@
 
 use sixfold_geometry::{Camera, Pose};
 use sixfold_mesh::Mesh;
-use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
+use sixfold_render::{BoundingBoxScale, RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Coverage;
 
 /// Coordinates (3 planes, normalised, 0 outside) and silhouette (0 or 1) of the whole object.
@@ -13,7 +13,7 @@ pub(super) fn targets(
     camera_from_object: &Pose,
 ) -> (Vec<f32>, Coverage) {
     let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&objects, &RenderOptions::default());
     let points = frame.object_coordinates(&objects);
     let pixels = camera.width * camera.height;

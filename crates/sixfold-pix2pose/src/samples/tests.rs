@@ -97,9 +97,9 @@ fn plain() -> SampleOptions {
         target_size: Some(64),
         color: ColorAugmentation::none(),
         render_color: ColorAugmentation::none(),
-        occlusion_chance: 0.0,
-        cut_chance: 0.0,
-        second_stage_share: 0.0,
+        occlusion_probability: 0.0,
+        cut_probability: 0.0,
+        second_stage_fraction: 0.0,
         rotation: std::f32::consts::PI,
         border_blur: [0.0; 2],
         paste_gain: [1.0; 2],
@@ -248,7 +248,7 @@ fn a_coordinate_projects_to_its_pixel_and_lies_on_the_surface() {
 #[test]
 fn occluders_change_what_is_visible_and_nothing_else() {
     let free = source(plain());
-    let hidden = source(SampleOptions { occlusion_chance: 1.0, occlusion: [0.2, 0.5], ..plain() });
+    let hidden = source(SampleOptions { occlusion_probability: 1.0, occlusion: [0.2, 0.5], ..plain() });
     let mut share = 0.0;
     for number in 0..60 {
         let (a, b) = (free.sample(0, 9, number), hidden.sample(0, 9, number));
@@ -263,11 +263,11 @@ fn occluders_change_what_is_visible_and_nothing_else() {
 #[test]
 fn what_is_left_of_a_cut_object_fills_the_crop_as_a_whole_one_does() {
     let still = SampleOptions { centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
-    let whole = source(SampleOptions { render_share: 1.0, visible_box_chance: 1.0, ..still.clone() });
+    let whole = source(SampleOptions { render_share: 1.0, visible_box_probability: 1.0, ..still.clone() });
     let cut = source(SampleOptions {
         render_share: 1.0,
-        visible_box_chance: 1.0,
-        cut_chance: 1.0,
+        visible_box_probability: 1.0,
+        cut_probability: 1.0,
         cut: [0.3, 0.3],
         ..still
     });
@@ -298,7 +298,7 @@ fn what_is_left_of_a_cut_object_fills_the_crop_as_a_whole_one_does() {
 #[test]
 fn the_second_stage_is_grey_outside_a_mask() {
     let source =
-        source(SampleOptions { second_stage_share: 1.0, color: ColorAugmentation::none(), ..plain() });
+        source(SampleOptions { second_stage_fraction: 1.0, color: ColorAugmentation::none(), ..plain() });
     let (mut kept, mut visible, mut outside, mut empty) = (0.0, 0.0, 0.0, 0.0);
     for number in 0..60 {
         let sample = source.sample(0, 9, number);
@@ -360,7 +360,7 @@ fn both_stages_in_blocks_or_mixed() {
     assert!((0..200).all(|n| blocks[n] == (n / 50 % 2 == 1)));
     let mixed = second_stages(SampleOptions::default());
     assert!((70..130).contains(&mixed.iter().filter(|s| **s).count()));
-    let none = second_stages(SampleOptions { second_stage_share: 0.0, ..SampleOptions::default() });
+    let none = second_stages(SampleOptions { second_stage_fraction: 0.0, ..SampleOptions::default() });
     assert!(none.iter().all(|s| !s));
 }
 
@@ -372,9 +372,9 @@ fn a_freely_turning_object_has_one_target() {
     turning.info.symmetries_continuous.push(symmetry);
     let info = turning.info.clone();
     let options = SampleOptions { render_share: 0.0, centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
-    let options = SampleOptions { visible_box_chance: 1.0, rotation: 0.0, ..options };
+    let options = SampleOptions { visible_box_probability: 1.0, rotation: 0.0, ..options };
     let make = |pose| {
-        // The same photograph and mask, the pose turned about the axis.
+        // The same photograph and mask, the pose rotated about the axis.
         let crop = photograph(7, poses()[0]);
         let silhouette =
             crop.visible(&sixfold_synth::augment::AffineMap { x: [1.0, 0.0, 0.0], y: [0.0, 1.0, 0.0] }, 320);
@@ -419,7 +419,7 @@ fn what_cannot_be_trained_is_said() {
         (SampleOptions { target_size: Some(0), ..default() }, "target_size"),
         (SampleOptions { occlusion: [0.5, 0.2], ..default() }, "occlusion"),
         (SampleOptions { cut: [0.1, 0.95], ..default() }, "cut"),
-        (SampleOptions { cut_chance: 1.5, ..default() }, "cut_chance"),
+        (SampleOptions { cut_probability: 1.5, ..default() }, "cut_probability"),
         (SampleOptions { render_share: f32::NAN, ..default() }, "render_share"),
         (SampleOptions { crop_factor: 0.0, ..default() }, "crop_factor"),
         (SampleOptions { distance: Some([0.0, 1.0]), ..default() }, "distance"),
@@ -428,7 +428,7 @@ fn what_cannot_be_trained_is_said() {
         assert!(message.contains(field), "{message}");
     }
     // Random colours, or photographs, make a mesh without colours usable.
-    let options = SampleOptions { random_color_chance: 1.0, size: 32, ..default() };
+    let options = SampleOptions { random_color_probability: 1.0, size: 32, ..default() };
     let source =
         SampleSource::new(vec![object(3, gray(&mesh))], vec![], Backgrounds::procedural(), options).unwrap();
     assert!(source.sample(0, 1, 1).object.iter().sum::<f32>() > 50.0);

@@ -1,4 +1,4 @@
-//! Where the window of a training crop lies, and photographs that are turned about their principal point.
+//! Where the window of a training crop lies, and photographs that are rotated about their principal point.
 //!
 //! A turn of the image about the principal point by `R_z` is exactly a turn of the scene about the camera's axis: the
 //! photograph of pose `P` becomes that of `R_z P` (for `fx != fy` with a small shear, which is kept). So targets are
@@ -54,7 +54,7 @@ impl Extent {
         (rest, Cut { point, outwards })
     }
 
-    /// A box of one point, for want of a better one.
+    /// A box of one point, for lack of a better one.
     pub fn at(point: Vec2) -> Extent {
         Extent { low: point, high: point }
     }
@@ -88,13 +88,13 @@ pub(super) fn window_around(extent: &Extent, options: &SampleOptions, random: &m
     Window { centre: extent.centre() + shift, side }
 }
 
-/// The scene turned about the camera's axis.
+/// The scene rotated about the camera's axis.
 pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn), Vec3::zeros()) * *pose
 }
 
 /// Where a pixel of the photograph lies after its turn about the principal point.
-pub(super) fn turned_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
+pub(super) fn rotated_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
     let (s, c) = turn.sin_cos();
     let (x, y) = ((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy);
     Vec2::new(camera.cx + camera.fx * (c * x - s * y), camera.cy + camera.fy * (s * x + c * y))
@@ -110,15 +110,15 @@ mod tests {
         let point = Vec3::new(0.11, -0.07, 0.9);
         let turn = 0.7;
         let window = Window { centre: Vec2::new(290.0, 310.0), side: 137.0 };
-        let turned_point = turned(&Pose::from_translation(point), turn).translation();
-        let in_crop = window.camera(&camera, 64).project(&turned_point).unwrap();
+        let rotated_point = turned(&Pose::from_translation(point), turn).translation();
+        let in_crop = window.camera(&camera, 64).project(&rotated_point).unwrap();
         let [x, y] = window.map(&camera, 64, turn).apply(in_crop.x as f32, in_crop.y as f32);
         let expected = camera.project(&point).unwrap();
         assert!((Vec2::new(f64::from(x), f64::from(y)) - expected).norm() < 1e-3, "{x} {y} {expected}");
-        let turned_in_image = camera.project(&turned_point).unwrap();
-        assert!((turned_pixel(&camera, &expected, turn) - turned_in_image).norm() < 1e-9);
+        let rotated_in_image = camera.project(&rotated_point).unwrap();
+        assert!((rotated_pixel(&camera, &expected, turn) - rotated_in_image).norm() < 1e-9);
         // Half the resolution: the centre of a block of four pixels.
-        let fine = window.camera(&camera, 128).project(&turned_point).unwrap();
+        let fine = window.camera(&camera, 128).project(&rotated_point).unwrap();
         assert!((((fine + Vec2::repeat(0.5)) * 0.5 - Vec2::repeat(0.5)) - in_crop).norm() < 1e-9);
     }
 }

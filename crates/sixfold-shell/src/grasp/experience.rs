@@ -41,7 +41,7 @@ pub fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
     let memory = Memory::new(place.open()?, model)?;
     if memory.index().is_empty() && !memory.is_empty() {
         eprintln!(
-            "note: the {} experiences in {place} were encoded by another network; `sixfold grasp store refresh` encodes them anew",
+            "note: the {} experiences in {place} were encoded by another network; `sixfold grasp store refresh` encodes them again",
             memory.len()
         );
     }

@@ -1,4 +1,4 @@
-//! Rows of a long measurement, each on the disk as soon as it is known, so that a stopped one goes on.
+//! Rows of a long measurement, each on the disk as soon as it is known, so that a stopped one resumes.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -44,7 +44,7 @@ impl Journal {
                 }
             }
             Some(_) => bail!(
-                "{name}: holds a measurement with other options; go on with the same ones, or start anew in another folder"
+                "{name}: holds a measurement with other options; continue with the same ones, or start again in another folder"
             ),
         }
         let mut file = OpenOptions::new()

@@ -8,22 +8,22 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::learner::{Learner, LearnerOptions, Lesson, PartOf};
+use sixfold_dgcm::learner::{GraspTask, Learner, LearnerOptions, PartOf};
 use sixfold_experience::StorePlace;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, middle_between_pads};
+use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, centre_between_pads};
 use sixfold_mesh::Mesh;
-use sixfold_simulation::{ConvexParts, Ending, PartsOptions, scene, try_grasp, wilson_interval};
+use sixfold_simulation::{AttemptOutcome, ConvexParts, PartsOptions, scene, try_grasp, wilson_interval};
 use sixfold_synth::shapes::{Family, Member, Rest, member};
 
 use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
 use super::journal::Journal;
 use super::object_list::{ObjectsArguments, named_objects};
-use super::trial::{Hardness, PhysicsArguments, ending_name, hardness};
+use super::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use crate::output::JsonArguments;
 use crate::progress::{Progress, check_interrupt};
 
-/// What `sixfold grasp learn` is told.
+/// Arguments of `sixfold grasp learn`.
 #[derive(Debug, Args)]
 pub struct LearnArguments {
     /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
@@ -32,13 +32,13 @@ pub struct LearnArguments {
     /// Where experiences wait for a server.
     #[command(flatten)]
     pub outbox: OutboxArguments,
-    /// Made-up objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    /// Synthetic objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
     pub families: Vec<String>,
-    /// Made-up objects of each family
+    /// Synthetic objects of each family
     #[arg(long, value_name = "N", default_value = "4", requires = "families")]
     pub members: u64,
-    /// The objects to learn on, where they are not made up.
+    /// The objects to learn on, where they are not synthetic.
     #[command(flatten)]
     pub objects: ObjectsArguments,
     /// Scenes of each object
@@ -53,7 +53,7 @@ pub struct LearnArguments {
     /// Feature distance of the nearest experience from which on it proposes: 0 for never (dissertation: 0.9)
     #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
     pub near: f64,
-    /// Try and store only grasps on parts of this name (made-up objects: handle of mug and drill)
+    /// Try and store only grasps on parts of this name (synthetic objects: handle of mug and drill)
     #[arg(long, value_name = "NAME")]
     pub part: Option<String>,
     /// Stronger sensor noise, an imprecise hand, less friction and a heavier object, see `sixfold grasp compare --help`
@@ -65,7 +65,7 @@ pub struct LearnArguments {
     /// The network.
     #[command(flatten)]
     pub network: NetworkArguments,
-    /// Folder for attempts.jsonl, from which a stopped run goes on
+    /// Folder for attempts.jsonl, from which a stopped run continues
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Seed of objects, poses, view points, noise and the planner
@@ -77,19 +77,19 @@ pub struct LearnArguments {
 }
 
 /// What is learned on.
-pub struct Pupil {
+pub struct TestObject {
     /// Class, as the provenance says it.
     pub class: String,
     /// Name, as rows and the store have it.
     pub name: String,
     /// Metres, as it lies.
     pub mesh: Mesh,
-    /// A made-up object, which knows its parts, and how it lies.
+    /// A synthetic object, which knows its parts, and how it lies.
     pub made: Option<(Member, Rest)>,
 }
 
-impl Pupil {
-    /// The part that a grasp is on: that of the surface nearest to the middle between the pads, a centimetre behind the
+impl TestObject {
+    /// The part that a grasp is on: that of the surface nearest to the centre between the pads, a centimetre behind the
     /// tips, if most of what was seen between the pads belongs to it too; `None` for no part in particular. A hand over the body of a
     /// drill whose tips reach the handle is not on the handle.
     fn part(
@@ -102,7 +102,7 @@ impl Pupil {
         let (member, rest) = self.made.as_ref()?;
         let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
         let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
-        let middle = part_at(&middle_between_pads(&grasp.camera_from_gripper));
+        let middle = part_at(&centre_between_pads(&grasp.camera_from_gripper));
         let gripper_from_camera = grasp.camera_from_gripper.inverse();
         let held: Vec<&Vec3> = view
             .object
@@ -115,8 +115,8 @@ impl Pupil {
     }
 }
 
-/// Made-up objects, the same for the same seed.
-pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<Pupil>> {
+/// Synthetic objects, the same for the same seed.
+pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<TestObject>> {
     let mut pupils = vec![];
     let families: Vec<Family> = if names.iter().any(|n| n == "all") {
         Family::ALL.to_vec()
@@ -138,7 +138,7 @@ pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<Pupil>> 
             random.set_stream(number * 64 + family as u64);
             let made = member(family, &mut random)?;
             let rest = family.rests()[number as usize % family.rests().len()];
-            pupils.push(Pupil {
+            pupils.push(TestObject {
                 class: family.name().to_owned(),
                 name: format!("{}-{number}", family.name()),
                 mesh: made.mesh.transformed(&rest.rotation()),
@@ -217,15 +217,15 @@ pub struct Curve {
 }
 
 /// The objects that the arguments name.
-fn pupils(a: &LearnArguments) -> Result<Vec<Pupil>> {
+fn pupils(a: &LearnArguments) -> Result<Vec<TestObject>> {
     if !a.families.is_empty() {
         return made_up(&a.families, a.members, a.seed);
     }
     let named = named_objects(&a.objects)?.into_iter();
-    Ok(named.map(|(class, name, mesh)| Pupil { class, name, mesh, made: None }).collect())
+    Ok(named.map(|(class, name, mesh)| TestObject { class, name, mesh, made: None }).collect())
 }
 
-/// Learns, or goes on learning.
+/// Learns, or continues learning.
 ///
 /// # Errors
 /// When the arguments, the store or the folder of an earlier run do not fit, and when the user asks to stop.
@@ -269,7 +269,7 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
             .with_context(|| pupil.name.clone())?;
         for attempt in 0..a.attempts {
             if !done(&rows, attempt) {
-                check_interrupt("what was learned is kept; run the same command again to go on")?;
+                check_interrupt("what was learned is kept; run the same command again to continue")?;
                 let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt)?;
                 journal.row(&row)?;
                 rows.push(row);
@@ -319,7 +319,7 @@ fn attempt(
     a: &LearnArguments,
     setting: &Hardness,
     learner: &mut Learner<'_>,
-    pupil: &Pupil,
+    pupil: &TestObject,
     parts: &ConvexParts,
     attempt: u64,
 ) -> Result<Row> {
@@ -330,7 +330,7 @@ fn attempt(
         attempt,
         from_experience: false,
         nearest: None,
-        ending: ending_name(scene.ending),
+        ending: outcome_name(scene.ending),
         held: false,
         rank: 0,
         stored: None,
@@ -338,7 +338,7 @@ fn attempt(
     let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
     let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
     let part_of = |grasp: &Grasp| pupil.part(&camera_from_object, grasp, view, &setting.gripper);
-    let lesson = Lesson {
+    let task = GraspTask {
         view,
         planner: AntipodalOptions { seed: scene.noise, ..setting.options.planner },
         object: &pupil.name,
@@ -346,7 +346,7 @@ fn attempt(
         part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
         now,
     };
-    let learned = learner.learn(&lesson, &mut |grasp| {
+    let learned = learner.learn(&task, &mut |grasp| {
         let sent = seen.world_from_camera * grasp.camera_from_gripper;
         let tried = try_grasp(
             parts,
@@ -356,7 +356,7 @@ fn attempt(
             grasp.opening,
             &setting.options.trial,
         )?;
-        let ending = Ending::Tried(tried.outcome);
+        let ending = AttemptOutcome::Tried(tried.outcome);
         Ok((ending.is_success(), ending))
     })?;
     row.nearest = learned.nearest;
@@ -365,7 +365,7 @@ fn attempt(
     row.stored = learned.stored;
     if let Some((rank, ending)) = learned.last {
         row.rank = rank;
-        row.ending = ending_name(ending);
+        row.ending = outcome_name(ending);
     }
     Ok(row)
 }

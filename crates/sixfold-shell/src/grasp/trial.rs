@@ -8,7 +8,7 @@ use sixfold_geometry::Pose;
 use sixfold_geometry::random::normal;
 use sixfold_grasp::Gripper;
 use sixfold_render::DepthSensor;
-use sixfold_simulation::{AttemptOptions, Ending, TrialOptions};
+use sixfold_simulation::{AttemptOptions, AttemptOutcome, TrialOptions};
 
 use super::gripper::gripper;
 
@@ -98,7 +98,7 @@ pub fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
 }
 
 /// The word for an ending in files and tables.
-pub fn ending_name(ending: Ending) -> String {
+pub fn outcome_name(ending: AttemptOutcome) -> String {
     match serde_json::to_value(ending) {
         Ok(serde_json::Value::String(word)) => word,
         Ok(serde_json::Value::Object(map)) => {

@@ -38,13 +38,13 @@ struct Source {
 #[derive(Debug, Clone)]
 pub struct Backgrounds {
     sources: Vec<Source>,
-    procedural_share: f32,
+    procedural_fraction: f32,
 }
 
 impl Backgrounds {
     /// Textures made from noise: no files are needed.
     pub fn procedural() -> Self {
-        Backgrounds { sources: Vec::new(), procedural_share: 1.0 }
+        Backgrounds { sources: Vec::new(), procedural_fraction: 1.0 }
     }
 
     /// The PNG and JPEG files of a folder, decoded once and kept reduced in memory. Other files are passed over.
@@ -93,12 +93,12 @@ impl Backgrounds {
     /// # Errors
     /// [`AugmentError::SmallImage`] for an image below 8x8 pixels.
     pub fn from_images(images: Vec<Arc<RgbImage>>) -> Result<Self, AugmentError> {
-        let mut backgrounds = Backgrounds { sources: Vec::new(), procedural_share: 0.0 };
+        let mut backgrounds = Backgrounds { sources: Vec::new(), procedural_fraction: 0.0 };
         for image in images {
             backgrounds = backgrounds.with_image(image, Vec::new())?;
         }
         if backgrounds.sources.is_empty() {
-            backgrounds.procedural_share = 1.0;
+            backgrounds.procedural_fraction = 1.0;
         }
         Ok(backgrounds)
     }
@@ -116,9 +116,9 @@ impl Backgrounds {
         Ok(self)
     }
 
-    /// The share of procedural textures between the photographs, 0..1.
-    pub fn with_procedural_share(mut self, share: f32) -> Self {
-        self.procedural_share = if self.sources.is_empty() { 1.0 } else { share.clamp(0.0, 1.0) };
+    /// The fraction of procedural textures between the photographs, 0..1.
+    pub fn with_procedural_fraction(mut self, share: f32) -> Self {
+        self.procedural_fraction = if self.sources.is_empty() { 1.0 } else { share.clamp(0.0, 1.0) };
         self
     }
 
@@ -129,7 +129,7 @@ impl Backgrounds {
 
     /// A background of the given size.
     pub fn patch(&self, width: usize, height: usize, random: &mut Random) -> Patch {
-        if self.sources.is_empty() || random.random::<f32>() < self.procedural_share {
+        if self.sources.is_empty() || random.random::<f32>() < self.procedural_fraction {
             return procedural_texture(width, height, random);
         }
         let source = &self.sources[random.random_range(0..self.sources.len())];
@@ -204,7 +204,7 @@ mod tests {
         let image = RgbImage::from_fn(200, 100, |x, _| if x < 50 { [255, 0, 0] } else { [0, 255, 0] });
         let backgrounds =
             Backgrounds::from_images(vec![]).unwrap().with_image(Arc::new(image), vec![red]).unwrap();
-        let backgrounds = backgrounds.with_procedural_share(0.0);
+        let backgrounds = backgrounds.with_procedural_fraction(0.0);
         let clean = (0..50)
             .filter(|&n| backgrounds.patch(16, 16, &mut stream(2, n)).data[..256].iter().all(|r| *r < 0.5))
             .count();

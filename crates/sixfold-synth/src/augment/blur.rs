@@ -1,11 +1,11 @@
 //! Separable Gaussian blur of one plane, borders repeated.
 
 /// Sigmas below this change no pixel by a visible amount.
-pub(crate) const LEAST_SIGMA: f32 = 0.2;
+pub(crate) const MIN_SIGMA: f32 = 0.2;
 
 /// Blurs a row-major plane in place.
 pub(crate) fn gaussian(plane: &mut [f32], width: usize, height: usize, sigma: f32) {
-    if sigma.is_nan() || sigma < LEAST_SIGMA || width == 0 || height == 0 {
+    if sigma.is_nan() || sigma < MIN_SIGMA || width == 0 || height == 0 {
         return;
     }
     let radius = ((2.5 * sigma).ceil() as usize).clamp(1, 24);

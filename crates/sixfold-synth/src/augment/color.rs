@@ -15,23 +15,23 @@ pub struct ColorAugmentation {
     pub add: [f32; 2],
     /// Contrast about 0.5, all channels alike.
     pub contrast: [f32; 2],
-    /// Factor on all channels, or with chance `multiply_per_channel` one for each.
+    /// Factor on all channels, or with probability `multiply_per_channel` one for each.
     pub multiply: [f32; 2],
-    /// Chance that the factor differs between channels.
+    /// Probability that the factor differs between channels.
     pub multiply_per_channel: f32,
     /// Sigma of a Gaussian blur, pixels.
     pub blur: [f32; 2],
-    /// Chance of noise.
-    pub noise_chance: f32,
+    /// Probability of noise.
+    pub noise_probability: f32,
     /// Standard deviation of the noise.
     pub noise: [f32; 2],
-    /// Chance of a second, stronger contrast.
-    pub strong_contrast_chance: f32,
+    /// Probability of a second, stronger contrast.
+    pub strong_contrast_probability: f32,
     /// The stronger contrast, about the patch's mean (about 0.5, dark objects would become black); per channel with
-    /// chance 0.3.
+    /// probability 0.3.
     pub strong_contrast: [f32; 2],
-    /// Chance of the three changes below.
-    pub tone_chance: f32,
+    /// Probability of the three changes below.
+    pub tone_probability: f32,
     /// Exponent on each value.
     pub gamma: [f32; 2],
     /// Turn of the hue, radians.
@@ -49,11 +49,11 @@ impl ColorAugmentation {
             multiply: [1.0; 2],
             multiply_per_channel: 0.0,
             blur: [0.0; 2],
-            noise_chance: 0.0,
+            noise_probability: 0.0,
             noise: [0.0; 2],
-            strong_contrast_chance: 0.0,
+            strong_contrast_probability: 0.0,
             strong_contrast: [1.0; 2],
-            tone_chance: 0.0,
+            tone_probability: 0.0,
             gamma: [1.0; 2],
             hue: [0.0; 2],
             saturation: [1.0; 2],
@@ -77,7 +77,7 @@ impl ColorAugmentation {
     pub fn table_4_1() -> Self {
         ColorAugmentation {
             multiply_per_channel: 0.0,
-            noise_chance: 1.0,
+            noise_probability: 1.0,
             noise: [0.0, 10.0 / 255.0],
             ..ColorAugmentation::table_3_2()
         }
@@ -86,9 +86,9 @@ impl ColorAugmentation {
     /// Table 3.2 with the noise and the strong contrast of the author's public code.
     pub fn real_images() -> Self {
         ColorAugmentation {
-            noise_chance: 0.1,
+            noise_probability: 0.1,
             noise: [10.0 / 255.0; 2],
-            strong_contrast_chance: 0.5,
+            strong_contrast_probability: 0.5,
             strong_contrast: [0.5, 2.2],
             ..ColorAugmentation::table_3_2()
         }
@@ -100,11 +100,11 @@ impl ColorAugmentation {
             multiply: [0.7, 1.3],
             multiply_per_channel: 0.5,
             blur: [0.0, 1.5],
-            noise_chance: 0.3,
+            noise_probability: 0.3,
             noise: [0.01, 0.05],
-            strong_contrast_chance: 0.3,
+            strong_contrast_probability: 0.3,
             strong_contrast: [0.5, 1.8],
-            tone_chance: 0.8,
+            tone_probability: 0.8,
             gamma: [0.7, 1.5],
             hue: [-0.1, 0.1],
             saturation: [0.5, 1.6],
@@ -132,9 +132,9 @@ impl ColorAugmentation {
             AugmentError::check_range(field, range, low, high, expected)?;
         }
         AugmentError::check_probability("multiply_per_channel", self.multiply_per_channel)?;
-        AugmentError::check_probability("noise_chance", self.noise_chance)?;
-        AugmentError::check_probability("strong_contrast_chance", self.strong_contrast_chance)?;
-        AugmentError::check_probability("tone_chance", self.tone_chance)
+        AugmentError::check_probability("noise_probability", self.noise_probability)?;
+        AugmentError::check_probability("strong_contrast_probability", self.strong_contrast_probability)?;
+        AugmentError::check_probability("tone_probability", self.tone_probability)
     }
 
     /// Changes a patch; the values stay within 0..1.
@@ -153,7 +153,7 @@ impl ColorAugmentation {
                     linear.then(factors(self.multiply, each, random), [0.0; 3]);
                 }
                 Step::Strong => {
-                    if random.random::<f32>() < self.strong_contrast_chance {
+                    if random.random::<f32>() < self.strong_contrast_probability {
                         let each = random.random::<f32>() < 0.3;
                         linear.flush(patch);
                         linear.contrast(factors(self.strong_contrast, each, random), mean(patch));
@@ -164,13 +164,13 @@ impl ColorAugmentation {
                     patch.blur(uniform(random, self.blur));
                 }
                 Step::Noise => {
-                    if random.random::<f32>() < self.noise_chance {
+                    if random.random::<f32>() < self.noise_probability {
                         linear.flush(patch);
                         add_noise(patch, uniform(random, self.noise), random);
                     }
                 }
                 Step::Tone => {
-                    if random.random::<f32>() < self.tone_chance {
+                    if random.random::<f32>() < self.tone_probability {
                         linear.flush(patch);
                         let hue = uniform(random, self.hue);
                         let saturation = uniform(random, self.saturation);

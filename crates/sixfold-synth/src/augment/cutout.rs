@@ -1,4 +1,4 @@
-//! Cut-out pictures of objects: pasted behind an object as clutter, or in front of it to hide a part.
+//! Cut-out images of objects: pasted behind an object as clutter, or in front of it to hide a part.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
@@ -7,7 +7,7 @@ use sixfold_geometry::{Mask, RgbImage};
 use super::coverage::Coverage;
 use super::patch::Patch;
 
-/// A small picture with coverage, 8 bits each.
+/// A small image with coverage, 8 bits each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cutout {
     width: usize,

@@ -176,7 +176,7 @@ impl Patch {
     /// Blurs only the borderline of something drawn into the patch: the band where the coverage, blurred by `sigma`,
     /// is neither 0 nor 1 (dissertation, section 3.4.1: the borderlines are blurred to make smooth boundaries).
     pub fn soften_border(&mut self, coverage: &Coverage, sigma: f32) {
-        if sigma.is_nan() || sigma < super::blur::LEAST_SIGMA {
+        if sigma.is_nan() || sigma < super::blur::MIN_SIGMA {
             return;
         }
         let mut band = coverage.clone();

@@ -29,12 +29,12 @@ impl Window {
         }
     }
 
-    /// From pixels of the crop (`size x size`, of the photograph turned by `turn` radians) to the photograph's.
+    /// From pixels of the crop (`size x size`, of the photograph rotated by `turn` radians) to the photograph's.
     pub fn map(&self, camera: &Camera, size: usize, turn: f64) -> AffineMap {
         let step = self.side / size as f64;
         let (s, c) = turn.sin_cos();
         let (across, down) = (s * camera.fx / camera.fy, s * camera.fy / camera.fx);
-        // Offset of the turned pixel of crop pixel (0, 0) from the principal point.
+        // Offset of the rotated pixel of crop pixel (0, 0) from the principal point.
         let q = self.centre - Vec2::repeat(0.5 * self.side - 0.5 * step) - Vec2::new(camera.cx, camera.cy);
         AffineMap {
             x: [(c * step) as f32, (across * step) as f32, (camera.cx + c * q.x + across * q.y) as f32],

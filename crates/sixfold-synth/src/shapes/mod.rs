@@ -20,9 +20,9 @@ use sixfold_mesh::{Mesh, MeshError};
 use crate::profiles;
 use solids::Builder;
 
-pub use toy::{TOY_DIAMETER, TOY_LEAST_SIDE, toy};
+pub use toy::{TOY_DIAMETER, TOY_MIN_SIDE, toy};
 
-/// Sides of turned solids.
+/// Sides of lathed solids.
 const SIDES: usize = 40;
 
 /// A family of objects.
@@ -85,7 +85,7 @@ impl Family {
     }
 
     /// The yaw angles between which views of it differ, radians: none for what looks the same from all sides, a quarter
-    /// turn for boxes (a further turn is another box: the ambiguity of section 6.3.2), half a turn for what lies.
+    /// turn for boxes (a further rotation is another box: the ambiguity of section 6.3.2), half a turn for what lies.
     pub fn yaw_range(self, rest: Rest) -> f64 {
         match (self, rest) {
             (Family::Can | Family::Bottle | Family::Cup | Family::Bowl, Rest::Upright) => 0.0,
@@ -138,7 +138,7 @@ impl Member {
         self.parts.iter().find(|(_, end)| face < *end).map_or("body", |(name, _)| name)
     }
 
-    /// The part nearest to a point of the object's frame, by the middles of its faces.
+    /// The part nearest to a point of the object's frame, by the midpoints of its faces.
     pub fn part_at(&self, point: &Vec3) -> &'static str {
         let distance = |face: usize| {
             let [a, b, c] = self.mesh.triangle(face);

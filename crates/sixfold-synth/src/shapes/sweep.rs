@@ -1,6 +1,6 @@
 //! One solid for everything that toys are made of: a section (ellipse to rectangle) that grows and shrinks along a straight
 //! or bent path. Ellipsoids, superquadrics (Barr 1981, "Superquadrics and angle-preserving transformations"), bars, cones
-//! and turned shapes differ in their profile only.
+//! and lathed shapes differ in their profile only.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -10,9 +10,9 @@ use sixfold_mesh::{Mesh, MeshError};
 /// A solid of length 1 that begins at the origin and goes along z, bent in the xz plane.
 #[derive(Debug, Clone)]
 pub(super) struct Sweep {
-    /// (share of the path, share of the radii), from the beginning to the end.
+    /// (fraction of the path, fraction of the radii), from the beginning to the end.
     pub profile: Vec<(f64, f64)>,
-    /// Largest half widths along x and y, as shares of the length.
+    /// Largest half widths along x and y, as fractions of the length.
     pub radii: (f64, f64),
     /// Exponent of the section: 1 an ellipse, towards 0 a rectangle, 2 a rhombus.
     pub section: f64,
@@ -31,7 +31,7 @@ impl Sweep {
             .collect()
     }
 
-    /// A profile through some (share of the path, share of the radii) points.
+    /// A profile through some (fraction of the path, fraction of the radii) points.
     pub fn profile_through(points: &[(f64, f64)], rows: usize) -> Vec<(f64, f64)> {
         (0..=rows)
             .map(|k| {

@@ -1,4 +1,4 @@
-//! Toys: made-up objects that belong to no family. A network that shall tell apart objects it has never seen needs more of
+//! Toys: synthetic objects that belong to no family. A network that shall distinguish objects it has never seen needs more of
 //! them than eight families give: the dissertation trains on the very objects that it is tested on.
 //!
 //! Every toy is 3 to 8 solids (`sweep.rs`, boxes) that grow into one another: figures with a plane of mirror symmetry (body,
@@ -17,8 +17,8 @@ use super::sweep::Sweep;
 /// Range of a toy's diameter, metres.
 pub const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);
 /// The second largest side of a toy's box is at least this, metres.
-pub const TOY_LEAST_SIDE: f64 = 0.03;
-/// Most solids in a toy.
+pub const TOY_MIN_SIDE: f64 = 0.03;
+/// Maximum number of solids in a toy.
 const MOST: usize = 8;
 
 /// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in [`TOY_DIAMETER`] (each
@@ -30,7 +30,7 @@ pub fn toy(random: &mut impl Rng) -> Result<Mesh, MeshError> {
     let (solids, turn) = match random.random_range(0..10u32) {
         0..=3 => (figure(random)?, UnitQuaternion::identity()),
         4..=6 => (machine(random)?, quarter_turns(random)),
-        _ => (heap(random)?, random_turn(random)),
+        _ => (heap(random)?, random_rotation(random)),
     };
     let mesh = Mesh::merged(&solids)?.transformed(&Pose::new(turn, Vec3::zeros()));
     let diameter = between(random, TOY_DIAMETER.0, TOY_DIAMETER.1);
@@ -46,9 +46,9 @@ fn standing(mesh: &Mesh, diameter: f64) -> Result<Mesh, MeshError> {
         let size = high - low;
         let longest = size.imax();
         let second = (0..3).filter(|axis| *axis != longest).max_by(|a, b| size[*a].total_cmp(&size[*b]));
-        let Some(second) = second.filter(|axis| size[*axis] < TOY_LEAST_SIDE) else { break };
+        let Some(second) = second.filter(|axis| size[*axis] < TOY_MIN_SIDE) else { break };
         let mut stretch = Vec3::repeat(1.0);
-        stretch[second] = 1.15 * TOY_LEAST_SIDE / size[second];
+        stretch[second] = 1.15 * TOY_MIN_SIDE / size[second];
         let vertices = mesh.vertices().iter().map(|v| v.component_mul(&stretch)).collect();
         let wider = Mesh::new(vertices, mesh.faces().to_vec())?;
         mesh = wider.scaled(diameter / wider.diameter());
@@ -237,7 +237,7 @@ fn heap(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
         }
         // Mostly on the first ones, so that not all of them become chains.
         let parent = random.random_range(0..parts.len()).min(random.random_range(0..parts.len()));
-        let direction = random_turn(random) * Vec3::z();
+        let direction = random_rotation(random) * Vec3::z();
         let new = new.scaled(between(random, 0.3, 0.9));
         parts.push(attach(&parts[parent].clone(), &direction, &new, false, random));
     }
@@ -338,7 +338,7 @@ fn attach(parent: &Mesh, direction: &Vec3, part: &Mesh, centred: bool, random: &
     part.transformed(&Pose::new(towards(&axis) * roll, place - axis * sink))
 }
 
-/// A place in the plane y = 0 and a turn that keeps it there, from z towards x.
+/// A place in the plane y = 0 and a rotation that keeps it there, from z towards x.
 fn in_plane(place: Vec3, angle: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), angle), place)
 }
@@ -353,14 +353,14 @@ fn between(random: &mut impl Rng, low: f64, high: f64) -> f64 {
     low + (high - low) * random.random::<f64>()
 }
 
-/// The shortest turn from z to `axis`.
+/// The shortest rotation from z to `axis`.
 fn towards(axis: &Vec3) -> UnitQuaternion<f64> {
     UnitQuaternion::rotation_between(&Vec3::z(), axis)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI))
 }
 
 /// A rotation, each as likely as any other.
-fn random_turn(random: &mut impl Rng) -> UnitQuaternion<f64> {
+fn random_rotation(random: &mut impl Rng) -> UnitQuaternion<f64> {
     let (z, angle) = (between(random, -1.0, 1.0), between(random, 0.0, TAU));
     let r = (1.0 - z * z).max(0.0).sqrt();
     let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), between(random, 0.0, TAU));
@@ -395,7 +395,7 @@ mod tests {
             assert!(low.z.abs() < 1e-9 && (low.x + high.x).abs() < 1e-9 && (low.y + high.y).abs() < 1e-9);
             let mut size: Vec<f64> = (high - low).iter().copied().collect();
             size.sort_by(f64::total_cmp);
-            assert!(size[1] >= TOY_LEAST_SIDE, "{seed} {size:?}");
+            assert!(size[1] >= TOY_MIN_SIDE, "{seed} {size:?}");
             flatness.push(size[0] / size[2]);
             let faces = mesh.faces().len();
             assert!((1500..=6000).contains(&faces), "{seed} {faces}");

@@ -108,7 +108,7 @@
 //! let sources = vec![SourceView::new(&posed, &mesh, 64)?];
 //! let maker = ViewMaker::new(&mesh, sources, Weighting::Best, 1)?;
 //! let view = maker.render(&camera, &pose(0.3));
-//! assert!(view.unseen_share() < 1.0);
+//! assert!(view.unseen_fraction() < 1.0);
 //! let (width, height) = view.mask.size();
 //! assert_eq!((width, height), (160, 120));
 //! # Ok::<(), Box<dyn std::error::Error>>(())

@@ -1,4 +1,4 @@
-//! What `sixfold demo` is told.
+//! Arguments of `sixfold demo`.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use sixfold_shell::output::JsonArguments;
 
 #[derive(Debug, Args)]
 pub(crate) struct DemoArguments {
-    /// Folder for results and pictures
+    /// Folder for results and images
     #[arg(long, default_value = "out/demo", value_name = "DIR")]
     pub out: PathBuf,
     /// Folder of the sample data (default: data/demo of this repository)

@@ -1,4 +1,4 @@
-//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and pictures. Here poses from depth and the
+//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and images. Here poses from depth and the
 //! report; `colour_poses.rs` adds poses from colour, `samples.rs` is what both know of the samples.
 
 pub(crate) mod arguments;
@@ -37,7 +37,7 @@ struct Row {
     object: u32,
     /// Mean distance of the model's points (nearest points for symmetric objects), millimetres.
     add_s_mm: f64,
-    /// The same as a share of the diameter.
+    /// The same as a fraction of the diameter.
     add_s_of_diameter: f64,
     confidence: f64,
     seconds: f64,
@@ -174,7 +174,7 @@ fn print_table(whole: &Whole) {
     colour::print_table(&whole.colour, |image, object| {
         whole.poses.iter().find(|r| r.image == image && r.object == object).map(|r| r.add_s_of_diameter)
     });
-    println!("\n{:.1} s in all. Pictures:", whole.seconds);
+    println!("\n{:.1} s in all. Images:", whole.seconds);
     for p in whole.pictures.iter().chain(&whole.colour.pictures) {
         println!("  {}", p.display());
     }

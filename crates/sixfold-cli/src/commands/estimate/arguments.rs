@@ -1,4 +1,4 @@
-//! What `sixfold estimate` is told: what all methods share here, and the options of the chosen one (`methods.rs`).
+//! Arguments of `sixfold estimate`: what all methods share here, and the options of the chosen one (`methods.rs`).
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;

@@ -34,7 +34,7 @@ pub(crate) enum GraspCommand {
         sixfold grasp learn --experiences experience.db --families all --members 6 --attempts 4 --out out/learn\n  \
         sixfold grasp learn --experiences experience.db --object drill.ply --unit mm --attempts 12 --out out/drill\n\n\
         When the nearest experience is near enough, its grasp is tried, else the geometric planner's. Stopped, the same \
-        command goes on.")]
+        command resumes.")]
     Learn(Box<sixfold_shell::grasp::learn::LearnArguments>),
     /// Compare geometry, experience and both on the same simulated scenes (runs sixfold-experiments)
     #[command(disable_help_flag = true)]

@@ -1,4 +1,4 @@
-//! `sixfold grasp propose`: from a depth image to ranked grasps and a picture of them.
+//! `sixfold grasp propose`: from a depth image to ranked grasps and an image of them.
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
@@ -164,7 +164,7 @@ struct FromExperience {
     distance: Option<f64>,
     /// Whether a difference in size was taken for a scale or for a turn.
     hypothesis: Option<&'static str>,
-    /// The share of experience that agrees with the grasp.
+    /// The fraction of experience that agrees with the grasp.
     share: f64,
 }
 

@@ -41,7 +41,7 @@ pub(crate) enum StoreCommand {
         #[arg(value_name = "FILE")]
         file: StorePlace,
     },
-    /// Show one experience: what is known, and a picture
+    /// Show one experience: what is known, and an image
     #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
     Show {
         /// The store
@@ -50,7 +50,7 @@ pub(crate) enum StoreCommand {
         /// Number of the experience
         #[arg(value_name = "ID")]
         id: i64,
-        /// The picture: normals with the gripper, VD-NOC, region of interest
+        /// The image: normals with the gripper, VD-NOC, region of interest
         #[arg(long, value_name = "PNG")]
         picture: Option<PathBuf>,
     },
@@ -74,7 +74,7 @@ pub(crate) enum StoreCommand {
         #[arg(value_name = "OTHER", required = true)]
         others: Vec<StorePlace>,
     },
-    /// Write all experiences as files: pictures, and JSON with everything else
+    /// Write all experiences as files: images, and JSON with everything else
     #[command(after_help = "Example:\n  sixfold grasp store export experience.db --out out/experiences")]
     Export {
         /// The store
@@ -84,7 +84,7 @@ pub(crate) enum StoreCommand {
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
     },
-    /// Encode all experiences anew, with another network, into another store
+    /// Encode all experiences again, with another network, into another store
     #[command(
         after_help = "Example:\n  sixfold grasp store refresh experience.db --out new.db --weights dgcm.safetensors"
     )]
@@ -291,7 +291,7 @@ fn merge(file: &StorePlace, others: &[StorePlace], json: &JsonArguments) -> Resu
     let mut store = file.create()?;
     let mut added = 0;
     for (source, name) in sources.iter().zip(others) {
-        check_interrupt("what was taken over is kept; the same command goes on")?;
+        check_interrupt("what was taken over is kept; the same command resumes")?;
         added += store.merge(&**source).with_context(|| name.display().to_string())?;
     }
     let merged = Merged { added, experiences: store.list()?.len() };
@@ -357,7 +357,7 @@ fn refresh(
     let mut progress = Progress::new("experiences", all.len());
     let mut added = 0;
     for summary in &all {
-        check_interrupt("what was encoded is kept; the same command goes on")?;
+        check_interrupt("what was encoded is kept; the same command resumes")?;
         let Some(stored) = source.get(summary.id)? else { continue };
         let encoded = stored.experience.encoded(&network);
         let encoded = encoded.with_context(|| format!("experience {}", stored.id))?;

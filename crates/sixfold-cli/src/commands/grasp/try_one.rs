@@ -10,7 +10,7 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::gripper_pose;
 use sixfold_mesh::Unit;
 use sixfold_simulation::{
-    ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_in_middle, try_grasp,
+    ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_at_centre, try_grasp,
 };
 
 use sixfold_shell::Outcome;
@@ -76,7 +76,7 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     let (world_from_object, world_from_gripper, opening) = match &a.grasp {
         Some(path) => read_grasp(path)?,
         None => {
-            let rest = settle_in_middle(&object.mesh, &parts, &Pose::identity())
+            let rest = settle_at_centre(&object.mesh, &parts, &Pose::identity())
                 .ok_or_else(|| anyhow!("{}: the object does not come to rest on the table", a.object))?;
             let tip = a.tip.as_deref().ok_or_else(|| anyhow!("--tip X,Y,Z is missing"))?;
             let pose = gripper_pose(

@@ -1,10 +1,10 @@
-//! What `sixfold object` is told.
+//! Arguments of `sixfold object`.
 
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
-use sixfold_mttm::Coverage;
+use sixfold_mttm::ViewCoverage;
 use sixfold_shell::output::JsonArguments;
 
 #[derive(Debug, Args)]
@@ -33,7 +33,7 @@ pub(crate) enum ObjectCommand {
     Show {
         /// Its name
         name: String,
-        /// Picture to write
+        /// Image to write
         #[arg(long, value_name = "FILE.png")]
         picture: Option<PathBuf>,
     },
@@ -83,7 +83,7 @@ pub(crate) enum Axis {
     Z,
 }
 
-/// From which sides templates are drawn.
+/// From which sides templates are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TemplateViews {
     /// From above, the camera held upright: 305 views with 7 turns, for what stands on a table, z axis up
@@ -93,10 +93,10 @@ pub(crate) enum TemplateViews {
 }
 
 impl TemplateViews {
-    pub fn coverage(self) -> Coverage {
+    pub fn coverage(self) -> ViewCoverage {
         match self {
-            TemplateViews::Above => Coverage::Above,
-            TemplateViews::Around => Coverage::Around,
+            TemplateViews::Above => ViewCoverage::Above,
+            TemplateViews::Around => ViewCoverage::Around,
         }
     }
 }

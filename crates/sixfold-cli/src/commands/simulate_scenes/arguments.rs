@@ -1,4 +1,4 @@
-//! What `sixfold simulate-scenes` is told, and whether it makes sense.
+//! Arguments of `sixfold simulate-scenes`, and whether it makes sense.
 
 use std::path::{Path, PathBuf};
 
@@ -20,7 +20,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold simulate-scenes --families can,mug --toys 40 --scenes 100 --views 10 --out out/toys\n  \
     sixfold simulate-scenes --dataset lmo --sensor xtion --out out/lmo-scenes\n\n\
     The folder is a BOP dataset, for `sixfold estimate --dataset` and `sixfold eval`. preview.png shows its first scenes.\n\
-    Stopped, the same command goes on.";
+    Stopped, the same command resumes.";
 
 #[derive(Debug, Args)]
 pub(crate) struct SimulateScenesArguments {
@@ -39,13 +39,13 @@ pub(crate) struct SimulateScenesArguments {
     /// Object ids of the dataset (default: all)
     #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
     pub ids: Vec<u32>,
-    /// Made-up household objects: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    /// Synthetic household objects: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     pub families: Vec<String>,
-    /// Made-up objects of each family
+    /// Synthetic objects of each family
     #[arg(long, value_name = "N", default_value = "1", requires = "families")]
     pub members: usize,
-    /// Made-up objects of no family: figures, machine parts and heaps of solids
+    /// Synthetic objects of no family: figures, machine parts and heaps of solids
     #[arg(long, value_name = "N", default_value = "0")]
     pub toys: usize,
     /// Scenes: each drops other objects
@@ -60,11 +60,11 @@ pub(crate) struct SimulateScenesArguments {
     /// Objects are dropped over a disc of this radius, metres
     #[arg(long, value_name = "METRES", default_value = "0.18")]
     pub radius: f64,
-    /// Share of the objects that start upright, the z axis of their mesh up; the others fall in any orientation
-    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    /// Fraction of the objects that start upright, the z axis of their mesh up; the others fall in any orientation
+    #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub upright: f64,
-    /// Share of the objects that fall wherever they fall, also on others; the rest look for a free place
-    #[arg(long, value_name = "SHARE", default_value = "0.4")]
+    /// Fraction of the objects that fall wherever they fall, also on others; the rest look for a free place
+    #[arg(long, value_name = "FRACTION", default_value = "0.4")]
     pub stacked: f64,
     /// Let objects collide as they are (hollow things stay hollow) and not as their convex hulls; takes seconds an object
     #[arg(long)]

@@ -59,7 +59,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     let progress = Mutex::new(Progress::new("scenes", missing.len()));
     let (dropped, resting) = (AtomicUsize::new(0), AtomicUsize::new(0));
     missing.par_iter().try_for_each(|&scene_id| -> Result<()> {
-        check_interrupt("give the same command again to go on")?;
+        check_interrupt("give the same command again to continue")?;
         let made = scene::write(a, &camera, &things, scene_id)?;
         dropped.fetch_add(made.dropped, Ordering::Relaxed);
         resting.fetch_add(made.resting, Ordering::Relaxed);

@@ -1,4 +1,4 @@
-//! What is dropped: meshes, the models of a dataset, made-up household objects and toys.
+//! What is dropped: meshes, the models of a dataset, synthetic household objects and toys.
 
 use std::path::Path;
 
@@ -63,7 +63,7 @@ pub(super) fn collect(a: &SimulateScenesArguments) -> Result<Vec<Thing>> {
     let mut progress = Progress::new("objects", described.len());
     let mut things = vec![];
     for (id, Described { name, mesh, info }) in described {
-        check_interrupt("give the same command again to go on")?;
+        check_interrupt("give the same command again to continue")?;
         let parts = if a.exact {
             ConvexParts::of_mesh(&mesh, &PartsOptions::default())
         } else {

@@ -1,4 +1,4 @@
-//! One picture of the first scenes: a row per scene, its first views in colour, then the depth of the first.
+//! One image of the first scenes: a row per scene, its first views in colour, then the depth of the first.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use sixfold_shell::overlay;
 /// Scenes and colour views shown.
 const SCENES: usize = 6;
 const VIEWS: usize = 3;
-/// Width of a picture in pixels.
+/// Width of an image in pixels.
 const WIDTH: usize = 320;
 
 pub(super) fn write(path: &Path, dataset: &BopDataset) -> Result<()> {

@@ -31,7 +31,7 @@ pub(super) fn write(
     let mut scene = Tabletop::new(&parts, &a.tabletop(), scene_id)?;
     let mut writer = SceneWriter::new(&a.out, &a.split, scene_id);
     for im_id in 0..a.views as u32 {
-        check_interrupt("give the same command again to go on")?;
+        check_interrupt("give the same command again to continue")?;
         let camera_from_world = scene.next_camera();
         add_view(a, camera, things, &scene, &camera_from_world, (scene_id, im_id, &mut writer))?;
     }

@@ -1,4 +1,4 @@
-//! What `sixfold synthesize` is told.
+//! Arguments of `sixfold synthesize`.
 
 use std::path::PathBuf;
 
@@ -30,7 +30,7 @@ pub(crate) enum SceneArgument {
 
 #[derive(Debug, Args)]
 pub(crate) struct SynthesizeArguments {
-    /// BOP dataset folder with models and posed photographs
+    /// BOP dataset folder with models and posed images
     #[arg(long, value_name = "DIR", required_unless_present = "photographs")]
     pub dataset: Option<PathBuf>,
     /// Split of the dataset
@@ -45,7 +45,7 @@ pub(crate) struct SynthesizeArguments {
     /// In place of a dataset: a JSON file that names a mesh and its photographs (see below)
     #[arg(long, value_name = "FILE.json", conflicts_with = "dataset")]
     pub photographs: Option<PathBuf>,
-    /// Folder for the new dataset, the refined poses and the pictures
+    /// Folder for the new dataset, the refined poses and the images
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Name of the new dataset's split
@@ -57,10 +57,10 @@ pub(crate) struct SynthesizeArguments {
     /// Photographs behind each new view
     #[arg(long, value_name = "N", default_value = "6")]
     pub per_view: usize,
-    /// Photographs that show less of the object than this share are left out
-    #[arg(long, value_name = "SHARE", default_value = "0.5")]
+    /// Photographs that show less of the object than this fraction are left out
+    #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub least_visible: f64,
-    /// Trained detector whose masks are taken where the photographs have none of their own (default: masks are drawn
+    /// Trained detector whose masks are taken where the photographs have none of their own (default: masks are rendered
     /// from the poses, which know nothing of what hides the object)
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
@@ -94,13 +94,13 @@ pub(crate) struct SynthesizeArguments {
     /// Side of the new images in pixels
     #[arg(long, value_name = "PIXELS", default_value = "192")]
     pub size: usize,
-    /// Folder of photographs for backgrounds (default: made-up textures)
+    /// Folder of photographs for backgrounds (default: procedural textures)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
     /// Put the photographs themselves, cut to the object, into the new dataset too
     #[arg(long)]
     pub with_photographs: bool,
-    /// Seed of turns, distances, backgrounds and disturbances
+    /// Seed of rotations, distances, backgrounds and disturbances
     #[arg(long, default_value = "0")]
     pub seed: u64,
     #[command(flatten)]
@@ -115,4 +115,4 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     A file for --photographs (paths are relative to it; poses as in BOP, object to camera, millimetres; mask may be left out):\n  \
     {\"mesh\": \"mug.ply\", \"unit\": \"mm\", \"photographs\": [{\"image\": \"1.png\", \"camera\": \"camera.json\",\n    \
     \"cam_R_m2c\": [1,0,0, 0,1,0, 0,0,1], \"cam_t_m2c\": [0, 0, 600], \"mask\": \"1-mask.png\"}]}\n\n\
-    Stopped, the same command goes on.";
+    Stopped, the same command resumes.";

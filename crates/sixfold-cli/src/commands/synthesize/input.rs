@@ -23,7 +23,7 @@ pub(super) struct Input {
     pub subjects: Vec<Subject>,
     /// Objects that are not looked for but may hide others.
     others: BTreeMap<u32, Mesh>,
-    /// Camera, objects and poses of every image some of whose masks were drawn from poses.
+    /// Camera, objects and poses of every image some of whose masks were rendered from poses.
     drawn: BTreeMap<usize, (Camera, Vec<(u32, Pose)>)>,
     /// Image and object of masks that were not.
     kept: BTreeSet<(usize, u32)>,
@@ -125,7 +125,7 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<Input> {
             let subjects = vec![from_file(a, file)?];
             Ok(Input { subjects, others: BTreeMap::new(), drawn: BTreeMap::new(), kept: BTreeSet::new() })
         }
-        (None, None) => bail!("what is to be seen anew? Give --dataset DIR or --photographs FILE.json"),
+        (None, None) => bail!("what is to be rendered? Give --dataset DIR or --photographs FILE.json"),
     }
 }
 

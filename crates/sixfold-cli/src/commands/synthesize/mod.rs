@@ -33,9 +33,9 @@ use sixfold_shell::progress::Progress;
 /// Side of the crops that new views take their colours from, pixels.
 const CROP: usize = 256;
 /// A photograph is left out where its mask covers less of the object's outline.
-const LEAST_MASK: f64 = 0.1;
+const MIN_MASK: f64 = 0.1;
 /// A further photograph of an object must add so many of its 3000 points.
-const LEAST_GAIN: f64 = 15.0;
+const MIN_GAIN: f64 = 15.0;
 
 #[derive(Serialize)]
 struct Summary {
@@ -55,11 +55,11 @@ struct ObjectSummary {
     photographs: usize,
     dropped: usize,
     images: usize,
-    /// Share of the visible parts that was left out because other photographs show another colour there.
+    /// Fraction of the visible parts that was left out because other photographs show another colour there.
     pixels_differing: f64,
-    /// Share of the surface that no photograph shows.
+    /// Fraction of the surface that no photograph shows.
     surface_unseen: f64,
-    /// Share of the object's pixels in all views that no photograph shows; they are filled from what is near.
+    /// Fraction of the object's pixels in all views that no photograph shows; they are filled from what is near.
     pixels_unseen: f64,
     median_moved_mm: f64,
     median_turned_degrees: f64,
@@ -121,7 +121,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
             dropped: count - subject.photographs.len(),
             images: written.images,
             pixels_differing: differing.iter().sum::<f64>() / differing.len().max(1) as f64,
-            surface_unseen: maker.unseen_share(),
+            surface_unseen: maker.unseen_fraction(),
             pixels_unseen: written.unseen,
             median_moved_mm: median(of_object().map(|p| p.moved_mm)),
             median_turned_degrees: median(of_object().map(|p| p.turned_degrees)),
@@ -218,7 +218,7 @@ fn check(a: &SynthesizeArguments) -> Result<()> {
         bail!("--sources: found 0, expected at least 1");
     }
     if !(0.0..=1.0).contains(&a.least_visible) {
-        bail!("--least-visible: found {}, expected a share from 0 to 1", a.least_visible);
+        bail!("--least-visible: found {}, expected a fraction from 0 to 1", a.least_visible);
     }
     if a.weights.is_some() && a.weighting != WeightingKind::Network {
         bail!("--weights belongs to --weighting network");
@@ -249,10 +249,10 @@ fn choose_sources(a: &SynthesizeArguments, subject: &mut Subject) -> Result<()> 
     let mut shown = vec![];
     for source in &subject.photographs {
         let view = SourceView::new(&source.photograph, &subject.mesh, 96)?;
-        let share = view.visible_share();
-        if share < LEAST_MASK {
+        let share = view.visible_fraction();
+        if share < MIN_MASK {
             let name = source.photograph.name().to_owned();
-            let wrong = NolError::Mask { name, share: 100.0 * share, least: 100.0 * LEAST_MASK };
+            let wrong = NolError::Mask { name, share: 100.0 * share, least: 100.0 * MIN_MASK };
             eprintln!("note: {wrong}; left out");
             shown.push(vec![]);
             continue;
@@ -261,7 +261,7 @@ fn choose_sources(a: &SynthesizeArguments, subject: &mut Subject) -> Result<()> 
     }
     let points = surface.points.len();
     shown.iter_mut().for_each(|s| s.resize(points, 0.0));
-    let least = if subject.photographs.len() > a.sources { 0.0 } else { LEAST_GAIN * 0.01 };
+    let least = if subject.photographs.len() > a.sources { 0.0 } else { MIN_GAIN * 0.01 };
     let mut chosen = choose_by_surface(&shown, None, a.sources, least);
     chosen.sort_unstable();
     let mut number = 0;

@@ -1,4 +1,4 @@
-//! Pictures of what was done: outlines at the poses before and after, and a sheet of new views.
+//! Images of what was done: outlines at the poses before and after, and a sheet of new views.
 
 use std::path::Path;
 
@@ -8,18 +8,18 @@ use sixfold_geometry::{Camera, Pose, RgbImage};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nol::SourceView;
-use sixfold_render::{Frame, RenderOptions, SceneObject};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use sixfold_shell::overlay;
 
-/// Side of a picture in a sheet.
+/// Side of an image in a sheet.
 const SIDE: usize = 160;
 const BEFORE: [u8; 3] = [255, 220, 0];
 const AFTER: [u8; 3] = [0, 255, 120];
 
 /// Draws the outline of a mesh into a square crop.
 fn outline(image: &mut RgbImage, mesh: &Mesh, camera: &Camera, pose: &Pose, color: [u8; 3]) {
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&[SceneObject { mesh, camera_from_object: *pose }], &RenderOptions::default());
     let (width, height) = image.size();
     let covered = |x: usize, y: usize| frame.inverse_depth()[y * width + x] > 0.0;
@@ -56,7 +56,7 @@ pub(super) fn refinement(path: &Path, rows: &[(&Mesh, Vec<(PosedImage, Pose)>)])
     Ok(write_rgb(path, &sheet)?)
 }
 
-/// A sheet of pictures, row by row, each with a text.
+/// A sheet of images, row by row, each with a text.
 pub(super) fn sheet(path: &Path, rows: &[Vec<(RgbImage, String)>]) -> Result<()> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let side = rows.iter().flatten().map(|(p, _)| p.width()).max().unwrap_or(0);

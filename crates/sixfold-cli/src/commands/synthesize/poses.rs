@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::Pose;
 use sixfold_mesh::Mesh;
-use sixfold_nol::refine::{RefineOptions, SceneKind, SceneSource, refine_scene};
+use sixfold_nol::refine::{PoseRefinementOptions, PosedSource, SceneKind, refine_scene};
 
 use super::arguments::{SceneArgument, SynthesizeArguments};
 use super::input::{Input, Source};
@@ -96,15 +96,15 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
         let next = numbers.len();
         numbers.entry(source.image).or_insert(next);
     }
-    let listed: Vec<SceneSource<'_>> = sources
+    let listed: Vec<PosedSource<'_>> = sources
         .iter()
-        .map(|(object, source)| SceneSource {
+        .map(|(object, source)| PosedSource {
             object: *object,
             image: numbers[&source.image],
             photograph: &source.photograph,
         })
         .collect();
-    let options = RefineOptions {
+    let options = PoseRefinementOptions {
         scene: match a.scene {
             SceneArgument::Judge => SceneKind::Judge,
             SceneArgument::Still => SceneKind::Still,
@@ -112,7 +112,7 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
         },
         rough: [a.rough[0] * 1e-3, a.rough[1].to_radians()],
         seed: a.seed,
-        ..RefineOptions::default()
+        ..PoseRefinementOptions::default()
     };
     let mut progress = Progress::new("poses, per cent", 100);
     let stop = interrupted();
@@ -138,7 +138,7 @@ pub(super) fn refine(a: &SynthesizeArguments, input: &Input, file: &Path) -> Res
     read(file).map(Some)
 }
 
-/// The poses as they were written: numbers in text may lose their last digit, and a run that goes on must not differ from one
+/// The poses as they were written: numbers in text may lose their last digit, and a run that continues must not differ from one
 /// that was never stopped.
 fn read(file: &Path) -> Result<PoseFile> {
     let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;

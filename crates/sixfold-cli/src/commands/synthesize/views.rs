@@ -11,20 +11,20 @@ use sixfold_mesh::Mesh;
 use sixfold_nol::SourceView;
 use sixfold_nol::synthesis::ViewMaker;
 use sixfold_nol::view_grid::{ViewGrid, over_background};
-use sixfold_render::{BoundingBoxScale, Frame, RenderOptions, SceneObject};
+use sixfold_render::{BoundingBoxScale, RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Backgrounds;
 
 use super::arguments::SynthesizeArguments;
 use super::input::Subject;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Pictures of an object in the preview.
+/// Images of an object in the preview.
 const PREVIEWED: usize = 10;
 
 /// What was written of one object.
 pub(super) struct Written {
     pub images: usize,
-    /// Share of the object's pixels in all views that no photograph shows.
+    /// Fraction of the object's pixels in all views that no photograph shows.
     pub unseen: f64,
     pub preview: Vec<(RgbImage, String)>,
 }
@@ -58,7 +58,7 @@ pub(super) fn write(
         BoundingBoxScale::of_corners(&low, &high)
     };
     for (number, place) in places.iter().enumerate() {
-        check_interrupt("give the same command again to go on")?;
+        check_interrupt("give the same command again to continue")?;
         let im_id = number as u32;
         let Some((camera, pose)) = *place else { continue };
         let image_file = folder(a, subject.id).join("rgb").join(format!("{im_id:06}.png"));
@@ -70,11 +70,11 @@ pub(super) fn write(
             (silhouette(&subject.mesh, &camera, &pose), None)
         } else {
             let view = maker.render(&camera, &pose);
-            written.unseen += view.unseen_share();
+            written.unseen += view.unseen_fraction();
             let mut random = stream(a.seed ^ 0x6e6f_6c00 ^ u64::from(subject.id), u64::from(im_id));
             let image = over_background(&view, backgrounds.patch(a.size, a.size, &mut random));
             if previewed {
-                let percent = (100.0 * view.unseen_share()).round();
+                let percent = (100.0 * view.unseen_fraction()).round();
                 let text = if percent >= 1.0 { format!("{percent:.0} % unseen") } else { String::new() };
                 written.preview.push((view.patch.to_rgb(), text));
             }
@@ -121,7 +121,7 @@ fn add_photograph(
 }
 
 fn silhouette(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Mask {
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     frame.render(&[SceneObject { mesh, camera_from_object: *pose }], &RenderOptions::default());
     frame.mask(0)
 }
@@ -181,7 +181,7 @@ fn write_coordinates(
     camera: &Camera,
     pose: &Pose,
 ) -> Result<()> {
-    let mut frame = Frame::new(camera);
+    let mut frame = VisibilityBuffer::new(camera);
     let objects = [SceneObject { mesh, camera_from_object: *pose }];
     frame.render(&objects, &RenderOptions::default());
     let points = frame.object_coordinates(&objects);

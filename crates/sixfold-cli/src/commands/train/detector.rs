@@ -36,8 +36,8 @@ pub(crate) struct TrainDetectorArguments {
     /// Highest learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().learning_rate)]
     pub learning_rate: f64,
-    /// The pretrained encoder's share of the learning rate, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = default().encoder_share)]
+    /// The pretrained encoder's fraction of the learning rate, 0 to 1
+    #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_share)]
     pub encoder_share: f64,
     /// Stages of the ImageNet encoder that stay as they are, of five
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
@@ -48,13 +48,13 @@ pub(crate) struct TrainDetectorArguments {
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
     #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
     pub size: usize,
-    /// Share of training images that are parts of photographs, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = default().photograph_share)]
+    /// Fraction of training images that are parts of photographs, 0 to 1
+    #[arg(long, value_name = "FRACTION", default_value_t = default().photograph_share)]
     pub photograph_share: f32,
-    /// Share of renders among pasted objects that have photographs, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = default().render_share)]
+    /// Fraction of renders among pasted objects that have photographs, 0 to 1
+    #[arg(long, value_name = "FRACTION", default_value_t = default().render_share)]
     pub render_share: f32,
-    /// Largest turn in the image plane, degrees
+    /// Largest rotation in the image plane, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
     pub rotation: Degrees,
     /// Draw the meshes in random colours, as untextured CAD models
@@ -66,7 +66,7 @@ pub(crate) struct TrainDetectorArguments {
     /// Score below which detections will be left out unless something else is asked for, 0 to 1
     #[arg(long, value_name = "SCORE", default_value_t = default().threshold)]
     pub threshold: f32,
-    /// Go on from the weights of another training of the same objects instead of ImageNet's
+    /// Continue from the weights of another training of the same objects instead of ImageNet's
     #[arg(long, value_name = "FILE.safetensors")]
     pub init: Option<PathBuf>,
     /// Train no further: write the model of the last checkpoint in --out

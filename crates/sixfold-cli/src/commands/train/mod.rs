@@ -79,7 +79,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
         TrainCommand::Nol(of) => {
             let summary = nol::train_nol(of)?;
             show(&a.json, &of.out, &summary, || {
-                println!("like the truth, on new made-up objects:");
+                println!("similarity to the ground truth, on new synthetic objects:");
                 for (name, score) in summary.more.quality.scores() {
                     println!("  {name}: {score:.3}");
                 }
@@ -90,7 +90,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             let summary = mttm::train_mttm(of)?;
             show(&a.json, &of.out, &summary, || {
                 let quality = &summary.more.quality;
-                println!("on {} regions of made-up objects it was not trained on:", quality.regions);
+                println!("on {} regions of synthetic objects it was not trained on:", quality.regions);
                 for (name, score) in quality.scores() {
                     println!("  {name}: {score:.3}");
                 }

@@ -1,4 +1,4 @@
-//! `sixfold train mttm`: made-up objects fall on a table, depth cameras look at them, and a network learns to match regions
+//! `sixfold train mttm`: synthetic objects fall on a table, depth cameras look at them, and a network learns to match regions
 //! with templates. Nothing but a seed goes in.
 
 use std::path::PathBuf;
@@ -43,7 +43,7 @@ pub(crate) struct TrainMttmArguments {
         help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
     )]
     pub learning_rate: Option<f64>,
-    /// Made-up objects: half of them household shapes, half of them toys
+    /// Synthetic objects: half of them household shapes, half of them toys
     #[arg(long, value_name = "N", default_value_t = default().objects)]
     pub objects: usize,
     /// Scenes in which they fall on a table, made at the start; each is seen by five cameras

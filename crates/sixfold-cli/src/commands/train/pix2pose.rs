@@ -1,4 +1,4 @@
-//! `sixfold train pix2pose`: posed photographs and meshes in, a model file out.
+//! `sixfold train pix2pose`: posed images and meshes in, a model file out.
 
 use std::path::PathBuf;
 
@@ -29,7 +29,7 @@ fn steps_help() -> String {
     let (compact, paper) = options();
     format!(
         "Training steps; each takes so many images of every object (default: {}; the dissertation's networks: {}). 0: the \
-         weights of --init as they are, with their alignment's constant error measured anew",
+         weights of --init as they are, with their alignment's constant error measured again",
         compact.common.steps, paper.steps
     )
 }
@@ -74,19 +74,19 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Stages of the ImageNet encoder that stay as they are, of five
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    /// Share of renders among the images, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = default().render_share)]
+    /// Fraction of renders among the images, 0 to 1
+    #[arg(long, value_name = "FRACTION", default_value_t = default().render_share)]
     pub render_share: f32,
-    /// Share of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
-    #[arg(long, value_name = "SHARE", default_value_t = default().near_photographs)]
+    /// Fraction of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
+    #[arg(long, value_name = "FRACTION", default_value_t = default().near_photographs)]
     pub near_photographs: f32,
-    /// Largest turn of photographs in the image plane, degrees
+    /// Largest rotation of photographs in the image plane, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
     pub rotation: Degrees,
     /// Side of the network's input in pixels; the output has half of it
     #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
     pub size: usize,
-    /// Go on from the weights of another training instead of ImageNet's
+    /// Continue from the weights of another training instead of ImageNet's
     #[arg(long, value_name = "FILE.safetensors")]
     pub init: Option<PathBuf>,
     /// Draw the meshes in random colours, as untextured CAD models

@@ -8,7 +8,7 @@ use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_on_part};
 use sixfold_geometry::Vec3;
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, draw_grasps, middle_between_pads,
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, centre_between_pads, draw_grasps,
 };
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
@@ -20,8 +20,8 @@ use sixfold_shell::grasp::trial::Hardness;
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// A handle of which less than this share of the object's pixels is seen gives no cue.
-const LEAST_SEEN: f64 = 0.02;
+/// A handle of which less than this fraction of the object's pixels is seen gives no cue.
+const MIN_SEEN: f64 = 0.02;
 /// Points this far off the named part's box still count as on it, metres.
 const AROUND: f64 = 0.006;
 
@@ -30,7 +30,7 @@ const AROUND: f64 = 0.006;
 pub(super) struct Row {
     pub object: String,
     pub number: u64,
-    /// Share of the object's pixels that show the handle.
+    /// Fraction of the object's pixels that show the handle.
     pub seen: f64,
     /// Whether the first grasp from experience on handles is on the handle; `None` where nothing was proposed.
     pub by_experience: Option<bool>,
@@ -72,7 +72,7 @@ impl Handles<'_> {
             let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
             // Views from behind show no handle: the next ones are taken.
             while done < self.views && number < 8 * self.views as u64 {
-                check_interrupt("what was tried is kept; run the same command again to go on")?;
+                check_interrupt("what was tried is kept; run the same command again to continue")?;
                 if let Some(row) = self.row(name, mesh, part, &parts, number, memory, folder)? {
                     journal.row(&row)?;
                     rows.push(row);
@@ -105,7 +105,7 @@ impl Handles<'_> {
         let on = |p: &Vec3| part.contains(&object_from_camera.transform_point(p), AROUND);
         let seen =
             view.object.points.iter().filter(|p| on(p)).count() as f64 / view.object.len().max(1) as f64;
-        if seen < LEAST_SEEN {
+        if seen < MIN_SEEN {
             return Ok(None);
         }
         let planner = AntipodalOptions { seed: scene.noise, ..options.planner };
@@ -117,7 +117,7 @@ impl Handles<'_> {
         let geometry = sixfold_grasp::antipodal_grasps(view, gripper, &planner)?;
         let first = rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes);
         let plain = sixfold_grasp::cluster_grasps(&geometry, &clusters);
-        let holds = |g: &Grasp| on(&middle_between_pads(&g.camera_from_gripper));
+        let holds = |g: &Grasp| on(&centre_between_pads(&g.camera_from_gripper));
         let row = Row {
             object: name.to_owned(),
             number,

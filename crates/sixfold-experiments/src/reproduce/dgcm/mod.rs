@@ -30,7 +30,7 @@ const NEAR: f64 = 0.9;
 const RUNS: u64 = 4;
 /// How often each grasp of table 6.2 is tried, each time with another error of the hand.
 const TRIES: usize = 4;
-/// Classes that no grasp of this hand holds in the hard setting, or hardly: told apart in the averages.
+/// Classes that no grasp of this hand holds in the hard setting, or hardly: distinguished in the averages.
 const HARDLY: [&str; 2] = ["plate", "scissors"];
 /// What is learned from nothing, by the end of its mesh's path.
 const FROM_NOTHING: [&str; 3] = ["PowerDrill.ply", "MustardBottle.ply", "Banana.ply"];
@@ -48,7 +48,7 @@ pub(crate) struct ReproduceDgcmArguments {
     pub quick: bool,
     #[command(flatten)]
     pub network: NetworkArguments,
-    /// Folder for table.md, reproduce.json, pictures and everything kept on the way
+    /// Folder for table.md, reproduce.json, images and everything kept on the way
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Seed of everything random
@@ -87,7 +87,7 @@ struct Point {
     count: usize,
     all_classes: bool,
     asked: usize,
-    /// Shares within 5 cm and 15 degrees, and within 1 cm and 10 degrees.
+    /// Fractions within 5 cm and 15 degrees, and within 1 cm and 10 degrees.
     within: [f64; 2],
 }
 
@@ -107,7 +107,7 @@ struct Stretched {
     within: [f64; 2],
 }
 
-/// Both limits: 5 cm and 15 degrees, as printed, and 1 cm and 10 degrees.
+/// Both limits: 5 cm and 15 degrees, as published, and 1 cm and 10 degrees.
 fn within<'a>(answers: impl IntoIterator<Item = &'a Answer>) -> (usize, [f64; 2]) {
     let mut count = 0usize;
     let mut near = [0usize; 2];
@@ -121,7 +121,7 @@ fn within<'a>(answers: impl IntoIterator<Item = &'a Answer>) -> (usize, [f64; 2]
 
 pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Outcome> {
     let experiences = a.out.join("experience.db");
-    eprintln!("1 of 5: experience on made-up objects");
+    eprintln!("1 of 5: experience on synthetic objects");
     learn::learn(&LearnArguments {
         families: vec!["all".to_owned()],
         members: if a.quick { 1 } else { 5 },
@@ -225,7 +225,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
     report(json, &whole, || {
         println!("{text}");
-        println!("table.md, reproduce.json and pictures are in {}", a.out.display());
+        println!("table.md, reproduce.json and images are in {}", a.out.display());
     })?;
     Ok(Outcome::Found)
 }
@@ -381,7 +381,7 @@ impl Whole {
         let c = &self.compare;
         let _ = writeln!(
             out,
-            "Share of grasps that held (table 6.2), hard setting, each tried with {TRIES} errors of the hand, with 95 % intervals \
+            "Fraction of grasps that held (table 6.2), hard setting, each tried with {TRIES} errors of the hand, with 95 % intervals \
              after Wilson as if tried once\n"
         );
         let _ = writeln!(out, "| class | scenes | {} |", METHODS.join(" | "));
@@ -488,7 +488,7 @@ fn after_second(held: &[bool]) -> (usize, usize) {
     (held[second..].iter().filter(|h| **h).count(), held.len() - second)
 }
 
-/// An object's name for a picture.
+/// An object's name for an image.
 fn short(instance: &Instance) -> String {
     let name = instance.name.trim_end_matches("/textured.obj");
     let name = name.rsplit('/').next().unwrap_or(name);

@@ -1,7 +1,7 @@
 //! Figure 6.7: how near a transferred grasp comes to the wanted one, against the number of experiences, and from every
 //! object to every other; and from an object to itself at other sizes.
 //!
-//! As in section 6.3.1 the wanted grasp comes from above, on the object's upright axis, and a turn about the approach does
+//! As in section 6.3.1 the wanted grasp comes from above, on the object's upright axis, and a rotation about the approach does
 //! not count. There the poses were annotated by hand on depth images; here they follow from the meshes, and the depth images
 //! are simulated. What is judged is the first grasp of the ranking by equation 6.6, whether it would hold or not.
 
@@ -54,7 +54,7 @@ pub(super) fn instances(objects: &[(String, String, Mesh)], gripper: &Gripper) -
         .collect()
 }
 
-/// The grasp from above on the axis through the middle of an object's top, closing along its narrower side.
+/// The grasp from above on the axis through the centre of an object's top, closing along its narrower side.
 fn from_above(mesh: &Mesh, gripper: &Gripper) -> Option<(Pose, f64)> {
     let (low, high) = mesh.bounding_box();
     let height = high.z - low.z;
@@ -147,7 +147,7 @@ impl Offline<'_> {
         let mut known: Vec<Vec<i64>> = vec![];
         let mut tests: Vec<View> = vec![];
         for (number, instance) in self.instances.iter().enumerate() {
-            check_interrupt("what was answered is kept; run the same command again to go on")?;
+            check_interrupt("what was answered is kept; run the same command again to continue")?;
             let (pool, views) = self.views(number, instance)?;
             let ids: Result<Vec<i64>> = pool.iter().map(|v| self.remember(&mut memory, v)).collect();
             known.push(ids?);
@@ -160,7 +160,7 @@ impl Offline<'_> {
         let mut progress = Progress::new("questions", questions.len());
         for (question, test, only) in questions {
             if let Entry::Vacant(place) = answers.entry(question) {
-                check_interrupt("what was answered is kept; run the same command again to go on")?;
+                check_interrupt("what was answered is kept; run the same command again to continue")?;
                 let error = self.ask(&mut memory, test, only)?;
                 let answer = Answer { question: place.key().clone(), error };
                 journal.row(&answer)?;
@@ -295,7 +295,7 @@ impl Offline<'_> {
         let mut progress = Progress::new("stretched", self.instances.len() * self.size.stretched as usize);
         for (number, instance) in self.instances.iter().enumerate() {
             for view in 0..self.size.stretched {
-                check_interrupt("what was answered is kept; run the same command again to go on")?;
+                check_interrupt("what was answered is kept; run the same command again to continue")?;
                 progress.step(instance.name.clone());
                 let mut random = stream(self.seed ^ 0x73_7472, view);
                 // As many times smaller as larger; in hundredths, to be a key.

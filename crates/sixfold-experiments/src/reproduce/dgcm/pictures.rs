@@ -1,4 +1,4 @@
-//! Figures 6.7 and 6.10 to 6.12 as pictures.
+//! Figures 6.7 and 6.10 to 6.12 as images.
 
 use sixfold_geometry::RgbImage;
 use sixfold_plot::{COLORS, Canvas, FAINT, INK, text_width};
@@ -6,7 +6,7 @@ use sixfold_plot::{COLORS, Canvas, FAINT, INK, text_width};
 use super::offline::COUNTS;
 use sixfold_shell::grasp::learn::Curve;
 
-/// A line of the left picture of figure 6.7: shares for each number of experiences.
+/// A line of the left image of figure 6.7: fractions for each number of experiences.
 pub(super) struct Line {
     pub class: String,
     /// Experience of all classes; else of this one.
@@ -14,7 +14,7 @@ pub(super) struct Line {
     pub shares: [f64; COUNTS.len()],
 }
 
-/// Shares against the number of experiences per object.
+/// Fractions against the number of experiences per object.
 pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
     let (left, top, width, height) = (70.0, 40.0, 420.0, 300.0);
     let mut canvas = Canvas::new(680, 400);
@@ -61,7 +61,7 @@ pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
     canvas.finish()
 }
 
-/// Shares from every object (rows) to every other (columns).
+/// Fractions from every object (rows) to every other (columns).
 pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>]) -> RgbImage {
     let cell = 46.0;
     let widest = names.iter().map(|n| text_width(n, 1.5)).fold(0.0, f64::max);

@@ -1,4 +1,4 @@
-//! What `sixfold reproduce nol` is told.
+//! Arguments of `sixfold reproduce nol`.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use clap::Args;
 /// Shown under `sixfold reproduce nol --help`.
 pub(crate) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce nol --dataset lmo --frames data/lmo-training-frames.json --weights nol.safetensors --hope hope --out out/reproduce-nol\n\n\
-    Every row is kept; interrupted, it goes on when the same command is given again.";
+    Every row is kept; interrupted, it continues when the same command is given again.";
 
 #[derive(Debug, Args)]
 pub(crate) struct ReproduceNolArguments {
@@ -29,10 +29,10 @@ pub(crate) struct ReproduceNolArguments {
     /// A scene photographed under several lamps by a camera that stood still (HOPE's): two as sources, the third predicted
     #[arg(long, value_name = "DIR")]
     pub hope: Option<PathBuf>,
-    /// Folder for the table, its JSON, the pictures, and the rows done so far
+    /// Folder for the table, its JSON, the images, and the rows done so far
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// One disturbance instead of three, and a quarter of the views; the same command without it goes on with the others
+    /// One disturbance instead of three, and a quarter of the views; the same command without it continues with the others
     #[arg(long)]
     pub quick: bool,
     /// Seed of the disturbances

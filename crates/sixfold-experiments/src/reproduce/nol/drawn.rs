@@ -1,8 +1,8 @@
-//! The same frames with poses that are exact: the coloured models drawn over photographs of other frames, under a lamp above the
+//! The same frames with poses that are exact: the coloured models drawn over images of other frames, under a lamp above the
 //! first object (so it stays with that object when the camera moves), and with table 4.1's changes of colour.
 //!
 //! Annotated poses of real photographs are off by pixels. Nothing can be nearer to them than they are to what the
-//! photographs show, and only of drawn objects is it known where they are.
+//! photographs show, and only of rendered objects is it known where they are.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use anyhow::Result;
 use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{RgbImage, Vec3};
 use sixfold_io::write_rgb;
-use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material as Surface, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::{Backgrounds, ColorAugmentation, Coverage, Patch};
 
 use super::material::{Material, PosedFrame};
@@ -33,7 +33,7 @@ pub(super) fn drawn(material: &Material, seed: u64) -> Result<Material> {
     Ok(Material { meshes: material.meshes.clone(), sources: sources.collect(), targets: vec![] })
 }
 
-/// All drawn frames at half their size.
+/// All rendered frames at half their size.
 pub(super) fn picture(drawn: &Material, file: &Path) -> Result<()> {
     const COLUMNS: usize = 4;
     let size = |of: fn(&RgbImage) -> usize| drawn.sources.iter().map(|f| of(&f.image) / 2).max().unwrap_or(0);
@@ -55,7 +55,7 @@ fn draw(material: &Material, frame: &PosedFrame, backgrounds: &Backgrounds, rand
         .iter()
         .map(|(id, pose)| SceneObject { mesh: &material.meshes[id], camera_from_object: *pose })
         .collect();
-    let mut fine = Frame::new(&camera);
+    let mut fine = VisibilityBuffer::new(&camera);
     fine.render(&objects, &RenderOptions::default());
     // The room's lamp: above the first object, whose z axis points up, and a little to its side.
     let down = -Vec3::new(0.4, 0.3, 1.0);

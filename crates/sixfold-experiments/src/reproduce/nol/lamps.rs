@@ -8,7 +8,7 @@ use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility}
 use sixfold_data::PosedImage;
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
-use sixfold_nol::similarity::Judge;
+use sixfold_nol::similarity::ImageSimilarity;
 
 use super::super::kept::kept_or_made;
 use super::picture::Strips;
@@ -18,7 +18,7 @@ use sixfold_shell::progress::{Progress, check_interrupt};
 /// Side of the crops: the objects are larger than in the other dataset.
 const SIDE: usize = 192;
 /// Less of an object is neither source nor target.
-const LEAST_VISIBLE: f64 = 0.8;
+const MIN_VISIBILITY: f64 = 0.8;
 /// Objects with `--quick`.
 const QUICK: usize = 3;
 /// The name of these rows' only set.
@@ -40,7 +40,7 @@ pub(super) fn rows(
     root: &Path,
     out: &Path,
     networks: &Networks,
-    judge: &Judge,
+    judge: &ImageSimilarity,
     strips: &Strips,
     quick: bool,
 ) -> Result<Vec<ViewRow>> {
@@ -117,7 +117,7 @@ fn things(root: &Path, quick: bool) -> Result<(Vec<u32>, Vec<Thing>)> {
             things.iter().zip(truth).map(|(t, g)| (&t.mesh, g.camera_from_object)).collect();
         let visible = ground_truth_visibility(&placed, &camera, None, VISIBILITY_DELTA);
         for ((thing, g), visible) in things.iter_mut().zip(truth).zip(visible) {
-            if visible.info.visib_fract >= LEAST_VISIBLE {
+            if visible.info.visib_fract >= MIN_VISIBILITY {
                 let name = format!("{im_id} of object {}", thing.object);
                 let posed = PosedImage::new(name, thing.object, image.clone(), camera, g.camera_from_object)?;
                 thing.photographs.push(posed.with_mask(&visible.mask_visible)?);

@@ -17,10 +17,10 @@ use super::arguments::ReproduceNolArguments;
 /// Poses are off by up to this much: metres along each axis, radians about each.
 pub(super) const REACH: [f64; 2] = [0.01, 0.05];
 /// Objects of which less is visible are no sources.
-const LEAST_VISIBLE: f64 = 0.5;
+const MIN_VISIBILITY: f64 = 0.5;
 /// Objects of which less is visible are no targets.
-const LEAST_VISIBLE_TARGET: f64 = 0.8;
-/// Every so manieth of the other frames; every so manieth with `--quick`.
+const MIN_TARGET_VISIBILITY: f64 = 0.8;
+/// Every n-th of the other frames; every n-th with `--quick`.
 const EVERY: [usize; 2] = [6, 24];
 
 /// A frame with what is in it.
@@ -131,7 +131,7 @@ impl Material {
         for (number, (frame, poses)) in self.sources.iter().zip(poses).enumerate() {
             let visible = self.visible(frame, poses);
             for (index, ((object, truth), (share, mask))) in frame.truth.iter().zip(visible).enumerate() {
-                if share < LEAST_VISIBLE {
+                if share < MIN_VISIBILITY {
                     continue;
                 }
                 let (image, pose) = (frame.image.clone(), poses[index]);
@@ -173,7 +173,7 @@ impl Material {
                 continue;
             }
             for ((id, pose), (share, mask)) in frame.truth.iter().zip(self.visible(frame, &poses)) {
-                if *id == object && share >= LEAST_VISIBLE_TARGET {
+                if *id == object && share >= MIN_TARGET_VISIBILITY {
                     let (id, image) = (frame.id.into(), frame.image.clone());
                     let photograph = PosedImage::of_frame(id, object, image, frame.camera, *pose)?;
                     all.push((frame.id, photograph.with_mask(&mask)?));
@@ -183,7 +183,7 @@ impl Material {
         Ok(all)
     }
 
-    /// Visible share and mask of everything in a frame.
+    /// Visible fraction and mask of everything in a frame.
     fn visible(&self, frame: &PosedFrame, poses: &[Pose]) -> Vec<(f64, sixfold_geometry::Mask)> {
         let placed: Vec<(&Mesh, Pose)> =
             frame.truth.iter().zip(poses).map(|((id, _), pose)| (&self.meshes[id], *pose)).collect();

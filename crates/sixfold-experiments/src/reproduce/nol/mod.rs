@@ -18,7 +18,7 @@ use serde::Serialize;
 use sixfold_data::PosedImage;
 use sixfold_mesh::Mesh;
 use sixfold_nol::model::NolModel;
-use sixfold_nol::similarity::Judge;
+use sixfold_nol::similarity::ImageSimilarity;
 
 use self::arguments::ReproduceNolArguments;
 use self::material::{Material, Source};
@@ -32,7 +32,7 @@ use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Behind an interrupt.
-const GO_ON: &str = "the rows done so far are kept; run the same command again to go on";
+const GO_ON: &str = "the rows done so far are kept; run the same command again to continue";
 /// Side of the views that are compared, pixels.
 const SIDE: usize = 128;
 /// What the views are rendered from, in the order of the table.
@@ -66,11 +66,11 @@ struct Inputs {
 #[derive(Serialize)]
 struct Whole {
     inputs: Inputs,
-    /// Whether only some rows were made. They are the same ones: without `--quick` the run goes on with the others.
+    /// Whether only some rows were made. They are the same ones: without `--quick` the run continues with the others.
     quick: bool,
     disturbances: u64,
     poses: Vec<PosesSummary>,
-    /// The same of drawn frames, whose poses are exact.
+    /// The same of rendered frames, whose poses are exact.
     drawn_poses: Vec<PosesSummary>,
     /// Targets that were compared, and that were left out.
     targets_of_views: [usize; 2],
@@ -84,7 +84,7 @@ struct Bench<'a> {
     a: &'a ReproduceNolArguments,
     material: Material,
     networks: Vec<(String, NolModel)>,
-    judge: Judge,
+    judge: ImageSimilarity,
     strips: Strips,
 }
 
@@ -113,7 +113,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         seed: a.seed,
     };
     same_inputs(&a.out, &inputs)?;
-    let bench = Bench { a, material, networks, judge: Judge::new()?, strips: Strips::new(&a.out) };
+    let bench = Bench { a, material, networks, judge: ImageSimilarity::new()?, strips: Strips::new(&a.out) };
     let disturbances = if a.quick { 1 } else { DISTURBANCES };
     let mut rows = vec![];
     for seed in a.seed..a.seed + disturbances {
@@ -152,7 +152,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
     write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&result)?.as_bytes())?;
     report(json, &result, || {
         println!("{text}");
-        println!("table.md, reproduce.json, the pictures and the rows are in {}", a.out.display());
+        println!("table.md, reproduce.json, the images and the rows are in {}", a.out.display());
     })?;
     Ok(if view_rows.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
@@ -261,7 +261,7 @@ impl Bench<'_> {
         &self.networks
     }
 
-    /// One picture per part.
+    /// One image per part.
     fn sheets(&self, views: &[ViewRow], lamps: &[ViewRow]) -> Result<()> {
         self.strips.sheet(&self.a.out.join("views.png"), views, &SETS[..5])?;
         self.strips.sheet(&self.a.out.join("geometry.png"), views, &SETS[4..7])?;

@@ -1,4 +1,4 @@
-//! Pictures of the views: a row per object, the photograph and what each way makes of it.
+//! Images of the views: a row per object, the photograph and what each way makes of it.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use super::views::ViewRow;
 /// Height of the headings.
 const HEAD: usize = 40;
 
-/// Strips of crops, kept beside the rows: a row that is not made again still has its pictures.
+/// Strips of crops, kept beside the rows: a row that is not made again still has its images.
 pub(super) struct Strips {
     folder: PathBuf,
 }
@@ -40,7 +40,7 @@ impl Strips {
         Ok(write_rgb(&self.path(&row.key), &strip)?)
     }
 
-    /// One picture of the strips of these rows, with the cells of these sets. Nothing where there is no strip.
+    /// One image of the strips of these rows, with the cells of these sets. Nothing where there is no strip.
     pub fn sheet(&self, file: &Path, rows: &[ViewRow], sets: &[&str]) -> Result<()> {
         let mut strips = vec![];
         for row in rows {

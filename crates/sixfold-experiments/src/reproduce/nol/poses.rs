@@ -10,7 +10,9 @@ use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3, stats};
 use sixfold_mesh::Mesh;
 use sixfold_nol::model::NolModel;
-use sixfold_nol::refine::{PrintedOptions, RefineOptions, SceneSource, printed_poses, refine_scene};
+use sixfold_nol::refine::{
+    PoseRefinementOptions, PosedSource, PublishedRuleOptions, published_rule_poses, refine_scene,
+};
 
 use super::material::{Material, Poses, Source};
 use sixfold_shell::output::pose_rows;
@@ -28,7 +30,7 @@ pub(super) const WAYS: [(&str, &str); 6] = [
 pub(super) const ANNOTATED: &str = "annotated";
 /// The way whose poses the views are rendered from.
 pub(super) const BEST: &str = "both";
-/// Others behind the printed rule's first rendering.
+/// Others behind the published rule first rendering.
 const PER_VIEW: usize = 6;
 
 /// One way with one disturbance.
@@ -54,7 +56,7 @@ pub(super) struct RefinedSource {
     pub dropped: Option<String>,
 }
 
-/// Metres at the middle of the object's box, and radians.
+/// Metres at the centre of the object's box, and radians.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct PoseError {
     pub distance: f64,
@@ -110,27 +112,27 @@ pub(super) fn refine(
             for (object, mesh) in &material.meshes {
                 let of: Vec<PosedImage> =
                     sources.iter().filter(|s| s.object == *object).map(|s| s.photograph.clone()).collect();
-                let options = PrintedOptions::default();
-                let side = RefineOptions::default().side;
-                poses.extend(printed_poses(&of, mesh, model, side, PER_VIEW, &options)?);
+                let options = PublishedRuleOptions::default();
+                let side = PoseRefinementOptions::default().side;
+                poses.extend(published_rule_poses(&of, mesh, model, side, PER_VIEW, &options)?);
             }
             let none = vec![None; poses.len()];
             (poses, none, None)
         }
         _ => {
-            let default = RefineOptions::default();
-            let options = RefineOptions {
+            let default = PoseRefinementOptions::default();
+            let options = PoseRefinementOptions {
                 colors: if way == "outline" { 0.0 } else { default.colors },
                 line: if way == "colours" { 0.0 } else { default.line },
                 ..default
             };
             let ids: Vec<u32> = material.meshes.keys().copied().collect();
             let meshes: Vec<Mesh> = material.meshes.values().cloned().collect();
-            let scene: Vec<SceneSource<'_>> = sources
+            let scene: Vec<PosedSource<'_>> = sources
                 .iter()
                 .filter_map(|s| {
                     let object = ids.iter().position(|id| *id == s.object)?;
-                    Some(SceneSource { object, image: s.frame, photograph: &s.photograph })
+                    Some(PosedSource { object, image: s.frame, photograph: &s.photograph })
                 })
                 .collect();
             let going = |_| !sixfold_shell::progress::interrupted().load(std::sync::atomic::Ordering::SeqCst);
@@ -182,7 +184,7 @@ pub(super) struct Medians {
     pub millimetres_across: f64,
     pub millimetres_along: f64,
     pub degrees: f64,
-    /// Share of the disturbed sources whose box's corners came nearer to their places.
+    /// Fraction of the disturbed sources whose box's corners came nearer to their places.
     pub improved: Option<f64>,
 }
 

@@ -5,7 +5,7 @@ use std::time::Instant;
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 use sixfold_data::PosedImage;
-use sixfold_nol::refine::{RefineOptions, refine_poses};
+use sixfold_nol::refine::{PoseRefinementOptions, refine_poses};
 
 use super::material::{Material, Source};
 use super::views::{Networks, ways};
@@ -49,7 +49,7 @@ pub(super) fn measure(material: &Material, sources: &[Source], networks: &Networ
     let photographs: Vec<PosedImage> =
         sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect();
     let start = Instant::now();
-    refine_poses(&photographs, mesh, &RefineOptions::default(), |_| true)?;
+    refine_poses(&photographs, mesh, &PoseRefinementOptions::default(), |_| true)?;
     let refinement = start.elapsed().as_secs_f64();
     let start = Instant::now();
     let ways = ways("", mesh, &photographs, &networks[..networks.len().min(1)], SIDE, false);

@@ -17,11 +17,11 @@ pub(super) fn markdown(whole: &Whole) -> String {
         whole.disturbances,
         if whole.quick { " **Quick: one disturbance, a quarter of the views.**" } else { "" }
     );
-    out += "\n## Poses\n\nMedians over photographs of objects: how far the middle of the object's box is from its place, across and along the \
-        optical axis; the angle; the share whose box came nearer to its place. The last row says how far annotations and photographs \
+    out += "\n## Poses\n\nMedians over photographs of objects: how far the centre of the object's box is from its place, across and along the \
+        optical axis; the angle; the fraction whose box came nearer to its place. The last row says how far annotations and photographs \
         disagree: no refinement can be nearer to the annotations than the photographs are.\n";
     poses(&mut out, &whole.poses);
-    out += "\n## Poses of drawn frames\n\nThe same frames, poses and disturbances with exact poses: the coloured models drawn over other \
+    out += "\n## Poses of rendered frames\n\nThe same frames, poses and disturbances with exact poses: the coloured models drawn over other \
         frames' photographs, light and colours changed from frame to frame.\n";
     poses(&mut out, &whole.drawn_poses);
     views(&mut out, &whole.views, &whole.targets_of_views);
@@ -88,8 +88,8 @@ fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
          them is shown by all). Compared where the object is visible and every way shows it. Things in front of the object that the ground truth does not name count against all. PSNR in dB; SSIM; perceptual: mean squared \
          difference of the first three EfficientNet-Lite0 features, each of length 1 at every place, without learned weights. \
          *In its light*: after the gain and offset per channel that fit best. *And place*: moved as well, by up to {} pixels along each axis, to where \
-         it fits best, away from the object's border: annotated poses of targets are off by pixels. *Better*: share of the targets on which the perceptual distance \
-         is smaller than averaging's from the same photographs. *Unseen*: share of the object that no photograph behind the view shows. \
+         it fits best, away from the object's border: annotated poses of targets are off by pixels. *Better*: fraction of the targets on which the perceptual distance \
+         is smaller than averaging's from the same photographs. *Unseen*: fraction of the object that no photograph behind the view shows. \
          *Agreeing*: \
          what the other photographs do not agree with is taken out of each before (things in front of the object that no mask knows of). \
          *500 faces* and *vertices 1 mm off*: true poses, the mesh simplified, and with vertices moved by N(0, 1 mm) along each axis.",

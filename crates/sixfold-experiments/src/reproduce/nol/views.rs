@@ -11,15 +11,15 @@ use sixfold_nn::layers::normal;
 use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
-use sixfold_nol::similarity::{Judge, Similarity, in_light_of, in_place_of, without_border};
+use sixfold_nol::similarity::{ImageSimilarity, Similarity, in_light_of, in_place_of, without_border};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
-use sixfold_render::{Frame, Light, Material as Surface, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material as Surface, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::Patch;
 
 /// Photographs behind a view (dissertation: 6).
 pub(super) const PER_VIEW: usize = 6;
 /// Targets with fewer pixels that all ways show are left out.
-const LEAST_PIXELS: usize = 200;
+const MIN_PIXELS: usize = 200;
 /// Views are moved by up to this many pixels of the crop to where they are most like the photograph.
 pub(super) const MOVED: usize = 6;
 /// The model's own colours are no view from photographs.
@@ -48,7 +48,7 @@ pub(super) struct Cell {
     pub lit: Similarity,
     /// After that and a shift, away from the border; `None` where too little is left of the object there.
     pub placed: Option<Similarity>,
-    /// Share of the object's pixels that no source shows.
+    /// Fraction of the object's pixels that no source shows.
     pub unseen: f64,
 }
 
@@ -104,8 +104,12 @@ pub(super) struct Target<'a> {
     pub side: usize,
 }
 
-/// Renders a target in all ways and compares; also the pictures: the photograph, then one per cell.
-pub(super) fn compare(target: &Target<'_>, ways: &[Way<'_>], judge: &Judge) -> Result<(ViewRow, Vec<Patch>)> {
+/// Renders a target in all ways and compares; also the images: the photograph, then one per cell.
+pub(super) fn compare(
+    target: &Target<'_>,
+    ways: &[Way<'_>],
+    judge: &ImageSimilarity,
+) -> Result<(ViewRow, Vec<Patch>)> {
     let side = target.side;
     let real = SourceView::new(target.photograph, target.mesh, side)?;
     let camera = real.camera;
@@ -128,7 +132,7 @@ pub(super) fn compare(target: &Target<'_>, ways: &[Way<'_>], judge: &Judge) -> R
     let mut pictures = vec![real.patch.clone()];
     let truth = judge.truth(&real.patch, &common);
     let middle = without_border(&common, MOVED);
-    let large = middle.as_slice().iter().filter(|m| **m).count() >= LEAST_PIXELS;
+    let large = middle.as_slice().iter().filter(|m| **m).count() >= MIN_PIXELS;
     let truth_in_middle = judge.truth(&real.patch, &middle);
     let mut add = |set: &str, method: &str, patch: &Patch, mask: &Mask, unseen: f64| {
         pictures.push(on_grey(patch, mask));
@@ -150,7 +154,7 @@ pub(super) fn compare(target: &Target<'_>, ways: &[Way<'_>], judge: &Judge) -> R
     if target.mesh.colors().is_some() || target.mesh.texture().is_some() {
         let whole = vec![Light::Ambient { color: [1.0; 3] }];
         for (method, lights) in [("its own colours", whole), ("under a lamp", Light::default_set())] {
-            let mut frame = Frame::new(&camera);
+            let mut frame = VisibilityBuffer::new(&camera);
             let objects = [SceneObject { mesh: target.mesh, camera_from_object: pose }];
             frame.render(&objects, &RenderOptions::default());
             let image = shade(&frame, &objects, &lights, &Surface::default(), None);
@@ -158,9 +162,9 @@ pub(super) fn compare(target: &Target<'_>, ways: &[Way<'_>], judge: &Judge) -> R
         }
     }
     for (way, view) in ways.iter().zip(&views) {
-        add(way.set, &way.method, &view.patch, &view.mask, view.unseen_share());
+        add(way.set, &way.method, &view.patch, &view.mask, view.unseen_fraction());
     }
-    if pixels < LEAST_PIXELS {
+    if pixels < MIN_PIXELS {
         row.cells.clear();
     }
     Ok((row, pictures))
@@ -201,7 +205,7 @@ pub(super) struct ViewsSummary {
     /// Over those targets that are large enough.
     pub placed: Similarity,
     pub unseen: f64,
-    /// Share of the targets on which it is perceptually nearer to the photograph than averaging from the same sources.
+    /// Fraction of the targets on which it is perceptually nearer to the photograph than averaging from the same sources.
     pub better_than_average: Option<f64>,
 }
 

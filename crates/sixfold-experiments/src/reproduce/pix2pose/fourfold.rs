@@ -1,4 +1,4 @@
-//! A made-up object that looks the same from four sides, as a small BOP dataset: what the symmetry pool of the
+//! A synthetic object that looks the same from four sides, as a small BOP dataset: what the symmetry pool of the
 //! transformer loss is for, and real datasets hardly have.
 
 use std::path::Path;
@@ -13,7 +13,7 @@ use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::random::{stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
-use sixfold_render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::Backgrounds;
 
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -44,10 +44,10 @@ pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
     let mut targets = vec![];
     let mut progress = Progress::new("images of the object with four equal sides", IMAGES as usize);
     for im_id in 0..IMAGES {
-        check_interrupt("run the same command again to go on")?;
+        check_interrupt("run the same command again to continue")?;
         let mut random = stream(seed, im_id.into());
         let mut draw = |low: f32, high: f32| f64::from(uniform(&mut random, [low, high]));
-        // From above, at any turn, the object upright in the image give or take 30 degrees.
+        // From above, at any rotation, the object upright in the image give or take 30 degrees.
         let (azimuth, elevation, roll) = (draw(-3.2, 3.2), draw(0.1, 1.3), draw(-0.5, 0.5));
         let (x, y, z) = (draw(-0.08, 0.08), draw(-0.05, 0.05), draw(0.6, 1.0));
         let down = Rotation3::from_axis_angle(&Vec3::x_axis(), std::f64::consts::FRAC_PI_2 + elevation);
@@ -55,7 +55,7 @@ pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
         let upright = Rotation3::from_axis_angle(&Vec3::z_axis(), roll) * down * turn;
         let pose = Pose::new(UnitQuaternion::from_rotation_matrix(&upright), Vec3::new(x, y, z));
         let objects = [SceneObject { mesh: &mesh, camera_from_object: pose }];
-        let mut frame = Frame::new(&camera);
+        let mut frame = VisibilityBuffer::new(&camera);
         frame.render(&objects, &RenderOptions::default());
         let ambient = draw(0.3, 0.7) as f32;
         let lamp = draw(0.2, 0.6) as f32;

@@ -65,7 +65,7 @@ pub(crate) struct ReproducePix2PoseArguments {
     /// Side of these networks' input in pixels
     #[arg(long, value_name = "PIXELS", default_value = "96", requires = "train")]
     pub size: usize,
-    /// Folder of photographs for the backgrounds of these trainings (default: made-up textures)
+    /// Folder of photographs for the backgrounds of these trainings (default: procedural textures)
     #[arg(long, value_name = "DIR", requires = "train")]
     pub backgrounds: Option<PathBuf>,
     /// Seed of the boxes' noise, of RANSAC and of the trainings
@@ -144,7 +144,7 @@ fn regions(
     Ok(all)
 }
 
-/// Every so manieth frame with `--quick`.
+/// Every n-th frame with `--quick`.
 const QUICK: usize = 8;
 
 pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Result<Outcome> {
@@ -171,7 +171,7 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
     let bench = Bench::new(a, dataset, targets, &pix2pose)?;
     let mut rows = vec![];
     for setting in settings(&bench) {
-        check_interrupt("the rows done so far are kept; run the same command again to go on")?;
+        check_interrupt("the rows done so far are kept; run the same command again to continue")?;
         let used = setting.of(&pix2pose, a.seed);
         rows.push(kept_or_made(&a.out, &setting.key, || bench.measure(&used, &setting, &a.out))?);
     }
@@ -226,7 +226,7 @@ fn settings(bench: &Bench) -> Vec<Setting> {
         Setting {
             refine: true,
             looks: 2,
-            ..plain("two-looks", "default, with a second look into the box of the aligned pose")
+            ..plain("two-looks", "default, with a second pass into the box of the aligned pose")
         },
         plain("no-refinement", "two stages, PnP (the dissertation's method)"),
     ];
@@ -292,7 +292,7 @@ fn test_targets(
         eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
         targets.retain(known);
     }
-    // The model's card says what it was trained on: scores on those frames would be worth nothing.
+    // The model's card states what it was trained on: scores on those frames would be worth nothing.
     let card = pix2pose.model().card();
     for t in &targets {
         let frame = FrameId::new(t.scene_id, t.im_id);

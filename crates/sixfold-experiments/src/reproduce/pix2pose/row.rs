@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use sixfold_bop::{Estimate, EvalOptions, Target, evaluate, write_results};
 use sixfold_geometry::{Image, Rect, RgbImage};
 use sixfold_pix2pose::aligned::AlignOptions;
-use sixfold_pix2pose::estimate::EstimateOptions;
+use sixfold_pix2pose::estimate::Pix2PoseOptions;
 
 use super::model::Pix2Pose;
 use super::{Bench, Regions};
@@ -23,16 +23,16 @@ pub(super) struct Setting {
     pub key: String,
     /// What the table says.
     pub title: String,
-    pub options: EstimateOptions,
+    pub options: Pix2PoseOptions,
     /// Whether the outline is aligned at the end.
     pub refine: bool,
     /// With it: how often is looked.
     pub looks: usize,
     /// With it: whether what the model is known to be off by is taken out.
     pub correct: bool,
-    /// With it: whether borders are drawn to edges of the image.
+    /// With it: whether borders are attracted to edges of the image.
     pub edges: bool,
-    /// Ground-truth boxes are moved and scaled by up to this share of their size.
+    /// Ground-truth boxes are moved and scaled by up to this fraction of their size.
     pub noise: Option<f64>,
     /// Half of every box, at one of its sides, is made black, as in the dissertation's figure 3.12.
     pub half_black: bool,
@@ -61,7 +61,7 @@ pub(super) struct Row {
 /// Detections as table 3.9 of the dissertation judges them.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct RightBoxes {
-    /// Share of the targets whose best box overlaps the visible ground truth's by more than half.
+    /// Fraction of the targets whose best box overlaps the visible ground truth's by more than half.
     pub share: f64,
     /// ADD(-S) below a tenth of the diameter over these targets alone.
     pub add_s: Option<f64>,
@@ -102,7 +102,7 @@ impl Setting {
         Setting {
             key: key.to_string(),
             title: title.to_string(),
-            options: EstimateOptions::default(),
+            options: Pix2PoseOptions::default(),
             refine: false,
             looks: AlignOptions::default().looks,
             correct: true,
@@ -116,7 +116,7 @@ impl Setting {
     /// The model used in this way.
     pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
         let mut options = AlignOptions {
-            estimate: EstimateOptions { seed, ..self.options.clone() },
+            estimate: Pix2PoseOptions { seed, ..self.options.clone() },
             looks: self.looks,
             correct: self.correct,
             ..AlignOptions::default()
@@ -141,7 +141,7 @@ impl Bench {
         let mut scenes = BTreeMap::new();
         let mut progress = Progress::new("images", images.len());
         for ((scene_id, im_id), targets) in &images {
-            check_interrupt("the rows done so far are kept; run the same command again to go on")?;
+            check_interrupt("the rows done so far are kept; run the same command again to continue")?;
             if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(*scene_id) {
                 place.insert(self.dataset.scene(*scene_id)?);
             }

@@ -21,7 +21,7 @@ enum Of {
     Symmetric,
     /// The first two without.
     Others,
-    /// A made-up object with four equal sides, from renders.
+    /// A synthetic object with four equal sides, from renders.
     Fourfold,
 }
 
@@ -54,7 +54,7 @@ const TRAININGS: [Training; 9] = [
     }),
 ];
 
-/// Trains, or goes on with the trainings, and measures what they came to.
+/// Trains, or continues with the trainings, and measures what they came to.
 pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<Row>> {
     let infos = bench.dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let symmetric = |id: &u32| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty());
@@ -132,7 +132,7 @@ impl Bench {
 }
 
 impl Training {
-    /// Trains, or goes on, and says where the model is.
+    /// Trains, or continues, and says where the model is.
     fn train(
         &self,
         a: &ReproducePix2PoseArguments,

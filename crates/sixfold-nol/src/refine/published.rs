@@ -10,15 +10,15 @@ use sixfold_align::outline::motion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::Frame;
+use sixfold_render::VisibilityBuffer;
 
 use crate::maps::Maps;
 use crate::projection::TargetSurface;
 use crate::source::SourceView;
 
-/// The numbers of the printed rule.
+/// The numbers of the published rule.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PrintedOptions {
+pub struct PublishedRuleOptions {
     /// First step.
     pub step: f64,
     /// Most steps.
@@ -26,28 +26,28 @@ pub struct PrintedOptions {
     /// Largest move in a step, metres.
     pub longest: f64,
     /// The end, when the error changes by less.
-    pub least_change: f64,
+    pub min_change: f64,
 }
 
-impl Default for PrintedOptions {
+impl Default for PublishedRuleOptions {
     fn default() -> Self {
-        PrintedOptions { step: 1e-4, iterations: 50, longest: 0.005, least_change: 1e-6 }
+        PublishedRuleOptions { step: 1e-4, iterations: 50, longest: 0.005, min_change: 1e-6 }
     }
 }
 
-/// Moves one photograph's pose by the printed rule. `target` is the view of the first rendering, `rendered` its channels at
+/// Moves one photograph's pose by the published rule. `target` is the view of the first rendering, `rendered` its channels at
 /// the target's pixels (`pixels x channels`), `known` which of them are; `maps` are the photograph's same channels.
 /// Returns the pose and the errors before and after.
-pub fn printed_rule(
+pub fn published_rule(
     view: &mut SourceView,
     maps: &Maps,
     mesh: &Mesh,
     target: &TargetSurface,
     rendered: &[f32],
     known: &[bool],
-    options: &PrintedOptions,
+    options: &PublishedRuleOptions,
 ) -> (Pose, [f64; 2]) {
-    let mut frame = Frame::new(&view.camera);
+    let mut frame = VisibilityBuffer::new(&view.camera);
     let mut pose = *view.camera_from_object();
     let (first, mut gradient) = error(view, maps, target, rendered, known);
     let (mut best, mut step) = (first, options.step);
@@ -63,7 +63,7 @@ pub fn printed_rule(
             let change = best - after;
             (pose, best, gradient) = (next, after, next_gradient);
             step *= 0.99;
-            if change < options.least_change {
+            if change < options.min_change {
                 break;
             }
         } else {

@@ -1,12 +1,12 @@
 //! The dissertation's refinement for all photographs of an object: the first rendering of each photograph's own view from
-//! itself and the others, then [`printed_rule`] against it.
+//! itself and the others, then [`published_rule`] against it.
 
 use rayon::prelude::*;
 use sixfold_data::PosedImage;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
-use super::printed::{PrintedOptions, printed_rule};
+use super::published::{PublishedRuleOptions, published_rule};
 use crate::error::NolError;
 use crate::features::SourceFeatures;
 use crate::maps::Maps;
@@ -19,19 +19,19 @@ use crate::surface::outwards;
 /// Points of the surface by which sources are chosen.
 const POINTS: usize = 3000;
 
-/// New poses of photographs of one object by the printed rule, in their order. The first rendering has `per_view` other
+/// New poses of photographs of one object by the published rule, in their order. The first rendering has `per_view` other
 /// photographs beside the one that moves (dissertation: 6), in crops of `side` pixels (a multiple of 16). With a network it has
 /// colours (-1 to 1) and features; without one it is the mean colour of the photographs.
 ///
 /// # Errors
 /// [`NolError`] for a photograph that cannot be cut out.
-pub fn printed_poses(
+pub fn published_rule_poses(
     photographs: &[PosedImage],
     mesh: &Mesh,
     model: Option<&NolModel>,
     side: usize,
     per_view: usize,
-    options: &PrintedOptions,
+    options: &PublishedRuleOptions,
 ) -> Result<Vec<Pose>, NolError> {
     let views: Vec<SourceView> =
         photographs.iter().map(|p| SourceView::new(p, mesh, side)).collect::<Result<_, _>>()?;
@@ -61,7 +61,7 @@ pub fn printed_poses(
                 None => average(&target, &chosen, &views, &maps),
             };
             let mut view = views[k].clone();
-            printed_rule(&mut view, &maps[k], mesh, &target, &rendered, &known, options).0
+            published_rule(&mut view, &maps[k], mesh, &target, &rendered, &known, options).0
         })
         .collect())
 }
