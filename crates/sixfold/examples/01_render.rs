@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use sixfold::io::{write_depth, write_rgb};
 use sixfold::prelude::*;
-use sixfold::render::{Frame, Light, Material, RenderOptions, SceneObject, shade};
+use sixfold::render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold::synth::primitives::mug;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     // One pass over the triangles; depth, masks, normals and colours are read from the frame.
     let objects = [SceneObject { mesh: &mesh, camera_from_object }];
-    let mut frame = Frame::new(&camera);
+    let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
     let colour = shade(&frame, &objects, &Light::default_set(), &Material::default(), None);
     println!("{} pixels show the mug", frame.mask(0).as_slice().iter().filter(|inside| **inside).count());

@@ -231,8 +231,8 @@ impl Tiny {
         Tiny::with(with_depth, false)
     }
 
-    #[cfg(feature = "networks")]
     /// With colour images and depth.
+    #[allow(dead_code)]
     pub fn coloured() -> Tiny {
         Tiny::with(true, true)
     }

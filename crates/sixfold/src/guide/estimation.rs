@@ -40,7 +40,7 @@
 //! use sixfold::geometry::Rect;
 //! use sixfold::mesh::ModelInfo;
 //! use sixfold::prelude::*;
-//! use sixfold::render::{Frame, RenderOptions, SceneObject};
+//! use sixfold::render::{VisibilityBuffer, RenderOptions, SceneObject};
 //! use sixfold::runner::{ImageRun, pose_table};
 //! use sixfold::synth::primitives::mug;
 //!
@@ -48,7 +48,7 @@
 //! let mesh = mug(0.035, 0.08, 0.004, 0.025)?;
 //! let at = |x: f64| Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(x, 0.0, 0.5));
 //! let two = [-0.06, 0.06].map(|x| SceneObject { mesh: &mesh, camera_from_object: at(x) });
-//! let mut frame = Frame::new(&camera);
+//! let mut frame = VisibilityBuffer::new(&camera);
 //! frame.render(&two, &RenderOptions::default());
 //!
 //! // There is no table in this image: its largest plane is kept.

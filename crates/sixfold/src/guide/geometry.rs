@@ -21,11 +21,11 @@
 //!
 //! # Render several objects: masks, normals, object coordinates
 //!
-//! One pass fills a [`Frame`](crate::render::Frame); everything else is read from it.
+//! One pass fills a [`VisibilityBuffer`](crate::render::VisibilityBuffer); everything else is read from it.
 //!
 //! ```
 //! use sixfold::prelude::*;
-//! use sixfold::render::{Frame, RenderOptions, SceneObject};
+//! use sixfold::render::{VisibilityBuffer, RenderOptions, SceneObject};
 //! use sixfold::synth::primitives::{cuboid, cylinder};
 //!
 //! let camera = Camera::new(300.0, 300.0, 79.5, 59.5, 160, 120)?;
@@ -35,7 +35,7 @@
 //!     SceneObject { mesh: &can, camera_from_object: at(0.5) },
 //!     SceneObject { mesh: &bar, camera_from_object: at(0.4) },
 //! ];
-//! let mut frame = Frame::new(&camera);
+//! let mut frame = VisibilityBuffer::new(&camera);
 //! frame.render(&objects, &RenderOptions::default());
 //! let (can_mask, bar_mask) = (frame.mask(0), frame.mask(1));
 //! assert!(bar_mask[(80, 60)] && !can_mask[(80, 60)]); // the bar is in front
