@@ -176,7 +176,7 @@ impl Run {
 fn run_error(error: RunError) -> PyErr {
     let text = describe(&error);
     match error {
-        RunError::Dataset(error) => dataset_error(error),
+        RunError::Dataset(error) => dataset_error(*error),
         RunError::Results(error) => results_error(error),
         RunError::Io { source, .. } => os_error(source.kind(), text),
         RunError::Cache(error) => file_or_value(&error),
@@ -190,10 +190,13 @@ fn run_error(error: RunError) -> PyErr {
             "a new file, or one that this call started",
             format!("{} without {}", results.display(), record.display()),
         ),
-        RunError::OtherOptions { results, record, option, before, now } => PyValueError::new_err(format!(
-            "out: {} was made with other options ({option}: {before:?}, now {now:?}); remove it and {}, or choose another",
-            results.display(),
-            record.display()
+        RunError::OtherOptions(other) => PyValueError::new_err(format!(
+            "out: {} was made with other options ({}: {:?}, now {:?}); remove it and {}, or choose another",
+            other.results.display(),
+            other.option,
+            other.before,
+            other.now,
+            other.record.display()
         )),
         RunError::Interrupted => PyRuntimeError::new_err("the run was interrupted; call it again to resume"),
         _ => PyValueError::new_err(text),

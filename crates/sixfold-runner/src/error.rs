@@ -13,7 +13,7 @@ use thiserror::Error;
 pub enum RunError {
     /// The dataset cannot be read.
     #[error(transparent)]
-    Dataset(#[from] DatasetError),
+    Dataset(Box<DatasetError>),
     /// The result file cannot be read or written.
     #[error(transparent)]
     Results(#[from] ResultsError),
@@ -63,22 +63,8 @@ pub enum RunError {
         record: PathBuf,
     },
     /// The result file was made with other options.
-    #[error(
-        "{} was made with other options ({option}: {before}, now {now}; see {}): remove both or choose another --out",
-        results.display(), record.display()
-    )]
-    OtherOptions {
-        /// The result file.
-        results: PathBuf,
-        /// The record beside it.
-        record: PathBuf,
-        /// The option that differs.
-        option: String,
-        /// What it was.
-        before: String,
-        /// What it is.
-        now: String,
-    },
+    #[error(transparent)]
+    OtherOptions(Box<OtherOptions>),
     /// A file cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
@@ -93,6 +79,31 @@ pub enum RunError {
     /// The caller's own work on a result failed.
     #[error(transparent)]
     Caller(Box<dyn std::error::Error + Send + Sync>),
+}
+
+impl From<DatasetError> for RunError {
+    fn from(error: DatasetError) -> RunError {
+        RunError::Dataset(Box::new(error))
+    }
+}
+
+/// A result file that was made with other options.
+#[derive(Debug, Error)]
+#[error(
+    "{} was made with other options ({option}: {before}, now {now}; see {}): remove both or choose another --out",
+    results.display(), record.display()
+)]
+pub struct OtherOptions {
+    /// The result file.
+    pub results: PathBuf,
+    /// The record beside it.
+    pub record: PathBuf,
+    /// The option that differs.
+    pub option: String,
+    /// What it was.
+    pub before: String,
+    /// What it is.
+    pub now: String,
 }
 
 /// The whole chain of causes in one line, without repeating a cause that its parent already prints.

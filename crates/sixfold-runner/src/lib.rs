@@ -9,7 +9,7 @@ mod regions;
 mod table;
 
 pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject};
-pub use error::{RunError, describe};
+pub use error::{OtherOptions, RunError, describe};
 pub use image::{FoundObject, FoundPose, ImageReport, ImageRun};
 pub use record::RunOptions;
 pub use regions::RegionSource;

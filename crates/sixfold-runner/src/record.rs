@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sixfold_io::{fnv1a, write_atomically};
 
-use crate::error::RunError;
+use crate::error::{OtherOptions, RunError};
 
 /// The options that decide about a run's results, by name. An option that names a file counts by the file's contents too.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -72,13 +72,9 @@ impl RunRecord {
         let differs = pairs.into_iter().find(|(_, a, b)| a != b);
         let differs = differs.map(|(name, a, b)| (name.to_owned(), a.clone(), b.clone()));
         if let Some((option, before, now)) = differs.or_else(|| options.difference(&before.options)) {
-            return Err(RunError::OtherOptions {
-                results: results.into(),
-                record: path,
-                option,
-                before,
-                now,
-            });
+            let results = results.into();
+            let other = OtherOptions { results, record: path, option, before, now };
+            return Err(RunError::OtherOptions(Box::new(other)));
         }
         Ok(RunRecord { path, record: Record { done: before.done, ..record } })
     }
