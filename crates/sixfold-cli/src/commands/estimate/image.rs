@@ -32,8 +32,10 @@ impl Input {
     fn read(a: &CommonArguments, estimator: &dyn PoseEstimator) -> Result<Input> {
         let (needs, method) = (estimator.needs(), estimator.name());
         if needs.depth == Need::Required && a.depth.is_none() {
+            // A method on colour needs depth for that alone.
+            let with = if needs.rgb == Need::Required { " with --icp" } else { "" };
             bail!(
-                "--method {method} works on depth: give --depth FILE (with --camera and --object) or --dataset DIR"
+                "--method {method}{with} works on depth: give --depth FILE (with --camera and --object) or --dataset DIR"
             );
         }
         if needs.rgb == Need::Required && a.rgb.is_none() {
