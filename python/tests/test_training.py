@@ -37,7 +37,8 @@ def test_pix2pose_learns_and_goes_on(demo, tmp_path):
     assert (tmp_path / "whole/training/curves.png").exists() and (tmp_path / "whole/model.md").exists()
     model = sixfold.Pix2Pose.load(trained["model"])
     assert [o["id"] for o in model.objects] == [8]
-    assert "2/3" in model.card["data"] and model.card["command"] == "sixfold.train_pix2pose"
+    assert model.card["training_frames"] == [{"scene_id": 2, "im_id": 3}]
+    assert model.card["command"] == "sixfold.train_pix2pose"
     # Nothing is left to do: the same bytes again. Other options are another training.
     before = trained["model"].read_bytes()
     trained["model"].unlink()
