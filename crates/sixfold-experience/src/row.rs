@@ -107,7 +107,7 @@ impl Raw {
             .ok_or_else(|| wrong("region", "one bit a pixel", self.region.len().to_string()))?;
         let gripper = parse_gripper(&self.gripper, "gripper")
             .map_err(|e| wrong("gripper", "a gripper", e.to_string()))?;
-        Ok(Experience {
+        let experience = Experience {
             crop,
             camera_from_gripper: pose,
             opening: self.opening,
@@ -120,6 +120,14 @@ impl Raw {
             part: self.part,
             time: self.time,
             provenance: self.provenance,
-        })
+        };
+        // What holds for one that is stored has to hold for one that is read: a file may have been changed by others.
+        experience.check().map_err(|error| match error {
+            StoreError::Field { field, expected, found, .. } => {
+                StoreError::Field { id, field, expected, found }
+            }
+            other => other,
+        })?;
+        Ok(experience)
     }
 }
