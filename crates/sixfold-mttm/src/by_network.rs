@@ -30,7 +30,7 @@ const LOOKED_AT: (usize, usize) = (64, 400);
 const HYPOTHESES: usize = 2;
 /// Pairs that go through the network at a time; of no influence on the result.
 const AT_A_TIME: usize = 32;
-/// The least trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
+/// The minimum trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
 /// hand; not swept.
 const MIN_TRUST: f64 = 0.1;
 

@@ -25,7 +25,7 @@ const MESH_FILE: &str = "verification-mesh.bin";
 pub struct MttmEstimator {
     /// How depth images are prepared.
     pub depth: DepthOptions,
-    /// How objects are searched; instances and the least confidence are the query's.
+    /// How objects are searched; instances and the minimum confidence are the query's.
     pub options: MttmOptions,
     /// Which templates are rendered from a mesh, where its folder holds none yet.
     pub templates: TemplateOptions,

@@ -15,7 +15,7 @@ const FEWEST_PIXELS: usize = 200;
 const FAR_OFF: f64 = 5.0;
 /// See [`FAR_OFF`].
 const WITHIN: f64 = 0.8;
-/// The least of that deviation, metres, for flat things that face the camera; chosen by hand, not swept.
+/// Lower bound of that deviation, metres, for flat things that face the camera; chosen by hand, not swept.
 const MIN_DEVIATION: f64 = 0.01;
 /// Directions in which an extent is measured: about 15 degrees apart over all of the sphere.
 const DIRECTIONS: usize = 120;

@@ -62,7 +62,7 @@ const DEPTH_ALONE: f32 = 0.2;
 const HIDDEN_WEIGHT: f32 = 0.15;
 /// Tolerance of depth in the first screening, in sampling steps: poses of votes are off by about so much. Chosen by hand; not swept.
 const COARSE_TOLERANCE: f64 = 1.5;
-/// The least of it, metres; chosen by hand, not swept.
+/// Lower bound, metres; chosen by hand, not swept.
 const MIN_COARSE_TOLERANCE: f64 = 0.006;
 /// Cosine above which normals agree in the first screening, about 45 degrees; chosen by hand, not swept.
 const COARSE_COSINE: f32 = 0.7;

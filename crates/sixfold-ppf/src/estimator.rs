@@ -24,7 +24,7 @@ pub struct PpfEstimator {
     pub depth: DepthOptions,
     /// How objects are described.
     pub model: ModelOptions,
-    /// How poses are estimated; instances and the least confidence are the query's.
+    /// How poses are estimated; instances and the minimum confidence are the query's.
     pub options: PpfOptions,
 }
 

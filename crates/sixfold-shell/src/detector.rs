@@ -44,7 +44,7 @@ impl Detector {
     /// Detections of an image as COCO has them.
     ///
     /// # Errors
-    /// When the image cannot be looked at.
+    /// When the image cannot be searched.
     pub fn detections(&self, image: &RgbImage, scene_id: u32, image_id: u32) -> Result<Vec<Detection>> {
         let start = Instant::now();
         let found = self.model.detect(image, &self.options)?;
