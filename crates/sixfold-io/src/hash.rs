@@ -1,6 +1,10 @@
 //! FNV-1a with 64 bits (Fowler, Noll, Vo): tells files and settings apart, the same on every machine. No protection against
 //! anybody who wants two to be equal.
 
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+
 /// A hash that grows with the bytes it is given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fnv1a(u64);
@@ -32,6 +36,21 @@ pub fn fnv1a(bytes: &[u8]) -> u64 {
     hash.value()
 }
 
+/// The hash of a file's bytes, read piece by piece.
+///
+/// # Errors
+/// What the system says.
+pub fn fnv1a_of_file(path: &Path) -> io::Result<u64> {
+    let mut file = File::open(path)?;
+    let (mut hash, mut buffer) = (Fnv1a::default(), vec![0; 1 << 16]);
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(hash.value()),
+            count => hash.write(&buffer[..count]),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -40,5 +59,8 @@ mod tests {
     fn the_hash_is_fnv_1a() {
         assert_eq!(fnv1a(b""), 0xcbf2_9ce4_8422_2325);
         assert_eq!(fnv1a(b"foobar"), 0x8594_4171_f739_67e8);
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("f"), b"foobar").unwrap();
+        assert_eq!(fnv1a_of_file(&folder.path().join("f")).unwrap(), 0x8594_4171_f739_67e8);
     }
 }

@@ -8,10 +8,12 @@ mod files;
 mod hash;
 mod image_files;
 mod images;
+mod lock;
 
 pub use camera_file::{CameraFile, CameraFileError};
 pub use error::ImageFileError;
 pub use files::{write_atomically, write_atomically_with};
-pub use hash::{Fnv1a, fnv1a};
+pub use hash::{Fnv1a, fnv1a, fnv1a_of_file};
 pub use image_files::ImageFile;
 pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
+pub use lock::{LockError, WriteLock};

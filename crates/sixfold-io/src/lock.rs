@@ -1,0 +1,153 @@
+//! One writer at a time: an advisory lock on a file or folder that several runs of a program could write at once.
+
+use std::fs::{File, TryLockError};
+use std::io::{self, Read, Seek, Write};
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+/// Why something is not locked.
+#[derive(Debug, Error)]
+pub enum LockError {
+    /// Another process writes there.
+    #[error(
+        "{}: another process{} is writing it; wait until that one is done, or choose another place for this one's output",
+        path.display(), holder.map(|id| format!(" ({id})")).unwrap_or_default()
+    )]
+    Taken {
+        /// What was to be locked.
+        path: PathBuf,
+        /// The other process, where it could be read.
+        holder: Option<u32>,
+    },
+    /// The system could not make or lock the lock file.
+    #[error("{}: cannot be locked: {source}", path.display())]
+    Io {
+        /// The lock file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// A lock that is held until it is dropped. It is a file beside what it locks, `.NAME.lock`, which goes away with the lock; one
+/// that a killed process left locks nothing.
+#[derive(Debug)]
+pub struct WriteLock {
+    path: PathBuf,
+    /// Holds the system's lock, which ends with the process in any case.
+    _file: File,
+}
+
+impl WriteLock {
+    /// Locks `path`, a file or a folder that need not exist yet. Folders on the way are made.
+    ///
+    /// # Errors
+    /// [`LockError::Taken`] at once when another process, or another lock of this one, holds it.
+    pub fn take(path: &Path) -> Result<WriteLock, LockError> {
+        let lock = lock_file(path).map_err(|source| LockError::Io { path: path.into(), source })?;
+        let io = |source| LockError::Io { path: lock.clone(), source };
+        if let Some(parent) = lock.parent().filter(|p| !p.as_os_str().is_empty()) {
+            std::fs::create_dir_all(parent).map_err(io)?;
+        }
+        loop {
+            let mut file =
+                File::options().read(true).write(true).create(true).truncate(false).open(&lock).map_err(io)?;
+            match file.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) => {
+                    let mut text = String::new();
+                    let holder = file.read_to_string(&mut text).ok().and_then(|_| text.trim().parse().ok());
+                    return Err(LockError::Taken { path: path.into(), holder });
+                }
+                Err(TryLockError::Error(source)) => return Err(io(source)),
+            }
+            // Whoever held it may have removed it between opening and locking: then this is a lock on nothing.
+            if !still_there(&file, &lock) {
+                continue;
+            }
+            let id = format!("{}\n", std::process::id());
+            file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes())).map_err(io)?;
+            return Ok(WriteLock { path: lock, _file: file });
+        }
+    }
+}
+
+impl Drop for WriteLock {
+    fn drop(&mut self) {
+        // Removed while it is still locked; where the system does not allow that, an empty lock file stays.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+fn lock_file(path: &Path) -> io::Result<PathBuf> {
+    let name = match path.file_name() {
+        Some(name) => name.to_os_string(),
+        // `.` and `..` have no name of their own.
+        None => path.canonicalize()?.file_name().map(ToOwned::to_owned).unwrap_or_default(),
+    };
+    let place = if path.file_name().is_some() { path.to_path_buf() } else { path.canonicalize()? };
+    Ok(place.with_file_name(format!(".{}.lock", name.to_string_lossy())))
+}
+
+#[cfg(unix)]
+fn still_there(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    match (file.metadata(), std::fs::metadata(path)) {
+        (Ok(mine), Ok(there)) => mine.ino() == there.ino() && mine.dev() == there.dev(),
+        _ => false,
+    }
+}
+
+#[cfg(not(unix))]
+fn still_there(_: &File, path: &Path) -> bool {
+    path.exists()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_second_writer_is_refused_until_the_first_is_done() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("deep/results.csv");
+        let first = WriteLock::take(&path).unwrap();
+        let error = WriteLock::take(&path).unwrap_err().to_string();
+        let id = std::process::id().to_string();
+        assert!(error.contains("results.csv") && error.contains(&id), "{error}");
+        drop(first);
+        assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 0);
+        drop(WriteLock::take(&path).unwrap());
+    }
+
+    #[test]
+    fn a_lock_file_without_its_process_locks_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(".out.lock"), "123").unwrap();
+        drop(WriteLock::take(&folder.path().join("out")).unwrap());
+        assert!(!folder.path().join(".out.lock").exists());
+    }
+
+    #[test]
+    fn many_threads_take_it_one_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out");
+        let inside = std::sync::atomic::AtomicUsize::new(0);
+        let taken = std::sync::atomic::AtomicUsize::new(0);
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    for _ in 0..200 {
+                        let Ok(lock) = WriteLock::take(&path) else { continue };
+                        assert_eq!(inside.fetch_add(1, std::sync::atomic::Ordering::SeqCst), 0);
+                        taken.fetch_add(1, std::sync::atomic::Ordering::SeqCst);
+                        inside.fetch_sub(1, std::sync::atomic::Ordering::SeqCst);
+                        drop(lock);
+                    }
+                });
+            }
+        });
+        assert!(taken.into_inner() > 0);
+    }
+}
