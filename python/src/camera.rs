@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::{PyTuple, PyType};
-use sixfold_geometry::{BrownConrady, Camera, Vec2};
-use sixfold_io::CameraFile;
+use sixfold::geometry::{BrownConrady, Camera, Vec2};
+use sixfold::io::CameraFile;
 
 use crate::arrays::{self, about, bad, whole};
 use crate::guard::{camera_file_error, free};
@@ -291,7 +291,7 @@ pub(crate) fn undistort_rgb<'py>(
     camera: PyCamera,
 ) -> PyResult<Bound<'py, PyArray3<u8>>> {
     let image = arrays::rgb("rgb", rgb)?;
-    let out = free(py, || sixfold_geometry::undistort_rgb(&image, &camera.0))?.map_err(about("rgb"))?;
+    let out = free(py, || sixfold::geometry::undistort_rgb(&image, &camera.0))?.map_err(about("rgb"))?;
     arrays::from_image_of(py, out)
 }
 
@@ -311,7 +311,7 @@ pub(crate) fn undistort_depth<'py>(
     camera: PyCamera,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let image = arrays::depth("depth", depth)?;
-    let out = free(py, || sixfold_geometry::undistort_depth(&image, &camera.0))?.map_err(about("depth"))?;
+    let out = free(py, || sixfold::geometry::undistort_depth(&image, &camera.0))?.map_err(about("depth"))?;
     arrays::from_image(py, out)
 }
 
@@ -328,7 +328,7 @@ pub(crate) fn pose_exp<'py>(
     let v = arrays::numbers("twist", twist)?;
     let v: [f64; 6] =
         v.try_into().map_err(|v: Vec<f64>| bad("twist", "6 numbers (v, w)", format!("{}", v.len())))?;
-    arrays::from_pose(py, &sixfold_geometry::Pose::exp(&v.into()))
+    arrays::from_pose(py, &sixfold::geometry::Pose::exp(&v.into()))
 }
 
 /// A pose (4, 4) to the six numbers (v, w) of pose_exp; for rotation angles below pi.

@@ -6,12 +6,12 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::Memory;
-use sixfold_experience::{
+use sixfold::dgcm::model::DgcmModel;
+use sixfold::dgcm::transfer::Memory;
+use sixfold::experience::{
     Description, Experience, ExperienceStore as _, FEATURE, Match, SqliteStore, StoreError, Summary,
 };
-use sixfold_grasp::{AntipodalQuality, Grasp};
+use sixfold::grasp::{AntipodalQuality, Grasp};
 
 use crate::arrays::{self, about, bad, whole};
 use crate::bop::json_to_python;
@@ -272,7 +272,7 @@ impl ExperienceStore {
                 };
                 let picture = stored.experience.picture().map_err(about("folder"))?;
                 let file = folder.join(format!("{id:06}.png"));
-                sixfold_io::write_rgb(&file, &picture).map_err(image_error)?;
+                sixfold::io::write_rgb(&file, &picture).map_err(image_error)?;
                 let file = file.with_extension("json");
                 let text = serde_json::to_string_pretty(&Description::new(&stored, true))
                     .map_err(about("folder"))?;
