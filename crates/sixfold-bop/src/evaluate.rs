@@ -233,7 +233,7 @@ struct Prepared<'a> {
     images: Vec<ImageTasks<'a>>,
 }
 
-/// Which ground truth counts and how many estimates are looked at.
+/// Which ground truth counts and how many estimates are scored.
 enum Mode {
     Localisation { visib_gt_min: Option<f64> },
     Detection,

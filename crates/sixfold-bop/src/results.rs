@@ -239,7 +239,7 @@ pub struct ResultsAppender {
 
 impl ResultsAppender {
     /// Opens or creates the file and reads what is there. A last line without line break is taken for torn and cut
-    /// off the file: what it said can be computed again, half a number cannot be told from a whole one.
+    /// off the file: what it said can be computed again, half a number cannot be distinguished from a whole one.
     ///
     /// # Errors
     /// [`ResultsError`]; a bad row that is not the torn last one is an error, as in [`read_results`].
