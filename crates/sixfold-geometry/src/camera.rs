@@ -220,7 +220,10 @@ impl Camera {
                 advice: "pixels are square or nearly so: is a digit lost? Scale a stretched image back first",
             });
         }
-        let axes = [("fields fx, cx", self.fx, self.cx, self.width), ("fields fy, cy", self.fy, self.cy, self.height)];
+        let axes = [
+            ("fields fx, cx", self.fx, self.cx, self.width),
+            ("fields fy, cy", self.fy, self.cy, self.height),
+        ];
         for (fields, focal, centre, side) in axes {
             let last = side as f64 - 1.0;
             let off_axis = centre.abs().max((last - centre).abs());
@@ -300,7 +303,12 @@ impl Camera {
                     fields: "field distortion",
                     found: format!(
                         "k1 {}, k2 {}, p1 {}, p2 {}, k3 {}, which move pixel ({x:.0}, {y:.0}) by a factor of {:.3}",
-                        d.k1, d.k2, d.p1, d.p2, d.k3, along / (before * before)
+                        d.k1,
+                        d.k2,
+                        d.p1,
+                        d.p2,
+                        d.k3,
+                        along / (before * before)
                     ),
                     expected: "a factor between 0.2 and 5 at the edges of the image",
                     advice: "the coefficients are OpenCV's, in its order k1, k2, p1, p2, k3",
@@ -492,7 +500,9 @@ mod tests {
             Camera::new(f, f, (w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0, w, h).unwrap()
         };
         // 165 degrees wide; a lens of 600 mm before a sensor of 36 mm; 1024 pixels at 1.2 degrees; a bin-picking camera.
-        for camera in [of(42.2, 640, 480), of(100_000.0, 6000, 4000), of(48_900.0, 1024, 768), of(2992.6, 1280, 960)] {
+        for camera in
+            [of(42.2, 640, 480), of(100_000.0, 6000, 4000), of(48_900.0, 1024, 768), of(2992.6, 1280, 960)]
+        {
             assert_eq!(camera.check_whole_image(), Ok(()));
         }
         let action = BrownConrady { k1: -0.25, k2: 0.07, p1: 2e-4, p2: -1e-4, k3: -0.008 };

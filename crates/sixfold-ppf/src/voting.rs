@@ -114,7 +114,8 @@ impl Grid {
         if !(cell > 0.0) {
             return None;
         }
-        let cells = |cell: f32| (0..3).map(|k| f64::from((high[k] - low[k]) / cell).floor() + 1.0).product::<f64>();
+        let cells =
+            |cell: f32| (0..3).map(|k| f64::from((high[k] - low[k]) / cell).floor() + 1.0).product::<f64>();
         while cells(cell) > MAX_CELLS {
             cell *= 2.0;
         }
@@ -368,8 +369,13 @@ mod tests {
         let mut points: Vec<Vec3> =
             (0..300).map(|_| Vec3::from_fn(|_, _| random.random_range(0.0..0.5))).collect();
         let near = points.len();
-        points.extend([Vec3::new(12_000.0, 9000.0, 5.0), Vec3::new(-1e9, 0.0, 1.0), Vec3::new(0.0, 1e12, 1.0)]);
-        let cloud = |points: &[Vec3]| PointCloud { points: points.to_vec(), normals: vec![Vec3::z(); points.len()] };
+        points.extend([
+            Vec3::new(12_000.0, 9000.0, 5.0),
+            Vec3::new(-1e9, 0.0, 1.0),
+            Vec3::new(0.0, 1e12, 1.0),
+        ]);
+        let cloud =
+            |points: &[Vec3]| PointCloud { points: points.to_vec(), normals: vec![Vec3::z(); points.len()] };
         let small = Grid::new(&cloud(&points[..near]), 0.1).unwrap();
         assert_eq!((small.cell, small.size), (0.1, [5, 5, 5]));
         for far in near + 1..=points.len() {

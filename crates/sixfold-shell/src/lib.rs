@@ -68,6 +68,21 @@ pub fn end_with_the_reader() {
     }));
 }
 
+/// The largest image that either program reads.
+#[derive(Debug, clap::Args)]
+pub struct PixelLimit {
+    /// Read images of at most this many pixels
+    #[arg(long, global = true, value_name = "N", default_value = "100000000")]
+    pub max_pixels: std::num::NonZeroU64,
+}
+
+impl PixelLimit {
+    /// Sets it for this process.
+    pub fn set(&self) {
+        sixfold_io::set_max_pixels(self.max_pixels.get());
+    }
+}
+
 /// Uses so many threads for everything, or all cores.
 pub fn use_threads(threads: Option<NonZeroUsize>) {
     if let Some(threads) = threads {
