@@ -53,6 +53,11 @@ fn png(image: DynamicImage) -> Option<Vec<u8>> {
     Some(bytes.into_inner())
 }
 
+/// An image of a column, of the crop's size: nothing larger is decoded.
+fn stored<'a>(bytes: &'a [u8], field: &'static str, side: usize) -> ImageFile<'a> {
+    ImageFile::of_bytes(Path::new(field), bytes).with_limit((side * side) as u64)
+}
+
 /// The crop of stored images. Points follow from depth and camera; so does the extent, but it is stored, as it is what the
 /// VD-NOC was made with.
 pub(super) fn crop(
@@ -62,18 +67,15 @@ pub(super) fn crop(
     table: Option<Plane>,
 ) -> Result<Crop, (&'static str, String)> {
     let side = camera.width;
-    let read = |bytes, field: &'static str| {
-        ImageFile::of_bytes(Path::new(field), bytes).with_limit((side * side) as u64)
-    };
     let wrong = |field, error: ImageFileError| (field, error.to_string());
     let sized = |field, size: (usize, usize)| match size {
         (width, height) if (width, height) == (side, side) => Ok(()),
         (width, height) => Err((field, format!("{width}x{height} pixels, not {side}x{side}"))),
     };
-    let depth = read(&images.depth, "depth").units().map_err(|e| wrong("depth", e))?;
+    let depth = stored(&images.depth, "depth", side).units().map_err(|e| wrong("depth", e))?;
     sized("depth", depth.size())?;
     let color = |bytes: &[u8], field| -> Result<Vec<[f32; 3]>, (&'static str, String)> {
-        let image = read(bytes, field).rgb().map_err(|e| wrong(field, e))?;
+        let image = stored(bytes, field, side).rgb().map_err(|e| wrong(field, e))?;
         sized(field, image.size())?;
         Ok(image.as_slice().iter().map(|p| p.map(|v| (f32::from(v) - 127.5) / 127.5)).collect())
     };

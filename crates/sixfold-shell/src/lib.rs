@@ -71,15 +71,17 @@ pub fn end_with_the_reader() {
 /// The largest image that either program reads.
 #[derive(Debug, clap::Args)]
 pub struct PixelLimit {
-    /// Read images of at most this many pixels
-    #[arg(long, global = true, value_name = "N", default_value = "100000000")]
-    pub max_pixels: std::num::NonZeroU64,
+    /// Read images of at most this many pixels (default: 100000000)
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pixels: Option<std::num::NonZeroU64>,
 }
 
 impl PixelLimit {
     /// Sets it for this process.
     pub fn set(&self) {
-        sixfold_io::set_max_pixels(self.max_pixels.get());
+        if let Some(pixels) = self.max_pixels {
+            sixfold_io::set_max_pixels(pixels.get());
+        }
     }
 }
 
