@@ -103,8 +103,8 @@ impl PyCamera {
 
     /// Reads a camera file: fx, fy, cx, cy or a matrix, and perhaps width, height, distortion and depth_scale, as BOP, OpenCV
     /// (YAML, XML, JSON) and ROS (CameraInfo, calibration files) write them, or a scene_camera.json of one image. `width` and
-    /// `height` are those of the image, pixels; they may be left out when the file says them. Returns the camera and the file's depth_scale, millimetres per unit of the
-    /// depth image, None without one.
+    /// `height` are those of the image, pixels; they may be left out when the file says them. Returns the camera and the file's
+    /// depth_scale, millimetres per unit of the depth image, None without one.
     ///
     /// Raises OSError when the file cannot be read; ValueError, with the file and field, when it is broken, states another
     /// size or a key that is unknown, has a fisheye lens, or is no camera of a whole image of that size: a wrong unit, another
