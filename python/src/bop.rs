@@ -337,6 +337,17 @@ impl PyDataset {
     }
 }
 
+/// Sets the largest image that is read from a file, in pixels, for everything in this process: 100 million unless it is set.
+///
+/// Raises ValueError for a limit below 1.
+///
+/// >>> set_max_pixels(100_000_000)
+#[pyfunction]
+fn set_max_pixels(pixels: i64) -> PyResult<()> {
+    sixfold_io::set_max_pixels(whole("pixels", pixels, 1)? as u64);
+    Ok(())
+}
+
 /// Reads a colour image (grey ones as colour): (H, W, 3) uint8. Raises OSError or ValueError.
 ///
 /// >>> rgb = read_rgb("data/demo/test/000002/rgb/000003.png")  # doctest: +SKIP
@@ -358,9 +369,10 @@ fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound
     arrays::from_image(py, image)
 }
 
-/// Reads a mask: (H, W) bool, True where the file is above zero.
+/// Reads a mask: (H, W) bool, True where the file is not zero. Grey, a palette, or RGB with one colour besides black; alpha that
+/// is not full everywhere is the mask.
 ///
-/// Raises OSError when the file cannot be read, ValueError when it is no such image.
+/// Raises OSError when the file cannot be read, ValueError when it is no such image, or when it could mean two things.
 ///
 /// >>> mask = read_mask("mask.png")  # doctest: +SKIP
 #[pyfunction]
@@ -495,6 +507,7 @@ pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(write_results, module)?)?;
     module.add_function(wrap_pyfunction!(pose_from_mm, module)?)?;
     module.add_function(wrap_pyfunction!(pose_to_mm, module)?)?;
+    module.add_function(wrap_pyfunction!(set_max_pixels, module)?)?;
     module.add_function(wrap_pyfunction!(read_rgb, module)?)?;
     module.add_function(wrap_pyfunction!(read_depth, module)?)?;
     module.add_function(wrap_pyfunction!(read_mask, module)?)?;

@@ -7,7 +7,7 @@ use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
-use sixfold_io::{ImageFile, ImageFileError};
+use sixfold_io::{ImageFile, ImageFileError, check_pixels, max_pixels};
 use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh};
 
 use crate::dataset_error::DatasetError;
@@ -228,7 +228,12 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     let json = parse(&text, path)?;
     let at = At::file(path);
     let map = at.object(&json)?;
-    let (Some(width), Some(height)) = (map.get("width"), map.get("height")) else { return Ok(None) };
+    let (width, height) = match (map.get("width"), map.get("height")) {
+        (Some(width), Some(height)) => (width, height),
+        (None, None) => return Ok(None),
+        (None, Some(_)) => return Err(at.error("width", "nothing", "both width and height, or neither")),
+        (Some(_), None) => return Err(at.error("height", "nothing", "both width and height, or neither")),
+    };
     let side = |field: &str, value| {
         let side = at.id(field, value)?;
         if side == 0 || side > 1 << 15 {
@@ -236,7 +241,10 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
         }
         Ok(side as usize)
     };
-    Ok(Some(((side("width", width)?, side("height", height)?), path.to_owned())))
+    let size = (side("width", width)?, side("height", height)?);
+    let large = |reason: String| at.error("width, height", reason, "the size of an image");
+    check_pixels(size.0, size.1, max_pixels()).map_err(large)?;
+    Ok(Some((size, path.to_owned())))
 }
 
 /// One image of a scene: what the text files say of it.
@@ -388,7 +396,10 @@ impl Scene {
         let k = image.camera;
         let camera = Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
         let path = self.dir.join("scene_camera.json");
-        camera.check().map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera"))?;
+        // Also that of a crop: its principal point may lie outside.
+        camera
+            .check_lens()
+            .map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera of this image"))?;
         Ok(camera)
     }
 

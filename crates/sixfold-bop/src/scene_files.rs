@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 use sixfold_geometry::{Mat3, Pose, Rect};
 
 use crate::dataset_error::DatasetError;
@@ -113,6 +113,12 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
                 return Err(at.error(field, format!("{found}"), format!("K[{i}] above zero")));
             }
         }
+        let ratio = k[0] / k[4];
+        if !(0.5..=2.0).contains(&ratio) {
+            let expected = "focal lengths in pixels within a factor of 2 of each other: is a digit lost?";
+            return Err(at.error("cam_K (fx, fy)", format!("{} and {}", k[0], k[4]), expected));
+        }
+        check_lens_keys(&at, map)?;
         // A skew is a number in some files' rounding; anything above a thousandth of a pixel is a real one.
         for (i, expected) in [(1, 0.0), (3, 0.0), (6, 0.0), (7, 0.0), (8, 1.0)] {
             if (k[i] - expected).abs() > 1e-3 {
@@ -150,6 +156,28 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
         );
     }
     Ok(cameras)
+}
+
+/// Refuses what changes where a point is seen and is not read: a lens that is no pinhole. Other keys are notes on how an image
+/// was taken.
+fn check_lens_keys(at: &At<'_>, map: &Map<String, Value>) -> Result<(), DatasetError> {
+    let pinhole = |value: &Value| value.is_null() || value.as_str() == Some("pinhole");
+    if let Some(model) = map.get("cam_model").filter(|value| !pinhole(value)) {
+        let expected = "\"pinhole\": undistort the images before, as those of BOP are";
+        return Err(at.error("cam_model", describe(model), expected));
+    }
+    for (key, value) in map {
+        let plain = key.to_lowercase();
+        let of_lens = plain.contains("dist") || plain.contains("coeff") || plain == "d";
+        let zero = |v: &Value| v.is_null() || v.as_f64() == Some(0.0);
+        let without = zero(value) || value.as_array().is_some_and(|list| list.iter().all(zero));
+        if of_lens && !without {
+            let expected =
+                "images without lens distortion, as BOP's are: undistort them and remove the field";
+            return Err(at.error(key.as_str(), describe(value), expected));
+        }
+    }
+    Ok(())
 }
 
 /// Parses `scene_gt.json`; `path` is for messages.
@@ -312,6 +340,12 @@ mod tests {
             (CAMERA.replace("\"depth_scale\": 0.1", "\"depth_scale\": 0.0"), "depth_scale: found 0"),
             (CAMERA.replace("\"depth_scale\": 0.1", "\"depth_scale\": 1e-6"), "depth_scale"),
             (CAMERA.replace("cam_K", "cam_model"), "only pinhole"),
+            (CAMERA.replace("572.4", "57.24"), "is a digit lost"),
+            (
+                CAMERA.replace("\"depth_scale\"", "\"dist_coeffs\": [0.1, 0, 0, 0], \"depth_scale\""),
+                "dist_coeffs",
+            ),
+            (CAMERA.replace("\"depth_scale\"", "\"cam_model\": \"fisheye\", \"depth_scale\""), "pinhole"),
         ] {
             let message = parse_scene_camera(text.as_bytes(), path()).unwrap_err().to_string();
             assert!(message.contains(part), "{message} lacks {part}");

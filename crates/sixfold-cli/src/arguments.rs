@@ -4,6 +4,8 @@ use std::num::NonZeroUsize;
 
 use clap::{Parser, Subcommand};
 
+use sixfold_shell::PixelLimit;
+
 use crate::commands::NETWORKS;
 use crate::commands::completions::CompletionsArguments;
 use crate::commands::demo::arguments::DemoArguments;
@@ -29,6 +31,8 @@ pub(crate) struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
     #[arg(long, global = true, value_name = "N")]
     pub threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    pub images: PixelLimit,
     #[command(subcommand)]
     pub command: Command,
 }

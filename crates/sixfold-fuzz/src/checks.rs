@@ -8,9 +8,9 @@ use sixfold_bop::{
 };
 #[cfg(feature = "networks")]
 use sixfold_experience::{ExperienceStore, Position, SqliteStore};
-use sixfold_geometry::Pose;
+use sixfold_geometry::{Pose, Vec2};
 use sixfold_grasp::parse_gripper;
-use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
+use sixfold_io::{CameraFile, ImageFile, max_pixels};
 use sixfold_mesh::{
     Mesh, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
 };
@@ -24,6 +24,7 @@ use sixfold_nn::training_log::read_training_log;
 use sixfold_nn::weights::read_card;
 use sixfold_ppf::ObjectModel;
 
+use crate::mutate::with_png_checksums;
 use crate::seeds;
 
 /// Runs a reader of paths on bytes, in a file of its own with this name.
@@ -98,6 +99,7 @@ pub(crate) fn scene_files(bytes: &[u8]) {
     let path = Path::new("fuzz.json");
     for camera in parse_scene_camera(bytes, path).unwrap_or_default().values() {
         assert!(camera.fx > 0.0 && camera.fy > 0.0, "focal lengths are positive");
+        assert!((0.5..=2.0).contains(&(camera.fx / camera.fy)), "{camera:?}");
         assert!([camera.fx, camera.fy, camera.cx, camera.cy].iter().all(|v| v.is_finite()), "{camera:?}");
         assert!(camera.depth_scale.is_none_or(|s| s.is_finite() && s > 0.0), "{camera:?}");
         assert!(camera.camera_from_world.iter().all(finite), "{camera:?}");
@@ -166,25 +168,56 @@ pub(crate) fn camera(bytes: &[u8]) {
         let Ok(file) = CameraFile::read(path) else { return };
         assert!(file.depth_scale.is_none_or(|s| s.is_finite() && s > 0.0), "{file:?}");
         file.camera.check().expect("a camera that was read is a camera");
+        if file.sized {
+            file.camera
+                .check_whole_image()
+                .expect("a camera that states its image's size is one of a whole image");
+            assert!((file.camera.width * file.camera.height) as u64 <= max_pixels(), "{file:?}");
+        }
         if let Ok(camera) = file.for_image(640, 480, path) {
-            camera.check().expect("a camera of an image is a camera");
+            camera.check_whole_image().expect("a camera of an image is one of a whole image");
             assert_eq!((camera.width, camera.height), (640, 480));
+            for (x, y) in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)] {
+                let (pixel, raw) = (Vec2::new(x, y), camera.distort_point(&Vec2::new(x, y)));
+                let point = camera.unproject(&pixel, 1.0);
+                assert!(point.norm() < 20.0 && raw.iter().all(|v| v.is_finite()), "{camera:?}");
+                let back = camera.project(&point).expect("a point before the camera");
+                assert!((back - pixel).norm() < 1e-6, "{camera:?}");
+            }
         }
     });
 }
 
+/// Largest image that is decoded under test, pixels.
+const PIXELS: u64 = 1 << 16;
+
+/// The bytes as they are, and with the checksums of a PNG.
 pub(crate) fn images(bytes: &[u8]) {
-    with_file("image.png", bytes, |path| {
-        if let Ok(image) = read_rgb(path) {
-            assert!(image.width() > 0 && image.height() > 0, "an image has pixels");
-        }
-        if let Ok(depth) = read_depth(path, 0.001) {
-            assert!(depth.as_slice().iter().all(|d| d.is_finite() && *d >= 0.0), "depth is a length");
-        }
-        if let Ok(mask) = read_mask(path) {
-            assert_eq!(mask.as_slice().len(), mask.width() * mask.height());
-        }
-    });
+    for bytes in [bytes.to_vec(), with_png_checksums(bytes.to_vec())] {
+        image(&bytes);
+    }
+}
+
+fn image(bytes: &[u8]) {
+    let file = ImageFile::of_bytes(Path::new("image.png"), bytes).with_limit(PIXELS);
+    let size = file.size().ok();
+    if let Some((width, height)) = size {
+        assert!(width > 0 && height > 0 && (width * height) as u64 <= PIXELS, "{width}x{height}");
+    }
+    if let Ok(image) = file.rgb() {
+        assert_eq!(Some(image.size()), size, "the header says the size");
+    }
+    let mask = file.mask();
+    if let Ok(mask) = &mask {
+        assert_eq!(mask.as_slice().len(), mask.width() * mask.height());
+        assert_eq!(Some(mask.size()), size, "the header says the size");
+    }
+    if let (Ok(units), Ok(depth)) = (file.units(), file.depth(0.001)) {
+        assert!(depth.as_slice().iter().all(|d| d.is_finite() && *d >= 0.0), "depth is a length");
+        let mask = mask.expect("what is grey is a mask");
+        let lost = units.as_slice().iter().zip(mask.as_slice()).filter(|(u, m)| (**u > 0) != **m).count();
+        assert_eq!(lost, 0, "pixels are in the mask where they are not zero");
+    }
 }
 
 #[cfg(feature = "networks")]

@@ -5,7 +5,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::RgbImage;
-use sixfold_io::write_atomically_with;
+use sixfold_io::{ImageFile, ImageFileError, write_atomically_with};
 
 use crate::{Mesh, MeshFileError, Unit};
 
@@ -130,19 +130,12 @@ fn significant(value: f64) -> String {
     }
 }
 
-/// Decodes a PNG or JPEG texture; at most 16384 pixels a side.
+/// Decodes a PNG or JPEG texture, of at most so many pixels as any image.
 pub(crate) fn decode_texture(bytes: &[u8]) -> Result<RgbImage, String> {
-    let mut reader = image::ImageReader::new(io::Cursor::new(bytes))
-        .with_guessed_format()
-        .map_err(|error| error.to_string())?;
-    let mut limits = image::Limits::default();
-    limits.max_image_width = Some(1 << 14);
-    limits.max_image_height = Some(1 << 14);
-    reader.limits(limits);
-    let rgb = reader.decode().map_err(|error| error.to_string())?.into_rgb8();
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
-    let pixels = rgb.into_raw().chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
-    RgbImage::from_vec(width, height, pixels).map_err(|error| error.to_string())
+    ImageFile::of_bytes(Path::new("texture"), bytes).rgb().map_err(|error| match error {
+        ImageFileError::Content { reason, .. } => reason,
+        other => other.to_string(),
+    })
 }
 
 /// Reads and decodes a texture that `field` of `file` names.

@@ -82,7 +82,7 @@ type Seen = ([usize; 2], Vec3);
 /// The points under the mask, without those far off the others in depth: masks bleed over edges.
 fn masked_points(view: &DepthView<'_>) -> Result<Vec<Seen>, TemplateError> {
     let (depth, camera, mask) = (view.depth, view.camera, view.mask);
-    camera.check()?;
+    camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;
     if mask.size() != depth.size() {
         return Err(TemplateError::MaskSize {

@@ -68,6 +68,23 @@ pub fn end_with_the_reader() {
     }));
 }
 
+/// The largest image that either program reads.
+#[derive(Debug, clap::Args)]
+pub struct PixelLimit {
+    /// Read images of at most this many pixels (default: 100000000)
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pixels: Option<std::num::NonZeroU64>,
+}
+
+impl PixelLimit {
+    /// Sets it for this process.
+    pub fn set(&self) {
+        if let Some(pixels) = self.max_pixels {
+            sixfold_io::set_max_pixels(pixels.get());
+        }
+    }
+}
+
 /// Uses so many threads for everything, or all cores.
 pub fn use_threads(threads: Option<NonZeroUsize>) {
     if let Some(threads) = threads {

@@ -65,7 +65,7 @@ pub(crate) struct CommonArguments {
     /// Depth image: PNG, one channel of 16 bits
     #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
     pub depth: Option<PathBuf>,
-    /// Camera: a JSON file with fx fy cx cy or cam_K, and depth_scale (millimetres per unit of the depth image)
+    /// Camera: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale (millimetres per unit of the depth image)
     #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
