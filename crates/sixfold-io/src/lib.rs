@@ -9,6 +9,7 @@ mod hash;
 mod image_files;
 mod images;
 mod lock;
+mod regular;
 
 pub use camera_file::{CameraFile, CameraFileError};
 pub use error::ImageFileError;
@@ -17,3 +18,4 @@ pub use hash::{Fnv1a, fnv1a, fnv1a_of_file};
 pub use image_files::ImageFile;
 pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
 pub use lock::{LockError, WriteLock};
+pub use regular::{limits, open_regular, read_regular, read_regular_text};

@@ -1,10 +1,12 @@
 //! The triangle mesh every other crate works on: checked once, in metres.
 
+use std::collections::HashSet;
+
 use sixfold_geometry::{RgbImage, Vec3};
 use thiserror::Error;
 
 use crate::MeshFileError;
-use crate::measure::computed_normals;
+use crate::measure::{computed_normals, position_key};
 
 /// Why arrays do not form a mesh.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -144,6 +146,19 @@ impl Mesh {
     /// The texture, when there is one.
     pub fn texture(&self) -> Option<&RgbImage> {
         self.texture.as_ref()
+    }
+
+    /// The mesh without the faces that are there already: the same three vertices, whichever is named first and whichever way
+    /// round. The first of them stays.
+    pub fn without_repeated_faces(&self) -> Mesh {
+        let mut seen = HashSet::with_capacity(self.faces.len());
+        let place = |i: u32| position_key(&self.vertices[i as usize]);
+        let first = |face: &&[u32; 3]| {
+            let mut corners = face.map(place);
+            corners.sort_unstable();
+            seen.insert(corners)
+        };
+        Mesh { faces: self.faces.iter().filter(first).copied().collect(), ..self.clone() }
     }
 
     /// A mesh with its vertices and normals mapped; faces, colours and texture stay.
