@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::meshes::MeshArguments;
 
 use crate::commands::NETWORKS;
 use crate::commands::completions::CompletionsArguments;
@@ -29,6 +30,8 @@ pub(crate) struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
     #[arg(long, global = true, value_name = "N")]
     pub threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    pub meshes: MeshArguments,
     #[command(subcommand)]
     pub command: Command,
 }

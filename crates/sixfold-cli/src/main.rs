@@ -18,6 +18,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     progress::catch_interrupts();
     use_threads(arguments.threads);
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) => commands::estimate::run(a),

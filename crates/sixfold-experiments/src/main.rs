@@ -10,6 +10,7 @@ use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::meshes::MeshArguments;
 use sixfold_shell::{end_with_the_reader, exit_code, progress, use_threads};
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
@@ -24,6 +25,8 @@ struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
     #[arg(long, global = true, value_name = "N")]
     threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    meshes: MeshArguments,
     #[command(subcommand)]
     command: Command,
 }
@@ -44,6 +47,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     progress::catch_interrupts();
     use_threads(arguments.threads);
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Reproduce(a) => reproduce::run(a),
         Command::Grasp(a) => grasp::run(a),

@@ -212,6 +212,11 @@ impl Mesh {
     }
 }
 
+/// A unit vector; `None` where the length is `least` or less, not finite or too large to be computed.
+pub(crate) fn direction(vector: &Vec3, least: f64) -> Option<Vec3> {
+    vector.try_normalize(least).filter(|n| (n.norm() - 1.0).abs() < 1e-6)
+}
+
 /// What a reader found in a file, before it is checked.
 #[derive(Debug, Default)]
 pub(crate) struct Parts {
@@ -234,7 +239,7 @@ impl Parts {
             mesh.check_length("normals", normals.len()).map_err(in_file)?;
             let mut missing = false;
             for normal in &mut normals {
-                let unit = normal.try_normalize(1e-12).filter(|n| n.iter().all(|c| c.is_finite()));
+                let unit = direction(normal, 1e-12);
                 missing |= unit.is_none();
                 *normal = unit.unwrap_or_default();
             }
