@@ -27,7 +27,8 @@ use crate::object::Object;
 /// The only version of `object.json` there is.
 const VERSION: u32 = 1;
 /// Diameters that an object known from depth images may have, metres: those of the tabletop objects that are taken as meshes.
-const DIAMETERS: std::ops::RangeInclusive<f64> = sixfold_mesh::SMALLEST_DIAMETER..=sixfold_mesh::LARGEST_DIAMETER;
+const DIAMETERS: std::ops::RangeInclusive<f64> =
+    sixfold_mesh::SMALLEST_DIAMETER..=sixfold_mesh::LARGEST_DIAMETER;
 /// How far the diameter in `object.json` may be off the mesh's, as a fraction: the mesh is stored in single precision.
 const SAME_DIAMETER: f64 = 1e-3;
 /// Most discrete symmetries (with the identity) times axes in `object.json`: a gear with 360 teeth has 360.
@@ -237,7 +238,9 @@ impl ObjectRecord {
             let pose = Pose::from_matrix(&Matrix4::from_row_slice(&flat))
                 .map_err(|e| format!("field symmetries_discrete: {e}"))?;
             if !(pose.translation().norm() <= FURTHEST) {
-                return Err(format!("field symmetries_discrete: found one that moves the object by more than {FURTHEST} m"));
+                return Err(format!(
+                    "field symmetries_discrete: found one that moves the object by more than {FURTHEST} m"
+                ));
             }
             info.symmetries_discrete.push(pose);
         }
@@ -437,9 +440,11 @@ impl ObjectStore {
     /// [`StoreError::Unknown`], with the names there are, and [`StoreError::Record`].
     pub fn record(&self, name: &str) -> Result<ObjectRecord, StoreError> {
         let path = self.place(name)?.join("object.json");
-        let text = self.whole(name, |place| match read_regular_text(&place.join("object.json"), limits::SMALL_TEXT) {
-            Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => None,
-            other => Some(other),
+        let text = self.whole(name, |place| {
+            match read_regular_text(&place.join("object.json"), limits::SMALL_TEXT) {
+                Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => None,
+                other => Some(other),
+            }
         });
         let wrong = |what: String| StoreError::Record { name: name.to_owned(), path: path.clone(), what };
         let Some(text) = text else {
@@ -456,7 +461,10 @@ impl ObjectStore {
             )));
         }
         if record.without_mesh && !DIAMETERS.contains(&record.diameter) {
-            return Err(wrong(format!("field diameter: found {} m, expected {DIAMETERS:?}", record.diameter)));
+            return Err(wrong(format!(
+                "field diameter: found {} m, expected {DIAMETERS:?}",
+                record.diameter
+            )));
         }
         Ok(record)
     }
@@ -501,7 +509,10 @@ impl ObjectStore {
             }
             // From the stored mesh, whose numbers are rounded: that is what later runs compare them with.
             derive(&loaded(name, new.record, fresh.clone())?)?;
-            write_atomically(&fresh.join("object.json"), serde_json::to_string_pretty(new.record)?.as_bytes())?;
+            write_atomically(
+                &fresh.join("object.json"),
+                serde_json::to_string_pretty(new.record)?.as_bytes(),
+            )?;
             let away = if replaced { Some(self.own(name, OLD)) } else { None };
             Ok(swap(&fresh, &place, away.as_deref(), |from, to| std::fs::rename(from, to))?)
         })();
@@ -770,7 +781,11 @@ mod tests {
             ("vertices", "\"vertices\": 4", "\"vertices\": 0".to_owned()),
             ("axis", none, axis("[0, 0, 0]", "[0, 0, 0]")),
             ("offset", none, axis("[0, 0, 1]", "[0, 0, 1e200]")),
-            ("symmetries_discrete", "\"symmetries_discrete\": []", "\"symmetries_discrete\": [[[1,0,0,0],[0,1,0,0],[0,0,1,1e300],[0,0,0,1]]]".to_owned()),
+            (
+                "symmetries_discrete",
+                "\"symmetries_discrete\": []",
+                "\"symmetries_discrete\": [[[1,0,0,0],[0,1,0,0],[0,0,1,1e300],[0,0,0,1]]]".to_owned(),
+            ),
             ("version", "\"version\": 1", "\"version\": 7".to_owned()),
         ] {
             assert!(good.contains(from), "{from}: {good}");

@@ -7,9 +7,9 @@ use sixfold_bop::{
     CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections, parse_results,
     parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets,
 };
+use sixfold_estimator::{Object, ObjectStore};
 #[cfg(feature = "networks")]
 use sixfold_experience::{ExperienceStore, Position, SqliteStore};
-use sixfold_estimator::{Object, ObjectStore};
 use sixfold_geometry::Pose;
 use sixfold_grasp::parse_gripper;
 use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};

@@ -54,7 +54,7 @@ impl CameraFile {
     /// # Errors
     /// [`CameraFileError`].
     pub fn read(path: &Path) -> Result<CameraFile, CameraFileError> {
-        let text = std::fs::read_to_string(path)
+        let text = crate::read_regular_text(path, crate::limits::SMALL_TEXT)
             .map_err(|source| CameraFileError::Read { path: path.into(), source })?;
         let value: Value = serde_json::from_str(&text)
             .map_err(|source| CameraFileError::Json { path: path.into(), source })?;

@@ -37,7 +37,8 @@ impl<'a> ImageFile<'a> {
     }
 
     fn bytes(&self) -> Result<Vec<u8>, ImageFileError> {
-        std::fs::read(self.path).map_err(|source| ImageFileError::Read { path: self.path.to_owned(), source })
+        crate::read_regular(self.path, crate::limits::IMAGE)
+            .map_err(|source| ImageFileError::Read { path: self.path.to_owned(), source })
     }
 
     fn decode(&self) -> Result<DynamicImage, ImageFileError> {

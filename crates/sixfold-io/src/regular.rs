@@ -53,8 +53,9 @@ pub fn read_regular(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 /// # Errors
 /// As [`open_regular`], and [`io::ErrorKind::InvalidData`] for bytes that are no UTF-8.
 pub fn read_regular_text(path: &Path, limit: u64) -> io::Result<String> {
-    String::from_utf8(read_regular(path, limit)?)
-        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "found bytes that are no UTF-8, expected text"))
+    String::from_utf8(read_regular(path, limit)?).map_err(|_| {
+        io::Error::new(io::ErrorKind::InvalidData, "found bytes that are no UTF-8, expected text")
+    })
 }
 
 fn check(found: &Metadata, limit: u64) -> io::Result<()> {
@@ -67,7 +68,8 @@ fn check(found: &Metadata, limit: u64) -> io::Result<()> {
 }
 
 fn too_large(found: u64, limit: u64) -> io::Error {
-    let message = format!("found {} MB, expected at most {} MB in a file of this kind", found >> 20, limit >> 20);
+    let message =
+        format!("found {} MB, expected at most {} MB in a file of this kind", found >> 20, limit >> 20);
     io::Error::new(io::ErrorKind::FileTooLarge, message)
 }
 

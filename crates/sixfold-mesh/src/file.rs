@@ -89,7 +89,11 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
 /// # Errors
 /// [`MeshFileError`], naming file, field, what was expected and found; [`MeshFileError::Size`] for a diameter
 /// outside 5 mm to 5 m, for an object far from the origin and for faces without end in one place.
-pub fn read_mesh_with(path: impl AsRef<Path>, unit: Unit, options: &MeshOptions) -> Result<Mesh, MeshFileError> {
+pub fn read_mesh_with(
+    path: impl AsRef<Path>,
+    unit: Unit,
+    options: &MeshOptions,
+) -> Result<Mesh, MeshFileError> {
     let path = path.as_ref();
     let file = path.display().to_string();
     let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
@@ -101,8 +105,8 @@ pub fn read_mesh_with(path: impl AsRef<Path>, unit: Unit, options: &MeshOptions)
         "xyz" => crate::parse_xyz,
         _ => return Err(MeshFileError::Format { file, found: ending }),
     };
-    let bytes =
-        read_regular(path, limits::MESH).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
+    let bytes = read_regular(path, limits::MESH)
+        .map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
     let beside = Beside { mesh: path, allow_outside: options.allow_outside, read: Cell::new(0) };
     let mut mesh = parse(&bytes, &file, unit, &|name| beside.bytes(name))?;
     if options.check_size {
@@ -143,7 +147,8 @@ impl Beside<'_> {
         let real = path.canonicalize()?;
         // Where the mesh file is a link, its own folder counts as well.
         let within = |folder: io::Result<PathBuf>| folder.is_ok_and(|folder| real.starts_with(folder));
-        let target = || self.mesh.canonicalize().map(|mesh| mesh.parent().map(Path::to_path_buf).unwrap_or(mesh));
+        let target =
+            || self.mesh.canonicalize().map(|mesh| mesh.parent().map(Path::to_path_buf).unwrap_or(mesh));
         if !self.allow_outside && !within(folder.canonicalize()) && !within(target()) {
             let message = format!(
                 "{} lies outside the mesh's folder and is not read unless --allow-outside is given",
@@ -331,7 +336,8 @@ mod tests {
         fs::create_dir_all(folder.join("below")).unwrap();
         let mut png = io::Cursor::new(Vec::new());
         image::RgbImage::new(2, 2).write_to(&mut png, image::ImageFormat::Png).unwrap();
-        let three: Vec<u8> = [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].iter().flat_map(|v| v.to_le_bytes()).collect();
+        let three: Vec<u8> =
+            [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].iter().flat_map(|v| v.to_le_bytes()).collect();
         let content = |kind: &str| match kind {
             "obj" => b"newmtl red\nKd 1 0 0\n".to_vec(),
             "ply" => png.get_ref().clone(),
@@ -341,14 +347,17 @@ mod tests {
         let open = MeshOptions { allow_outside: true, ..strict };
         for (kind, template) in [("obj", NAMING_OBJ), ("ply", NAMING_PLY), ("gltf", NAMING_GLTF)] {
             let name = format!("m.{kind}");
-            let with = |named: &str, options| said(&folder, &name, &template.replace("NAMED", named), options);
+            let with =
+                |named: &str, options| said(&folder, &name, &template.replace("NAMED", named), options);
             let outside = root.path().join(format!("secret-{kind}"));
             for place in [&outside, &folder.join("below/beside"), &folder.join("beside")] {
                 fs::write(place, content(kind)).unwrap();
             }
             let link = folder.join(format!("link-{kind}"));
             std::os::unix::fs::symlink(&outside, &link).unwrap();
-            for named in ["beside", "below/beside", "./below/../beside", &folder.join("beside").to_string_lossy()] {
+            for named in
+                ["beside", "below/beside", "./below/../beside", &folder.join("beside").to_string_lossy()]
+            {
                 assert_eq!(with(named, &strict), "read 1 faces", "{kind} {named}");
             }
             let linked = format!("link-{kind}");
@@ -413,7 +422,9 @@ mod tests {
         let nearly = |k: u32| two(k) + Vec3::new(0.0, f64::from(k / 2) * 1e-13, 0.0);
         explain((0..400_000).map(nearly).collect(), vec![]).unwrap();
         explain((0..400_000).map(|k| Vec3::x() * (f64::from(k) / 4e5)).collect(), vec![]).unwrap();
-        assert!(explain(vec![Vec3::repeat(1e30), -Vec3::repeat(1e30)], vec![]).unwrap_err().contains("no unit"));
+        assert!(
+            explain(vec![Vec3::repeat(1e30), -Vec3::repeat(1e30)], vec![]).unwrap_err().contains("no unit")
+        );
         assert!(explain(vec![Vec3::repeat(f64::MAX), -Vec3::repeat(f64::MAX)], vec![]).is_err());
         let far = explain(vec![Vec3::x() * 1e6, Vec3::x() * 1e6 + Vec3::y()], vec![]).unwrap_err();
         assert!(far.contains("1e6 m") || far.contains("from the origin"), "{far}");
@@ -425,7 +436,8 @@ mod tests {
     #[test]
     fn faces_that_are_there_two_hundred_thousand_times_are_read_once() {
         let root = tempfile::tempdir().unwrap();
-        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n".to_owned() + &"f 1 2 3\nf 3 1 2\n".repeat(100_000);
+        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n".to_owned()
+            + &"f 1 2 3\nf 3 1 2\n".repeat(100_000);
         assert_eq!(said(root.path(), "m.obj", &text, &MeshOptions::default()), "read 2 faces");
         // A few of them are left as they are.
         let few = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 3 2 1\n";

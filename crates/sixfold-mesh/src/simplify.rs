@@ -252,11 +252,8 @@ impl Collapser {
     }
 
     fn neighbours(&self, i: u32) -> Vec<u32> {
-        let mut neighbours: Vec<u32> = self
-            .around(i)
-            .flat_map(|f| self.faces[f as usize])
-            .filter(|&v| v != i)
-            .collect();
+        let mut neighbours: Vec<u32> =
+            self.around(i).flat_map(|f| self.faces[f as usize]).filter(|&v| v != i).collect();
         neighbours.sort_unstable();
         neighbours.dedup();
         neighbours

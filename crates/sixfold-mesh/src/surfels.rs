@@ -108,7 +108,8 @@ mod tests {
         let equal = vec![Vec3::new(0.1, 0.2, 0.3); 40_000];
         assert_eq!(Mesh::new(equal.clone(), vec![]).unwrap().surfels(), Err(MeshError::Empty));
         // Half of them at one place, the others around: the surface is that of the others.
-        let around = (0..20_000).map(|k| Vec3::new(f64::from(k % 141) * 1e-3, f64::from(k / 141) * 1e-3, 0.0));
+        let around =
+            (0..20_000).map(|k| Vec3::new(f64::from(k % 141) * 1e-3, f64::from(k / 141) * 1e-3, 0.0));
         let mixed = Mesh::new(equal[..20_000].iter().copied().chain(around).collect(), vec![]).unwrap();
         assert_eq!(mixed.surfels().unwrap().faces().len(), 20_000 * 4);
         assert!(start.elapsed().as_secs() < 15, "{:?}", start.elapsed());

@@ -78,7 +78,8 @@ impl MttmEstimator {
                 method: METHOD,
                 advice: "add it with `sixfold object add`",
             })?;
-            let only = |source| StoreError::OnlyTemplates { object: object.name.clone(), source: Box::new(source) };
+            let only =
+                |source| StoreError::OnlyTemplates { object: object.name.clone(), source: Box::new(source) };
             return ObjectTemplates::read(&file).map_err(|e| wrap(Box::new(only(e))));
         };
         let Some(file) = file else {

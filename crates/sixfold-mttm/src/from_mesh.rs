@@ -64,10 +64,12 @@ impl ObjectTemplates {
     ) -> Result<(ObjectTemplates, Option<StoreError>), TemplateError> {
         let mut note = None;
         match ObjectTemplates::read(path) {
-            Ok(templates) if templates.made_from == fingerprint(mesh, options) => match templates.fits(mesh, options) {
-                Ok(()) => return Ok((templates, None)),
-                Err(what) => note = Some(StoreError::Damaged { path: path.into(), what }),
-            },
+            Ok(templates) if templates.made_from == fingerprint(mesh, options) => {
+                match templates.fits(mesh, options) {
+                    Ok(()) => return Ok((templates, None)),
+                    Err(what) => note = Some(StoreError::Damaged { path: path.into(), what }),
+                }
+            }
             Ok(_) => note = Some(StoreError::Damaged { path: path.into(), what: "made from another mesh" }),
             Err(StoreError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
             Err(error) => note = Some(error),
