@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use sixfold::bop::ModelPoints;
 use sixfold::geometry::{Pose, Vec3};
-use sixfold::mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, UnitError};
+use sixfold::mesh::{ContinuousSymmetry, Mesh, MeshOptions, ModelInfo, PlyFormat, Unit, UnitError};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::guard::{free, interruptible, mesh_file_error};
@@ -179,22 +179,25 @@ impl PyMesh {
     /// do not say it.
     ///
     /// Raises OSError when the file cannot be read; ValueError when it is broken, or with check_size when the object
-    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits).
+    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits). Textures, materials and buffers
+    /// that the file names are read at or below its folder only, anywhere with allow_outside.
     ///
     /// >>> Mesh.load("data/demo/models/obj_000001.ply", unit="mm").diameter  # doctest: +SKIP
     /// 0.10209...
     #[classmethod]
-    #[pyo3(signature = (path, unit, *, check_size=true))]
+    #[pyo3(signature = (path, unit, *, check_size=true, allow_outside=false))]
     fn load(
         _class: &Bound<'_, PyType>,
         py: Python<'_>,
         path: PathBuf,
         unit: &str,
         check_size: bool,
+        allow_outside: bool,
     ) -> PyResult<Self> {
         let unit = self::unit(unit)?;
-        let read = if check_size { sixfold::mesh::read_mesh } else { sixfold::mesh::read_mesh_unchecked };
-        let mesh = free(py, || read(&path, unit))?.map_err(mesh_file_error)?;
+        let options = MeshOptions { allow_outside, check_size };
+        let mesh =
+            free(py, || sixfold::mesh::read_mesh_with(&path, unit, &options))?.map_err(mesh_file_error)?;
         Ok(PyMesh::plain(mesh))
     }
 

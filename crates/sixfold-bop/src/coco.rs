@@ -78,7 +78,8 @@ pub struct ReadDetections {
 /// # Errors
 /// [`DatasetError`] naming file, entry and field.
 pub fn read_detections(path: &Path, options: &ReadDetections) -> Result<Detections, DatasetError> {
-    let text = std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+    let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
     parse_detections(&text, path, options)
 }
 

@@ -1,7 +1,7 @@
 //! Ground truth of 2D detection from poses, for datasets without `scene_gt_coco.json`, and scores of detections that
 //! look at how much of an object is visible.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde::Serialize;
@@ -108,8 +108,12 @@ impl CocoGroundTruth {
         let mut categories: Vec<u32> = self.annotations.iter().map(|a| a.category_id).collect();
         categories.sort_unstable();
         categories.dedup();
+        let mut first: BTreeMap<u32, &Annotation> = BTreeMap::new();
+        for annotation in &self.annotations {
+            first.entry(annotation.image_id).or_insert(annotation);
+        }
         let size = |im_id: u32| {
-            let of = self.annotations.iter().find(|a| a.image_id == im_id)?.segmentation.as_ref()?;
+            let of = first.get(&im_id)?.segmentation.as_ref()?;
             Some((of.width(), of.height()))
         };
         let images: Vec<_> = self
@@ -180,16 +184,19 @@ pub fn found_at_half(
     let mut taken = vec![false; annotations.len()];
     let mut wrong = 0usize;
     let images = truth.truth.images.len();
+    let known: BTreeSet<(u32, u32)> = truth.truth.images.iter().copied().collect();
+    let mut of_kind: BTreeMap<(u32, u32, u32), Vec<usize>> = BTreeMap::new();
+    for (i, a) in annotations.iter().enumerate() {
+        of_kind.entry((a.scene_id, a.image_id, a.category_id)).or_default().push(i);
+    }
     for d in order {
-        if !truth.truth.images.contains(&(d.scene_id, d.image_id)) {
+        if !known.contains(&(d.scene_id, d.image_id)) {
             continue;
         }
         let Some(bbox) = d.bbox.or_else(|| d.segmentation.as_ref().map(Rle::bounding_box)) else { continue };
-        let of_kind = annotations.iter().enumerate().filter(|(_, a)| {
-            (a.scene_id, a.image_id, a.category_id) == (d.scene_id, d.image_id, d.category_id)
-        });
+        let of_kind = of_kind.get(&(d.scene_id, d.image_id, d.category_id)).into_iter().flatten();
         let overlapping: Vec<(usize, f64)> =
-            of_kind.map(|(i, a)| (i, a.bbox.iou(&bbox))).filter(|(_, iou)| *iou >= 0.5).collect();
+            of_kind.map(|&i| (i, annotations[i].bbox.iou(&bbox))).filter(|(_, iou)| *iou >= 0.5).collect();
         let free = overlapping.iter().filter(|(i, _)| !taken[*i]).max_by(|a, b| a.1.total_cmp(&b.1));
         match free {
             Some((index, _)) => taken[*index] = true,

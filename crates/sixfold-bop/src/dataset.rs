@@ -171,8 +171,8 @@ impl BopDataset {
                 return self.object_targets(&targets);
             }
         };
-        let text =
-            std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+        let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+            .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
         parse_targets(&text, path)
     }
 
@@ -224,7 +224,8 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+    let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
     let json = parse(&text, path)?;
     let at = At::file(path);
     let map = at.object(&json)?;
@@ -294,7 +295,7 @@ impl Scene {
     fn read(scene_id: u32, dir: &Path, size: Option<StatedSize>) -> Result<Self, DatasetError> {
         let read = |name: &str| -> Result<Option<(Vec<u8>, PathBuf)>, DatasetError> {
             let path = dir.join(name);
-            match std::fs::read(&path) {
+            match sixfold_io::read_regular(&path, sixfold_io::limits::LARGE_TEXT) {
                 Ok(text) => Ok(Some((text, path))),
                 Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
                 Err(source) => Err(DatasetError::Read { path, source }),

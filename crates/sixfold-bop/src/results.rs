@@ -118,7 +118,8 @@ pub fn read_results(path: &Path) -> Result<Vec<Estimate>, ResultsError> {
 /// # Errors
 /// [`ResultsError::Read`] and [`ResultsError::NotText`] only.
 pub fn read_results_lenient(path: &Path) -> Result<(Vec<Estimate>, Vec<BadRow>), ResultsError> {
-    let bytes = std::fs::read(path).map_err(|source| ResultsError::Read { path: path.to_owned(), source })?;
+    let bytes = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| ResultsError::Read { path: path.to_owned(), source })?;
     let text = std::str::from_utf8(&bytes).map_err(|e| ResultsError::NotText {
         path: path.to_owned(),
         line: 1 + bytes[..e.valid_up_to()].iter().filter(|&&b| b == b'\n').count(),

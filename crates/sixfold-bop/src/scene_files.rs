@@ -13,6 +13,9 @@ use crate::dataset_error::DatasetError;
 use crate::errors::Placement;
 use crate::json::{At, by_image, describe, parse};
 
+/// Most instances of an object in one image that targets may ask for: all of them are searched for, and scored.
+const MAX_INSTANCES: usize = 1000;
+
 /// Intrinsics of one image without its size, and what turns a depth pixel into metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ImageCamera {
@@ -266,7 +269,14 @@ pub fn parse_targets(text: &[u8], path: &Path) -> Result<Vec<Target>, DatasetErr
                 obj_id: at.id("obj_id", value)?,
                 inst_count: match map.get("inst_count") {
                     None => 1,
-                    Some(value) => at.id("inst_count", value)? as usize,
+                    Some(value) => match at.id("inst_count", value)? as usize {
+                        count if count <= MAX_INSTANCES => count,
+                        count => {
+                            let expected =
+                                format!("up to {MAX_INSTANCES} instances of an object in one image");
+                            return Err(at.error("inst_count", count.to_string(), expected));
+                        }
+                    },
                 },
             }),
         };

@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::meshes::MeshArguments;
 
 use sixfold_shell::PixelLimit;
 
@@ -33,6 +34,8 @@ pub(crate) struct Arguments {
     pub threads: Option<NonZeroUsize>,
     #[command(flatten)]
     pub images: PixelLimit,
+    #[command(flatten)]
+    pub meshes: MeshArguments,
     #[command(subcommand)]
     pub command: Command,
 }

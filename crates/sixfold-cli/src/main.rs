@@ -19,6 +19,7 @@ fn main() -> ExitCode {
     progress::catch_interrupts();
     use_threads(arguments.threads);
     arguments.images.set();
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) => commands::estimate::run(a),

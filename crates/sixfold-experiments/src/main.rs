@@ -10,6 +10,7 @@ use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::meshes::MeshArguments;
 use sixfold_shell::{PixelLimit, end_with_the_reader, exit_code, progress, use_threads};
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
@@ -26,6 +27,8 @@ struct Arguments {
     threads: Option<NonZeroUsize>,
     #[command(flatten)]
     images: PixelLimit,
+    #[command(flatten)]
+    meshes: MeshArguments,
     #[command(subcommand)]
     command: Command,
 }
@@ -47,6 +50,7 @@ fn main() -> ExitCode {
     progress::catch_interrupts();
     use_threads(arguments.threads);
     arguments.images.set();
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Reproduce(a) => reproduce::run(a),
         Command::Grasp(a) => grasp::run(a),

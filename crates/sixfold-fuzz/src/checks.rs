@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use sixfold_align::VerificationMesh;
 use sixfold_bop::{
     CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections, parse_results,
     parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets,
 };
+use sixfold_estimator::{Object, ObjectStore};
 #[cfg(feature = "networks")]
 use sixfold_experience::{ExperienceStore, Position, SqliteStore};
 use sixfold_geometry::{Pose, Vec2};
@@ -44,8 +46,21 @@ fn mesh(mesh: &Mesh) {
     let count = mesh.vertices().len();
     assert!(mesh.vertices().iter().all(|v| v.iter().all(|c| c.is_finite())), "vertices are finite");
     assert!(mesh.faces().iter().flatten().all(|&i| (i as usize) < count), "faces name vertices");
-    assert!(mesh.diameter() >= 0.0, "a diameter is no negative number and not NaN");
-    assert_eq!(mesh.vertex_normals().len(), count, "a normal for each vertex");
+    let diameter = mesh.diameter();
+    assert!(diameter >= 0.0, "a diameter is no negative number and not NaN");
+    let from_first = mesh.vertices().iter().map(|v| (v - mesh.vertices()[0]).norm()).fold(0.0, f64::max);
+    assert!(diameter * (1.0 + 1e-9) >= from_first, "no two vertices are further apart than the diameter");
+    let (low, high) = mesh.bounding_box();
+    assert!(diameter <= (high - low).norm() * (1.0 + 1e-9), "the diameter is within the box");
+    let normals = mesh.vertex_normals();
+    assert_eq!(normals.len(), count, "a normal for each vertex");
+    let unit = |n: &sixfold_geometry::Vec3| (n.norm() - 1.0).abs() < 1e-6 || n.norm() == 0.0;
+    assert!(normals.iter().all(unit), "a normal is a direction, or zero where it is not known");
+    let once = mesh.without_repeated_faces();
+    assert!(once.faces().len() <= mesh.faces().len() && once.vertices() == mesh.vertices());
+    if let Ok(surface) = mesh.surfels() {
+        assert!(surface.faces().len() <= 4 * count, "four faces for each point");
+    }
     assert!(mesh.colors().is_none_or(|c| c.len() == count), "a colour for each vertex");
     assert!(mesh.texcoords().is_none_or(|t| t.len() == count), "texture coordinates for each vertex");
     assert!(mesh.sample_surface(3, 0).points.len() <= 3, "no more samples than asked for");
@@ -239,9 +254,57 @@ pub(crate) fn ppf(bytes: &[u8]) {
         let described = ObjectModel::cached(path, &seeds::tetrahedron(), &[], &seeds::coarse());
         let (model, _) =
             described.expect("a file of any content does not keep an object from being described");
-        assert!(model.diameter() >= 0.0);
-        assert_eq!(model.samples().points.len(), model.samples().normals.len());
+        let (samples, tetrahedron) = (model.samples(), seeds::tetrahedron());
+        assert_eq!(model.diameter(), tetrahedron.diameter(), "the diameter is that of the mesh");
+        assert_eq!(samples.points.len(), samples.normals.len());
+        assert!((20..=16_000).contains(&samples.len()), "samples within bounds");
+        let on_it = |p: &sixfold_geometry::Vec3| p.norm() < 0.2;
+        assert!(samples.points.iter().all(on_it), "samples lie on the object");
+        assert!(samples.normals.iter().all(|n| (n.norm() - 1.0).abs() < 1e-5), "normals are directions");
+        assert!(!model.mesh().faces().is_empty(), "there is something to render");
+        mesh(model.mesh());
     });
+}
+
+/// A damaged mesh for verification is simplified again.
+pub(crate) fn verification_mesh(bytes: &[u8]) {
+    with_file("verification-mesh.bin", bytes, |path| {
+        let fine = seeds::fine();
+        let kept = VerificationMesh::cached(Some(path), &fine);
+        let kept = kept.expect("a file of any content does not keep a mesh from being verified").mesh;
+        assert!(!kept.faces().is_empty() && kept.faces().len() <= fine.faces().len());
+        assert!(kept.vertices().iter().all(|v| v.norm() < 1.0), "it lies where the mesh lies");
+        mesh(&kept);
+    });
+}
+
+/// An object of a store is loaded as a whole or not at all.
+fn stored(record: &[u8], mesh_file: &[u8]) {
+    let root = tempfile::tempdir().expect("a temporary folder can be made");
+    let folder = root.path().join("part");
+    std::fs::create_dir(&folder).expect("a folder can be made");
+    for (name, bytes) in [("object.json", record), ("mesh.ply", mesh_file)] {
+        std::fs::write(folder.join(name), bytes).expect("a temporary file can be written");
+    }
+    let store = ObjectStore::new(root.path());
+    assert_eq!(store.names().expect("a store can be listed"), ["part"]);
+    if let Ok(Object { mesh: Some(read), info: Some(info), .. }) = store.load("part") {
+        mesh(&read);
+        assert!((0.005..=5.0).contains(&info.diameter), "the diameter is that of an object");
+        assert!((info.diameter - read.diameter()).abs() < 1e-9, "and of its mesh");
+        let symmetries = info.symmetry_poses(1.0);
+        assert!(symmetries.iter().all(finite), "symmetries are rigid");
+        assert!(symmetries.len() <= 10_000, "symmetries within bounds");
+    }
+    store.remove("part").expect("an object of any content can be removed");
+}
+
+pub(crate) fn object_record(bytes: &[u8]) {
+    stored(bytes, &seeds::object_mesh()[0]);
+}
+
+pub(crate) fn object_mesh(bytes: &[u8]) {
+    stored(&seeds::object_record()[0], bytes);
 }
 
 #[cfg(feature = "networks")]
@@ -250,6 +313,16 @@ pub(crate) fn templates(bytes: &[u8]) {
     if let Ok(read) = ObjectTemplates::parse(bytes, path) {
         let again = ObjectTemplates::parse(&read.to_bytes(), path);
         again.expect("what was read can be written and read again");
+        assert!(read.diameter > 0.0 && read.diameter <= 1000.0, "a diameter is a length");
+        assert!((1..=4096).contains(&read.templates.len()), "templates within bounds");
+        let size = read.options.margin * read.diameter;
+        assert!((read.size - size).abs() <= 1e-6 * size, "the patch is the margin times the diameter");
+        for template in &read.templates {
+            assert!(finite(&template.view_from_object) && template.distance.is_finite());
+            assert!(template.depth.iter().any(|z| *z > 0), "a template shows something");
+        }
+        let (cloud, pixels) = read.templates[0].cloud(read.size);
+        assert!(cloud.len() == pixels.len() && cloud.points.iter().all(|p| p.iter().all(|c| c.is_finite())));
     }
 }
 

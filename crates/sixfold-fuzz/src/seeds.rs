@@ -1,7 +1,9 @@
 //! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
 
 use image::{DynamicImage, GrayAlphaImage, ImageBuffer, ImageFormat, LumaA, Rgb, Rgba, RgbaImage};
+use sixfold_align::VerificationMesh;
 use sixfold_bop::Rle;
+use sixfold_estimator::ObjectRecord;
 #[cfg(feature = "networks")]
 use sixfold_experience::{Copy, Experience, ExperienceStore, SqliteStore};
 #[cfg(feature = "networks")]
@@ -12,7 +14,7 @@ use sixfold_geometry::{Image, Mask, Vec3};
 #[cfg(feature = "networks")]
 use sixfold_grasp::Gripper;
 use sixfold_io::{write_depth, write_mask, write_rgb};
-use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes};
+use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, ply_bytes};
 #[cfg(feature = "networks")]
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 use sixfold_ppf::{ModelOptions, ObjectModel};
@@ -238,6 +240,40 @@ pub(crate) fn ppf() -> Vec<Vec<u8>> {
         ObjectModel::cached(path, &tetrahedron(), &[], &coarse()).expect("a tetrahedron can be described");
     });
     vec![description]
+}
+
+/// A wavy sheet of a few more faces than are rendered.
+pub(crate) fn fine() -> Mesh {
+    let side = 46u32;
+    let at = |i: u32| {
+        let (x, y) = (f64::from(i % side) * 1e-3, f64::from(i / side) * 1e-3);
+        Vec3::new(x, y, 0.002 * (300.0 * x).sin() * (200.0 * y).cos())
+    };
+    let faces = (0..(side - 1) * (side - 1)).flat_map(|k| {
+        let i = k / (side - 1) * side + k % (side - 1);
+        [[i, i + 1, i + side], [i + 1, i + side + 1, i + side]]
+    });
+    Mesh::new((0..side * side).map(at).collect(), faces.collect()).expect("a sheet is a mesh")
+}
+
+pub(crate) fn verification_mesh() -> Vec<Vec<u8>> {
+    let kept = made("verification-mesh.bin", |path| {
+        VerificationMesh::cached(Some(path), &fine()).expect("a sheet has a surface");
+    });
+    vec![kept]
+}
+
+pub(crate) fn object_record() -> Vec<Vec<u8>> {
+    let mesh = tetrahedron();
+    let mut info = ModelInfo::of_mesh(&mesh);
+    info.symmetries_discrete.push(sixfold_geometry::Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 3.0].into()));
+    info.symmetries_continuous.push(ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::zeros() });
+    let record = ObjectRecord::of_mesh("a.ply".as_ref(), Unit::Metre, &mesh, &info);
+    vec![serde_json::to_vec_pretty(&record).expect("a record can be written")]
+}
+
+pub(crate) fn object_mesh() -> Vec<Vec<u8>> {
+    vec![ply_bytes(&tetrahedron(), Unit::Metre, PlyFormat::BinaryLittleEndian, None)]
 }
 
 #[cfg(feature = "networks")]

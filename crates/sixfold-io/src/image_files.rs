@@ -64,19 +64,16 @@ impl<'a> ImageFile<'a> {
         if let Some(bytes) = self.bytes {
             return Ok(bytes.into());
         }
-        let read = |source| ImageFileError::Read { path: self.path.to_owned(), source };
         let most = self.limit.saturating_mul(BYTES_A_PIXEL).saturating_add(BESIDE_PIXELS);
-        let mut bytes = vec![];
-        let file = File::open(self.path).map_err(read)?;
-        file.take(most.saturating_add(1)).read_to_end(&mut bytes).map_err(read)?;
-        if bytes.len() as u64 > most {
-            return Err(self.error(format!(
+        match crate::read_regular(self.path, most) {
+            Ok(bytes) => Ok(bytes.into()),
+            Err(error) if error.kind() == std::io::ErrorKind::FileTooLarge => Err(self.error(format!(
                 "found more than {} MB, expected an image of at most {:.1} megapixels (--max-pixels, set_max_pixels)",
                 most / 1_000_000,
                 self.limit as f64 / 1e6
-            )));
+            ))),
+            Err(source) => Err(ImageFileError::Read { path: self.path.to_owned(), source }),
         }
-        Ok(bytes.into())
     }
 
     /// The decoder of these bytes once their header was read, if the size is as expected and within the limit; and the format.

@@ -11,6 +11,7 @@ mod images;
 mod limit;
 mod lock;
 mod mask_pixels;
+mod regular;
 
 pub use camera_file::{CameraFile, CameraFileError};
 pub use error::ImageFileError;
@@ -20,3 +21,4 @@ pub use image_files::ImageFile;
 pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
 pub use limit::{DEFAULT_MAX_PIXELS, check_pixels, max_pixels, set_max_pixels};
 pub use lock::{LockError, WriteLock};
+pub use regular::{limits, open_regular, read_regular, read_regular_text};

@@ -35,7 +35,8 @@ mod xyz;
 
 pub use error::MeshFileError;
 pub use file::{
-    LARGEST_DIAMETER, Resources, SMALLEST_DIAMETER, check_size, no_resources, read_mesh, read_mesh_unchecked,
+    LARGEST_AREA, LARGEST_DIAMETER, LARGEST_OFFSET, MeshOptions, Resources, SMALLEST_DIAMETER, check_size,
+    no_resources, read_mesh, read_mesh_unchecked, read_mesh_with,
 };
 pub use gltf_file::parse_gltf;
 pub use mesh::{Mesh, MeshError};

@@ -103,7 +103,8 @@ impl ModelsInfo {
     pub fn read(path: impl AsRef<Path>) -> Result<Self, MeshFileError> {
         let path = path.as_ref();
         let file = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
+        let bytes = sixfold_io::read_regular(path, sixfold_io::limits::SMALL_TEXT)
+            .map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
         Self::parse(&bytes, &file)
     }
 

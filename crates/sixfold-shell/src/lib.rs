@@ -5,6 +5,7 @@
 pub mod detector;
 pub mod frames;
 pub mod grasp;
+pub mod meshes;
 pub mod objects;
 pub mod output;
 pub mod overlay;

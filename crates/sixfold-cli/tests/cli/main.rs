@@ -10,6 +10,7 @@ mod experience;
 #[cfg(unix)]
 mod experiments;
 mod grasp;
+mod hostile_meshes;
 mod image;
 #[cfg(feature = "networks")]
 mod mttm;

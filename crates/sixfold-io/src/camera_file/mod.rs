@@ -68,11 +68,7 @@ impl CameraFile {
     pub fn read(path: &Path) -> Result<CameraFile, CameraFileError> {
         let read = |source| CameraFileError::Read { path: path.into(), source };
         let wrong = |message: String| CameraFileError::Content { path: path.into(), message };
-        let mut bytes = vec![];
-        File::open(path).map_err(read)?.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(read)?;
-        if bytes.len() as u64 > MAX_BYTES {
-            return Err(wrong(format!("found more than {} MB, expected a camera file", MAX_BYTES >> 20)));
-        }
+        let bytes = crate::read_regular(path, MAX_BYTES).map_err(read)?;
         let text = String::from_utf8(bytes)
             .map_err(|_| wrong("found no text, expected JSON, YAML or XML".to_owned()))?;
         let file = fields::camera(&content(&text, path)?).map_err(wrong)?;

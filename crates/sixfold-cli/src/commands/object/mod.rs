@@ -126,11 +126,8 @@ fn info(a: &AddArguments, mut info: ModelInfo) -> Result<ModelInfo> {
 }
 
 fn list(store: &ObjectStore, folder: &Path, json: &JsonArguments) -> Result<Outcome> {
-    let listed = store
-        .names()?
-        .into_iter()
-        .map(|name| Ok(Listed { record: store.record(&name)?, name }))
-        .collect::<Result<Vec<_>>>()?;
+    let listed: Vec<Listed> =
+        store.records()?.into_iter().map(|(name, record)| Listed { name, record }).collect();
     report(json, &listed, || {
         if listed.is_empty() {
             println!("no objects in {}", folder.display());
