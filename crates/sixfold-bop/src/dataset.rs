@@ -133,7 +133,10 @@ impl BopDataset {
     }
 
     /// The same with the name of its file, read once.
-    fn named_models_info(&self, models: Models) -> Result<&Option<(String, ModelsInfo)>, DatasetError> {
+    pub(crate) fn named_models_info(
+        &self,
+        models: Models,
+    ) -> Result<&Option<(String, ModelsInfo)>, DatasetError> {
         let place = match models {
             Models::Evaluation => &self.infos[0],
             Models::Rendering => &self.infos[1],

@@ -2,6 +2,7 @@
 //! and the inputs that it was begun with; a folder of images knows which files are its own.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -173,6 +174,17 @@ impl DatasetFolder {
     }
 }
 
+/// Takes the folder of a dataset that is made in one go: there is nothing in it yet.
+///
+/// # Errors
+/// When it is an input, another process writes it, or it holds anything.
+pub fn take_empty(path: &Path, inputs: &[&Path]) -> Result<WriteLock> {
+    let lock = lock(path)?;
+    refuse_inputs(path, inputs)?;
+    refuse_contents(path)?;
+    Ok(lock)
+}
+
 /// The lock of a folder, the same by whatever path it is named.
 fn lock(path: &Path) -> Result<WriteLock> {
     Ok(WriteLock::take(&path.canonicalize().unwrap_or_else(|_| path.to_path_buf()))?)
@@ -250,11 +262,14 @@ impl OutputFolder {
                 self.path.join(name).display()
             );
         }
-        let before = self.own.len();
-        self.own.extend(names.iter().map(|name| (*name).to_owned()));
-        if self.own.len() > before {
-            let list: String = self.own.iter().map(|name| format!("{name}\n")).collect();
-            write_atomically(&self.path.join(OWN_FILES), list.as_bytes())?;
+        let new: Vec<String> = names
+            .iter()
+            .map(|name| (*name).to_owned())
+            .filter(|name| self.own.insert(name.clone()))
+            .collect();
+        if !new.is_empty() {
+            let list = self.path.join(OWN_FILES);
+            note_files(&list, &new).with_context(|| list.display().to_string())?;
         }
         Ok(names.iter().map(|name| self.path.join(name)).collect())
     }
@@ -278,6 +293,19 @@ impl OutputFolder {
         write_atomically(&path, text.as_bytes())?;
         Ok(path)
     }
+}
+
+/// Adds names to the list of a folder's own files, before the files are written.
+fn note_files(list: &Path, names: &[String]) -> std::io::Result<()> {
+    if let Some(folder) = list.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    let mut file = std::fs::File::options().append(true).read(true).create(true).open(list)?;
+    let mut before = vec![];
+    file.read_to_end(&mut before)?;
+    // A process that was killed may have left half a line.
+    let gap = if before.last().is_some_and(|byte| *byte != b'\n') { "\n" } else { "" };
+    file.write_all(format!("{gap}{}\n", names.join("\n")).as_bytes())
 }
 
 #[cfg(test)]

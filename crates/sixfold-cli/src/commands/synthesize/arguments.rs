@@ -6,6 +6,7 @@ use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use sixfold_nol::refine::{PoseRefinementOptions, SceneKind};
+use sixfold_nol::view_grid::ViewGrid;
 use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges::{in_range, without_duplicates};
 
@@ -142,6 +143,7 @@ impl SynthesizeArguments {
         if !(1..=72).contains(&self.turns) {
             bail!("--turns: found {}, expected 1 to 72", self.turns);
         }
+        in_range("views of an object by --step, --elevation and --turns", self.grid().count(), 1..=200_000)?;
         if !(32..=1024).contains(&self.size) {
             bail!("--size: found {}, expected 32 to 1024 pixels", self.size);
         }
@@ -168,6 +170,12 @@ impl SynthesizeArguments {
             }
             other => bail!("--disturb: found {other:?}, expected millimetres and degrees, 0 to 1000"),
         }
+    }
+
+    /// Where the views are taken from.
+    pub fn grid(&self) -> ViewGrid {
+        let (step, elevation) = (self.step, [self.elevation[0], self.elevation[1]]);
+        ViewGrid { step, elevation, turns: self.turns, size: self.size, seed: self.seed }
     }
 
     /// How poses are made better; none where they are taken as they are.

@@ -83,7 +83,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     };
     folder.write_models(images.objects.iter().map(|o| (o.id, &o.mesh, &o.info)))?;
     let views = Views { a, backgrounds: backgrounds(a)?, model };
-    let mut progress = Progress::new("views", views::grid(a).count() * images.objects.len());
+    let mut progress = Progress::new("views", a.grid().count() * images.objects.len());
     let (mut rows, mut objects) = (vec![], vec![]);
     for (object, count) in images.objects.iter().zip(&counts) {
         if object.images.is_empty() {

@@ -11,7 +11,7 @@ use sixfold_mesh::Mesh;
 use sixfold_nol::SourceView;
 use sixfold_nol::coordinates::write_coordinates;
 use sixfold_nol::synthesis::ViewMaker;
-use sixfold_nol::view_grid::{ViewGrid, over_background};
+use sixfold_nol::view_grid::over_background;
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Backgrounds;
 
@@ -29,12 +29,6 @@ pub(super) struct Written {
     pub preview: Vec<(RgbImage, String)>,
 }
 
-/// Where the views are taken from.
-pub(super) fn grid(a: &SynthesizeArguments) -> ViewGrid {
-    let (step, elevation) = (a.step, [a.elevation[0], a.elevation[1]]);
-    ViewGrid { step, elevation, turns: a.turns, size: a.size, seed: a.seed }
-}
-
 /// The folder of the object's scene.
 fn folder(a: &SynthesizeArguments, id: u32) -> PathBuf {
     a.out.join(&a.new_split).join(format!("{id:06}"))
@@ -49,7 +43,7 @@ pub(super) fn write(
     progress: &mut Progress,
 ) -> Result<Written> {
     let photographs: Vec<&PosedImage> = object.images.iter().map(|i| &i.posed).collect();
-    let places = grid(a).placed(&object.mesh, &photographs, object.id);
+    let places = a.grid().placed(&object.mesh, &photographs, object.id);
     let mut writer = SceneWriter::new(&a.out, &a.new_split, object.id);
     let mut written = Written { images: 0, unseen: 0.0, preview: vec![] };
     let every = places.len().div_ceil(PREVIEWED).max(1);
