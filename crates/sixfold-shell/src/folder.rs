@@ -195,7 +195,7 @@ fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
     let Ok(place) = out.canonicalize() else { return Ok(()) };
     if let Some(input) = inputs.iter().find(|input| input.canonicalize().is_ok_and(|i| i == place)) {
         bail!(
-            "--out {}: that is the input {}, which would be written over; choose another --out",
+            "--out {}: holds another dataset or file: it is the input {}, which would be written over; choose another --out",
             out.display(),
             input.display()
         );

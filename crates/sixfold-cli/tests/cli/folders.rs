@@ -109,7 +109,11 @@ fn images_of_the_user_are_not_replaced() {
     assert_eq!(read(dir, "overlay.png"), b"mine");
     let tiny = Tiny::new(false);
     std::fs::create_dir_all(tiny.path().join("there/train")).unwrap();
-    fails(tiny.path(), "simulate-depth --dataset tiny --out there", &["--out there", "another dataset", "train"]);
+    fails(
+        tiny.path(),
+        "simulate-depth --dataset tiny --out there",
+        &["--out there", "another dataset", "train"],
+    );
 }
 
 #[test]
