@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
 use sixfold_io::{ImageFile, ImageFileError, check_pixels, max_pixels};
@@ -37,6 +38,8 @@ pub struct BopDataset {
     split_dir: PathBuf,
     size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
+    /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
+    infos: Arc<[OnceLock<Option<(String, ModelsInfo)>>; 2]>,
 }
 
 impl BopDataset {
@@ -50,7 +53,8 @@ impl BopDataset {
         if dir.join("scene_camera.json").is_file() {
             let name = dir.file_name().and_then(|n| n.to_str()).and_then(|n| n.parse().ok());
             let scenes = BTreeMap::from([(name.unwrap_or(0), dir.to_owned())]);
-            return Ok(BopDataset { root: dir.to_owned(), split_dir: dir.to_owned(), size, scenes });
+            let (root, split_dir) = (dir.to_owned(), dir.to_owned());
+            return Ok(BopDataset { root, split_dir, size, scenes, infos: Arc::default() });
         }
         if !dir.is_dir() {
             return Err(DatasetError::Missing {
@@ -80,7 +84,7 @@ impl BopDataset {
         if scenes.is_empty() {
             return Err(missing("a scene folder"));
         }
-        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes })
+        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes, infos: Arc::default() })
     }
 
     /// The dataset's folder.
@@ -125,12 +129,33 @@ impl BopDataset {
     /// # Errors
     /// [`DatasetError::Model`] when the file is broken.
     pub fn models_info(&self, models: Models) -> Result<Option<ModelsInfo>, DatasetError> {
+        Ok(self.named_models_info(models)?.as_ref().map(|(_, infos)| infos.clone()))
+    }
+
+    /// The same with the name of its file, read once.
+    pub(crate) fn named_models_info(
+        &self,
+        models: Models,
+    ) -> Result<&Option<(String, ModelsInfo)>, DatasetError> {
+        let place = match models {
+            Models::Evaluation => &self.infos[0],
+            Models::Rendering => &self.infos[1],
+        };
+        if let Some(read) = place.get() {
+            return Ok(read);
+        }
+        let read = self.read_models_info(models)?;
+        Ok(place.get_or_init(|| read))
+    }
+
+    fn read_models_info(&self, models: Models) -> Result<Option<(String, ModelsInfo)>, DatasetError> {
         let first = self.models_dir(models);
         let other = self.models_dir(Models::Rendering);
         for dir in [first, other].into_iter().flatten() {
             let path = dir.join("models_info.json");
             if path.is_file() {
-                return ModelsInfo::read(&path).map(Some).map_err(|e| DatasetError::Model(Box::new(e)));
+                let infos = ModelsInfo::read(&path).map_err(|e| DatasetError::Model(Box::new(e)))?;
+                return Ok(Some((path.display().to_string(), infos)));
             }
         }
         Ok(None)
@@ -139,14 +164,20 @@ impl BopDataset {
     /// Reads the model of an object, in metres.
     ///
     /// # Errors
-    /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken.
+    /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken or `models_info.json`
+    /// does not describe it.
     pub fn model(&self, obj_id: u32, models: Models) -> Result<Mesh, DatasetError> {
         let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
         let path = dir.join(format!("obj_{obj_id:06}.ply"));
         if !path.is_file() {
             return Err(DatasetError::NoModel { path: dir, obj_id });
         }
-        read_mesh(&path, Unit::Millimetre).map_err(|e| DatasetError::Model(Box::new(e)))
+        let model = |error| DatasetError::Model(Box::new(error));
+        let mesh = read_mesh(&path, Unit::Millimetre).map_err(model)?;
+        if let Some((file, infos)) = self.named_models_info(models)? {
+            infos.check_mesh(obj_id, &mesh, file).map_err(model)?;
+        }
+        Ok(mesh)
     }
 
     /// What has to be found: from `file`, or the dataset's `test_targets_bop19.json`, or where neither exists every

@@ -29,7 +29,8 @@ fn the_cameras_of_real_datasets_pass() {
         below(&folder, "camera.json", 3, &mut files);
         for file in files {
             let read = CameraFile::read(&file).unwrap();
-            let (width, height) = if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
+            let (width, height) =
+                if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
             read.for_image(width, height, &file).unwrap();
         }
         let mut scenes = vec![];

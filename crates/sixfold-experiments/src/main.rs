@@ -11,6 +11,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sixfold_shell::meshes::MeshArguments;
+use sixfold_shell::ranges::threads;
 use sixfold_shell::{PixelLimit, end_with_the_reader, exit_code, progress, use_threads};
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
@@ -23,7 +24,7 @@ use sixfold_shell::{PixelLimit, end_with_the_reader, exit_code, progress, use_th
 )]
 struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
-    #[arg(long, global = true, value_name = "N")]
+    #[arg(long, global = true, value_name = "N", value_parser = threads)]
     threads: Option<NonZeroUsize>,
     #[command(flatten)]
     images: PixelLimit,

@@ -14,7 +14,7 @@ use sixfold_geometry::{Pose, Vec2};
 use sixfold_grasp::parse_gripper;
 use sixfold_io::{CameraFile, ImageFile, max_pixels};
 use sixfold_mesh::{
-    Mesh, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
+    Mesh, ModelInfo, ModelsInfo, Unit, no_resources, parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz,
 };
 #[cfg(feature = "networks")]
 use sixfold_mttm::ObjectTemplates;
@@ -106,6 +106,8 @@ pub(crate) fn models_info(bytes: &[u8]) {
             let symmetries = info.symmetry_poses(1.0);
             assert!(!symmetries.is_empty(), "the identity at least");
             assert!(symmetries.iter().all(finite), "symmetries are rigid");
+            let scored = info.symmetry_poses(ModelInfo::BOP_MAX_STEP).len();
+            assert!(scored <= 16_384, "{scored} symmetries are more than anyone can wait for");
         }
     }
 }

@@ -4,8 +4,7 @@
 //! (text, colour profiles) may take [`BESIDE_PIXELS`] in all, which also bounds what is inflated from it.
 
 use std::borrow::Cow;
-use std::fs::File;
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::Path;
 
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};

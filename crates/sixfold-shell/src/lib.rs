@@ -3,6 +3,7 @@
 
 #[cfg(feature = "networks")]
 pub mod detector;
+pub mod folder;
 pub mod frames;
 pub mod grasp;
 pub mod meshes;
@@ -10,6 +11,9 @@ pub mod objects;
 pub mod output;
 pub mod overlay;
 pub mod progress;
+pub mod ranges;
+#[cfg(feature = "physics")]
+pub mod scenes;
 #[cfg(feature = "networks")]
 pub mod training;
 

@@ -15,10 +15,12 @@ use sixfold_io::{read_rgb, write_rgb};
 use super::detect_arguments::DetectArguments;
 use sixfold_shell::Outcome;
 use sixfold_shell::detector::Detector;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{report, write_atomically};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::ranges::without_duplicates;
 
 #[derive(Serialize)]
 struct Found {
@@ -77,6 +79,7 @@ struct Summary {
 }
 
 pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
+    without_duplicates("--ids", &a.ids)?;
     let model = DetectorModel::load(&a.weights)?;
     for id in &a.ids {
         model.check_object(*id).with_context(|| "--ids".to_string())?;
@@ -108,24 +111,25 @@ fn wanted(a: &DetectArguments, id: u32) -> bool {
 }
 
 fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Outcome> {
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let paths =
+        folder.as_mut().map(|f| f.files(&["overlay.png", "detections.json", "result.json"])).transpose()?;
     let image = read_rgb(file)?;
     let start = Instant::now();
     let mut found = detector.detections(&image, 0, 0).with_context(|| file.display().to_string())?;
     let seconds = start.elapsed().as_secs_f64();
     found.retain(|d| wanted(a, d.category_id));
     let (mut overlay, mut json) = (None, None);
-    if let Some(folder) = &a.out {
-        let path = folder.join("overlay.png");
-        write_rgb(&path, &picture(&image, &found))?;
-        overlay = Some(path);
-        let path = folder.join("detections.json");
-        write_detections(&path, &found)?;
-        json = Some(path);
+    if let Some(paths) = &paths {
+        write_rgb(&paths[0], &picture(&image, &found))?;
+        overlay = Some(paths[0].clone());
+        write_detections(&paths[1], &found)?;
+        json = Some(paths[1].clone());
     }
     let detections = found.iter().filter_map(Found::new).collect();
     let whole = Whole { detections, seconds, file: json, overlay };
-    if let Some(folder) = &a.out {
-        write_atomically(&folder.join("result.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    if let Some(paths) = &paths {
+        write_atomically(&paths[2], serde_json::to_string_pretty(&whole)?.as_bytes())?;
     }
     report(&a.json, &whole, || {
         println!("{:>8} {:>8} {:>32} {:>10}", "object", "score", "box: x, y, width, height", "mask");
@@ -147,6 +151,8 @@ fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Out
 
 /// Several images that belong to no dataset; in `detections.json` their ids are their places, from 1.
 fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Result<Outcome> {
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let file = folder.as_mut().map(|f| f.file("detections.json")).transpose()?;
     let mut progress = Progress::new("images", files.len());
     let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
     for (number, file) in (1..).zip(files) {
@@ -156,10 +162,9 @@ fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Res
             let mut found = detector.detections(&image, 0, number)?;
             let seconds = start.elapsed().as_secs_f64();
             found.retain(|d| wanted(a, d.category_id));
-            if let Some(folder) = &a.out {
+            if let Some(folder) = &mut folder {
                 let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-                let path = folder.join(format!("overlays/{number:06}_{stem}.png"));
-                write_rgb(&path, &picture(&image, &found))?;
+                folder.write_rgb(&format!("overlays/{number:06}_{stem}.png"), &picture(&image, &found))?;
             }
             Ok((found, seconds))
         });
@@ -177,8 +182,8 @@ fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Res
     for s in &skipped {
         eprintln!("skipped {s}");
     }
-    if let Some(folder) = &a.out {
-        write_detections(&folder.join("detections.json"), &all)?;
+    if let Some(file) = &file {
+        write_detections(file, &all)?;
     }
     let per_image = (!images.is_empty()).then(|| all.len() as f64 / images.len() as f64);
     let many = Many { images, detections: all.len(), detections_per_image: per_image, skipped };
@@ -209,6 +214,7 @@ fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<O
     }
     let dataset = BopDataset::open(root, &a.split)?;
     let images = images(a, &dataset)?;
+    let mut folder = a.overlays.as_deref().map(OutputFolder::take).transpose()?;
     let mut progress = Progress::new("images", images.len());
     let (mut all, mut skipped, mut seconds) = (vec![], vec![], vec![]);
     let mut scene = None;
@@ -224,11 +230,11 @@ fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<O
             let mut found = detector.detections(&image, *scene_id, *im_id)?;
             let time = start.elapsed().as_secs_f64();
             found.retain(|d| wanted(a, d.category_id));
-            if let Some(folder) = &a.overlays {
+            if let Some(folder) = &mut folder {
                 let sure = detector.model().usage().threshold;
                 let shown: Vec<Detection> =
                     found.iter().filter(|d| d.score >= f64::from(sure)).cloned().collect();
-                write_rgb(&folder.join(format!("{scene_id:06}_{im_id:06}.png")), &picture(&image, &shown))?;
+                folder.write_rgb(&format!("{scene_id:06}_{im_id:06}.png"), &picture(&image, &shown))?;
             }
             Ok((found, time))
         });

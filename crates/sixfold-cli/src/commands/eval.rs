@@ -16,6 +16,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Progress;
+use sixfold_shell::ranges::in_range;
 
 #[derive(Debug, Args)]
 pub(crate) struct EvalArguments {
@@ -68,6 +69,7 @@ struct Whole {
 }
 
 pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
+    in_range("--min-score", a.min_score, 0.0..=1.0)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     if a.detections.is_some() {
         return coco(a, &dataset);

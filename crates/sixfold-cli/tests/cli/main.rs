@@ -9,6 +9,7 @@ mod eval;
 mod experience;
 #[cfg(unix)]
 mod experiments;
+mod folders;
 mod grasp;
 mod hostile_meshes;
 mod image;

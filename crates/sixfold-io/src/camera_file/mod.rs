@@ -6,9 +6,6 @@ mod json;
 mod xml;
 mod yaml;
 
-use std::fs::File;
-use std::io::Read;
-
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;

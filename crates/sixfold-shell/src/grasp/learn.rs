@@ -22,6 +22,7 @@ use super::object_list::{ObjectsArguments, named_objects};
 use super::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use crate::output::JsonArguments;
 use crate::progress::{Progress, check_interrupt};
+use crate::ranges::in_range;
 
 /// Arguments of `sixfold grasp learn`.
 #[derive(Debug, Args)]
@@ -233,9 +234,10 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
     if a.near.is_nan() || a.near < 0.0 {
         bail!("--near: found {}, expected 0 or more", a.near);
     }
-    if a.tries == 0 || a.attempts == 0 {
-        bail!("--tries and --attempts: expected at least 1");
-    }
+    in_range("--attempts", a.attempts, 1..=1_000_000)?;
+    in_range("--tries", a.tries, 1..=1000)?;
+    in_range("--explore", a.explore, 0..=1000)?;
+    in_range("--members", a.members, 1..=10_000)?;
     let setting = hardness(&a.physics, a.hard)?;
     let gripper = &setting.gripper;
     let network = model(&a.network)?;

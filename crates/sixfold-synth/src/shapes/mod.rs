@@ -7,6 +7,7 @@
 
 pub(crate) mod solids;
 mod sweep;
+mod symmetry;
 mod toy;
 
 use std::f64::consts::{FRAC_PI_2, PI};

@@ -8,13 +8,13 @@ use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
 use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
-use sixfold_io::write_rgb;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
 
 use super::arguments::DemoArguments;
 use super::colour::{Colour, Row};
 use super::samples::{Known, add_s, found_upwards};
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::training::was_trained_on;
@@ -28,6 +28,7 @@ const MIN_DETECTION: f32 = 0.1;
 
 pub(super) fn run(
     a: &DemoArguments,
+    out: &mut OutputFolder,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
@@ -40,7 +41,7 @@ pub(super) fn run(
     };
     let result = Pix2PoseEstimator::load(&weights)
         .map_err(anyhow::Error::from)
-        .and_then(|pix2pose| with_model(a, &pix2pose, &weights, dataset, targets, known));
+        .and_then(|pix2pose| with_model(a, out, &pix2pose, &weights, dataset, targets, known));
     match result {
         Ok(colour) => Ok(colour),
         // Those that were asked for have to be right.
@@ -62,6 +63,7 @@ fn objects(
 
 fn with_model(
     a: &DemoArguments,
+    out: &mut OutputFolder,
     pix2pose: &Pix2PoseEstimator,
     weights: &Path,
     dataset: &BopDataset,
@@ -125,9 +127,8 @@ fn with_model(
                     color: overlay::color(o.obj_id as usize),
                 });
             }
-            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}_colour.png"));
-            write_rgb(&picture, &overlay::draw(&image, &camera, &drawn))?;
-            colour.pictures.push(picture);
+            let picture = overlay::draw(&image, &camera, &drawn);
+            colour.pictures.push(out.write_rgb(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture)?);
         }
     }
     progress.finish();

@@ -19,13 +19,13 @@ use serde::Serialize;
 use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
 use sixfold_geometry::Pose;
-use sixfold_io::write_rgb;
 use sixfold_ppf::{PpfOptions, estimate};
 
 use self::arguments::DemoArguments;
 use self::colour::Colour;
 use self::samples::{Known, add_s, sample_folder};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -57,6 +57,7 @@ struct Whole {
 
 pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let start = Instant::now();
+    let mut out = OutputFolder::take(&a.out)?;
     let folder = sample_folder(a.data.as_deref())?;
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
@@ -109,17 +110,16 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 }
             }
             let background = scene.rgb(im_id)?.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}.png"));
-            write_rgb(&picture, &overlay::draw(&background, &camera, &drawn(&found, &known)))?;
-            pictures.push(picture);
+            let picture = overlay::draw(&background, &camera, &drawn(&found, &known));
+            pictures.push(out.write_rgb(&format!("{scene_id:06}_{im_id:06}.png"), &picture)?);
         }
     }
     progress.finish();
     let evaluation = evaluate(&dataset, &results, &dataset.targets(None)?, &EvalOptions::default(), &|_| {})?;
-    let curves = a.out.join("recall.png");
+    let curves = out.file("recall.png")?;
     write_recall_curves(&curves, &evaluation)?;
     pictures.push(curves);
-    let colour = colour_poses::run(a, &dataset, &targets, &known)?;
+    let colour = colour_poses::run(a, &mut out, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
     let whole = Whole {
         poses: rows,

@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
 
+use sixfold_shell::folder::OutputFolder;
+
 use super::arguments::DemoArguments;
 use super::colour::Colour;
 use super::samples::Known;
@@ -13,6 +15,7 @@ use crate::commands::without_networks::MESSAGE;
 /// No poses, and why; an error where weights were given.
 pub(super) fn run(
     a: &DemoArguments,
+    _out: &mut OutputFolder,
     _dataset: &BopDataset,
     _targets: &[Target],
     _known: &BTreeMap<u32, Known>,

@@ -10,6 +10,7 @@ use sixfold_estimator::{Cache, ObjectStore, check_min_confidence};
 use sixfold_mesh::Unit;
 use sixfold_runner::RunOptions;
 use sixfold_shell::output::JsonArguments;
+use sixfold_shell::ranges::count;
 
 use super::methods::{METHODS, Method};
 
@@ -93,7 +94,7 @@ pub(crate) struct CommonArguments {
     )]
     pub region: Option<Vec<f64>>,
     /// Most instances of each object (in a dataset: what its targets say)
-    #[arg(long, value_name = "N", default_value = "1")]
+    #[arg(long, value_name = "N", default_value = "1", value_parser = count::<1000>)]
     pub instances: NonZeroUsize,
     /// BOP dataset folder: estimate all its targets
     #[arg(long, value_name = "DIR", requires = "out")]

@@ -7,10 +7,11 @@ use anyhow::{Context, Result, anyhow, bail};
 use sixfold_align::PreparedDepth;
 use sixfold_estimator::{Need, Object, PoseEstimator, Query};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
-use sixfold_io::{CameraFile, read_depth, read_rgb, write_mask, write_rgb};
+use sixfold_io::{CameraFile, read_depth, read_rgb, write_mask};
 use sixfold_mttm::mask::to_image;
 use sixfold_runner::{FoundObject, ImageReport, ImageRun, pose_table};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::{report, write_atomically};
 use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -105,6 +106,9 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
         );
     }
     let input = Input::read(common, estimator)?;
+    // Before the poses take their time: what stands in the folder may be the input itself.
+    let mut folder = common.out.as_deref().map(OutputFolder::take).transpose()?;
+    folder.as_mut().map(|f| f.files(&["poses.json", "overlay.png"])).transpose()?;
     let depth = input.prepared(common, estimator)?;
     if let Some(depth) = &depth {
         warn_about(depth, estimator);
@@ -131,7 +135,7 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let image = ImageRun { estimator, query };
     let found = search(common, &image, matches!(place, Where::Nowhere))?;
     let whole = image.report(&found);
-    finish(common, &input, &found, whole)
+    finish(common, folder.as_mut(), &input, &found, whole)
 }
 
 /// Searches every object.
@@ -173,6 +177,7 @@ fn search(a: &CommonArguments, image: &ImageRun<'_>, nowhere: bool) -> Result<Ve
 /// Writes the poses, then the images, and prints the poses.
 fn finish(
     a: &CommonArguments,
+    folder: Option<&mut OutputFolder>,
     input: &Input,
     found: &[FoundObject],
     mut whole: ImageReport,
@@ -197,22 +202,22 @@ fn finish(
         }
     })?;
     // Results first: an image that cannot be written costs none of them.
-    for (path, image) in &images {
-        write_rgb(path, image)?;
-    }
-    if let Some(folder) = &a.out {
+    if let Some(folder) = folder {
+        for (name, image) in names.iter().zip(images.iter().map(|(_, image)| image)) {
+            folder.write_rgb(name, image)?;
+        }
         write_masks(folder, input, found)?;
     }
     Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
 
 /// The masks of all poses that have one.
-fn write_masks(folder: &Path, input: &Input, found: &[FoundObject]) -> Result<()> {
+fn write_masks(folder: &mut OutputFolder, input: &Input, found: &[FoundObject]) -> Result<()> {
     for (i, f) in found.iter().enumerate() {
         for (k, estimate) in f.estimates.iter().enumerate() {
             if let Some(mask) = &estimate.mask {
                 let name = format!("masks/{}-{}-{}.png", i + 1, file_name(f.object.name()), k + 1);
-                write_mask(&folder.join(name), &to_image(mask, input.camera.width, input.camera.height))?;
+                write_mask(&folder.file(&name)?, &to_image(mask, input.camera.width, input.camera.height))?;
             }
         }
     }

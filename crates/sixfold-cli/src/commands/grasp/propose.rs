@@ -15,11 +15,13 @@ use sixfold_io::write_rgb;
 
 use super::input::{self, Input, InputArguments};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 #[cfg(feature = "experience")]
 use sixfold_shell::grasp::experience::{self, NetworkArguments};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
 use sixfold_shell::overlay;
+use sixfold_shell::ranges::count;
 
 #[derive(Debug, Args)]
 pub(crate) struct ProposeArguments {
@@ -29,7 +31,7 @@ pub(crate) struct ProposeArguments {
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
     /// Most grasps
-    #[arg(long, value_name = "N", default_value = "5")]
+    #[arg(long, value_name = "N", default_value = "5", value_parser = count::<10_000>)]
     pub number: NonZeroUsize,
     /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
     /// postgres://user@host/database
@@ -62,6 +64,8 @@ const OTHER: [u8; 3] = [86, 150, 233];
 
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.seed)?;
     let proposed: Vec<Proposed> = match &view {
         None => vec![],
@@ -80,9 +84,9 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         }
     };
     let seconds = began.elapsed().as_secs_f64();
-    let picture = match &a.out {
+    let picture = match &files {
         None => None,
-        Some(folder) => {
+        Some(files) => {
             let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
             let drawn: Vec<DrawnGrasp> = proposed
                 .iter()
@@ -94,7 +98,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
                     color: if i == 0 { BEST } else { OTHER },
                 })
                 .collect();
-            let path = folder.join("overlay.png");
+            let path = files[0].clone();
             write_rgb(&path, &draw_grasps(&background, Some(&depth), &camera, &gripper, &drawn)?)?;
             Some(path)
         }
@@ -112,9 +116,8 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         overlay: picture,
         seconds,
     };
-    if let Some(folder) = &a.out {
-        let text = serde_json::to_string_pretty(&whole)?;
-        write_atomically(&folder.join("grasps.json"), text.as_bytes())?;
+    if let Some(files) = &files {
+        write_atomically(&files[1], serde_json::to_string_pretty(&whole)?.as_bytes())?;
     }
     report(&a.json, &whole, || print_table(&whole, a.out.as_deref()))?;
     Ok(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found })

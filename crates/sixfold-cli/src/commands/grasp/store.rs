@@ -13,9 +13,10 @@ use sixfold_io::write_rgb;
 
 use super::input::{self, InputArguments};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::grasp::experience::{NetworkArguments, model, now};
 use sixfold_shell::grasp::gripper::gripper;
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Args)]
@@ -311,6 +312,7 @@ struct Exported {
 fn export(file: &StorePlace, out: &Path, json: &JsonArguments) -> Result<Outcome> {
     let store = file.open()?;
     let all = store.list()?;
+    let mut folder = OutputFolder::take(out)?;
     let mut progress = Progress::new("experiences", all.len());
     let mut done = Exported { experiences: 0, unreadable: 0, folder: out.to_path_buf() };
     for summary in &all {
@@ -318,10 +320,10 @@ fn export(file: &StorePlace, out: &Path, json: &JsonArguments) -> Result<Outcome
         match store.get(summary.id) {
             Ok(Some(stored)) => {
                 let name = format!("{:06}", stored.id);
-                write_rgb(&out.join(format!("{name}.png")), &stored.experience.picture()?)?;
+                folder.write_rgb(&format!("{name}.png"), &stored.experience.picture()?)?;
                 let shown = Description::new(&stored, true);
                 let text = serde_json::to_string_pretty(&shown)?;
-                write_atomically(&out.join(format!("{name}.json")), text.as_bytes())?;
+                folder.write_text(&format!("{name}.json"), &text)?;
                 done.experiences += 1;
             }
             Ok(None) => {}
