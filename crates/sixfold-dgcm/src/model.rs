@@ -95,21 +95,13 @@ impl DgcmModel {
     ) -> Result<(Network, CropOptions), ModelError> {
         let wrong =
             |field, expected, found| ModelError::Card { file: path.to_path_buf(), field, expected, found };
-        let network = Network::of_architecture(&card.architecture, device)
-            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
         let crop: CropOptions = serde_json::from_value(card.extra["crop"].clone())
             .map_err(|e| wrong("extra.crop", "how objects are cut out", e.to_string()))?;
-        let sane = crop.side == network.side()
-            && crop.size > 0.01
-            && crop.size < 5.0
-            && (1..=50).contains(&crop.normal_radius)
-            && (0.0..0.5).contains(&crop.trim);
-        if !sane {
-            return Err(wrong(
-                "extra.crop",
-                "the network's side, a size of 0.01 to 5 m",
-                format!("{crop:?}"),
-            ));
+        check_crop(&crop).map_err(|(field, expected, found)| wrong(field, expected, found))?;
+        let network = Network::of_architecture(&card.architecture, device)
+            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
+        if crop.side != network.side() {
+            return Err(wrong("extra.crop.side", "the side of the network's input, pixels", crop.side.to_string()));
         }
         Ok((network, crop))
     }
@@ -175,6 +167,27 @@ impl DgcmModel {
         let side = self.crop.side;
         Tensor::from_data(TensorData::new(values, [count, 3, side, side]), &self.device)
     }
+}
+
+/// Whether numbers of a card can be those of a crop; otherwise which field cannot, what it should hold, and what it holds.
+fn check_crop(crop: &CropOptions) -> Result<(), (&'static str, &'static str, String)> {
+    if !(crop.size > 0.01 && crop.size < 5.0) {
+        return Err(("extra.crop.size", "0.01 to 5 m", crop.size.to_string()));
+    }
+    if !(1..=50).contains(&crop.normal_radius) {
+        return Err(("extra.crop.normal_radius", "1 to 50 pixels", crop.normal_radius.to_string()));
+    }
+    if !(0.0..0.5).contains(&crop.trim) {
+        return Err(("extra.crop.trim", "0 up to 0.5", crop.trim.to_string()));
+    }
+    if !(8..=1024).contains(&crop.side) {
+        return Err(("extra.crop.side", "8 to 1024 pixels", crop.side.to_string()));
+    }
+    let pixels = crop.side * crop.side;
+    if !(1..=pixels).contains(&crop.min_pixels) {
+        return Err(("extra.crop.min_pixels", "1 to the pixels of the crop", crop.min_pixels.to_string()));
+    }
+    Ok(())
 }
 
 fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {

@@ -5,10 +5,12 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
+use sixfold_data::background_files;
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use crate::loss::Perceptual;
@@ -114,6 +116,19 @@ impl Recipe for NolRecipe {
         let expected = "network paper; the compact network brings its encoder along";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
         self.options().check()
+    }
+
+    fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        #[rustfmt::skip]
+        let NolRecipe { network, encoder, parts, backgrounds, steps: _, learning_rate: _, seed: _, command: _ } = self;
+        let backgrounds =
+            background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
+        Fingerprint::of(&self.options())?
+            .merged(&Fingerprint::of(&serde_json::json!({ "parts": parts }))?)
+            .with("network", network.name())
+            .with_file("encoder", encoder.as_deref())?
+            .with_files("backgrounds", &backgrounds)
     }
 
     fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<NolTraining, Backgrounds>, TrainError> {
