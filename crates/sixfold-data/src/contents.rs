@@ -21,7 +21,8 @@ impl TrainingSet {
         let mut contents =
             vec![("ids".to_owned(), ids.join(", ")), ("frames".to_owned(), frames_in_words(&self.frames))];
         for object in &self.objects {
-            contents.push((format!("mesh of object {}", object.id), format!("{:016x}", hash_of_object(object))));
+            contents
+                .push((format!("mesh of object {}", object.id), format!("{:016x}", hash_of_object(object))));
         }
         let images = match self.images.len() {
             0 => "none".to_owned(),
@@ -171,7 +172,10 @@ mod tests {
         let mask = Mask::from_fn(32, 24, |x, _| x > 4);
         let info = ModelInfo::of_mesh(&mesh);
         TrainingSet {
-            objects: vec![TrainingObject::new(5, mesh.clone(), info.clone()), TrainingObject::new(8, mesh, info)],
+            objects: vec![
+                TrainingObject::new(5, mesh.clone(), info.clone()),
+                TrainingObject::new(8, mesh, info),
+            ],
             images: vec![posed(5).with_mask(&mask).unwrap(), posed(8)],
             frames: vec![frame],
             description: "anything".to_owned(),
@@ -204,7 +208,8 @@ mod tests {
             s.images[1] = s.images[1].with_pose(moved).unwrap();
         };
         let mask = |s: &mut TrainingSet| {
-            s.images[0] = s.images[0].clone().with_mask(&Mask::from_fn(32, 24, |x, y| x > 4 && y > 0)).unwrap();
+            s.images[0] =
+                s.images[0].clone().with_mask(&Mask::from_fn(32, 24, |x, y| x > 4 && y > 0)).unwrap();
         };
         let pixel = |s: &mut TrainingSet| {
             let mut image = s.images[1].image().as_ref().clone();

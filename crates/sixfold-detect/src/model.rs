@@ -256,8 +256,9 @@ fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
         .map_err(|e| wrong("extra.network", "the network's sizes", e.to_string()))?;
     let usage: DetectorUse = serde_json::from_value(card.extra["use"].clone())
         .map_err(|e| wrong("extra.use", "longest_side and threshold", e.to_string()))?;
-    let bytes =
-        std::fs::metadata(path).map_err(|source| WeightsError::Read { file: path.to_path_buf(), source })?.len();
+    let bytes = std::fs::metadata(path)
+        .map_err(|source| WeightsError::Read { file: path.to_path_buf(), source })?
+        .len();
     check_sizes(&config, &usage, classes.len(), bytes)
         .map_err(|(field, expected, found)| wrong(field, expected, found))?;
     if architecture(&config) != card.architecture {
@@ -278,7 +279,11 @@ fn check_sizes(
 ) -> Result<(), (&'static str, &'static str, String)> {
     let DetectorConfig { classes, width, levels, shared, own, prototypes, .. } = *config;
     if classes != objects {
-        return Err(("extra.network.classes", "as many as there are objects", format!("{classes} for {objects} objects")));
+        return Err((
+            "extra.network.classes",
+            "as many as there are objects",
+            format!("{classes} for {objects} objects"),
+        ));
     }
     let ranges = [
         ("extra.network.classes", classes, 1..=10_000, "1 to 10000"),

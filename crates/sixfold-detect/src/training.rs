@@ -57,7 +57,12 @@ impl DetectorTrainingOptions {
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
         OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
-        OptionError::unless(self.frozen_stages <= ENCODER_STAGES, "frozen_stages", self.frozen_stages, "0 to 5")?;
+        OptionError::unless(
+            self.frozen_stages <= ENCODER_STAGES,
+            "frozen_stages",
+            self.frozen_stages,
+            "0 to 5",
+        )?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }
 }

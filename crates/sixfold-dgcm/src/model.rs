@@ -101,7 +101,11 @@ impl DgcmModel {
         let network = Network::of_architecture(&card.architecture, device)
             .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
         if crop.side != network.side() {
-            return Err(wrong("extra.crop.side", "the side of the network's input, pixels", crop.side.to_string()));
+            return Err(wrong(
+                "extra.crop.side",
+                "the side of the network's input, pixels",
+                crop.side.to_string(),
+            ));
         }
         Ok((network, crop))
     }
@@ -229,5 +233,42 @@ mod tests {
         assert!(missing.contains("none.safetensors"), "{missing}");
         let error = DgcmModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
         assert!(error.contains("dgcm.safetensors"), "{error}");
+    }
+
+    #[test]
+    fn cards_with_impossible_numbers_are_refused() {
+        use serde_json::{Value, json};
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("dgcm.safetensors");
+        let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
+        let whole = DgcmModel::new(network.clone(), CropOptions::compact(), ModelCard::new("", "test")).card;
+        let crop: [(&str, Value, &str); 9] = [
+            ("side", json!(0), "extra.crop.side"),
+            ("side", json!(1u64 << 63), "extra.crop.side"),
+            ("side", json!(128), "extra.crop.side"),
+            ("size", json!(1e300), "extra.crop.size"),
+            ("size", json!(-0.3), "extra.crop.size"),
+            ("normal_radius", json!(u64::MAX), "extra.crop.normal_radius"),
+            ("trim", json!(0.5), "extra.crop.trim"),
+            ("min_pixels", json!(0), "extra.crop.min_pixels"),
+            ("min_pixels", json!(u64::MAX), "extra.crop.min_pixels"),
+        ];
+        let refused = |card: &ModelCard, field: &str| {
+            save_weights(&network, card, &file).unwrap();
+            let bytes = std::fs::read(&file).unwrap();
+            for error in
+                [DgcmModel::load(&file).unwrap_err(), DgcmModel::from_bytes(&file, &bytes).unwrap_err()]
+            {
+                let error = error.to_string();
+                assert!(error.contains("dgcm.safetensors") && error.contains(field), "{field}: {error}");
+            }
+        };
+        for (name, value, field) in crop {
+            let mut card = whole.clone();
+            card.extra["crop"][name] = value;
+            refused(&card, field);
+        }
+        refused(&ModelCard { extra: Value::Null, ..whole.clone() }, "extra.crop");
+        refused(&ModelCard { architecture: "dgcm".to_owned(), ..whole }, "dgcm-compact");
     }
 }

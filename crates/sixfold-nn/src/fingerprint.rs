@@ -138,7 +138,8 @@ mod tests {
 
     #[test]
     fn differences_are_named_with_both_values() {
-        let was = Fingerprint::of(&json!({"steps": 3, "pool": {"crop": {"side": 96}, "sides": [1, 2]}})).unwrap();
+        let was =
+            Fingerprint::of(&json!({"steps": 3, "pool": {"crop": {"side": 96}, "sides": [1, 2]}})).unwrap();
         let text = serde_json::to_string(&was).unwrap();
         assert_eq!(text, r#"{"pool.crop.side":96,"pool.sides":[1,2],"steps":3}"#);
         assert_eq!(was.difference(&serde_json::from_str(&text).unwrap()), None);
@@ -165,9 +166,8 @@ mod tests {
         let of = |name: &str| Fingerprint::default().with_file("init", Some(&path(name))).unwrap();
         assert_eq!(of("a"), of("b"));
         assert!(of("a").difference(&of("c")).unwrap().starts_with("init was \""));
-        let files = |names: [&str; 2]| {
-            Fingerprint::default().with_files("backgrounds", &names.map(path)).unwrap()
-        };
+        let files =
+            |names: [&str; 2]| Fingerprint::default().with_files("backgrounds", &names.map(path)).unwrap();
         assert_eq!(files(["a", "c"]), files(["b", "c"]));
         assert_ne!(files(["a", "c"]), files(["c", "a"]));
         let error = Fingerprint::default().with_file("init", Some(&path("d"))).unwrap_err().to_string();

@@ -184,7 +184,10 @@ mod tests {
         options.schedule().check().unwrap();
         let wrong = [
             (TrainingOptions { steps: 0, ..options.clone() }, "steps: found 0, expected 1 or more"),
-            (TrainingOptions { steps: u64::MAX, ..options.clone() }, "steps: found 18446744073709551615, expected at most"),
+            (
+                TrainingOptions { steps: u64::MAX, ..options.clone() },
+                "steps: found 18446744073709551615, expected at most",
+            ),
             (TrainingOptions { learning_rate: f64::NAN, ..options.clone() }, "learning_rate: found NaN"),
             (TrainingOptions { weight_decay: -1.0, ..options.clone() }, "weight_decay: found -1"),
             (TrainingOptions { max_grad_norm: Some(0.0), ..options.clone() }, "max_grad_norm: found 0"),

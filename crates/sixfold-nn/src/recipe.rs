@@ -461,7 +461,9 @@ mod tests {
         let model = std::fs::read(session.model()).unwrap();
         // Done already: not for other inputs, and for other steps only after samples are made.
         assert!(said(train(&recipe, 11, &mut session).unwrap_err()).contains("offset was 10, is 11"));
-        assert!(said(train(&SumRecipe { steps: 5 }, 10, &mut session).unwrap_err()).contains("steps was 4, is 5"));
+        assert!(
+            said(train(&SumRecipe { steps: 5 }, 10, &mut session).unwrap_err()).contains("steps was 4, is 5")
+        );
         assert_eq!(std::fs::read(session.model()).unwrap(), model);
         // Samples were made of the right inputs alone: begun, resumed, and of other steps.
         assert_eq!(notes, 3);
@@ -474,9 +476,15 @@ mod tests {
         let mut session = Session::new(folder.path(), &stop, &mut events);
         let before = CheckpointWriter::new(3).state("options", &serde_json::json!({ "steps": 4 })).unwrap();
         before.state("sum", &3).unwrap().write(&session.folder()).unwrap();
-        for ended in [train(&SumRecipe { steps: 4 }, 1, &mut session), export(&SumRecipe { steps: 4 }, 1, &mut session)] {
+        for ended in [
+            train(&SumRecipe { steps: 4 }, 1, &mut session),
+            export(&SumRecipe { steps: 4 }, 1, &mut session),
+        ] {
             let error = ended.unwrap_err().to_string();
-            assert!(error.contains("does not say from which inputs") && error.contains("another folder"), "{error}");
+            assert!(
+                error.contains("does not say from which inputs") && error.contains("another folder"),
+                "{error}"
+            );
         }
     }
 

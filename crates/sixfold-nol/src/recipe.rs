@@ -4,13 +4,13 @@
 use std::path::PathBuf;
 
 use burn::tensor::Device;
+use sixfold_data::background_files;
 use sixfold_nn::choice::Choice;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::ModelCard;
-use sixfold_data::background_files;
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use crate::loss::Perceptual;

@@ -301,13 +301,18 @@ fn described(path: &Path, card: &ModelCard) -> Result<(Vec<ObjectEntry>, ImageSi
         COMPACT => true,
         PAPER | RESNET50 => false,
         other => {
-            return Err(wrong("architecture", "pix2pose-compact, pix2pose-paper or pix2pose-resnet50", other.to_owned()));
+            return Err(wrong(
+                "architecture",
+                "pix2pose-compact, pix2pose-paper or pix2pose-resnet50",
+                other.to_owned(),
+            ));
         }
     };
     let count = card.objects.len();
     if compact {
         let expected = "1 to 1000 objects, and 500 kB of the file for each";
-        let bytes = std::fs::metadata(path).map_err(|source| WeightsError::Read { file: file(), source })?.len();
+        let bytes =
+            std::fs::metadata(path).map_err(|source| WeightsError::Read { file: file(), source })?.len();
         if !(1..=MOST_OBJECTS).contains(&count) || bytes < count as u64 * DECODER_BYTES {
             return Err(wrong("objects", expected, format!("{count} in a file of {bytes} bytes")));
         }
@@ -316,9 +321,12 @@ fn described(path: &Path, card: &ModelCard) -> Result<(Vec<ObjectEntry>, ImageSi
     }
     let mut objects: Vec<ObjectEntry> = Vec::with_capacity(count);
     for value in &card.objects {
-        let entry: ObjectEntry = serde_json::from_value(value.clone())
-            .map_err(|error| wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string()))?;
-        entry.check().map_err(|(field, expected, found)| wrong(field, expected, format!("{found} (object {})", entry.id)))?;
+        let entry: ObjectEntry = serde_json::from_value(value.clone()).map_err(|error| {
+            wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string())
+        })?;
+        entry.check().map_err(|(field, expected, found)| {
+            wrong(field, expected, format!("{found} (object {})", entry.id))
+        })?;
         if objects.iter().any(|o| o.id == entry.id) {
             return Err(wrong("objects", "every id once", format!("object {} twice", entry.id)));
         }

@@ -79,7 +79,11 @@ impl ObjectEntry {
             return Err(("objects.diameter", "metres from 0.001 to 10", self.diameter.to_string()));
         }
         if !self.half_size.iter().all(length) {
-            return Err(("objects.half_size", "three lengths above 0 up to 10 m", format!("{:?}", self.half_size)));
+            return Err((
+                "objects.half_size",
+                "three lengths above 0 up to 10 m",
+                format!("{:?}", self.half_size),
+            ));
         }
         if !self.centre.iter().all(|c| c.abs() <= 1000.0) {
             return Err(("objects.centre", "coordinates within 1000 m", format!("{:?}", self.centre)));

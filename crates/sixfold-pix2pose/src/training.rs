@@ -70,7 +70,12 @@ impl Pix2PoseTrainingOptions {
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
         OptionError::unless_samples("per_object", self.per_object, 1, "1 or more")?;
-        OptionError::unless(self.frozen_stages <= ENCODER_STAGES, "frozen_stages", self.frozen_stages, "0 to 5")?;
+        OptionError::unless(
+            self.frozen_stages <= ENCODER_STAGES,
+            "frozen_stages",
+            self.frozen_stages,
+            "0 to 5",
+        )?;
         OptionError::unless_weight("adversarial", f64::from(self.adversarial))?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }
