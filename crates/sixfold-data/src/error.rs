@@ -117,6 +117,12 @@ pub enum TrainingSetError {
         /// The dataset.
         root: PathBuf,
     },
+    /// An object is named twice: a model would have it twice.
+    #[error("ids: object {id} is named more than once; name every object once")]
+    NamedTwice {
+        /// The object.
+        id: u32,
+    },
     /// There is no colour image.
     #[error("{}: split {split} has no colour images to learn from", root.display())]
     NoImages {

@@ -5,6 +5,7 @@
 
 mod backgrounds;
 mod colors;
+mod contents;
 mod error;
 mod photograph_file;
 mod posed_image;
@@ -16,7 +17,7 @@ mod rough_images;
 mod training_set;
 mod visible_mask;
 
-pub use backgrounds::{backgrounds_with_images, plain_backgrounds};
+pub use backgrounds::{background_files, backgrounds_with_images, plain_backgrounds};
 pub use colors::image_color_augmentation;
 pub use error::{PosedImageError, TrainingSetError};
 pub use posed_image::{MIN_PIXELS, PosedImage};

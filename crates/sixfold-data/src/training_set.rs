@@ -72,6 +72,9 @@ impl TrainingSet {
         frames: &FrameSelection,
         min_visibility: f64,
     ) -> Result<TrainingSet, TrainingSetError> {
+        if let Some(id) = ids.iter().enumerate().find(|(i, id)| ids[..*i].contains(id)).map(|(_, id)| *id) {
+            return Err(TrainingSetError::NamedTwice { id });
+        }
         let dataset = BopDataset::open(root, split)?;
         let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
         let ids: Vec<u32> = if ids.is_empty() { infos.0.keys().copied().collect() } else { ids.to_vec() };

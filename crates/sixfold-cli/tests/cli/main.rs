@@ -24,6 +24,8 @@ mod simulate_scenes;
 mod support;
 #[cfg(feature = "networks")]
 mod synthesize;
+#[cfg(feature = "networks")]
+mod trainings;
 #[cfg(not(feature = "networks"))]
 mod without_networks;
 

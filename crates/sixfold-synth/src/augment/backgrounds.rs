@@ -1,6 +1,6 @@
 //! Where backgrounds come from: photographs of a folder, images in memory, or procedural textures.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::DynamicImage;
@@ -68,19 +68,8 @@ impl Backgrounds {
     /// [`AugmentError`] when the folder cannot be listed or holds no readable photograph.
     pub fn from_folder(path: impl AsRef<Path>, options: &PhotographOptions) -> Result<Self, AugmentError> {
         let path = path.as_ref();
-        let folder = |source| AugmentError::Folder { path: path.to_owned(), source };
-        let mut files = Vec::new();
-        for entry in std::fs::read_dir(path).map_err(folder)? {
-            let file = entry.map_err(folder)?.path();
-            let end = file.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-            if matches!(end.as_deref(), Some("png" | "jpg" | "jpeg")) {
-                files.push(file);
-            }
-        }
-        // The order in which a system lists files is not the same everywhere.
-        files.sort();
         let mut images = Vec::new();
-        for file in files.into_iter().take(options.most) {
+        for file in Backgrounds::files(path, options)? {
             let Ok(decoded) = read_rgb(&file) else { continue };
             let side = options.longest_side.clamp(16, 1 << 14);
             let Some(image) = reduced(decoded, side) else { continue };
@@ -92,6 +81,26 @@ impl Backgrounds {
             return Err(AugmentError::NoPhotographs { path: path.to_owned(), found: 0 });
         }
         Backgrounds::from_images(images)
+    }
+
+    /// The files that [`Backgrounds::from_folder`] reads, in its order.
+    ///
+    /// # Errors
+    /// [`AugmentError::Folder`] when the folder cannot be listed.
+    pub fn files(path: &Path, options: &PhotographOptions) -> Result<Vec<PathBuf>, AugmentError> {
+        let folder = |source| AugmentError::Folder { path: path.to_owned(), source };
+        let mut files = Vec::new();
+        for entry in std::fs::read_dir(path).map_err(folder)? {
+            let file = entry.map_err(folder)?.path();
+            let end = file.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+            if matches!(end.as_deref(), Some("png" | "jpg" | "jpeg")) {
+                files.push(file);
+            }
+        }
+        // The order in which a system lists files is not the same everywhere.
+        files.sort();
+        files.truncate(options.most);
+        Ok(files)
     }
 
     /// Images that are already in memory.
