@@ -8,16 +8,19 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::learner::{GraspTask, Learner, LearnerOptions, PartOf};
-use sixfold_experience::StorePlace;
+use sixfold_dgcm::learner::{GraspTask, JournalOf, Learned, Learner, LearnerOptions, PartOf};
+use sixfold_dgcm::transfer::Memory;
+use sixfold_experience::{ExperienceStore, JournalEntry, StorePlace, TaskRecord};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, centre_between_pads};
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOutcome, ConvexParts, PartsOptions, scene, try_grasp, wilson_interval};
 use sixfold_synth::shapes::{Family, Member, Rest, member};
 
-use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
-use super::journal::Journal;
+use super::experience::{
+    NetworkArguments, OutboxArguments, local_file, model, note_left_out, now, writable_store,
+};
+use super::journal::StoreJournal;
 use super::object_list::{ObjectsArguments, named_objects};
 use super::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use crate::output::JsonArguments;
@@ -230,6 +233,11 @@ fn pupils(a: &LearnArguments) -> Result<Vec<TestObject>> {
 /// # Errors
 /// When the arguments, the store or the folder of an earlier run do not fit, and when the user asks to stop.
 pub fn learn(a: &LearnArguments) -> Result<Whole> {
+    learn_with(a, |store| store)
+}
+
+/// `wrap` gets the store before anything is done with it.
+fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -> Result<Whole> {
     if a.near.is_nan() || a.near < 0.0 {
         bail!("--near: found {}, expected 0 or more", a.near);
     }
@@ -237,7 +245,6 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
         bail!("--tries and --attempts: expected at least 1");
     }
     let setting = hardness(&a.physics, a.hard)?;
-    let gripper = &setting.gripper;
     let network = model(&a.network)?;
     let pupils = pupils(a)?;
     let recorded = Recorded {
@@ -253,9 +260,17 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
         network: network.fingerprint(),
         gripper: &setting.real,
     };
-    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
-    let mut memory = new_memory(&a.experiences, &a.outbox, &a.out, &network)?;
+    let file = local_file(&a.experiences, &a.outbox, &a.out)?;
+    let mut journal = StoreJournal::open(&a.out.join("attempts.jsonl"), &recorded)?;
+    let place = file.display().to_string();
+    if !journal.is_empty() && !file.exists() {
+        bail!(journal.of_another_store(0, &place));
+    }
+    let store = wrap(writable_store(&a.experiences, &file)?);
+    let mut rows: Vec<Row> = journal.complete(&*store, &place)?;
+    let mut memory = Memory::new(store, &network)?;
     let options = LearnerOptions { tries: a.tries, explore: a.explore, near: a.near, part: a.part.clone() };
+    let gripper = &setting.gripper;
     let mut learner = Learner { network: &network, memory: &mut memory, gripper, options: &options };
     let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
     for pupil in &pupils {
@@ -270,37 +285,48 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
         for attempt in 0..a.attempts {
             if !done(&rows, attempt) {
                 check_interrupt("what was learned is kept; run the same command again to continue")?;
-                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt)?;
-                journal.row(&row)?;
+                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt, &journal.name)?;
+                journal.line(&line(&row))?;
                 rows.push(row);
+                note_left_out(&learner.memory.take_left_out(), &place);
             }
             progress.step(pupil.name.clone());
         }
     }
     progress.finish();
     memory.refresh()?;
+    note_left_out(&memory.take_left_out(), &place);
+    Ok(whole(&pupils, &rows, &mut memory, &gripper.name))
+}
+
+type BoxedStore = Box<dyn ExperienceStore + Send>;
+
+/// A row as store and journal keep it.
+fn line(row: &Row) -> String {
+    serde_json::to_string(row).unwrap_or_default()
+}
+
+fn whole(pupils: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str) -> Whole {
     let held = rows.iter().filter(|r| r.held).count();
-    Ok(Whole {
+    let curve = |p: &TestObject| {
+        let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
+        Curve {
+            object: p.name.clone(),
+            held: mine.iter().map(|r| r.held).collect(),
+            nearest: mine.iter().map(|r| r.nearest).collect(),
+            from_experience: mine.iter().map(|r| r.from_experience).collect(),
+        }
+    };
+    Whole {
         attempts: rows.len(),
         held,
         rate: held as f64 / rows.len().max(1) as f64,
         interval: wilson_interval(held, rows.len()),
         from_experience: rows.iter().filter(|r| r.from_experience).count(),
         experiences: memory.len(),
-        outcomes: memory.outcomes(&gripper.name).attempts,
-        objects: pupils
-            .iter()
-            .map(|p| {
-                let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
-                Curve {
-                    object: p.name.clone(),
-                    held: mine.iter().map(|r| r.held).collect(),
-                    nearest: mine.iter().map(|r| r.nearest).collect(),
-                    from_experience: mine.iter().map(|r| r.from_experience).collect(),
-                }
-            })
-            .collect(),
-    })
+        outcomes: memory.outcomes(gripper).attempts,
+        objects: pupils.iter().map(curve).collect(),
+    }
 }
 
 /// One letter an attempt: G geometry, E experience; capitals held.
@@ -314,7 +340,7 @@ pub fn marks(curve: &Curve) -> String {
     curve.held.iter().zip(&curve.from_experience).map(letter).collect()
 }
 
-/// One scene with an object, and what was learned of it.
+/// One scene with an object, and what was learned of it, which the store keeps with a row of the journal.
 fn attempt(
     a: &LearnArguments,
     setting: &Hardness,
@@ -322,9 +348,10 @@ fn attempt(
     pupil: &TestObject,
     parts: &ConvexParts,
     attempt: u64,
+    journal: &str,
 ) -> Result<Row> {
     let scene = scene(&pupil.mesh, parts, &setting.options, a.seed, attempt);
-    let mut row = Row {
+    let empty = Row {
         object: pupil.name.clone(),
         class: pupil.class.clone(),
         attempt,
@@ -335,7 +362,11 @@ fn attempt(
         rank: 0,
         stored: None,
     };
-    let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
+    let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else {
+        let journal = Some(JournalEntry { journal, row: &|_| line(&empty) });
+        learner.memory.store().add_record(&TaskRecord { journal, ..TaskRecord::default() })?;
+        return Ok(empty);
+    };
     let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
     let part_of = |grasp: &Grasp| pupil.part(&camera_from_object, grasp, view, &setting.gripper);
     let task = GraspTask {
@@ -346,7 +377,7 @@ fn attempt(
         part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
         now,
     };
-    let learned = learner.learn(&task, &mut |grasp| {
+    let mut try_one = |grasp: &Grasp| {
         let sent = seen.world_from_camera * grasp.camera_from_gripper;
         let tried = try_grasp(
             parts,
@@ -358,16 +389,24 @@ fn attempt(
         )?;
         let ending = AttemptOutcome::Tried(tried.outcome);
         Ok((ending.is_success(), ending))
-    })?;
-    row.nearest = learned.nearest;
-    row.from_experience = learned.from_experience;
-    row.held = learned.held;
-    row.stored = learned.stored;
-    if let Some((rank, ending)) = learned.last {
-        row.rank = rank;
-        row.ending = outcome_name(ending);
-    }
-    Ok(row)
+    };
+    let row = |learned: &Learned<AttemptOutcome>, stored: Option<i64>| {
+        let mut row = Row {
+            nearest: learned.nearest,
+            from_experience: learned.from_experience,
+            held: learned.held,
+            stored,
+            ..empty.clone()
+        };
+        if let Some((rank, ending)) = learned.last {
+            row.rank = rank;
+            row.ending = outcome_name(ending);
+        }
+        row
+    };
+    let of_task = JournalOf { journal, row: &|learned, stored| line(&row(learned, stored)) };
+    let learned = learner.learn(&task, &mut try_one, Some(&of_task))?;
+    Ok(row(&learned, learned.stored))
 }
 
 #[cfg(test)]
