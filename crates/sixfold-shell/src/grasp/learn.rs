@@ -411,7 +411,10 @@ fn attempt(
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
+    use sixfold_experience::{Attempt, Changes, Experience, Position, StoreError, Stored, Summary};
     use sixfold_geometry::{Camera, DepthImage, Mask, PointCloud};
     use sixfold_grasp::{AntipodalQuality, gripper_pose};
 
@@ -462,5 +465,111 @@ mod tests {
         let front = body.iter().map(|p| p.x).fold(f64::MIN, f64::max);
         let height = body.iter().map(|p| p.z).sum::<f64>() / body.len() as f64;
         assert_eq!(part(Vec3::new(0.6 * front, 0.0, height - 0.01), -Vec3::z()), Some("body"));
+    }
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        learn: LearnArguments,
+    }
+
+    /// A store whose process is stopped before its n-th write.
+    struct Stopping {
+        store: BoxedStore,
+        left: usize,
+    }
+
+    impl Stopping {
+        fn write(&mut self) -> Result<&mut BoxedStore, StoreError> {
+            let file = PathBuf::from("stopped");
+            self.left = self.left.checked_sub(1).ok_or(StoreError::Full { file })?;
+            Ok(&mut self.store)
+        }
+    }
+
+    impl ExperienceStore for Stopping {
+        fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
+            self.write()?.add(experience)
+        }
+
+        fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
+            self.write()?.add_attempt(attempt)
+        }
+
+        fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+            self.write()?.add_record(record)
+        }
+
+        fn forget(&mut self, id: i64) -> Result<bool, StoreError> {
+            self.write()?.forget(id)
+        }
+
+        fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
+            self.store.get(id)
+        }
+
+        fn list(&self) -> Result<Vec<Summary>, StoreError> {
+            self.store.list()
+        }
+
+        fn changes(&self, since: Position) -> Result<Changes, StoreError> {
+            self.store.changes(since)
+        }
+
+        fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+            self.store.attempts(after)
+        }
+
+        fn journal(&self, name: &str) -> Result<Vec<String>, StoreError> {
+            self.store.journal(name)
+        }
+    }
+
+    /// All that a run leaves behind, but for times and the journal's name.
+    fn left_behind(folder: &Path) -> (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>) {
+        let text = std::fs::read_to_string(folder.join("attempts.jsonl")).unwrap();
+        let store = StorePlace::File(folder.join("e.db")).open().unwrap();
+        let attempts = store.attempts(0).unwrap().into_iter().map(|(_, a)| Attempt { time: 0, ..a }).collect();
+        let experiences = store.list().unwrap().into_iter().map(|summary| {
+            let stored = store.get(summary.id).unwrap().unwrap().experience;
+            (Summary { time: 0, ..summary }, stored.copies[0].feature.clone())
+        });
+        (text.lines().skip(1).map(str::to_owned).collect(), attempts, experiences.collect())
+    }
+
+    #[test]
+    fn a_run_that_is_stopped_at_any_write_ends_as_one_that_was_not() {
+        use clap::Parser;
+        let weights = concat!(env!("CARGO_MANIFEST_DIR"), "/../../weights/dgcm.safetensors");
+        let all = tempfile::tempdir().unwrap();
+        let arguments = |name: &str| {
+            let folder = all.path().join(name);
+            let store = folder.join("e.db");
+            let place = [store.to_str().unwrap(), folder.to_str().unwrap()].map(str::to_owned);
+            let [store, out] = place;
+            let text = ["learn", "--families", "can", "--members", "1", "--attempts", "3", "--tries", "2"];
+            let more = ["--explore", "2", "--weights", weights, "--experiences", &store, "--out", &out];
+            (Line::parse_from(text.into_iter().chain(more)).learn, folder)
+        };
+        let (undisturbed, folder) = arguments("undisturbed");
+        let whole = learn(&undisturbed).unwrap();
+        let expected = left_behind(&folder);
+        assert!(whole.held > 0 && expected.1.len() > 3 && !expected.2.is_empty());
+        for stop in 0..3 {
+            let (a, folder) = arguments(&format!("stopped {stop}"));
+            let stopped = learn_with(&a, |store| Box::new(Stopping { store, left: stop }));
+            assert!(stopped.is_err());
+            let before = left_behind(&folder);
+            assert_eq!(before.0, expected.0[..stop], "scenes are there whole, or not at all");
+            // Stopped after the store's write, and before or within the journal's.
+            let file = folder.join("attempts.jsonl");
+            let text = std::fs::read_to_string(&file).unwrap();
+            let last = text.trim_end().rfind('\n').map_or(text.len(), |end| end + 1);
+            let cut = [text.len(), last, text.len() - 4][if stop == 0 { 0 } else { stop }];
+            std::fs::write(&file, &text[..cut]).unwrap();
+            let resumed = learn(&a).unwrap();
+            assert_eq!(left_behind(&folder), expected, "stopped before write {stop}");
+            assert_eq!((resumed.held, resumed.outcomes), (whole.held, whole.outcomes));
+        }
     }
 }
