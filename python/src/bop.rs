@@ -344,7 +344,7 @@ impl PyDataset {
 /// >>> set_max_pixels(100_000_000)
 #[pyfunction]
 fn set_max_pixels(pixels: i64) -> PyResult<()> {
-    sixfold_io::set_max_pixels(whole("pixels", pixels, 1)? as u64);
+    sixfold::io::set_max_pixels(whole("pixels", pixels, 1)? as u64);
     Ok(())
 }
 

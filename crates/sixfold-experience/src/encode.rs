@@ -174,12 +174,12 @@ pub(super) fn attempt(attempt: &Attempt) -> Result<([u8; 16], String), StoreErro
 }
 
 pub(super) fn from_attempt(id: i64, text: &str) -> Result<Attempt, StoreError> {
-    serde_json::from_str(text).map_err(|e| StoreError::Field {
-        id,
-        field: "attempt",
-        expected: "an attempt as this program writes it",
-        found: e.to_string(),
-    })
+    let attempt: Attempt =
+        serde_json::from_str(text).map_err(|e| StoreError::Attempt { id, reason: e.to_string() })?;
+    match attempt.check() {
+        Ok(()) => Ok(attempt),
+        Err(field) => Err(StoreError::Attempt { id, reason: format!("no finite number in {field}") }),
+    }
 }
 
 /// FNV-1a over 128 bits: the same bytes give the same key on every machine.

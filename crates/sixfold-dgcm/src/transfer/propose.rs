@@ -281,7 +281,8 @@ pub(super) fn place(
         .iter()
         .map(|w| w + room)
         .chain([gripper.max_opening])
-        .map(|o| o.clamp(0.01, gripper.max_opening))
+        // Not `clamp`: a small gripper opens less than a centimetre.
+        .map(|o| o.max(0.01).min(gripper.max_opening))
         .collect();
     openings.dedup_by(|a, b| (*a - *b).abs() < 0.002);
     let start = t.camera_from_experience * *source.grasp;
