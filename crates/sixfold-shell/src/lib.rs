@@ -1,6 +1,10 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
 //! arguments, stores and scenes that both take.
 
+// First: its macros take the place of the standard ones in all that follows.
+#[macro_use]
+pub mod screen;
+
 #[cfg(feature = "networks")]
 pub mod detector;
 pub mod frames;
@@ -8,6 +12,7 @@ pub mod grasp;
 pub mod objects;
 pub mod output;
 pub mod overlay;
+pub mod pictures;
 pub mod progress;
 #[cfg(feature = "networks")]
 pub mod training;
@@ -26,17 +31,20 @@ pub enum Outcome {
     Incomplete,
 }
 
-/// The exit status of a command; the reason of an error goes to standard error.
+/// The exit status of a command; the reason of an error goes to standard error, and as JSON to standard output where that was
+/// asked for.
 pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
-    match result {
-        Ok(Outcome::Found) => ExitCode::SUCCESS,
-        Ok(Outcome::NothingFound) => ExitCode::from(1),
-        Ok(Outcome::Incomplete) => ExitCode::from(2),
+    screen::finish(match result {
+        Ok(Outcome::Found) => 0,
+        Ok(Outcome::NothingFound) => 1,
+        Ok(Outcome::Incomplete) => 2,
         Err(error) => {
-            eprintln!("error: {}", describe(error));
-            ExitCode::from(2)
+            let stopped = progress::was_interrupted();
+            let failure = if stopped { screen::Failure::Interrupt } else { screen::Failure::Command };
+            screen::fail(&describe(error), failure);
+            2
         }
-    }
+    })
 }
 
 /// The whole chain of causes in one line, without repeating a cause that its parent already prints.
@@ -52,20 +60,6 @@ pub fn describe(error: &anyhow::Error) -> String {
         }
     }
     text
-}
-
-/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end one in C, rather
-/// than with a message of a panic. What a command has to keep it writes to files.
-pub fn end_with_the_reader() {
-    let usual = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        let message = panic.payload().downcast_ref::<String>();
-        if message.is_some_and(|m| m.starts_with("failed printing to") && m.contains("Broken pipe")) {
-            // 128 and the number of SIGPIPE.
-            std::process::exit(141);
-        }
-        usual(panic);
-    }));
 }
 
 /// Uses so many threads for everything, or all cores.
