@@ -160,7 +160,10 @@ impl BopDataset {
         }
         let [scene_id] = scenes[..] else {
             let (count, all) = (read.without_scene.len(), read.detections.len());
-            let found = format!("nothing in {count} of {all} detections, the first of image {}", read.detections[first].image_id);
+            let found = format!(
+                "nothing in {count} of {all} detections, the first of image {}",
+                read.detections[first].image_id
+            );
             let known = list_ids(scenes.iter());
             let expected = format!("the scene of each: add \"scene_id\", one of {known}");
             return Err(At::file(file).error("scene_id", found, expected));

@@ -9,8 +9,8 @@ use serde_json::json;
 use sixfold_io::write_atomically;
 use sixfold_mesh::Mesh;
 
-use crate::coco_score::{CocoScores, IouType, evaluate_coco};
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
+use crate::coco_score::{CocoScores, IouType, evaluate_coco};
 use crate::dataset::{BopDataset, MaskKind, Models};
 use crate::dataset_error::DatasetError;
 use crate::rle::Rle;
@@ -45,8 +45,8 @@ impl VisibleTruth {
         }
         let mut truth = CocoGroundTruth::default();
         for (scene_id, file) in files {
-            let text = std::fs::read(&file)
-                .map_err(|source| DatasetError::Read { path: file.clone(), source })?;
+            let text =
+                std::fs::read(&file).map_err(|source| DatasetError::Read { path: file.clone(), source })?;
             truth.add_scene(scene_id, &text, &file)?;
         }
         truth.images.retain(|image| images.contains(image));

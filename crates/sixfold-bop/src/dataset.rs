@@ -2,8 +2,8 @@
 //! read when they are asked for. What a dataset leaves out (depth, masks, ground truth, models) is `None`, what is
 //! broken is an error.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};

@@ -51,8 +51,13 @@ impl WriteLock {
             std::fs::create_dir_all(parent).map_err(io)?;
         }
         loop {
-            let mut file =
-                File::options().read(true).write(true).create(true).truncate(false).open(&lock).map_err(io)?;
+            let mut file = File::options()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .open(&lock)
+                .map_err(io)?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => {
@@ -67,7 +72,10 @@ impl WriteLock {
                 continue;
             }
             let id = format!("{}\n", std::process::id());
-            file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes())).map_err(io)?;
+            file.set_len(0)
+                .and_then(|()| file.rewind())
+                .and_then(|()| file.write_all(id.as_bytes()))
+                .map_err(io)?;
             return Ok(WriteLock { path: lock, _file: file });
         }
     }

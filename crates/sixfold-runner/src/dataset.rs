@@ -137,7 +137,8 @@ impl DatasetRun<'_> {
         }
         let mut record = RunRecord::open(results, self.estimator.name(), self.options)?;
         let infos = self.dataset.models_info(Models::Rendering)?;
-        let mut work = Work { infos, known: BTreeMap::new(), scenes: BTreeMap::new(), images: BTreeMap::new() };
+        let mut work =
+            Work { infos, known: BTreeMap::new(), scenes: BTreeMap::new(), images: BTreeMap::new() };
         for t in self.targets {
             work.images.entry((t.scene_id, t.im_id)).or_default().push(*t);
             if let Entry::Vacant(place) = work.scenes.entry(t.scene_id) {
@@ -225,7 +226,8 @@ impl DatasetRun<'_> {
         image: (u32, u32),
         events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
     ) -> Result<(), RunError> {
-        let ids: BTreeSet<u32> = work.images[&image].iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+        let ids: BTreeSet<u32> =
+            work.images[&image].iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
         for id in ids {
             if let Entry::Vacant(place) = work.known.entry(id) {
                 place.insert(self.known(id, work.infos.as_ref(), events)?);

@@ -156,7 +156,8 @@ impl DetectionRun<'_> {
         im_id: u32,
         events: &mut dyn FnMut(DetectionEvent<'_>),
     ) -> Result<(Vec<Detection>, f64), RunError> {
-        let image = scene.rgb(im_id)?.ok_or(RunError::Lacks { what: "colour image", user: "the detector" })?;
+        let image =
+            scene.rgb(im_id)?.ok_or(RunError::Lacks { what: "colour image", user: "the detector" })?;
         let start = Instant::now();
         let found = detections(self.detector, &image, self.ids, (scene.scene_id, im_id))?;
         let time = start.elapsed().as_secs_f64();

@@ -90,7 +90,8 @@ impl Inputs {
 
     /// The first input that is another than before, and its file.
     pub fn difference(&self, before: &BTreeMap<String, String>) -> Option<(&'static str, PathBuf)> {
-        let differs = |(name, (hash, _)): &(&&'static str, &(String, PathBuf))| before.get(**name) != Some(hash);
+        let differs =
+            |(name, (hash, _)): &(&&'static str, &(String, PathBuf))| before.get(**name) != Some(hash);
         self.0.iter().find(differs).map(|(name, (_, file))| (*name, file.clone()))
     }
 }

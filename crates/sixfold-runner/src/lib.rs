@@ -14,7 +14,7 @@ mod table;
 pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject};
 pub use detection::{DetectionEvent, DetectionRun, DetectionSummary, FoundDetection, detections};
 pub use error::{OtherInput, OtherOptions, RunError, describe};
-pub use image::{FoundObject, FoundPose, ImageReport, ImageRun};
+pub use image::{FoundObject, FoundPose, ImageReport, ImageRun, depth_notes};
 pub use record::RunOptions;
 pub use regions::RegionSource;
 pub use table::pose_table;

@@ -5,8 +5,7 @@
 #[macro_use]
 pub mod screen;
 
-#[cfg(feature = "networks")]
-pub mod detector;
+pub mod found;
 pub mod frames;
 pub mod grasp;
 pub mod objects;

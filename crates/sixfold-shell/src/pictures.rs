@@ -14,21 +14,21 @@ pub struct Pictures {
 }
 
 impl Pictures {
-    /// Writes a colour image.
-    pub fn write(&mut self, path: &Path, image: &RgbImage) {
-        self.did(write_rgb(path, image));
+    /// Writes a colour image; whether it is there.
+    pub fn write(&mut self, path: &Path, image: &RgbImage) -> bool {
+        self.did(write_rgb(path, image))
     }
 
-    /// Writes a mask.
-    pub fn write_mask(&mut self, path: &Path, mask: &Mask) {
-        self.did(write_mask(path, mask));
+    /// Writes a mask; whether it is there.
+    pub fn write_mask(&mut self, path: &Path, mask: &Mask) -> bool {
+        self.did(write_mask(path, mask))
     }
 
-    /// Takes note of an image that somebody else wrote, or could not.
-    pub fn did<E: Into<anyhow::Error>>(&mut self, written: Result<(), E>) {
-        if let Err(error) = written {
-            self.failed.push(crate::describe(&error.into()));
-        }
+    /// Takes note of an image that somebody else wrote, or could not; whether it is there.
+    pub fn did<E: Into<anyhow::Error>>(&mut self, written: Result<(), E>) -> bool {
+        let is_there = written.is_ok();
+        self.failed.extend(written.err().map(|error| crate::describe(&error.into())));
+        is_there
     }
 
     /// What could not be written, a sentence each; nothing is left of it here.

@@ -149,7 +149,9 @@ pub(crate) fn finish(code: u8) -> ExitCode {
     match FAILED.lock().unwrap_or_else(PoisonError::into_inner).take() {
         None => ExitCode::from(code),
         Some(error) => {
-            eprintln!("error: standard output: cannot be written: {error}; give --json FILE or --out for a file");
+            eprintln!(
+                "error: standard output: cannot be written: {error}; give --json FILE or --out for a file"
+            );
             ExitCode::from(2)
         }
     }
@@ -163,10 +165,7 @@ mod tests {
     fn terminals_see_no_control_characters() {
         assert!(matches!(plain("Tasse, 12 µm\n\tΩ"), Cow::Borrowed(_)));
         let hostile = "mug\u{1b}[2J\u{1b}]0;title\u{7}\r\u{9b}1m\u{202e}gnp.\u{7f}";
-        assert_eq!(
-            plain(hostile),
-            "mug\\u001b[2J\\u001b]0;title\\u0007\\u000d\\u009b1m\\u202egnp.\\u007f"
-        );
+        assert_eq!(plain(hostile), "mug\\u001b[2J\\u001b]0;title\\u0007\\u000d\\u009b1m\\u202egnp.\\u007f");
         // JSON means the same as before.
         let text = json!({ "name": hostile }).to_string();
         let back: serde_json::Value = serde_json::from_str(&plain(&text)).unwrap();
@@ -179,7 +178,9 @@ mod tests {
         for text in ["eval --json", "eval --json --dataset lmo", "object list --json -v"] {
             assert!(wanted(text), "{text}");
         }
-        for text in ["eval", "eval --json out.json", "eval --json=out.json", "eval -- --json", "eval --json -"] {
+        for text in
+            ["eval", "eval --json out.json", "eval --json=out.json", "eval -- --json", "eval --json -"]
+        {
             assert!(!wanted(text), "{text}");
         }
     }

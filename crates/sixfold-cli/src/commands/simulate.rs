@@ -10,7 +10,6 @@ use sixfold_bop::{
     BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
 };
 use sixfold_geometry::{Camera, DepthImage, Pose};
-use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_render::{
     DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, plane_mesh, simulate_depth, support_plane,
@@ -19,6 +18,7 @@ use sixfold_render::{
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -92,6 +92,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     let mut images = 0;
     let mut without_table = vec![];
     let mut first_camera = None;
+    let mut pictures = Pictures::default();
     for scene_id in dataset.scene_ids() {
         let scene = dataset.scene(scene_id)?;
         let ids: Vec<u32> = scene.image_ids().into_iter().filter(|i| wanted(*i)).collect();
@@ -115,7 +116,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             }
             if let Some(folder) = &a.pictures {
                 let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
-                write_rgb(&path, &overlay::side_by_side(&ideal, &depth))?;
+                pictures.write(&path, &overlay::side_by_side(&ideal, &depth));
             }
             let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
@@ -147,7 +148,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     }
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
-    Ok(if images > 0 { Outcome::Found } else { Outcome::NothingFound })
+    Ok(pictures.outcome(if images > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// The depth of posed objects on a table, if they may have one, as it is and as the camera measures it; whether there is a

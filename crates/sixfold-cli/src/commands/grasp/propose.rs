@@ -11,7 +11,6 @@ use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
     antipodal_grasps, cluster_grasps, draw_grasps,
 };
-use sixfold_io::write_rgb;
 
 use super::input::{self, Input, InputArguments};
 use sixfold_shell::Outcome;
@@ -20,6 +19,7 @@ use sixfold_shell::grasp::experience::{self, NetworkArguments};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
 use sixfold_shell::overlay;
+use sixfold_shell::pictures::Pictures;
 
 #[derive(Debug, Args)]
 pub(crate) struct ProposeArguments {
@@ -80,25 +80,6 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         }
     };
     let seconds = began.elapsed().as_secs_f64();
-    let picture = match &a.out {
-        None => None,
-        Some(folder) => {
-            let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let drawn: Vec<DrawnGrasp> = proposed
-                .iter()
-                .enumerate()
-                .rev()
-                .map(|(i, p)| DrawnGrasp {
-                    camera_from_gripper: p.pose,
-                    opening: p.opening,
-                    color: if i == 0 { BEST } else { OTHER },
-                })
-                .collect();
-            let path = folder.join("overlay.png");
-            write_rgb(&path, &draw_grasps(&background, Some(&depth), &camera, &gripper, &drawn)?)?;
-            Some(path)
-        }
-    };
     let whole = Whole {
         method: method(a),
         gripper: gripper.name.clone(),
@@ -109,7 +90,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
             .map(|t| Table { normal: t.normal.into(), offset: t.offset }),
         cut_by_edge: view.as_ref().is_some_and(|v| v.cut_by_edge),
         grasps: proposed,
-        overlay: picture,
+        overlay: a.out.as_ref().map(|folder| folder.join("overlay.png")),
         seconds,
     };
     if let Some(folder) = &a.out {
@@ -117,7 +98,23 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         write_atomically(&folder.join("grasps.json"), text.as_bytes())?;
     }
     report(&a.json, &whole, || print_table(&whole, a.out.as_deref()))?;
-    Ok(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    let mut pictures = Pictures::default();
+    if let Some(path) = &whole.overlay {
+        let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
+        let drawn = drawn(&whole.grasps);
+        pictures.write(path, &draw_grasps(&background, Some(&depth), &camera, &gripper, &drawn)?);
+    }
+    Ok(pictures.outcome(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
+}
+
+/// The grasps as an image shows them, the best one on top.
+fn drawn(grasps: &[Proposed]) -> Vec<DrawnGrasp> {
+    let drawn = grasps.iter().enumerate().rev().map(|(i, p)| DrawnGrasp {
+        camera_from_gripper: p.pose,
+        opening: p.opening,
+        color: if i == 0 { BEST } else { OTHER },
+    });
+    drawn.collect()
 }
 
 #[derive(Serialize)]

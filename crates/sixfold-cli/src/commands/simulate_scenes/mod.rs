@@ -18,6 +18,7 @@ use sixfold_bop::{BopDataset, write_camera, write_targets};
 use self::arguments::SimulateScenesArguments;
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{go_on_with, report};
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 #[derive(Serialize)]
@@ -77,8 +78,9 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     if !targets_file.exists() {
         write_targets(&targets_file, &dataset.targets(None)?)?;
     }
+    let mut pictures = Pictures::default();
     if !a.no_rgb {
-        preview::write(&a.out.join("preview.png"), &dataset)?;
+        pictures.did(preview::write(&a.out.join("preview.png"), &dataset));
     }
     let (images, instances, visible) = count(&dataset)?;
     let summary = Summary {
@@ -96,7 +98,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
         scenes_per_second: missing.len() as f64 / seconds.max(1e-9),
     };
     report(&a.json, &summary, || table(&a.out, &summary))?;
-    Ok(if instances > 0 { Outcome::Found } else { Outcome::NothingFound })
+    Ok(pictures.outcome(if instances > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// The text file that is written last stands for the whole scene.

@@ -16,7 +16,8 @@ use sixfold_io::{CameraFile, read_mask, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 
 use super::arguments::SynthesizeArguments;
-use sixfold_shell::detector::Detector;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_runner::detections;
 
 /// All that is given.
 pub(super) struct Input {
@@ -30,7 +31,7 @@ pub(super) struct Input {
 }
 
 /// Masks that a detector sees in photographs.
-struct DetectedMasks(Option<Detector>);
+struct DetectedMasks(Option<TrainedDetector>);
 
 /// A detection is that of a posed object where its mask and the pose's silhouette overlap by this much (intersection over union).
 const SAME_OBJECT: f64 = 0.3;
@@ -38,7 +39,7 @@ const SAME_OBJECT: f64 = 0.3;
 impl DetectedMasks {
     fn new(a: &SynthesizeArguments, ids: &[u32]) -> Result<Self> {
         let Some(weights) = &a.detector else { return Ok(DetectedMasks(None)) };
-        let detector = Detector::load(weights)?;
+        let detector = TrainedDetector::load(weights)?;
         for id in ids {
             detector.model().check_object(*id).with_context(|| weights.display().to_string())?;
         }
@@ -47,7 +48,7 @@ impl DetectedMasks {
 
     /// What is seen in an image, best first.
     fn of(&self, image: &RgbImage) -> Result<Vec<Detection>> {
-        self.0.as_ref().map_or_else(|| Ok(vec![]), |detector| detector.detections(image, 0, 0))
+        self.0.as_ref().map_or_else(|| Ok(vec![]), |detector| Ok(detections(detector, image, &[], (0, 0))?))
     }
 
     /// The mask of an object that lies about where it was drawn.

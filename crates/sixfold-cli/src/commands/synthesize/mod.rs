@@ -28,6 +28,7 @@ pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
 use self::input::{Input, Subject};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{go_on_with, report};
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
 
 /// Side of the crops that new views take their colours from, pixels.
@@ -80,7 +81,8 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     let Some(poses) = poses::refine(a, &input, &a.out.join("poses.json"))? else {
         bail!("interrupted; give the same command again");
     };
-    picture_of_poses(a, &input, &poses)?;
+    let mut sheets = Pictures::default();
+    sheets.did(picture_of_poses(a, &input, &poses));
     poses::apply(&mut input, &poses)?;
     let model = match (a.weighting, &a.weights) {
         (WeightingKind::Network, Some(file)) => Some(NolModel::load(file)?),
@@ -129,7 +131,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         rows.push(written.preview);
     }
     progress.finish();
-    pictures::sheet(&a.out.join("preview.png"), &rows)?;
+    sheets.did(pictures::sheet(&a.out.join("preview.png"), &rows));
     write_size(a, &input)?;
     let found = !objects.is_empty();
     let summary = Summary {
@@ -143,7 +145,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         seconds: start.elapsed().as_secs_f64(),
     };
     report(&a.json, &summary, || table(a, &summary))?;
-    Ok(if found { Outcome::Found } else { Outcome::NothingFound })
+    Ok(sheets.outcome(if found { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// The dataset's camera file. Every image has its own camera; this one gives the size.
