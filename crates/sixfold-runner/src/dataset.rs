@@ -149,7 +149,7 @@ impl DatasetRun<'_> {
         for id in ids {
             record.object(id, &Inputs::of_object(self.dataset, id, work.infos.as_ref()))?;
         }
-        record.check_images(|scene_id, im_id| self.inputs_of(&work, scene_id, im_id))?;
+        record.check_images(stop, |scene_id, im_id| self.inputs_of(&work, scene_id, im_id))?;
         let mut rows = open_results(results, &record, events)?;
         let mut summary = DatasetSummary {
             images: work.images.len(),
@@ -189,9 +189,7 @@ impl DatasetRun<'_> {
         let mut seconds = vec![];
         let images: Vec<(u32, u32)> = work.images.keys().copied().collect();
         for (scene_id, im_id) in images {
-            if stop.load(Ordering::Relaxed) {
-                return Err(RunError::Interrupted);
-            }
+            check(stop)?;
             let image = format!("{scene_id}/{im_id}");
             if record.is_done(scene_id, im_id) {
                 events(DatasetEvent::Image { image, earlier: true })?;
@@ -199,7 +197,7 @@ impl DatasetRun<'_> {
             }
             // Hashed before they are read: what changes in between makes the next run refuse, never believe.
             let inputs = self.inputs_of(work, scene_id, im_id);
-            self.prepare(work, (scene_id, im_id), events)?;
+            self.prepare(work, (scene_id, im_id), stop, events)?;
             let (scene, targets) = (&work.scenes[&scene_id], &work.images[&(scene_id, im_id)]);
             let start = Instant::now();
             match self.estimate_image(scene, im_id, targets, &work.known, events) {
@@ -224,11 +222,13 @@ impl DatasetRun<'_> {
         &self,
         work: &mut Work,
         image: (u32, u32),
+        stop: &AtomicBool,
         events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
     ) -> Result<(), RunError> {
         let ids: BTreeSet<u32> =
             work.images[&image].iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
         for id in ids {
+            check(stop)?;
             if let Entry::Vacant(place) = work.known.entry(id) {
                 place.insert(self.known(id, work.infos.as_ref(), events)?);
             }
@@ -348,6 +348,11 @@ impl Input {
             ..Query::new(&self.camera)
         }
     }
+}
+
+/// An error once the caller has asked to stop.
+pub(crate) fn check(stop: &AtomicBool) -> Result<(), RunError> {
+    if stop.load(Ordering::Relaxed) { Err(RunError::Interrupted) } else { Ok(()) }
 }
 
 /// The rows of an image, all with the time that they took together.

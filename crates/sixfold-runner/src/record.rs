@@ -11,11 +11,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use sixfold_io::{fnv1a_of_file, write_atomically};
 
+use crate::dataset::check;
 use crate::error::{OtherInput, OtherOptions, RunError};
 use crate::inputs::{Inputs, hex};
 
@@ -119,12 +121,13 @@ impl RunRecord {
     }
 
     /// An error where an image that is done was done with other inputs than `now` says.
-    pub fn check_images(&self, now: impl Fn(u32, u32) -> Inputs) -> Result<(), RunError> {
-        let check = |done: &DoneImage| {
+    pub fn check_images(&self, stop: &AtomicBool, now: impl Fn(u32, u32) -> Inputs) -> Result<(), RunError> {
+        let same = |done: &DoneImage| {
+            check(stop)?;
             let image = format!("image {}/{}", done.scene_id, done.im_id);
             self.same(&done.inputs, &now(done.scene_id, done.im_id), &image)
         };
-        self.record.done.iter().try_for_each(check)
+        self.record.done.iter().try_for_each(same)
     }
 
     fn same(&self, before: &BTreeMap<String, String>, now: &Inputs, of: &str) -> Result<(), RunError> {
