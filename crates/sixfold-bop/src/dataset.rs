@@ -2,8 +2,8 @@
 //! read when they are asked for. What a dataset leaves out (depth, masks, ground truth, models) is `None`, what is
 //! broken is an error.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
@@ -161,15 +161,21 @@ impl BopDataset {
         Ok(None)
     }
 
+    /// Where the model of an object is, or would be.
+    pub fn model_path(&self, obj_id: u32, models: Models) -> PathBuf {
+        let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
+        dir.join(format!("obj_{obj_id:06}.ply"))
+    }
+
     /// Reads the model of an object, in metres.
     ///
     /// # Errors
     /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken or `models_info.json`
     /// does not describe it.
     pub fn model(&self, obj_id: u32, models: Models) -> Result<Mesh, DatasetError> {
-        let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
-        let path = dir.join(format!("obj_{obj_id:06}.ply"));
+        let path = self.model_path(obj_id, models);
         if !path.is_file() {
+            let dir = path.parent().unwrap_or(&path).to_owned();
             return Err(DatasetError::NoModel { path: dir, obj_id });
         }
         let model = |error| DatasetError::Model(Box::new(error));
@@ -188,10 +194,9 @@ impl BopDataset {
     /// # Errors
     /// [`DatasetError`] when a file is missing or broken.
     pub fn targets(&self, file: Option<&Path>) -> Result<Vec<Target>, DatasetError> {
-        let default = self.root.join("test_targets_bop19.json");
-        let path = match file {
+        let default = self.targets_file();
+        let path = match file.or(default.as_deref()) {
             Some(path) => path,
-            None if default.is_file() => &default,
             None => {
                 let mut targets = Vec::new();
                 for scene_id in self.scene_ids() {
@@ -205,6 +210,26 @@ impl BopDataset {
         let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
             .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
         parse_targets(&text, path)
+    }
+
+    /// The images (scene, image) of the targets in `file`, ascending, or all of the split without a file.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when a file is missing or broken.
+    pub fn images(&self, file: Option<&Path>) -> Result<BTreeSet<(u32, u32)>, DatasetError> {
+        if let Some(file) = file {
+            return Ok(self.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id)).collect());
+        }
+        let mut images = BTreeSet::new();
+        for scene_id in self.scene_ids() {
+            images.extend(self.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
+        }
+        Ok(images)
+    }
+
+    /// The dataset's own file of targets, `test_targets_bop19.json`, where it has one.
+    pub fn targets_file(&self) -> Option<PathBuf> {
+        Some(self.root.join("test_targets_bop19.json")).filter(|path| path.is_file())
     }
 
     /// Targets with an object each: those of a whole image become one per object with ground truth there that is at
@@ -240,7 +265,7 @@ impl BopDataset {
     }
 }
 
-fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
+pub(crate) fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
     const SHOWN: usize = 12;
     let more = ids.len().saturating_sub(SHOWN);
     let mut text = ids.take(SHOWN).map(u32::to_string).collect::<Vec<_>>().join(", ");

@@ -3,6 +3,10 @@
 //!
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
+// What is printed goes through `sixfold_shell::screen`: its macros take the place of the standard ones.
+#[macro_use]
+extern crate sixfold_shell;
+
 mod grasp;
 mod reproduce;
 
@@ -12,7 +16,8 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use sixfold_shell::meshes::MeshArguments;
 use sixfold_shell::ranges::threads;
-use sixfold_shell::{PixelLimit, end_with_the_reader, exit_code, progress, use_threads};
+use sixfold_shell::screen::parse;
+use sixfold_shell::{PixelLimit, exit_code, progress, use_threads};
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
 #[derive(Debug, Parser)]
@@ -46,8 +51,10 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    end_with_the_reader();
-    let arguments = Arguments::parse();
+    let arguments = match parse::<Arguments>() {
+        Ok(arguments) => arguments,
+        Err(code) => return code,
+    };
     progress::catch_interrupts();
     use_threads(arguments.threads);
     arguments.images.set();

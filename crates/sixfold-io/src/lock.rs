@@ -98,8 +98,9 @@ fn lock_file(path: &Path) -> io::Result<PathBuf> {
     Ok(place.with_file_name(format!(".{}.lock", name.to_string_lossy())))
 }
 
+/// Whether `path` still names this open file.
 #[cfg(unix)]
-fn still_there(file: &File, path: &Path) -> bool {
+pub(crate) fn still_there(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     match (file.metadata(), std::fs::metadata(path)) {
         (Ok(mine), Ok(there)) => mine.ino() == there.ino() && mine.dev() == there.dev(),
@@ -107,8 +108,9 @@ fn still_there(file: &File, path: &Path) -> bool {
     }
 }
 
+/// Whether `path` still names a file; that it is this one cannot be told here.
 #[cfg(not(unix))]
-fn still_there(_: &File, path: &Path) -> bool {
+pub(crate) fn still_there(_: &File, path: &Path) -> bool {
     path.exists()
 }
 

@@ -241,6 +241,11 @@ impl OutputFolder {
         Ok(OutputFolder { path: path.to_path_buf(), own, _lock: lock })
     }
 
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// The path of a file that is to be written, which is then one of the folder's own.
     ///
     /// # Errors

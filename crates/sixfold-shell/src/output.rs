@@ -47,14 +47,10 @@ pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()
     Ok(())
 }
 
-/// Writes a file under another name first, so that no reader sees half of it.
+/// Writes a file so that no reader sees half of it ([`sixfold_io::write_atomically`]), with the file's name in the error.
+///
+/// # Errors
+/// What the system says.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
-    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
-        std::fs::create_dir_all(parent).with_context(|| format!("folder {}", parent.display()))?;
-    }
-    let mut name = path.as_os_str().to_owned();
-    name.push(format!(".{}.tmp", std::process::id()));
-    std::fs::write(&name, bytes)
-        .and_then(|()| std::fs::rename(&name, path))
-        .with_context(|| format!("cannot write {}", path.display()))
+    sixfold_io::write_atomically(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }

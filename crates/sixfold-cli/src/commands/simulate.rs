@@ -19,6 +19,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::folder::{OutputFolder, take_empty};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::ranges::without_duplicates;
 
@@ -90,7 +91,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
         bail!("{} exists already: remove it or choose another --out", a.out.join(&a.split).display());
     }
     let _lock = take_empty(&a.out, &[&a.dataset])?;
-    let mut pictures = a.pictures.as_deref().map(OutputFolder::take).transpose()?;
+    let mut pictures = Pictures::of(a.pictures.as_deref().map(OutputFolder::take).transpose()?);
     let wanted = |im_id: u32| a.images.is_empty() || a.images.contains(&im_id);
     let mut meshes: BTreeMap<u32, Mesh> = BTreeMap::new();
     let mut images = 0;
@@ -117,9 +118,9 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             if !has_table && !a.no_table {
                 without_table.push(format!("{scene_id}/{im_id}"));
             }
-            if let Some(folder) = &mut pictures {
+            if a.pictures.is_some() {
                 let picture = overlay::side_by_side(&ideal, &depth);
-                folder.write_rgb(&format!("{scene_id:06}_{im_id:06}.png"), &picture)?;
+                pictures.write(&format!("{scene_id:06}_{im_id:06}.png"), &picture);
             }
             let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
@@ -151,7 +152,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     }
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
-    Ok(if images > 0 { Outcome::Found } else { Outcome::NothingFound })
+    Ok(pictures.outcome(if images > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// The depth of posed objects on a table, if they may have one, as it is and as the camera measures it; whether there is a

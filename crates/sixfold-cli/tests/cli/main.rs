@@ -18,6 +18,7 @@ mod mttm;
 mod objects;
 #[cfg(feature = "networks")]
 mod pix2pose;
+mod printing;
 mod simulate;
 #[cfg(feature = "physics")]
 mod simulate_scenes;

@@ -14,9 +14,9 @@ use sixfold_runner::RegionSource;
 use super::arguments::DemoArguments;
 use super::colour::{Colour, Row};
 use super::samples::{Known, add_s, found_upwards};
-use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::overlay::{self, Drawn};
-use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::pictures::Pictures;
+use sixfold_shell::progress::Progress;
 use sixfold_shell::training::was_trained_on;
 
 /// Weights of the sample objects, relative to the repository.
@@ -28,7 +28,7 @@ const MIN_DETECTION: f32 = 0.1;
 
 pub(super) fn run(
     a: &DemoArguments,
-    out: &mut OutputFolder,
+    out: &mut Pictures,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
@@ -63,7 +63,7 @@ fn objects(
 
 fn with_model(
     a: &DemoArguments,
-    out: &mut OutputFolder,
+    out: &mut Pictures,
     pix2pose: &Pix2PoseEstimator,
     weights: &Path,
     dataset: &BopDataset,
@@ -88,7 +88,6 @@ fn with_model(
     for scene_id in dataset.scene_ids() {
         let scene = dataset.scene(scene_id)?;
         for im_id in scene.image_ids() {
-            check_interrupt("run it again")?;
             let Some(image) = scene.rgb(im_id)? else { continue };
             let detector = detector_card.as_ref().zip(colour.detector.as_deref());
             for (card, file) in [(pix2pose.model.card(), weights)].into_iter().chain(detector) {
@@ -128,7 +127,7 @@ fn with_model(
                 });
             }
             let picture = overlay::draw(&image, &camera, &drawn);
-            colour.pictures.push(out.write_rgb(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture)?);
+            colour.pictures.extend(out.write(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture));
         }
     }
     progress.finish();

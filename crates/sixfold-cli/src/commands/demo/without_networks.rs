@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
+use sixfold_shell::pictures::Pictures;
 
 use sixfold_shell::folder::OutputFolder;
 
@@ -19,6 +20,7 @@ pub(super) fn run(
     _dataset: &BopDataset,
     _targets: &[Target],
     _known: &BTreeMap<u32, Known>,
+    _drawer: &mut Pictures,
 ) -> Result<Colour> {
     if a.weights.is_some() || a.detector.is_some() {
         bail!("--weights and --detector: {MESSAGE}");

@@ -11,7 +11,6 @@ use sixfold_dgcm::transfer::grasps_from_experience;
 use sixfold_grasp::AntipodalOptions;
 #[cfg(feature = "experience")]
 use sixfold_grasp::{GraspView, Gripper};
-use sixfold_io::write_rgb;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
 #[cfg(feature = "experience")]
@@ -22,6 +21,7 @@ use sixfold_shell::grasp::input::{self, Input, InputArguments};
 use sixfold_shell::grasp::proposals::of_both;
 use sixfold_shell::grasp::proposals::{Proposed, Table, by_geometry, picture, print_table};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::ranges::count;
 
 #[derive(Debug, Args)]
@@ -81,14 +81,6 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         }
     };
     let seconds = began.elapsed().as_secs_f64();
-    let overlay = match &files {
-        None => None,
-        Some(files) => {
-            let path = files[0].clone();
-            write_rgb(&path, &picture(rgb, &depth, &camera, &gripper, &proposed)?)?;
-            Some(path)
-        }
-    };
     let whole = Whole {
         method: method(a),
         gripper: gripper.name.clone(),
@@ -96,14 +88,18 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         table: view.as_ref().and_then(|v| v.table).map(Table::from),
         cut_by_edge: view.as_ref().is_some_and(|v| v.cut_by_edge),
         grasps: proposed,
-        overlay,
+        overlay: files.as_ref().map(|files| files[0].clone()),
         seconds,
     };
     if let Some(files) = &files {
         write_atomically(&files[1], serde_json::to_string_pretty(&whole)?.as_bytes())?;
     }
     report(&a.json, &whole, || report_grasps(&whole, a.out.as_deref()))?;
-    Ok(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    let mut pictures = Pictures::of(folder);
+    if whole.overlay.is_some() {
+        pictures.write("overlay.png", &picture(rgb, &depth, &camera, &gripper, &whole.grasps)?);
+    }
+    Ok(pictures.outcome(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
 }
 
 #[derive(Serialize)]

@@ -16,6 +16,7 @@ use self::arguments::SimulateScenesArguments;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::scenes::{Counts, DEPTH_SCALE, Made, SceneMaker, write_objects};
 
@@ -69,8 +70,9 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     if !targets_file.exists() {
         write_targets(&targets_file, &dataset.targets(None)?)?;
     }
+    let mut pictures = Pictures::default();
     if !a.no_rgb {
-        preview::write(&a.out.join("preview.png"), &dataset)?;
+        pictures.did(preview::write(&a.out.join("preview.png"), &dataset));
     }
     let Counts { images, instances, visible } = Counts::of(&dataset)?;
     let summary = Summary {
@@ -88,7 +90,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
         scenes_per_second: missing.len() as f64 / seconds.max(1e-9),
     };
     report(&a.json, &summary, || table(&a.out, &summary))?;
-    Ok(if instances > 0 { Outcome::Found } else { Outcome::NothingFound })
+    Ok(pictures.outcome(if instances > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// Makes scenes, several at a time; what came of all of them.

@@ -4,17 +4,18 @@ use std::collections::BTreeSet;
 
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_data::{RoughImageOptions, RoughImages, TrainingSetError};
+use sixfold_detect::detector::TrainedDetector;
 use sixfold_geometry::RgbImage;
-use sixfold_shell::detector::Detector;
+use sixfold_runner::detections;
 use sixfold_shell::folder::Contents;
 
 use super::arguments::SynthesizeArguments;
 
 /// All that is given.
 pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
-    let detector = a.detector.as_deref().map(Detector::load).transpose()?;
+    let detector = a.detector.as_deref().map(TrainedDetector::load).transpose()?;
     let detect = |image: &RgbImage| match &detector {
-        Some(detector) => detector.detections(image, 0, 0).map_err(|error| error.into_boxed_dyn_error()),
+        Some(detector) => detections(detector, image, &[], (0, 0)).map_err(Into::into),
         None => Ok(vec![]),
     };
     let options = RoughImageOptions {

@@ -27,6 +27,7 @@ pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, interrupted};
 
 /// Side of the crops that new views take their colours from, pixels.
@@ -75,7 +76,8 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         choose_images(object, a.sources)?.iter().for_each(|note| eprintln!("note: {note}"));
     }
     let counts: Vec<usize> = images.objects.iter().map(|o| o.images.len()).collect();
-    let poses = refined_poses(a, &mut images)?;
+    let mut sheets = Pictures::default();
+    let poses = refined_poses(a, &mut images, &mut sheets)?;
     let model = match (a.weighting, &a.weights) {
         (WeightingKind::Network, Some(file)) => Some(NolModel::load(file)?),
         (WeightingKind::Network, None) => Some(NolModel::shipped()?),
@@ -95,7 +97,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         rows.push(preview);
     }
     progress.finish();
-    pictures::sheet(&a.out.join("preview.png"), &rows)?;
+    sheets.did(pictures::sheet(&a.out.join("preview.png"), &rows));
     write_size(a, &images)?;
     let found = !objects.is_empty();
     let summary = Summary {
@@ -109,11 +111,15 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         seconds: start.elapsed().as_secs_f64(),
     };
     report(&a.json, &summary, || table(a, &summary))?;
-    Ok(if found { Outcome::Found } else { Outcome::NothingFound })
+    Ok(sheets.outcome(if found { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// Makes the poses better, draws them, and puts them in place of the given ones.
-fn refined_poses(a: &SynthesizeArguments, images: &mut RoughImages) -> Result<PoseFile> {
+fn refined_poses(
+    a: &SynthesizeArguments,
+    images: &mut RoughImages,
+    sheets: &mut Pictures,
+) -> Result<PoseFile> {
     let file = a.out.join("poses.json");
     let mut progress = Progress::new("poses, per cent", 100);
     let stop = interrupted();
@@ -124,7 +130,7 @@ fn refined_poses(a: &SynthesizeArguments, images: &mut RoughImages) -> Result<Po
     })?;
     progress.finish();
     let Some(poses) = poses else { bail!("interrupted; give the same command again") };
-    pictures::refinement(&a.out.join("poses.png"), images, &poses)?;
+    sheets.did(pictures::refinement(&a.out.join("poses.png"), images, &poses));
     poses.apply(images, &file)?.iter().for_each(|note| eprintln!("note: {note}"));
     Ok(poses)
 }
