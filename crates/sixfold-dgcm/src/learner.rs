@@ -140,8 +140,11 @@ impl Learner<'_> {
         };
         let entry = journal.filter(|_| tried.is_ok()).map(|j| JournalEntry { journal: j.journal, row: &row });
         let experience = record.experience.as_ref();
-        let stored =
-            self.memory.store().add_record(&TaskRecord { attempts: &record.attempts, experience, journal: entry })?;
+        let stored = self.memory.store().add_record(&TaskRecord {
+            attempts: &record.attempts,
+            experience,
+            journal: entry,
+        })?;
         let mut learned = tried?;
         learned.stored = stored;
         if stored.is_some() {

@@ -60,7 +60,11 @@ fn asks_for_clear_text(heard: &[u8]) -> Option<bool> {
 }
 
 impl AsyncRead for Guarded {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
         let before = buf.filled().len();
         ready_or_wait!(Pin::new(&mut self.socket).poll_read(cx, buf))?;
         let Some(heard) = &mut self.heard else { return Poll::Ready(Ok(())) };

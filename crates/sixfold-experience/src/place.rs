@@ -162,8 +162,8 @@ impl StorePlace {
 
 /// Words before an equals sign in `host=server user=robot password=..` and its like.
 const KEYWORDS: [&str; 15] = [
-    "host", "hostaddr", "port", "user", "password", "dbname", "database", "service", "passfile", "sslmode", "server",
-    "username", "uid", "pwd", "passwd",
+    "host", "hostaddr", "port", "user", "password", "dbname", "database", "service", "passfile", "sslmode",
+    "server", "username", "uid", "pwd", "passwd",
 ];
 
 /// Whether a text is meant to be the address of a server. A path that begins like one (`/`, `./`, `../`) never is.
@@ -197,7 +197,9 @@ pub(super) fn address(text: &str) -> Result<String, String> {
     let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
     const FILE: &str = "if it is the name of a file, write ./ before it";
     let Some((scheme, rest)) = text.split_once("://") else {
-        return Err(format!("it looks like the address of a server, but does not begin with postgres://; {FILE}"));
+        return Err(format!(
+            "it looks like the address of a server, but does not begin with postgres://; {FILE}"
+        ));
     };
     let scheme = scheme.to_ascii_lowercase();
     if scheme != "postgres" && scheme != "postgresql" {
@@ -299,9 +301,14 @@ mod tests {
 
     #[test]
     fn files_are_files_and_servers_are_servers() {
-        for text in
-            ["a.db", "out/experience.db", "./host=1.db", "/data/robot:1@home.db", "robot@home.db", "C:\\a@b\\c.db"]
-        {
+        for text in [
+            "a.db",
+            "out/experience.db",
+            "./host=1.db",
+            "/data/robot:1@home.db",
+            "robot@home.db",
+            "C:\\a@b\\c.db",
+        ] {
             assert_eq!(StorePlace::from(text), StorePlace::File(text.into()), "{text}");
         }
         for (text, shown) in [

@@ -23,9 +23,7 @@ use super::index::{Match, distance};
 use super::password_guard::{ASKED, PasswordGuard};
 use super::place::{address, shown};
 use super::row::{self, Raw};
-use super::{
-    AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord,
-};
+use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord};
 use crate::Attempt;
 use crate::FEATURE;
 

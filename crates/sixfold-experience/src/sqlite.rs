@@ -13,9 +13,7 @@ use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Row, Transac
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
 use super::row::{self, Raw};
-use super::{
-    AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord,
-};
+use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord};
 use crate::Attempt;
 
 /// Says that a SQLite file is one of ours: "6fEx".
@@ -45,8 +43,23 @@ const JOURNAL: &str = "
 ";
 /// What an experience is read from.
 const COLUMNS: [&str; 17] = [
-    "time", "object", "part", "gripper", "opening", "width", "camera_from_gripper", "camera", "side", "extent", "depth",
-    "normals", "vd_noc", "region", "network", "provenance", "table_plane",
+    "time",
+    "object",
+    "part",
+    "gripper",
+    "opening",
+    "width",
+    "camera_from_gripper",
+    "camera",
+    "side",
+    "extent",
+    "depth",
+    "normals",
+    "vd_noc",
+    "region",
+    "network",
+    "provenance",
+    "table_plane",
 ];
 
 /// A store in a file.
@@ -260,11 +273,13 @@ impl SqliteStore {
     /// Rows of a table that are read one at a time, where reading all at once fails: the numbers up to the last one that was ever
     /// given or, where that cannot be read either, that the file has room for.
     fn candidates(&self, table: &str) -> std::ops::RangeInclusive<i64> {
-        let last = self.connection.query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| {
-            r.get::<_, i64>(0)
-        });
-        let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 128) as i64;
-        1..=last.unwrap_or(room).clamp(0, room.max(1))
+        let last: Result<Option<i64>, _> = self
+            .connection
+            .query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| r.get(0))
+            .optional();
+        // No row takes fewer bytes.
+        let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 256) as i64;
+        1..=last.map_or(room, |last| last.unwrap_or(0).min(room))
     }
 
     /// The same for an experience that is not understood as for one that is: an error of one row.
@@ -291,7 +306,8 @@ impl SqliteStore {
     /// The attempts of a damaged file.
     fn attempts_one_by_one(&self, after: i64) -> Vec<AttemptRow> {
         let read = |id: i64| {
-            let row = self.connection.query_row("SELECT attempt FROM attempt WHERE id=?1", [id], |r| text(r, 0));
+            let row =
+                self.connection.query_row("SELECT attempt FROM attempt WHERE id=?1", [id], |r| text(r, 0));
             match self.checked(row.optional()) {
                 Ok(text) => Some((id, encode::from_attempt(id, &text?))),
                 Err(error) => Some((id, Err(error))),
@@ -453,20 +469,28 @@ impl ExperienceStore for SqliteStore {
 
     fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
         let plane = if self.number("PRAGMA user_version")? < VERSION { "NULL" } else { "table_plane" };
-        let question =
-            format!("SELECT {}, {plane} FROM experience WHERE id=?1", COLUMNS[..COLUMNS.len() - 1].join(", "));
+        let question = format!(
+            "SELECT {}, {plane} FROM experience WHERE id=?1",
+            COLUMNS[..COLUMNS.len() - 1].join(", ")
+        );
         let raw = self.of_row(id, self.connection.query_row(&question, [id], raw).optional())?;
         let Some(raw) = raw else { return Ok(None) };
-        let copies = self.of_row(id, (|| {
-            let mut query = self
-                .connection
-                .prepare("SELECT angle, feature FROM feature WHERE experience=?1 ORDER BY id")?;
-            query
-                .query_map([id], |row| {
-                    Ok(Copy { angle: row.get(0)?, feature: encode::from_floats(&row.get::<_, Vec<u8>>(1)?) })
-                })?
-                .collect::<rusqlite::Result<Vec<Copy>>>()
-        })())?;
+        let copies = self.of_row(
+            id,
+            (|| {
+                let mut query = self
+                    .connection
+                    .prepare("SELECT angle, feature FROM feature WHERE experience=?1 ORDER BY id")?;
+                query
+                    .query_map([id], |row| {
+                        Ok(Copy {
+                            angle: row.get(0)?,
+                            feature: encode::from_floats(&row.get::<_, Vec<u8>>(1)?),
+                        })
+                    })?
+                    .collect::<rusqlite::Result<Vec<Copy>>>()
+            })(),
+        )?;
         Ok(Some(Stored { id, experience: raw.understand(id, copies)? }))
     }
 

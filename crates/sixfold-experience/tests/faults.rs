@@ -108,7 +108,8 @@ fn a_record_is_stored_whole_or_not_at_all() {
         let attempts: Vec<Attempt> = (0..10).map(|k| attempt(10 * number + k)).collect();
         let experience = experience(number.into());
         let before = state(&store);
-        let stored = store.add_record(&TaskRecord { attempts: &attempts, experience: Some(&experience), journal });
+        let stored =
+            store.add_record(&TaskRecord { attempts: &attempts, experience: Some(&experience), journal });
         stored.err().map(|error| (error, before))
     });
     let (error, before) = full.expect("the disk is full at last");

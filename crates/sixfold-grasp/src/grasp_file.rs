@@ -168,7 +168,10 @@ mod tests {
             read_grasp(&path, number).map_err(|e| e.to_string())
         };
         let grasp = read(&good, 1).unwrap();
-        assert_eq!((grasp.opening, grasp.width, grasp.camera_from_gripper.translation().x), (0.05, 0.03, 0.1));
+        assert_eq!(
+            (grasp.opening, grasp.width, grasp.camera_from_gripper.translation().x),
+            (0.05, 0.03, 0.1)
+        );
         let list = format!(r#"{{"grasps": [{good}, {}]}}"#, good.replace("0.05", "0.06"));
         assert_eq!(read(&list, 2).unwrap().opening, 0.06);
         for (text, number, word) in [

@@ -164,7 +164,8 @@ fn a_hand_that_is_killed_ends_as_if_nothing_had_happened() {
         assert_eq!(end, expected, "killed for the {kill}. time");
         assert_eq!(rows(&path.join(out)), rows(&path.join("learn")));
         let attempts = |file: &str| {
-            let listed = sixfold(path, &format!("grasp store list {file} --attempts --json")).expect(0).json();
+            let listed =
+                sixfold(path, &format!("grasp store list {file} --attempts --json")).expect(0).json();
             let mut listed = listed.as_array().unwrap().clone();
             listed.iter_mut().for_each(|attempt| attempt["time"] = 0.into());
             listed
@@ -198,7 +199,8 @@ fn a_gripper_under_a_centimetre_is_no_panic() {
     };
     for (opening, others) in [(0.001, 0.001), (0.0099, 0.001), (0.009, 0.05), (1.0, 0.001)] {
         fs::write(path.join("small.json"), small(opening, others).to_string()).unwrap();
-        let run = sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --gripper small.json"));
+        let run =
+            sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --gripper small.json"));
         assert!(run.code == 0 || run.code == 1, "{}", run.stderr);
     }
     for (field, value) in [("max_opening", 0.0), ("palm_width", 1e300), ("finger_width", -1.0)] {
@@ -237,7 +239,11 @@ fn one_broken_row_blocks_nothing_and_can_be_removed() {
         let run = sixfold(path, command).expect(0);
         for words in [
             ["experience 1", "field depth", "grasp store forget e.db 1`"],
-            [&format!("attempt {broken}"), "left out", &format!("grasp store forget e.db --attempt {broken}`")],
+            [
+                &format!("attempt {broken}"),
+                "left out",
+                &format!("grasp store forget e.db --attempt {broken}`"),
+            ],
         ] {
             let named = run.stderr.lines().any(|line| words.iter().all(|word| line.contains(word)));
             assert!(named, "{command}: {words:?}: {}", run.stderr);
@@ -262,7 +268,9 @@ fn a_damaged_store_is_saved_by_the_command_that_it_names() {
     }
     let bytes = fs::read(path.join("a.db")).unwrap();
     fs::write(path.join("a.db"), &bytes[..bytes.len() * 3 / 4]).unwrap();
-    for command in ["grasp store list a.db".to_owned(), format!("{VIEW} --experiences a.db --weights w.safetensors")] {
+    for command in
+        ["grasp store list a.db".to_owned(), format!("{VIEW} --experiences a.db --weights w.safetensors")]
+    {
         fails(path, &command, &["a.db", "damaged", "sixfold grasp store merge NEW.db a.db"]);
     }
     let saved = sixfold(path, "grasp store merge NEW.db a.db --json").expect(2).json();
@@ -284,7 +292,9 @@ fn an_address_that_is_none_is_refused_without_its_password() {
         "robot:secret@127.0.0.1/fleet",
     ] {
         let learn = LEARN.replace("e.db", address).replace("--attempts 3", "--attempts 1");
-        for command in [format!("grasp store list {address}"), format!("grasp store merge {address} {address}")] {
+        for command in
+            [format!("grasp store list {address}"), format!("grasp store merge {address} {address}")]
+        {
             let run = sixfold(path, &command).expect(2);
             assert!(!run.stderr.contains("secret"), "{}", run.stderr);
         }

@@ -5,7 +5,9 @@ use sixfold_grasp::{
 };
 use thiserror::Error;
 
-use super::{Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part};
+use super::{
+    Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
+};
 use crate::model::DgcmModel;
 
 /// Why there are no grasps.

@@ -55,7 +55,10 @@ impl Memory {
         self.index.refresh(&*self.store)?;
         for id in self.index.take_unusable() {
             let found = "something else".to_owned();
-            self.leave_out(id, StoreError::Field { id, field: "feature", expected: "256 finite numbers", found });
+            self.leave_out(
+                id,
+                StoreError::Field { id, field: "feature", expected: "256 finite numbers", found },
+            );
         }
         self.labels = self.store.list()?.into_iter().map(|s| (s.id, s)).collect();
         self.kept.retain(|id, _| self.labels.contains_key(id));

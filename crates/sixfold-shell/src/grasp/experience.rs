@@ -54,7 +54,9 @@ pub fn note_left_out(errors: &[StoreError], place: &str) {
     for error in errors {
         match error {
             StoreError::Field { id, .. } => {
-                eprintln!("note: {error}; it is left out, `sixfold grasp store forget {place} {id}` removes it");
+                eprintln!(
+                    "note: {error}; it is left out, `sixfold grasp store forget {place} {id}` removes it"
+                );
             }
             StoreError::Attempt { id, .. } => {
                 eprintln!(

@@ -529,7 +529,8 @@ mod tests {
     fn left_behind(folder: &Path) -> (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>) {
         let text = std::fs::read_to_string(folder.join("attempts.jsonl")).unwrap();
         let store = StorePlace::File(folder.join("e.db")).open().unwrap();
-        let attempts = store.attempts(0).unwrap().into_iter().map(|(_, a)| Attempt { time: 0, ..a }).collect();
+        let attempts =
+            store.attempts(0).unwrap().into_iter().map(|(_, a)| Attempt { time: 0, ..a }).collect();
         let experiences = store.list().unwrap().into_iter().map(|summary| {
             let stored = store.get(summary.id).unwrap().unwrap().experience;
             (Summary { time: 0, ..summary }, stored.copies[0].feature.clone())

@@ -4,8 +4,8 @@ use anyhow::Result;
 use serde::Serialize;
 use sixfold_geometry::{Camera, DepthImage, Plane, Pose, RgbImage};
 use sixfold_grasp::{
-    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper, antipodal_grasps,
-    cluster_grasps, draw_grasps,
+    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
+    antipodal_grasps, cluster_grasps, draw_grasps,
 };
 
 use crate::output::pose_rows;
