@@ -273,11 +273,13 @@ impl SqliteStore {
     /// Rows of a table that are read one at a time, where reading all at once fails: the numbers up to the last one that was ever
     /// given or, where that cannot be read either, that the file has room for.
     fn candidates(&self, table: &str) -> std::ops::RangeInclusive<i64> {
-        let last = self
+        let last: Result<Option<i64>, _> = self
             .connection
-            .query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| r.get::<_, i64>(0));
-        let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 128) as i64;
-        1..=last.unwrap_or(room).clamp(0, room.max(1))
+            .query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| r.get(0))
+            .optional();
+        // No row takes fewer bytes.
+        let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 256) as i64;
+        1..=last.map_or(room, |last| last.unwrap_or(0).min(room))
     }
 
     /// The same for an experience that is not understood as for one that is: an error of one row.

@@ -59,25 +59,45 @@ fn is_zero(number: &usize) -> bool {
     *number == 0
 }
 
-/// Names a row that is left out; any other error ends the work.
-fn leave_out(error: StoreError) -> Result<()> {
-    match error {
-        error if error.is_of_one_row() => eprintln!("left out: {error}"),
-        StoreError::Broken { reason, .. } => eprintln!("left out: a row on a damaged page ({reason})"),
-        error => return Err(error.into()),
-    }
-    Ok(())
+/// Rows that could not be read.
+#[derive(Default)]
+struct LeftOut {
+    rows: usize,
+    /// Those of them that lie on damaged pages.
+    damaged: usize,
 }
 
-/// Adds the experiences of a store to another one, as `change` makes them; how many are new, and how many could not be read.
+impl LeftOut {
+    /// Names a row that is left out; any other error ends the work.
+    fn row(&mut self, error: StoreError) -> Result<()> {
+        match error {
+            error if error.is_of_one_row() => eprintln!("left out: {error}"),
+            StoreError::Broken { .. } => self.damaged += 1,
+            error => return Err(error.into()),
+        }
+        self.rows += 1;
+        Ok(())
+    }
+
+    /// How many there were.
+    fn count(self, place: &StorePlace) -> usize {
+        if self.damaged > 0 {
+            eprintln!("left out: {} rows of {place} that lie on damaged pages", self.damaged);
+        }
+        self.rows
+    }
+}
+
+/// Adds the experiences of a store to another one, as `change` makes them; how many are new.
 fn take_over(
     target: &mut dyn ExperienceStore,
     source: &dyn ExperienceStore,
+    left_out: &mut LeftOut,
     change: impl Fn(Stored) -> Result<Experience>,
-) -> Result<(usize, usize)> {
+) -> Result<usize> {
     let numbers = source.numbers()?;
     let mut progress = Progress::new("experiences", numbers.len());
-    let (mut added, mut unreadable) = (0, 0);
+    let mut added = 0;
     for id in numbers {
         check_interrupt("what was taken over is kept; the same command resumes")?;
         match source.get(id) {
@@ -86,14 +106,11 @@ fn take_over(
                 added += usize::from(target.add(&change(stored)?)?.1);
             }
             Ok(None) => {}
-            Err(error) => {
-                leave_out(error)?;
-                unreadable += 1;
-            }
+            Err(error) => left_out.row(error)?,
         }
     }
     progress.finish();
-    Ok((added, unreadable))
+    Ok(added)
 }
 
 /// Takes over experiences and attempts of other stores; damaged ones give what can still be read.
@@ -104,23 +121,18 @@ pub fn merge(place: &StorePlace, others: &[StorePlace]) -> Result<Moved> {
     let sources: Vec<_> = others.iter().map(StorePlace::open_to_save).collect::<Result<_, _>>()?;
     let mut store = place.create()?;
     let (mut added, mut unreadable) = (0, 0);
-    for (source, name) in sources.iter().zip(others) {
-        let context = || name.display().to_string();
-        let moved =
-            take_over(&mut *store, &**source, |stored| Ok(stored.experience)).with_context(context)?;
-        added += moved.0;
-        unreadable += moved.1;
+    for (source, place) in sources.iter().zip(others) {
+        let context = || place.display().to_string();
+        let mut left_out = LeftOut::default();
+        added += take_over(&mut *store, &**source, &mut left_out, |stored| Ok(stored.experience))
+            .with_context(context)?;
         for (_, attempt) in source.attempt_rows(0).with_context(context)? {
             match attempt {
-                Ok(attempt) => {
-                    store.add_attempt(&attempt)?;
-                }
-                Err(error) => {
-                    leave_out(error)?;
-                    unreadable += 1;
-                }
+                Ok(attempt) => store.add_attempt(&attempt).map(|_| ())?,
+                Err(error) => left_out.row(error)?,
             }
         }
+        unreadable += left_out.count(place);
     }
     Ok(Moved { added, experiences: store.list()?.len(), unreadable })
 }
@@ -138,8 +150,9 @@ pub fn refresh(place: &StorePlace, out: &StorePlace, network: &DgcmModel) -> Res
     let encode = |stored: Stored| {
         stored.experience.encoded(network).with_context(|| format!("experience {}", stored.id))
     };
-    let (added, unreadable) = take_over(&mut *target, &*source, encode)?;
-    Ok(Moved { added, experiences: target.list()?.len(), unreadable })
+    let mut left_out = LeftOut::default();
+    let added = take_over(&mut *target, &*source, &mut left_out, encode)?;
+    Ok(Moved { added, experiences: target.list()?.len(), unreadable: left_out.count(place) })
 }
 
 /// What was written as files.
@@ -173,6 +186,7 @@ pub fn export(place: &StorePlace, out: &Path) -> Result<Exported> {
     let mut folder = OutputFolder::take(out)?;
     let mut progress = Progress::new("experiences", numbers.len());
     let mut done = Exported { experiences: 0, unreadable: 0, folder: out.to_path_buf() };
+    let mut left_out = LeftOut::default();
     for id in numbers {
         check_interrupt("what was written is whole")?;
         match store.get(id) {
@@ -185,12 +199,10 @@ pub fn export(place: &StorePlace, out: &Path) -> Result<Exported> {
                 progress.step(stored.experience.object);
             }
             Ok(None) => {}
-            Err(error) => {
-                leave_out(error)?;
-                done.unreadable += 1;
-            }
+            Err(error) => left_out.row(error)?,
         }
     }
     progress.finish();
+    done.unreadable = left_out.count(place);
     Ok(done)
 }
