@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::Vec3;
+use sixfold_io::write_atomically;
 use sixfold_mesh::{Mesh, MeshError, simplify};
 use thiserror::Error;
 
@@ -74,20 +75,11 @@ impl VerificationMesh {
             Err(source) => note = Some(VerificationMeshError::Io { path: path.into(), source }),
         }
         let mesh = verification_mesh(mesh)?;
-        if let Err(source) = write(path, &encode(&mesh, key)) {
+        if let Err(source) = write_atomically(path, &encode(&mesh, key)) {
             note = Some(VerificationMeshError::Io { path: path.into(), source });
         }
         Ok(VerificationMesh { mesh, note })
     }
-}
-
-fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    // Under a name of its own first: a reader, or a crash, never sees half a file.
-    let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
-    std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path))
 }
 
 /// FNV-1a (Fowler, Noll, Vo).
