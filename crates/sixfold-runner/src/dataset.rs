@@ -150,7 +150,7 @@ impl DatasetRun<'_> {
             record.object(id, &Inputs::of_object(self.dataset, id, work.infos.as_ref()))?;
         }
         record.check_images(stop, |scene_id, im_id| self.inputs_of(&work, scene_id, im_id))?;
-        let mut rows = open_results(results, &record, events)?;
+        let mut rows = open_results(results, &mut record, events)?;
         let mut summary = DatasetSummary {
             images: work.images.len(),
             targets: self.targets.len(),
@@ -206,7 +206,7 @@ impl DatasetRun<'_> {
                     let time = start.elapsed().as_secs_f64();
                     seconds.push(time);
                     rows.append(&rows_of(&found, (scene_id, im_id), time))?;
-                    record.finished(scene_id, im_id, &inputs)?;
+                    record.finished((scene_id, im_id), found.len(), &inputs)?;
                     summary.poses += found.len();
                     summary.seconds_per_image = Some(seconds.iter().sum::<f64>() / seconds.len() as f64);
                     events(DatasetEvent::Result(&ImageResult { scene, scene_id, im_id, found }))?;
@@ -368,7 +368,7 @@ fn rows_of(found: &[PosedObject<'_>], (scene_id, im_id): (u32, u32), time: f64) 
 /// record does not have.
 fn open_results(
     path: &Path,
-    record: &RunRecord,
+    record: &mut RunRecord,
     events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
 ) -> Result<ResultsAppender, RunError> {
     let mut results = ResultsAppender::open(path)?;
@@ -376,6 +376,7 @@ fn open_results(
         let text = format!("{}: the last line was cut off and is dropped: {torn}", path.display());
         events(DatasetEvent::Note(text))?;
     }
+    record.forget_unless_whole(results.existing());
     let unfinished = results.existing().iter().find(|e| !record.is_done(e.scene_id, e.im_id));
     if let Some(Estimate { scene_id, im_id, .. }) = unfinished {
         let text = format!(

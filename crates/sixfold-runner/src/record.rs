@@ -6,8 +6,8 @@
 //! is refused and names the input: poses of the former contents and of the present ones must not stand in one file as if they
 //! belonged together.
 //!
-//! Rows are written first and the record after them, once a second at most. Rows of images that the record does not have are
-//! those of a run that was cut off; they are computed again.
+//! Rows are written first and the record after them, once a second at most. Images that the record does not have, or with another
+//! number of rows, are those of a run that was cut off; they are computed again.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -15,6 +15,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
+use sixfold_bop::Estimate;
 use sixfold_io::{fnv1a_of_file, write_atomically};
 
 use crate::dataset::check;
@@ -61,6 +62,7 @@ struct Record {
 struct DoneImage {
     scene_id: u32,
     im_id: u32,
+    rows: usize,
     inputs: BTreeMap<String, String>,
 }
 
@@ -145,10 +147,25 @@ impl RunRecord {
         self.done.contains(&(scene_id, im_id))
     }
 
-    /// Takes down an image whose rows are on the disk.
-    pub fn finished(&mut self, scene_id: u32, im_id: u32, inputs: &Inputs) -> Result<(), RunError> {
+    /// Forgets the images that have not as many rows in the result file as they were written with.
+    pub fn forget_unless_whole(&mut self, rows: &[Estimate]) {
+        let mut counts: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+        for row in rows {
+            *counts.entry((row.scene_id, row.im_id)).or_default() += 1;
+        }
+        self.record.done.retain(|d| counts.get(&(d.scene_id, d.im_id)).copied().unwrap_or(0) == d.rows);
+        self.done = self.record.done.iter().map(|d| (d.scene_id, d.im_id)).collect();
+    }
+
+    /// Takes down an image with this many rows, which are on the disk.
+    pub fn finished(
+        &mut self,
+        (scene_id, im_id): (u32, u32),
+        rows: usize,
+        inputs: &Inputs,
+    ) -> Result<(), RunError> {
         self.done.insert((scene_id, im_id));
-        self.record.done.push(DoneImage { scene_id, im_id, inputs: inputs.hashes() });
+        self.record.done.push(DoneImage { scene_id, im_id, rows, inputs: inputs.hashes() });
         if self.saved.elapsed() < SAVED_EVERY { Ok(()) } else { self.save() }
     }
 

@@ -316,3 +316,18 @@ fn the_demo_scores_and_draws_its_samples() {
         assert!(image::open(tiny.path().join(picture.as_str().unwrap())).is_ok(), "{picture}");
     }
 }
+
+#[test]
+fn rows_that_went_missing_are_computed_again() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    let whole = rows(&csv);
+    let text = std::fs::read_to_string(&csv).unwrap();
+    // One of the two rows of the second image, the last one of the third.
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    std::fs::write(&csv, [&lines[..3], &lines[4..6]].concat().concat()).unwrap();
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert!(run.stderr.contains("image 7/4"), "{}", run.stderr);
+    assert_eq!(rows(&csv), whole);
+}

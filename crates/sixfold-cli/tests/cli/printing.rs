@@ -15,9 +15,7 @@ fn errors_are_json_where_json_was_asked_for() {
     assert!(message.contains("nowhere") && run.stderr.contains(message), "{message}\n{}", run.stderr);
 
     // The command line itself is wrong.
-    for arguments in
-        ["eval --nonsense 3 --json", "estimate --json", "grasp --json propose", "nonsense --json"]
-    {
+    for arguments in ["eval --nonsense 3 --json", "grasp propose --json", "nonsense --json"] {
         let run = sixfold(dir.path(), arguments).expect(2);
         let json = run.json();
         let error = &json["error"];

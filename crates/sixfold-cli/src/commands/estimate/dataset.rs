@@ -22,6 +22,8 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     if out.extension().is_none_or(|e| e != "csv") {
         bail!("--out: found {}, expected a file that ends in .csv", out.display());
     }
+    // The files that they name are hashed before they are read: what changes in between is never taken for the same.
+    let options = a.run_options();
     let dataset = BopDataset::open(root, &common.split)?;
     let mut targets = dataset.targets(common.targets.as_deref())?;
     let left_out = excepted(&dataset, common.except.as_deref())?;
@@ -30,7 +32,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     let (regions, mut skipped) = regions(common, &dataset, &targets)?;
     let estimator = a.method.build(a.of_method(), common)?;
     let images: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
-    let (cache, options) = (common.cache.cache(), a.run_options());
+    let cache = common.cache.cache();
     let run = DatasetRun {
         estimator: estimator.as_ref(),
         dataset: &dataset,
