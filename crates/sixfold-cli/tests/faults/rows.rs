@@ -1,0 +1,47 @@
+//! A table of commands becomes tests: every driver on every row. The columns: name, inputs, beginnings of what is written, what
+//! the command may say when all is done already, arguments.
+
+macro_rules! rows {
+    ($($name:ident: $prepare:expr, $writes:expr, $again:expr, $arguments:expr;)*) => {
+        $(mod $name {
+            use super::*;
+
+            pub const ROW: crate::driver::Row = crate::driver::Row {
+                name: stringify!($name),
+                prepare: $prepare,
+                arguments: $arguments,
+                writes: &$writes,
+                again: $again,
+            };
+
+            #[test]
+            fn is_killed_and_restarted() {
+                crate::kill::killed_and_restarted(&ROW);
+            }
+
+            #[test]
+            fn runs_twice_at_once() {
+                crate::two::two_at_once(&ROW);
+            }
+
+            #[test]
+            fn fills_a_disk() {
+                crate::space::small_disk(&ROW);
+            }
+
+            #[test]
+            fn may_only_read() {
+                crate::unwritable::read_only(&ROW);
+            }
+
+            #[test]
+            fn has_no_standard_output() {
+                crate::unwritable::no_standard_output(&ROW);
+            }
+        })*
+
+        /// All rows.
+        #[allow(dead_code)]
+        pub const ROWS: &[crate::driver::Row] = &[$($name::ROW),*];
+    };
+}

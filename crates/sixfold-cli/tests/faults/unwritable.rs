@@ -1,0 +1,72 @@
+//! Standard output that cannot be written, and a folder that cannot be written.
+
+use std::fs::File;
+use std::path::Path;
+
+use crate::driver::{Row, command, prepared, reference, start};
+use crate::outputs::{differences, tree};
+use crate::space::{Jail, jail};
+
+/// Runs a row's command with a standard output on which nothing fits: its files are there all the same.
+pub fn no_standard_output(row: &Row) {
+    if !Path::new("/dev/full").exists() {
+        println!("skipped: there is no /dev/full");
+        return;
+    }
+    let reference = reference(row);
+    let mut wrong = vec![];
+    for json in ["", "--json"] {
+        if !json.is_empty() && row.arguments.contains("--json") {
+            continue;
+        }
+        let folder = prepared(row);
+        let mut program = command(row, folder.path());
+        if !json.is_empty() {
+            program.arg(json);
+        }
+        let output = program.stdout(File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        if output.status.code() != Some(2)
+            || message.contains("panicked")
+            || !message.contains("No space left")
+        {
+            wrong.push(format!("{json}: {}: {}", output.status, message.trim()));
+        }
+        wrong.extend(
+            differences(&reference.tree, &tree(folder.path())).iter().map(|d| format!("{json}: {d}")),
+        );
+    }
+    assert!(wrong.is_empty(), "sixfold {} > /dev/full\n{}", row.arguments, wrong.join("\n"));
+}
+
+/// Runs a row's command on a file system that may only be read.
+pub fn read_only(row: &Row) {
+    let Jail::Ready(wrap) = jail() else {
+        println!("skipped: no file system can be mounted here");
+        return;
+    };
+    let folder = prepared(row);
+    let before = tree(folder.path());
+    let inside = command(row, folder.path());
+    let mut program = wrap(&[
+        "sh",
+        "-c",
+        "mount --bind . . && mount -o remount,ro,bind . && cd \"$PWD\" && exec \"$@\"",
+        "sh",
+    ]);
+    program.arg(inside.get_program()).args(inside.get_args());
+    crate::driver::environment(&mut program, folder.path());
+    let run = start(program).wait();
+    let named = run.stderr.lines().any(|line| {
+        line.contains("Read-only file system") && row.writes.iter().any(|name| line.contains(name))
+    });
+    let refused = run.stderr.contains("read-only") || run.stderr.contains("readonly");
+    assert!(
+        run.code == 2 && (named || refused),
+        "sixfold {}\nexit status {}: {}",
+        row.arguments,
+        run.code,
+        run.stderr
+    );
+    assert_eq!(differences(&before, &tree(folder.path())), Vec::<String>::new());
+}

@@ -1,0 +1,37 @@
+//! The table: commands of `sixfold-experiments` that write, on the smallest inputs they accept.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use crate::driver::{copy, kept};
+use crate::support::{OneImage, Tiny};
+
+/// The mesh of one object.
+fn mesh(folder: &Path) {
+    static CASE: LazyLock<PathBuf> = LazyLock::new(|| {
+        let case = OneImage::new();
+        let folder = kept("mesh");
+        fs::copy(case.path().join("part.ply"), folder.join("part.ply")).unwrap();
+        folder
+    });
+    copy(&CASE, folder);
+}
+
+/// A dataset `tiny` of which one image is looked at.
+fn dataset(folder: &Path) {
+    static CASE: LazyLock<PathBuf> = LazyLock::new(|| {
+        let tiny = Tiny::coloured();
+        let targets = serde_json::json!([{"scene_id": 7, "im_id": 4, "obj_id": 1, "inst_count": 1}]);
+        fs::write(tiny.file("test_targets_bop19.json"), targets.to_string()).unwrap();
+        let folder = kept("dataset");
+        copy(tiny.path(), &folder);
+        folder
+    });
+    copy(&CASE, folder);
+}
+
+rows! {
+    reproduce_mttm: dataset, ["out"], None, "reproduce mttm --dataset tiny --out out --no-ppf";
+    grasp_measure: mesh, ["out"], None, "grasp measure --object part.ply --unit mm --trials 2 --out out";
+}
