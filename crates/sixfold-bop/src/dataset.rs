@@ -39,8 +39,11 @@ pub struct BopDataset {
     size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
     /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
-    infos: Arc<[OnceLock<Option<(String, ModelsInfo)>>; 2]>,
+    infos: Arc<[OnceLock<ReadInfos>; 2]>,
 }
+
+/// The file `models_info.json` of a folder of models and what it says, if it is there.
+type ReadInfos = Option<(String, ModelsInfo)>;
 
 impl BopDataset {
     /// Opens `dir/split` (such as `test`), or `dir` itself where it is a scene folder (`scene_camera.json` in it);

@@ -98,7 +98,7 @@ pub enum StoreError {
         /// The object.
         name: String,
         /// Why.
-        source: MeshFileError,
+        source: Box<MeshFileError>,
     },
     /// A mesh file needs a unit.
     #[error("{}: a mesh file does not say its unit: give --unit mm (or m, cm, in)", path.display())]
@@ -602,7 +602,7 @@ fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, 
     let (mut mesh, mut info) = (None, None);
     if !record.without_mesh {
         let read = read_mesh(folder.join("mesh.ply"), Unit::Metre)
-            .map_err(|source| StoreError::StoredMesh { name: name.to_owned(), source })?;
+            .map_err(|source| StoreError::StoredMesh { name: name.to_owned(), source: Box::new(source) })?;
         let wrong =
             |what| StoreError::Record { name: name.to_owned(), path: folder.join("object.json"), what };
         let mut of_record = record.info(&read).map_err(wrong)?;

@@ -21,7 +21,7 @@ pub(super) fn parse(text: &str) -> Result<Value, String> {
     let mut reader = Reader { text };
     reader.skip()?;
     let name = reader.opening()?.ok_or_else(|| reader.found("an element such as <opencv_storage>"))?;
-    let value = reader.inside(&name.0, 0)?;
+    let value = reader.inside(name.0, 0)?;
     reader.skip()?;
     if reader.text.is_empty() { Ok(value) } else { Err(reader.found("the end of the file")) }
 }
