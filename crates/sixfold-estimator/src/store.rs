@@ -31,6 +31,8 @@ const DIAMETERS: std::ops::RangeInclusive<f64> =
     sixfold_mesh::SMALLEST_DIAMETER..=sixfold_mesh::LARGEST_DIAMETER;
 /// How far the diameter in `object.json` may be off the mesh's, as a fraction: the mesh is stored in single precision.
 const SAME_DIAMETER: f64 = 1e-3;
+/// The same for a point, as a fraction of its distance from the origin.
+const SAME_POINT: f64 = 1e-6;
 /// Most discrete symmetries (with the identity) times axes in `object.json`: a gear with 360 teeth has 360.
 const MAX_SYMMETRIES: usize = 1000;
 /// Furthest that a point on an axis, or the way of a symmetry, is from the origin, metres.
@@ -213,7 +215,9 @@ impl ObjectRecord {
     /// Diameter, box and symmetries; what is wrong with the record beside this mesh otherwise.
     fn info(&self, mesh: &Mesh) -> Result<ModelInfo, String> {
         let mut info = ModelInfo::of_mesh(mesh);
-        if !((self.diameter - info.diameter).abs() <= SAME_DIAMETER * info.diameter) {
+        let furthest = info.min.abs().sup(&(info.min + info.size).abs()).amax();
+        let rounding = SAME_DIAMETER * info.diameter + SAME_POINT * furthest;
+        if !((self.diameter - info.diameter).abs() <= rounding) {
             return Err(format!(
                 "field diameter: found {} m, that of mesh.ply beside it is {} m",
                 self.diameter, info.diameter

@@ -292,7 +292,7 @@ fn stored(record: &[u8], mesh_file: &[u8]) {
     assert_eq!(store.names().expect("a store can be listed"), ["part"]);
     if let Ok(Object { mesh: Some(read), info: Some(info), .. }) = store.load("part") {
         mesh(&read);
-        assert!((0.005..=5.0).contains(&info.diameter), "the diameter is that of an object");
+        assert!((0.004..=20.0).contains(&info.diameter), "the diameter is that of an object");
         assert!((info.diameter - read.diameter()).abs() < 1e-9, "and of its mesh");
         let symmetries = info.symmetry_poses(1.0);
         assert!(symmetries.iter().all(finite), "symmetries are rigid");

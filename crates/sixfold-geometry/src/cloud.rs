@@ -90,7 +90,10 @@ impl PointCloud {
             let mut at = *head;
             while at != END {
                 let group = &mut groups[at];
-                if !with_normals || group.first_normal.dot(&n) >= cosine {
+                let alike = || group.first_normal.dot(&n) >= cosine;
+                // Normals that are not known are alike, or each would make a group that the others are held against.
+                let unknown = || !(n.norm_squared() > 0.0 || group.first_normal.norm_squared() > 0.0);
+                if !with_normals || alike() || unknown() {
                     group.point += p;
                     group.normal += n;
                     group.count += 1.0;
@@ -168,6 +171,15 @@ mod tests {
         assert_eq!(thin.len(), 2);
         assert!((thin.points[0] - Vec3::new(0.0046, 0.0046, 0.0052)).norm() < 1e-9);
         assert!((thin.normals[1] + Vec3::z()).norm() < 1e-9);
+    }
+
+    #[test]
+    fn a_hundred_thousand_points_without_a_normal_are_one() {
+        let n = 100_000;
+        for normal in [Vec3::zeros(), Vec3::repeat(f64::NAN)] {
+            let cloud = PointCloud { points: vec![Vec3::repeat(0.1); n], normals: vec![normal; n] };
+            assert_eq!(cloud.voxel_downsample(0.02, 0.5).len(), 1);
+        }
     }
 
     #[test]

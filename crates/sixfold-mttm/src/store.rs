@@ -189,7 +189,7 @@ impl Reader<'_> {
     fn template(&mut self) -> Option<Template> {
         let distance = self.number()?;
         let q = Quaternion::new(self.number()?, self.number()?, self.number()?, self.number()?);
-        if !((q.norm() - 1.0).abs() <= 1e-6) {
+        if !((q.norm() - 1.0).abs() <= 1e-9) {
             return None;
         }
         let rotation = UnitQuaternion::new_unchecked(q);

@@ -108,6 +108,30 @@ fn objects_without_a_shape_are_a_message_or_a_result_at_once_in_every_format() {
     }
 }
 
+#[cfg(feature = "physics")]
+#[test]
+fn objects_without_a_shape_are_dropped_or_explained() {
+    let case = OneImage::new();
+    let dir = case.path();
+    for (name, vertices, faces, words) in degenerate() {
+        let file = format!("{name}.ply");
+        std::fs::write(dir.join(&file), ply(&vertices, &faces)).unwrap();
+        for exact in ["", "--exact"] {
+            let start = Instant::now();
+            let command = format!(
+                "simulate-scenes --object {file} --unit m {exact} --scenes 1 --views 1 --objects-per-scene 1,1 \
+                 --camera camera.json --out scenes-{name}{exact}"
+            );
+            let run = sixfold(dir, &command);
+            assert!(start.elapsed() < Duration::from_secs(120), "{command}: {:?}", start.elapsed());
+            assert!((0..=2).contains(&run.code), "{command}: {run:?}");
+            if !words.is_empty() {
+                assert!(run.code == 2 && words.iter().all(|w| run.stderr.contains(w)), "{command}: {run:?}");
+            }
+        }
+    }
+}
+
 #[cfg(unix)]
 #[test]
 fn a_mesh_reads_files_outside_its_folder_only_when_asked_for() {
