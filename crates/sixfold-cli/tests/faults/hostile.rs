@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 use crate::commands;
-use crate::driver::{Row, environment, start, thorough};
+use crate::driver::{Row, environment, program, start, thorough};
 
 /// A run may take so long.
 const SECONDS: u64 = 10;
@@ -64,7 +64,7 @@ fn kind(name: &str, value: &str) -> Kind {
 
 /// The options of a command that take a value, from its help.
 fn options(command: &str) -> Vec<Opt> {
-    let output = Command::new(crate::PROGRAM).args(command.split(' ')).arg("--help").output().unwrap();
+    let output = Command::new(program()).args(command.split(' ')).arg("--help").output().unwrap();
     let help = String::from_utf8(output.stdout).unwrap();
     let mut found = vec![];
     for line in help.lines() {
@@ -172,15 +172,10 @@ fn with_value(arguments: &str, option: &str, value: &str) -> Vec<String> {
 
 /// Runs the program in a folder within the limits. `words`: one of them has to be in the message.
 fn refused(folder: &Path, parts: &[String], words: &[&str]) -> Option<Finding> {
-    let mut program = Command::new("sh");
-    program
-        .arg("-c")
-        .arg(format!("ulimit -v {KILOBYTES}; exec \"$@\""))
-        .arg("sh")
-        .arg(crate::PROGRAM)
-        .args(parts);
-    environment(&mut program, folder);
-    let mut run = start(program);
+    let mut command = Command::new("sh");
+    command.arg("-c").arg(format!("ulimit -v {KILOBYTES}; exec \"$@\"")).arg("sh").arg(program()).args(parts);
+    environment(&mut command, folder);
+    let mut run = start(command);
     let began = Instant::now();
     while !run.is_done() {
         if began.elapsed() > Duration::from_secs(SECONDS) {
