@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyIterator;
-use sixfold_geometry::{
+use sixfold::geometry::{
     AlignmentError, DepthTarget, IcpError, IcpLevel, IcpOptions, IcpReport, IndexedCloud, NormalOptions,
     PnpError, PnpOptions, PnpReport, PnpSolver, PointCloud, Pose, RefineOptions,
 };
@@ -129,9 +129,9 @@ pub(crate) fn pnp_ransac(
     };
     let camera = camera.0;
     let found = if max_iterations > MANY_ITERATIONS || object.len() > 200_000 {
-        interruptible(py, move |_| sixfold_geometry::pnp_ransac(&object, &image, &camera, &options))?
+        interruptible(py, move |_| sixfold::geometry::pnp_ransac(&object, &image, &camera, &options))?
     } else {
-        free(py, || sixfold_geometry::pnp_ransac(&object, &image, &camera, &options))?
+        free(py, || sixfold::geometry::pnp_ransac(&object, &image, &camera, &options))?
     };
     let PnpReport { camera_from_object, inliers, inlier_count, iterations, score, rms_px, .. } =
         found.map_err(pnp_error)?;
@@ -164,7 +164,7 @@ pub(crate) fn epnp<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let object = arrays::points3("object_points", object_points)?;
     let image = arrays::points2("image_points", image_points)?;
-    let pose = free(py, || sixfold_geometry::epnp(&object, &image, &camera.0))?.map_err(pnp_error)?;
+    let pose = free(py, || sixfold::geometry::epnp(&object, &image, &camera.0))?.map_err(pnp_error)?;
     arrays::from_pose(py, &pose)
 }
 
@@ -196,7 +196,7 @@ pub(crate) fn refine_pose<'py>(
     let initial = arrays::pose("initial", initial)?;
     let max_iterations = whole("max_iterations", max_iterations, 0)?;
     let options = RefineOptions { threshold_px, max_iterations, ..RefineOptions::default() };
-    let report = free(py, || sixfold_geometry::refine_pose(&object, &image, &camera.0, &initial, &options))?
+    let report = free(py, || sixfold::geometry::refine_pose(&object, &image, &camera.0, &initial, &options))?
         .map_err(pnp_error)?;
     Ok((arrays::from_pose(py, &report.camera_from_object)?, report.inlier_count))
 }
@@ -214,7 +214,7 @@ fn alignment_error(error: AlignmentError) -> PyErr {
 }
 
 /// Source and target points, and their weights.
-type Pairs = (Vec<sixfold_geometry::Vec3>, Vec<sixfold_geometry::Vec3>, Option<Vec<f64>>);
+type Pairs = (Vec<sixfold::geometry::Vec3>, Vec<sixfold::geometry::Vec3>, Option<Vec<f64>>);
 
 fn pairs(
     source: &Bound<'_, PyAny>,
@@ -246,7 +246,7 @@ pub(crate) fn kabsch<'py>(
     weights: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let (source, target, weights) = pairs(source, target, weights)?;
-    let pose = free(py, || sixfold_geometry::kabsch(&source, &target, weights.as_deref()))?
+    let pose = free(py, || sixfold::geometry::kabsch(&source, &target, weights.as_deref()))?
         .map_err(alignment_error)?;
     arrays::from_pose(py, &pose)
 }
@@ -270,7 +270,7 @@ pub(crate) fn umeyama<'py>(
     weights: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, f64)> {
     let (source, target, weights) = pairs(source, target, weights)?;
-    let found = free(py, || sixfold_geometry::umeyama(&source, &target, weights.as_deref()))?
+    let found = free(py, || sixfold::geometry::umeyama(&source, &target, weights.as_deref()))?
         .map_err(alignment_error)?;
     Ok((arrays::from_pose(py, &found.target_from_source)?, found.scale))
 }
@@ -385,7 +385,7 @@ fn cloud(
             }
             normals
                 .iter()
-                .map(|n| n.try_normalize(1e-12).unwrap_or_else(sixfold_geometry::Vec3::zeros))
+                .map(|n| n.try_normalize(1e-12).unwrap_or_else(sixfold::geometry::Vec3::zeros))
                 .collect()
         }
     };
@@ -431,7 +431,7 @@ pub(crate) fn icp(
     let options = icp_options(rejection_distance, levels, max_angle)?;
     let report = interruptible(py, move |_| {
         let target = IndexedCloud::new(target)?;
-        sixfold_geometry::icp(&source, &target, &initial, &options)
+        sixfold::geometry::icp(&source, &target, &initial, &options)
     })?;
     icp_result(py, report)
 }
@@ -463,9 +463,9 @@ pub(crate) fn icp_to_depth(
     let initial = arrays::pose("initial", initial)?;
     let options = icp_options(rejection_distance, levels, max_angle)?;
     let report = interruptible(py, move |_| {
-        let normals = sixfold_geometry::normals_from_depth(&depth, &camera, &NormalOptions::default());
+        let normals = sixfold::geometry::normals_from_depth(&depth, &camera, &NormalOptions::default());
         let target = DepthTarget { depth: &depth, normals: &normals, camera: &camera };
-        sixfold_geometry::icp(&source, &target, &initial, &options)
+        sixfold::geometry::icp(&source, &target, &initial, &options)
     })?;
     icp_result(py, report)
 }

@@ -10,9 +10,9 @@ use numpy::{
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_bop::Placement;
-use sixfold_geometry::nalgebra::{Matrix4, Vector2, Vector3};
-use sixfold_geometry::{
+use sixfold::bop::Placement;
+use sixfold::geometry::nalgebra::{Matrix4, Vector2, Vector3};
+use sixfold::geometry::{
     DepthImage, Image, Mask, Mat3, NormalImage, PointImage, Pose, Rect, RgbImage, Vec2, Vec3,
 };
 

@@ -8,8 +8,8 @@ use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
-use sixfold_bop::{BopDataset, Estimate, MaskKind, Models, Placement, Scene};
-use sixfold_geometry::Pose;
+use sixfold::bop::{BopDataset, Estimate, MaskKind, Models, Placement, Scene};
+use sixfold::geometry::Pose;
 
 use crate::arrays::{self, about, bad, id, positive, whole};
 use crate::camera::PyCamera;
@@ -126,14 +126,14 @@ impl PyEstimate {
 #[pyo3(signature = (path, *, lenient=false))]
 fn read_results(py: Python<'_>, path: PathBuf, lenient: bool) -> PyResult<Vec<PyEstimate>> {
     let estimates = if lenient {
-        let (good, rows) = free(py, || sixfold_bop::read_results_lenient(&path))?.map_err(results_error)?;
+        let (good, rows) = free(py, || sixfold::bop::read_results_lenient(&path))?.map_err(results_error)?;
         if let Some(first) = rows.first() {
             let text = format!("{}: {} rows left out, the first: {first}", path.display(), rows.len());
             py.import("warnings")?.call_method1("warn", (text,))?;
         }
         good
     } else {
-        free(py, || sixfold_bop::read_results(&path))?.map_err(results_error)?
+        free(py, || sixfold::bop::read_results(&path))?.map_err(results_error)?
     };
     Ok(estimates.into_iter().map(PyEstimate).collect())
 }
@@ -144,7 +144,7 @@ fn read_results(py: Python<'_>, path: PathBuf, lenient: bool) -> PyResult<Vec<Py
 #[pyfunction]
 fn write_results(py: Python<'_>, path: PathBuf, estimates: Vec<PyEstimate>) -> PyResult<()> {
     let rows: Vec<Estimate> = estimates.into_iter().map(|e| e.0).collect();
-    free(py, || sixfold_bop::write_results(&path, &rows))?.map_err(results_error)
+    free(py, || sixfold::bop::write_results(&path, &rows))?.map_err(results_error)
 }
 
 /// A pose (4, 4) in metres from a rotation (3, 3) and a translation (3,) in millimetres, as BOP files have them.
@@ -295,7 +295,7 @@ impl PyDataset {
         let out = PyList::empty(py);
         for (index, truth) in image.ground_truth.iter().enumerate() {
             let info = image.info.as_ref().map(|i| &i[index]);
-            let corners = |r: Option<sixfold_geometry::Rect>| {
+            let corners = |r: Option<sixfold::geometry::Rect>| {
                 r.map(|r| PyArray1::from_vec(py, vec![r.x, r.y, r.width, r.height]))
             };
             let entry = PyDict::new(py);
@@ -337,12 +337,23 @@ impl PyDataset {
     }
 }
 
+/// Sets the largest image that is read from a file, in pixels, for everything in this process: 100 million unless it is set.
+///
+/// Raises ValueError for a limit below 1.
+///
+/// >>> set_max_pixels(100_000_000)
+#[pyfunction]
+fn set_max_pixels(pixels: i64) -> PyResult<()> {
+    sixfold::io::set_max_pixels(whole("pixels", pixels, 1)? as u64);
+    Ok(())
+}
+
 /// Reads a colour image (grey ones as colour): (H, W, 3) uint8. Raises OSError or ValueError.
 ///
 /// >>> rgb = read_rgb("data/demo/test/000002/rgb/000003.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> {
-    let image = free(py, || sixfold_io::read_rgb(&path))?.map_err(image_error)?;
+    let image = free(py, || sixfold::io::read_rgb(&path))?.map_err(image_error)?;
     arrays::from_image_of(py, image)
 }
 
@@ -354,18 +365,19 @@ fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> 
 #[pyfunction]
 fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound<'_, PyArray2<f32>>> {
     let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
-    let image = free(py, || sixfold_io::read_depth(&path, metres))?.map_err(image_error)?;
+    let image = free(py, || sixfold::io::read_depth(&path, metres))?.map_err(image_error)?;
     arrays::from_image(py, image)
 }
 
-/// Reads a mask: (H, W) bool, True where the file is above zero.
+/// Reads a mask: (H, W) bool, True where the file is not zero. Grey, a palette, or RGB with one colour besides black; alpha that
+/// is not full everywhere is the mask.
 ///
-/// Raises OSError when the file cannot be read, ValueError when it is no such image.
+/// Raises OSError when the file cannot be read, ValueError when it is no such image, or when it could mean two things.
 ///
 /// >>> mask = read_mask("mask.png")  # doctest: +SKIP
 #[pyfunction]
 fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>>> {
-    let image = free(py, || sixfold_io::read_mask(&path))?.map_err(image_error)?;
+    let image = free(py, || sixfold::io::read_mask(&path))?.map_err(image_error)?;
     arrays::from_image(py, image)
 }
 
@@ -377,7 +389,7 @@ fn read_mask(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<bool>
 #[pyfunction]
 fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::rgb("rgb", rgb)?;
-    free(py, || sixfold_io::write_rgb(&path, &image))?.map_err(image_error)
+    free(py, || sixfold::io::write_rgb(&path, &image))?.map_err(image_error)
 }
 
 /// Writes a depth image (H, W) in metres as 16 bit PNG in steps of mm_per_unit millimetres (BOP's depth_scale).
@@ -389,7 +401,7 @@ fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<
 fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_unit: f64) -> PyResult<()> {
     let image = arrays::depth("depth", depth)?;
     let metres = positive("mm_per_unit", mm_per_unit)? / 1000.0;
-    free(py, || sixfold_io::write_depth(&path, &image, metres))?.map_err(image_error)
+    free(py, || sixfold::io::write_depth(&path, &image, metres))?.map_err(image_error)
 }
 
 /// Writes a mask (H, W) bool as PNG.
@@ -400,7 +412,7 @@ fn write_depth(py: Python<'_>, path: PathBuf, depth: &Bound<'_, PyAny>, mm_per_u
 #[pyfunction]
 fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResult<()> {
     let image = arrays::mask("mask", mask)?;
-    free(py, || sixfold_io::write_mask(&path, &image))?.map_err(image_error)
+    free(py, || sixfold::io::write_mask(&path, &image))?.map_err(image_error)
 }
 
 /// Masks and visibility of posed objects, [(mesh, camera_from_object (4, 4)), ...], as BOP's ground-truth info: a list of
@@ -429,7 +441,7 @@ fn ground_truth_visibility<'py>(
     let delta = positive("delta", delta)?;
     let seen = free(py, || {
         let posed: Vec<_> = objects.iter().map(|(mesh, pose)| (mesh.as_ref(), *pose)).collect();
-        sixfold_bop::ground_truth_visibility(&posed, &camera, depth.as_ref(), delta)
+        sixfold::bop::ground_truth_visibility(&posed, &camera, depth.as_ref(), delta)
     })?;
     let out = PyList::empty(py);
     for object in seen {
@@ -450,7 +462,7 @@ fn ground_truth_visibility<'py>(
 #[pyfunction]
 pub(crate) fn encode_mask<'py>(py: Python<'py>, mask: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
     let mask = arrays::mask("mask", mask)?;
-    let rle = sixfold_bop::Rle::encode(&mask).map_err(about("mask"))?;
+    let rle = sixfold::bop::Rle::encode(&mask).map_err(about("mask"))?;
     let out = PyDict::new(py);
     out.set_item("size", [rle.height(), rle.width()])?;
     out.set_item("counts", rle.to_compressed())?;
@@ -474,15 +486,15 @@ pub(crate) fn decode_mask<'py>(
     let (height, width) = size.extract::<[u64; 2]>().map(|[h, w]| (h, w)).map_err(|_| wrong())?;
     let counts = rle.get_item("counts")?.ok_or_else(wrong)?;
     let rle = if let Ok(text) = counts.extract::<String>() {
-        sixfold_bop::Rle::from_compressed(width, height, &text)
+        sixfold::bop::Rle::from_compressed(width, height, &text)
     } else if let Ok(bytes) = counts
         .extract::<Vec<u8>>()
         .and_then(|b| if counts.is_instance_of::<pyo3::types::PyBytes>() { Ok(b) } else { Err(wrong()) })
     {
         let text = String::from_utf8(bytes).map_err(|_| wrong())?;
-        sixfold_bop::Rle::from_compressed(width, height, &text)
+        sixfold::bop::Rle::from_compressed(width, height, &text)
     } else {
-        sixfold_bop::Rle::new(width, height, counts.extract::<Vec<u32>>().map_err(|_| wrong())?)
+        sixfold::bop::Rle::new(width, height, counts.extract::<Vec<u32>>().map_err(|_| wrong())?)
     };
     arrays::from_image(py, rle.map_err(about("rle"))?.decode())
 }
@@ -495,6 +507,7 @@ pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(write_results, module)?)?;
     module.add_function(wrap_pyfunction!(pose_from_mm, module)?)?;
     module.add_function(wrap_pyfunction!(pose_to_mm, module)?)?;
+    module.add_function(wrap_pyfunction!(set_max_pixels, module)?)?;
     module.add_function(wrap_pyfunction!(read_rgb, module)?)?;
     module.add_function(wrap_pyfunction!(read_depth, module)?)?;
     module.add_function(wrap_pyfunction!(read_mask, module)?)?;

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::{PyTuple, PyType};
-use sixfold_geometry::{BrownConrady, Camera, Vec2};
-use sixfold_io::CameraFile;
+use sixfold::geometry::{BrownConrady, Camera, Vec2};
+use sixfold::io::CameraFile;
 
 use crate::arrays::{self, about, bad, whole};
 use crate::guard::{camera_file_error, free};
@@ -16,7 +16,9 @@ use crate::guard::{camera_file_error, free};
 ///
 /// `distortion` are Brown's coefficients in OpenCV's order: (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
 ///
-/// Raises ValueError for a focal length that is not above zero, an empty image, or numbers that are not finite.
+/// Raises ValueError for what no lens has: a focal length that is not above zero or not in pixels (an edge of the image more
+/// than 85 degrees off the optical axis), fx and fy that differ by more than a factor of 2, an empty image, numbers that are not
+/// finite.
 ///
 /// >>> camera = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 /// >>> camera.matrix[0].tolist()
@@ -29,6 +31,12 @@ pub(crate) struct PyCamera(pub(crate) Camera);
 const MAX_PIXELS: u64 = 1 << 26;
 
 impl PyCamera {
+    /// A camera that a lens can have.
+    fn checked(camera: Camera) -> PyResult<Self> {
+        camera.check_lens().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
+        Ok(PyCamera(camera))
+    }
+
     /// The camera, or an error where only images without distortion are taken.
     pub(crate) fn pinhole(&self) -> PyResult<Camera> {
         if self.0.distortion.is_some() {
@@ -90,17 +98,17 @@ impl PyCamera {
         };
         let (width, height) = (whole("width", width, 1)?, whole("height", height, 1)?);
         let camera = Camera { fx, fy, cx, cy, width, height, distortion };
-        camera.check().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
-        Ok(PyCamera(camera))
+        PyCamera::checked(camera)
     }
 
-    /// Reads a JSON file with fx, fy, cx, cy or cam_K, and perhaps width, height, distortion and depth_scale (BOP's
-    /// camera.json), or a scene_camera.json of one image. `width` and `height` are those of the image, pixels; they may be
-    /// left out when the file says them. Returns the camera and the file's depth_scale, millimetres per unit of the
-    /// depth image, None without one.
+    /// Reads a camera file: fx, fy, cx, cy or a matrix, and perhaps width, height, distortion and depth_scale, as BOP, OpenCV
+    /// (YAML, XML, JSON) and ROS (CameraInfo, calibration files) write them, or a scene_camera.json of one image. `width` and
+    /// `height` are those of the image, pixels; they may be left out when the file says them. Returns the camera and the file's
+    /// depth_scale, millimetres per unit of the depth image, None without one.
     ///
     /// Raises OSError when the file cannot be read; ValueError, with the file and field, when it is broken, states another
-    /// size, or belongs to another resolution.
+    /// size or a key that is unknown, has a fisheye lens, or is no camera of a whole image of that size: a wrong unit, another
+    /// resolution.
     ///
     /// >>> camera, mm_per_unit = Camera.load("data/demo/camera.json", 640, 480)  # doctest: +SKIP
     #[classmethod]
@@ -247,14 +255,13 @@ impl PyCamera {
                 format!("{} x {}", rect.width, rect.height),
             ));
         }
-        Ok(PyCamera(self.0.crop(&rect)))
+        PyCamera::checked(self.0.crop(&rect))
     }
 
     /// The camera of the image resized to width x height pixels.
     fn resize(&self, width: i64, height: i64) -> PyResult<PyCamera> {
         let camera = self.0.resize(whole("width", width, 1)?, whole("height", height, 1)?);
-        camera.check().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
-        Ok(PyCamera(camera))
+        PyCamera::checked(camera)
     }
 
     fn __repr__(&self) -> String {
@@ -291,7 +298,7 @@ pub(crate) fn undistort_rgb<'py>(
     camera: PyCamera,
 ) -> PyResult<Bound<'py, PyArray3<u8>>> {
     let image = arrays::rgb("rgb", rgb)?;
-    let out = free(py, || sixfold_geometry::undistort_rgb(&image, &camera.0))?.map_err(about("rgb"))?;
+    let out = free(py, || sixfold::geometry::undistort_rgb(&image, &camera.0))?.map_err(about("rgb"))?;
     arrays::from_image_of(py, out)
 }
 
@@ -311,7 +318,7 @@ pub(crate) fn undistort_depth<'py>(
     camera: PyCamera,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let image = arrays::depth("depth", depth)?;
-    let out = free(py, || sixfold_geometry::undistort_depth(&image, &camera.0))?.map_err(about("depth"))?;
+    let out = free(py, || sixfold::geometry::undistort_depth(&image, &camera.0))?.map_err(about("depth"))?;
     arrays::from_image(py, out)
 }
 
@@ -328,7 +335,7 @@ pub(crate) fn pose_exp<'py>(
     let v = arrays::numbers("twist", twist)?;
     let v: [f64; 6] =
         v.try_into().map_err(|v: Vec<f64>| bad("twist", "6 numbers (v, w)", format!("{}", v.len())))?;
-    arrays::from_pose(py, &sixfold_geometry::Pose::exp(&v.into()))
+    arrays::from_pose(py, &sixfold::geometry::Pose::exp(&v.into()))
 }
 
 /// A pose (4, 4) to the six numbers (v, w) of pose_exp; for rotation angles below pi.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_bop::{
+use sixfold::bop::{
     CocoGroundTruth, Detection, IouType, ReadDetections, VisibleTruth, evaluate_coco, parse_detections,
 };
 
@@ -128,7 +128,7 @@ fn read_detections<'py>(
     lenient: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
     let options = ReadDetections { lenient, image_size };
-    let read = free(py, || sixfold_bop::read_detections(&path, &options))?.map_err(dataset_error)?;
+    let read = free(py, || sixfold::bop::read_detections(&path, &options))?.map_err(dataset_error)?;
     if let Some(first) = read.adjusted.first() {
         let text = format!(
             "{} detections were changed or left out, the first: {}",
@@ -166,7 +166,7 @@ fn write_detections(py: Python<'_>, path: PathBuf, detections: &Bound<'_, PyAny>
         return Err(PyValueError::new_err("detections: expected a list of dicts, found a path"));
     }
     let list = detections_of("detections", detections)?;
-    free(py, || sixfold_bop::write_detections(Path::new(&path), &list))?.map_err(dataset_error)
+    free(py, || sixfold::bop::write_detections(Path::new(&path), &list))?.map_err(dataset_error)
 }
 
 /// Adds what is in `sixfold.coco`.

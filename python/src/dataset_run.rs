@@ -7,10 +7,10 @@ use std::sync::Arc;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_bop::{BopDataset, Target};
-use sixfold_detect::detector::TrainedDetector;
-use sixfold_estimator::{Cache, PoseEstimator};
-use sixfold_runner::{
+use sixfold::bop::{BopDataset, Target};
+use sixfold::detect::detector::TrainedDetector;
+use sixfold::estimator::{Cache, PoseEstimator};
+use sixfold::runner::{
     DatasetEvent, DatasetRun, DatasetSummary, RegionSource, RunError, RunOptions, describe,
 };
 

@@ -7,9 +7,9 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyType;
-use sixfold_detect::detect::DetectOptions;
-use sixfold_detect::model::{DetectorModel, ModelError};
-use sixfold_nn::weights::WeightsError;
+use sixfold::detect::detect::DetectOptions;
+use sixfold::detect::model::{DetectorModel, ModelError};
+use sixfold::nn::weights::WeightsError;
 
 use crate::arrays::{self, about, bad, whole};
 use crate::guard::{interruptible, os_error};

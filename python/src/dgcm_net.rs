@@ -7,11 +7,11 @@ use numpy::PyArray1;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyType;
-use sixfold_dgcm::model::{DgcmModel, ModelError};
-use sixfold_experience::Crop;
-use sixfold_geometry::{Camera, DepthImage, Mask};
-use sixfold_grasp::{GraspView, ViewOptions};
-use sixfold_nn::weights::WeightsError;
+use sixfold::dgcm::model::{DgcmModel, ModelError};
+use sixfold::experience::Crop;
+use sixfold::geometry::{Camera, DepthImage, Mask};
+use sixfold::grasp::{GraspView, ViewOptions};
+use sixfold::nn::weights::WeightsError;
 
 use crate::arrays::{self, about, bad};
 use crate::bop::json_to_python;

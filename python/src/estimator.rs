@@ -8,14 +8,14 @@ use numpy::PyArray2;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_align::PreparedDepth;
-use sixfold_estimator::{
+use sixfold::align::PreparedDepth;
+use sixfold::estimator::{
     EstimatorError, Need, Object, PoseEstimate, PoseEstimator, PreparedObject, Query, Region,
 };
-use sixfold_geometry::{Camera, Mask, Rect};
-use sixfold_mesh::{Mesh, ModelInfo};
-use sixfold_mttm::mask::to_image;
-use sixfold_runner::{RunOptions, describe};
+use sixfold::geometry::{Camera, Mask, Rect};
+use sixfold::mesh::{Mesh, ModelInfo};
+use sixfold::mttm::mask::to_image;
+use sixfold::runner::{RunOptions, describe};
 
 use crate::arrays::{self, about, bad, seed, whole};
 use crate::bop::json_to_python;

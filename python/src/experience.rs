@@ -6,12 +6,13 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::Memory;
-use sixfold_experience::{
-    Description, Experience, ExperienceStore as _, FEATURE, Match, SqliteStore, StoreError, Summary,
+use sixfold::dgcm::model::DgcmModel;
+use sixfold::dgcm::transfer::Memory;
+use sixfold::experience::{
+    Description, Experience, ExperienceStore as _, FEATURE, Match, SqliteStore, StoreError, StorePlace,
+    Summary,
 };
-use sixfold_grasp::{AntipodalQuality, Grasp};
+use sixfold::grasp::{AntipodalQuality, Grasp};
 
 use crate::arrays::{self, about, bad, whole};
 use crate::bop::json_to_python;
@@ -126,6 +127,7 @@ impl ExperienceStore {
         create: bool,
     ) -> PyResult<Self> {
         let network = weights.map(|w| network_of(py, w)).transpose()?;
+        let path = file_of("path", path)?;
         let file = path.clone();
         let open = move |_: &Stop| if create { SqliteStore::create(&file) } else { SqliteStore::open(&file) };
         let store = interruptible(py, open)?.map_err(store_error)?;
@@ -213,6 +215,7 @@ impl ExperienceStore {
     ///
     /// Raises OSError or ValueError when the other file cannot be read.
     fn merge(&self, py: Python<'_>, other: PathBuf) -> PyResult<usize> {
+        let other = file_of("other", other)?;
         self.with(py, move |opened, stop| {
             let source = SqliteStore::open(&other)?;
             let mut added = 0;
@@ -233,6 +236,7 @@ impl ExperienceStore {
     /// Raises ValueError when out is this store, or for an experience of another size than the network wants.
     fn refresh(&self, py: Python<'_>, out: PathBuf, weights: &Bound<'_, PyAny>) -> PyResult<usize> {
         let model = network_of(py, weights)?;
+        let out = file_of("out", out)?;
         let same =
             |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
         if same(&out, &self.path) {
@@ -272,7 +276,7 @@ impl ExperienceStore {
                 };
                 let picture = stored.experience.picture().map_err(about("folder"))?;
                 let file = folder.join(format!("{id:06}.png"));
-                sixfold_io::write_rgb(&file, &picture).map_err(image_error)?;
+                sixfold::io::write_rgb(&file, &picture).map_err(image_error)?;
                 let file = file.with_extension("json");
                 let text = serde_json::to_string_pretty(&Description::new(&stored, true))
                     .map_err(about("folder"))?;
@@ -330,6 +334,16 @@ struct Near {
     id: i64,
     angle: f64,
     distance: f64,
+}
+
+/// A path, unless it is the address of a server, which must not become a file whose name holds a password.
+fn file_of(argument: &str, path: PathBuf) -> PyResult<PathBuf> {
+    match StorePlace::from(path.into_os_string()) {
+        StorePlace::File(path) => Ok(path),
+        place => {
+            Err(bad(argument, "the path of a file; servers are for the program `sixfold`", place.to_string()))
+        }
+    }
 }
 
 /// Seconds since 1970.

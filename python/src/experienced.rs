@@ -2,8 +2,8 @@
 
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
-use sixfold_experience::Stored;
-use sixfold_geometry::Image;
+use sixfold::experience::Stored;
+use sixfold::geometry::Image;
 
 use crate::arrays::{self, about};
 use crate::camera::PyCamera;

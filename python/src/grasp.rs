@@ -4,9 +4,9 @@ use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank_by_outcome, rank_on_part};
-use sixfold_geometry::Pose;
-use sixfold_grasp::{
+use sixfold::dgcm::transfer::{Kind, ProposeError, ProposeOptions, propose, rank_by_outcome, rank_on_part};
+use sixfold::geometry::Pose;
+use sixfold::grasp::{
     AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, GraspView, ViewError, ViewOptions,
     antipodal_grasps, cluster_grasps, draw_grasps as draw, find_objects as find,
 };

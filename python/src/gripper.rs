@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_grasp::{Gripper, GripperError, read_gripper};
+use sixfold::grasp::{Gripper, GripperError, read_gripper};
 
 use crate::arrays::{about, bad};
 use crate::guard::os_error;

@@ -9,9 +9,9 @@ use std::time::Duration;
 
 use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use sixfold_bop::{DatasetError, EvalError, ResultsError};
-use sixfold_io::{CameraFileError, ImageFileError};
-use sixfold_mesh::MeshFileError;
+use sixfold::bop::{DatasetError, EvalError, ResultsError};
+use sixfold::io::{CameraFileError, ImageFileError};
+use sixfold::mesh::MeshFileError;
 
 /// How often Ctrl-C is looked for.
 const LISTEN: Duration = Duration::from_millis(20);

@@ -5,8 +5,8 @@ use numpy::PyArray2;
 use pyo3::prelude::*;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sixfold_simulation::{ConvexParts, PileOptions};
-use sixfold_synth::shapes::{Family, member, toy};
+use sixfold::simulation::{ConvexParts, PileOptions};
+use sixfold::synth::shapes::{Family, member, toy};
 
 use crate::arrays::{self, about, bad};
 use crate::guard::{free, interruptible};
@@ -72,7 +72,7 @@ pub(crate) fn drop_objects<'py>(
         .collect::<PyResult<Vec<_>>>()?;
     let poses = interruptible(py, move |_| {
         let parts: Vec<&ConvexParts> = parts.iter().map(AsRef::as_ref).collect();
-        sixfold_simulation::drop_objects(&parts, &options, seed, 0)
+        sixfold::simulation::drop_objects(&parts, &options, seed, 0)
     })?;
     poses.iter().map(|pose| pose.as_ref().map(|pose| arrays::from_pose(py, pose)).transpose()).collect()
 }

@@ -7,9 +7,9 @@ use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
-use sixfold_bop::ModelPoints;
-use sixfold_geometry::{Pose, Vec3};
-use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, UnitError};
+use sixfold::bop::ModelPoints;
+use sixfold::geometry::{Pose, Vec3};
+use sixfold::mesh::{ContinuousSymmetry, Mesh, MeshOptions, ModelInfo, PlyFormat, Unit, UnitError};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::guard::{free, interruptible, mesh_file_error};
@@ -179,22 +179,25 @@ impl PyMesh {
     /// do not say it.
     ///
     /// Raises OSError when the file cannot be read; ValueError when it is broken, or with check_size when the object
-    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits).
+    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits). Textures, materials and buffers
+    /// that the file names are read at or below its folder only, anywhere with allow_outside.
     ///
     /// >>> Mesh.load("data/demo/models/obj_000001.ply", unit="mm").diameter  # doctest: +SKIP
     /// 0.10209...
     #[classmethod]
-    #[pyo3(signature = (path, unit, *, check_size=true))]
+    #[pyo3(signature = (path, unit, *, check_size=true, allow_outside=false))]
     fn load(
         _class: &Bound<'_, PyType>,
         py: Python<'_>,
         path: PathBuf,
         unit: &str,
         check_size: bool,
+        allow_outside: bool,
     ) -> PyResult<Self> {
         let unit = self::unit(unit)?;
-        let read = if check_size { sixfold_mesh::read_mesh } else { sixfold_mesh::read_mesh_unchecked };
-        let mesh = free(py, || read(&path, unit))?.map_err(mesh_file_error)?;
+        let options = MeshOptions { allow_outside, check_size };
+        let mesh =
+            free(py, || sixfold::mesh::read_mesh_with(&path, unit, &options))?.map_err(mesh_file_error)?;
         Ok(PyMesh::plain(mesh))
     }
 
@@ -206,7 +209,7 @@ impl PyMesh {
     fn save(&self, py: Python<'_>, path: PathBuf, unit: &str, binary: bool) -> PyResult<()> {
         let unit = self::unit(unit)?;
         let format = if binary { PlyFormat::BinaryLittleEndian } else { PlyFormat::Ascii };
-        free(py, || sixfold_mesh::write_ply(&path, &self.mesh, unit, format))?.map_err(mesh_file_error)
+        free(py, || sixfold::mesh::write_ply(&path, &self.mesh, unit, format))?.map_err(mesh_file_error)
     }
 
     /// Vertices, (N, 3) float64, metres.
@@ -339,7 +342,7 @@ impl PyMesh {
     /// >>> coarse = mesh.simplify(2000)  # doctest: +SKIP
     fn simplify(&self, py: Python<'_>, faces: i64) -> PyResult<PyMesh> {
         let (mesh, faces) = (self.mesh.clone(), whole("faces", faces, 1)?);
-        Ok(self.like(interruptible(py, move |_| sixfold_mesh::simplify(&mesh, faces))?))
+        Ok(self.like(interruptible(py, move |_| sixfold::mesh::simplify(&mesh, faces))?))
     }
 
     /// The smallest convex body around the vertices (Barber et al. 1996). Raises ValueError when they lie in a plane.

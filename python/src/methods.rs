@@ -4,12 +4,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use pyo3::prelude::*;
-use sixfold_align::DepthOptions;
-use sixfold_estimator::PoseEstimator;
-use sixfold_mttm::{MatchedBy, MttmEstimator, MttmOptions};
-use sixfold_pix2pose::estimator::Pix2PoseEstimator;
-use sixfold_ppf::PpfEstimator;
-use sixfold_runner::RunOptions;
+use sixfold::align::DepthOptions;
+use sixfold::estimator::PoseEstimator;
+use sixfold::mttm::{MatchedBy, MttmEstimator, MttmOptions};
+use sixfold::pix2pose::estimator::Pix2PoseEstimator;
+use sixfold::ppf::PpfEstimator;
+use sixfold::runner::RunOptions;
 
 use crate::arrays::bad;
 use crate::guard::interruptible;

@@ -6,12 +6,12 @@ use std::sync::Arc;
 use numpy::PyArray1;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_bop::{
+use sixfold::bop::{
     Estimate, EvalOptions, ModelPoints, Models, VsdError, VsdOptions, evaluate, evaluate_detection,
     write_recall_curves,
 };
-use sixfold_geometry::Pose;
-use sixfold_mesh::ModelInfo;
+use sixfold::geometry::Pose;
+use sixfold::mesh::ModelInfo;
 
 use crate::arrays::{self, bad};
 use crate::bop::{PyDataset, PyEstimate, json_to_python};
@@ -70,7 +70,7 @@ fn add(
 ) -> PyResult<f64> {
     let points = model.points()?;
     let (e, g) = (arrays::placement("estimate", estimate)?, arrays::placement("ground_truth", ground_truth)?);
-    free(py, || sixfold_bop::add(&points, e, g))
+    free(py, || sixfold::bop::add(&points, e, g))
 }
 
 /// As add with the nearest point in place of the corresponding one: ADD-S or ADI, for symmetric objects
@@ -89,7 +89,7 @@ fn adi(
 ) -> PyResult<f64> {
     let points = model.points()?;
     let (e, g) = (arrays::placement("estimate", estimate)?, arrays::placement("ground_truth", ground_truth)?);
-    free(py, || sixfold_bop::adi(&points, e, g))
+    free(py, || sixfold::bop::adi(&points, e, g))
 }
 
 /// Maximum symmetry-aware surface distance (Hodan et al. 2020, section 2.2), metres. symmetries (S, 4, 4) with the identity
@@ -110,7 +110,7 @@ fn mssd(
 ) -> PyResult<f64> {
     let (points, turns) = (model.points()?, model.symmetries(symmetries)?);
     let (e, g) = (arrays::placement("estimate", estimate)?, arrays::placement("ground_truth", ground_truth)?);
-    free(py, || sixfold_bop::mssd(&points, e, g, &turns))
+    free(py, || sixfold::bop::mssd(&points, e, g, &turns))
 }
 
 /// Maximum symmetry-aware projection distance (Hodan et al. 2020, section 2.2), pixels of a pinhole camera; infinite when a
@@ -134,7 +134,7 @@ fn mspd(
 ) -> PyResult<f64> {
     let (points, turns) = (model.points()?, model.symmetries(symmetries)?);
     let (e, g) = (arrays::placement("estimate", estimate)?, arrays::placement("ground_truth", ground_truth)?);
-    free(py, || sixfold_bop::mspd(&points, e, g, &camera.0, &turns))
+    free(py, || sixfold::bop::mspd(&points, e, g, &camera.0, &turns))
 }
 
 /// The mean distance in pixels between the projections of corresponding points (Brachmann et al. 2016); infinite when one
@@ -157,7 +157,7 @@ fn projection_error(
 ) -> PyResult<f64> {
     let points = model.points()?;
     let (e, g) = (arrays::placement("estimate", estimate)?, arrays::placement("ground_truth", ground_truth)?);
-    free(py, || sixfold_bop::projection_error(&points, e, g, &camera.0))
+    free(py, || sixfold::bop::projection_error(&points, e, g, &camera.0))
 }
 
 /// The angle in radians between two rotations, under the symmetry (S, 4, 4) for which it is smallest.
@@ -173,7 +173,7 @@ fn rotation_error(
     symmetries: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<f64> {
     let (e, g) = (arrays::pose("estimate", estimate)?, arrays::pose("ground_truth", ground_truth)?);
-    Ok(sixfold_bop::rotation_error(&e, &g, &self::symmetries(symmetries)?))
+    Ok(sixfold::bop::rotation_error(&e, &g, &self::symmetries(symmetries)?))
 }
 
 /// The distance in metres between two origins, under the symmetry (S, 4, 4) for which it is smallest.
@@ -190,7 +190,7 @@ fn translation_error(
     symmetries: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<f64> {
     let (e, g) = (arrays::pose("estimate", estimate)?, arrays::pose("ground_truth", ground_truth)?);
-    Ok(sixfold_bop::translation_error(&e, &g, &self::symmetries(symmetries)?))
+    Ok(sixfold::bop::translation_error(&e, &g, &self::symmetries(symmetries)?))
 }
 
 fn vsd_error(error: VsdError) -> PyErr {
@@ -247,8 +247,8 @@ fn vsd<'py>(
     let diameter = diameter.unwrap_or_else(|| mesh.known_diameter());
     let options = vsd_options(taus, delta)?;
     let errors = free(py, || {
-        let draw = |pose: &Pose| sixfold_render::render_depth(&mesh.mesh, pose, &camera);
-        sixfold_bop::vsd(&draw(&e), &draw(&g), &test, &camera, diameter, &options)
+        let draw = |pose: &Pose| sixfold::render::render_depth(&mesh.mesh, pose, &camera);
+        sixfold::bop::vsd(&draw(&e), &draw(&g), &test, &camera, diameter, &options)
     })?;
     Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
@@ -279,7 +279,7 @@ fn vsd_of_depth<'py>(
     let g = arrays::depth("depth_ground_truth", depth_ground_truth)?;
     let t = arrays::depth("depth", depth)?;
     let options = vsd_options(taus, delta)?;
-    let errors = free(py, || sixfold_bop::vsd(&e, &g, &t, &camera.0, diameter, &options))?;
+    let errors = free(py, || sixfold::bop::vsd(&e, &g, &t, &camera.0, diameter, &options))?;
     Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
 
@@ -295,7 +295,7 @@ fn average_precision(right: Vec<bool>, positives: i64) -> PyResult<Option<f64>> 
     if positives > 0 && found > positives {
         return Err(bad("right", format!("at most {positives} matches"), found.to_string()));
     }
-    Ok(sixfold_bop::average_precision(&right, positives))
+    Ok(sixfold::bop::average_precision(&right, positives))
 }
 
 /// Area under the accuracy-threshold curve from 0 to `largest` metres, 0 to 1, as PoseCNN's toolbox computes it (Xiang et
@@ -310,7 +310,7 @@ fn area_under_accuracy(errors: Vec<f64>, largest: f64) -> PyResult<Option<f64>> 
     if errors.iter().any(|e| e.is_nan() || *e < 0.0) {
         return Err(bad("errors", "numbers from 0 (infinite for missing ones)", "NaN or a negative number"));
     }
-    Ok(sixfold_bop::area_under_accuracy(&errors, arrays::positive("largest", largest)?))
+    Ok(sixfold::bop::area_under_accuracy(&errors, arrays::positive("largest", largest)?))
 }
 
 /// The fraction of errors (N,) below a threshold, 0 to 1; None for an empty list.
@@ -319,7 +319,7 @@ fn area_under_accuracy(errors: Vec<f64>, largest: f64) -> PyResult<Option<f64>> 
 /// 0.5
 #[pyfunction]
 fn recall_below(errors: Vec<f64>, threshold: f64) -> Option<f64> {
-    sixfold_bop::recall_below(&errors, threshold)
+    sixfold::bop::recall_below(&errors, threshold)
 }
 
 #[derive(FromPyObject)]
@@ -332,7 +332,7 @@ impl Results {
     fn read(self) -> PyResult<Vec<Estimate>> {
         match self {
             Results::List(list) => Ok(list.into_iter().map(|e| e.0).collect()),
-            Results::File(path) => sixfold_bop::read_results(&path).map_err(results_error),
+            Results::File(path) => sixfold::bop::read_results(&path).map_err(results_error),
         }
     }
 }
@@ -344,11 +344,11 @@ enum DatasetOrFolder<'py> {
 }
 
 impl DatasetOrFolder<'_> {
-    fn open(self, split: &str) -> PyResult<Arc<sixfold_bop::BopDataset>> {
+    fn open(self, split: &str) -> PyResult<Arc<sixfold::bop::BopDataset>> {
         match self {
             DatasetOrFolder::Dataset(dataset) => Ok(dataset.get().0.clone()),
             DatasetOrFolder::Folder(path) => {
-                Ok(Arc::new(sixfold_bop::BopDataset::open(&path, split).map_err(dataset_error)?))
+                Ok(Arc::new(sixfold::bop::BopDataset::open(&path, split).map_err(dataset_error)?))
             }
         }
     }

@@ -8,10 +8,10 @@ use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
-use sixfold_mttm::mask::to_image;
-use sixfold_mttm::model::{ModelError, MttmModel};
-use sixfold_mttm::{
+use sixfold::geometry::{Camera, DepthImage, Mask, Pose};
+use sixfold::mttm::mask::to_image;
+use sixfold::mttm::model::{ModelError, MttmModel};
+use sixfold::mttm::{
     DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, SIDE, Source, StoreError, TemplateError,
     TemplateOptions, ViewCoverage, estimate,
 };

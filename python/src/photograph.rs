@@ -5,8 +5,8 @@ use std::sync::Arc;
 use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_data::PosedImage;
-use sixfold_nol::NolError;
+use sixfold::data::PosedImage;
+use sixfold::nol::NolError;
 
 use crate::arrays::{self, about, bad};
 use crate::camera::PyCamera;

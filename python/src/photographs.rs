@@ -6,14 +6,14 @@ use std::sync::atomic::Ordering;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_data::PosedImage;
-use sixfold_mesh::Mesh;
-use sixfold_nn::weights::WeightsError;
-use sixfold_nol::SourceView;
-use sixfold_nol::agreement::leave_out_what_differs;
-use sixfold_nol::model::{ModelError, NolModel};
-use sixfold_nol::refine::{PoseRefinementOptions, PosedSource, Refinement, SceneKind, refine_scene};
-use sixfold_nol::synthesis::{NewView, ViewMaker, Weighting};
+use sixfold::data::PosedImage;
+use sixfold::mesh::Mesh;
+use sixfold::nn::weights::WeightsError;
+use sixfold::nol::SourceView;
+use sixfold::nol::agreement::leave_out_what_differs;
+use sixfold::nol::model::{ModelError, NolModel};
+use sixfold::nol::refine::{PoseRefinementOptions, PosedSource, Refinement, SceneKind, refine_scene};
+use sixfold::nol::synthesis::{NewView, ViewMaker, Weighting};
 
 use crate::arrays::{self, bad, whole};
 use crate::camera::PyCamera;
@@ -42,7 +42,7 @@ impl RefinedPoses {
     fn numbers<'py>(
         &self,
         py: Python<'py>,
-        of: impl Fn(&sixfold_nol::refine::SourceReport) -> f64,
+        of: impl Fn(&sixfold::nol::refine::SourceReport) -> f64,
     ) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_iter(py, self.refinement.sources.iter().map(of))
     }

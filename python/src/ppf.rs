@@ -7,9 +7,9 @@ use numpy::PyArray2;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_align::{DepthOptions, DepthRegion, PreparedDepthError, VerificationScore, verification_mesh};
-use sixfold_mesh::Mesh;
-use sixfold_ppf::{ModelOptions, ObjectModel, PpfOptions};
+use sixfold::align::{DepthOptions, DepthRegion, PreparedDepthError, VerificationScore, verification_mesh};
+use sixfold::mesh::Mesh;
+use sixfold::ppf::{ModelOptions, ObjectModel, PpfOptions};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::camera::PyCamera;
@@ -216,7 +216,7 @@ pub(crate) fn estimate_ppf(
     options.refined = refined.map_or(Ok(options.refined), |r| whole("refined", r, 1))?;
     let scene = scene_of(py, scene, camera, mask, seed)?;
     let model = model_of(py, "model", model)?;
-    let found = interruptible(py, move |_| sixfold_ppf::estimate(&scene, &model, &options))?;
+    let found = interruptible(py, move |_| sixfold::ppf::estimate(&scene, &model, &options))?;
     found
         .into_iter()
         .map(|e| {

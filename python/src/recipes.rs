@@ -66,8 +66,8 @@ pub(crate) fn train_pix2pose<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_pix2pose::preset::Preset;
-    use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
+    use sixfold::pix2pose::preset::Preset;
+    use sixfold::pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
     let default = Pix2PoseRecipe::default();
     let recipe = checked(Pix2PoseRecipe {
         network: choice("network", network, default.network)?,
@@ -139,7 +139,7 @@ pub(crate) fn train_detector<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_detect::recipe::{DetectorRecipe, MIN_VISIBILITY};
+    use sixfold::detect::recipe::{DetectorRecipe, MIN_VISIBILITY};
     let default = DetectorRecipe::default();
     let recipe = checked(DetectorRecipe {
         network: choice("network", network, default.network)?,
@@ -192,7 +192,7 @@ pub(crate) fn train_dgcm<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_dgcm::recipe::DgcmRecipe;
+    use sixfold::dgcm::recipe::DgcmRecipe;
     let default = DgcmRecipe::default();
     let recipe = checked(DgcmRecipe {
         network: choice("network", network, default.network)?,
@@ -239,7 +239,7 @@ pub(crate) fn train_mttm<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_mttm::recipe::MttmRecipe;
+    use sixfold::mttm::recipe::MttmRecipe;
     let default = MttmRecipe::default();
     let recipe = checked(MttmRecipe {
         network: choice("network", network, default.network)?,
@@ -287,8 +287,8 @@ pub(crate) fn train_nol<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    use sixfold_nol::network::{IntegratorKind, Parts};
-    use sixfold_nol::recipe::NolRecipe;
+    use sixfold::nol::network::{IntegratorKind, Parts};
+    use sixfold::nol::recipe::NolRecipe;
     let default = NolRecipe::default();
     let integrator = lstm.map(|lstm| if lstm { IntegratorKind::Lstm } else { IntegratorKind::Average });
     let recipe = checked(NolRecipe {

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use numpy::{PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyIterator, PyList, PyTuple};
-use sixfold_geometry::{Camera, Image, Mask, NormalImage, PointImage, Pose, RgbImage, Vec3};
-use sixfold_mesh::Mesh;
-use sixfold_render::{
+use sixfold::geometry::{Camera, Image, Mask, NormalImage, PointImage, Pose, RgbImage, Vec3};
+use sixfold::mesh::Mesh;
+use sixfold::render::{
     Culling, DepthSensor, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade,
 };
 
@@ -369,7 +369,7 @@ pub(crate) fn render_depth<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let pose = arrays::pose("camera_from_object", camera_from_object)?;
     let (mesh, camera) = (mesh.get(), camera.drawable()?);
-    arrays::from_image(py, free(py, || sixfold_render::render_depth(&mesh.mesh, &pose, &camera))?)
+    arrays::from_image(py, free(py, || sixfold::render::render_depth(&mesh.mesh, &pose, &camera))?)
 }
 
 /// Depth (H, W) float32 in metres as a Kinect-class camera would measure it, from ideal depth (H, W) and the normals
@@ -395,7 +395,7 @@ pub(crate) fn simulate_depth<'py>(
         return Err(bad("normals", size(depth.size()) + ", as the depth", size(normals.size())));
     }
     let seed = self::seed(seed)?;
-    let out = free(py, || sixfold_render::simulate_depth(&depth, &normals, &DepthSensor::kinect(), seed))?;
+    let out = free(py, || sixfold::render::simulate_depth(&depth, &normals, &DepthSensor::kinect(), seed))?;
     arrays::from_image(py, out)
 }
 
@@ -412,7 +412,7 @@ pub(crate) fn support_plane(
     let plane = free(py, || {
         let objects: Vec<SceneObject<'_>> =
             objects.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
-        sixfold_render::support_plane(&objects)
+        sixfold::render::support_plane(&objects)
     })?;
     Ok(plane.map(crate::scene::PyPlane))
 }

@@ -2,7 +2,7 @@
 
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
-use sixfold_geometry::{NormalOptions, Plane, PlaneOptions, PointCloud, Vec3};
+use sixfold::geometry::{NormalOptions, Plane, PlaneOptions, PointCloud, Vec3};
 
 use crate::arrays::{self, bad, positive, seed, whole};
 use crate::camera::PyCamera;
@@ -37,7 +37,7 @@ pub(crate) fn normals_from_depth<'py>(
     if let Some(step) = max_relative_step {
         options.max_relative_step = positive("max_relative_step", step)?;
     }
-    let normals = free(py, || sixfold_geometry::normals_from_depth(&depth, &camera, &options))?;
+    let normals = free(py, || sixfold::geometry::normals_from_depth(&depth, &camera, &options))?;
     arrays::from_image_of(py, normals)
 }
 
@@ -56,7 +56,7 @@ pub(crate) fn inpaint_depth<'py>(
     let (depth, rounds) = (arrays::depth("depth", depth)?, whole("rounds", rounds, 0)?);
     // More rounds than the image has pixels along a side change nothing.
     let rounds = rounds.min(depth.width().max(depth.height()));
-    arrays::from_image(py, free(py, || sixfold_geometry::inpaint_depth(&depth, rounds))?)
+    arrays::from_image(py, free(py, || sixfold::geometry::inpaint_depth(&depth, rounds))?)
 }
 
 /// The points (N, 3) float64 in the camera frame of a depth image (H, W) in metres, one a valid pixel, and their normals
@@ -78,7 +78,7 @@ pub(crate) fn point_cloud<'py>(
     let depth = arrays::depth("depth", depth)?;
     let camera = camera.of_image("depth", depth.size())?;
     let cloud = free(py, || {
-        let normals = sixfold_geometry::normals_from_depth(&depth, &camera, &NormalOptions::default());
+        let normals = sixfold::geometry::normals_from_depth(&depth, &camera, &NormalOptions::default());
         PointCloud::from_depth(&depth, Some(&normals), &camera)
     })?;
     Ok((arrays::from_points3(py, &cloud.points)?, arrays::from_points3(py, &cloud.normals)?))
@@ -185,7 +185,7 @@ pub(crate) fn dominant_plane(
         ..PlaneOptions::default()
     };
     let (cloud, seed) = (PointCloud { points, normals }, self::seed(seed)?);
-    let plane = interruptible(py, move |_| sixfold_geometry::dominant_plane(&cloud, &options, seed))?;
+    let plane = interruptible(py, move |_| sixfold::geometry::dominant_plane(&cloud, &options, seed))?;
     Ok(plane.map(PyPlane))
 }
 
@@ -196,7 +196,7 @@ pub(crate) fn dominant_plane(
 #[pyfunction]
 pub(crate) fn fit_plane(py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<PyPlane> {
     let points = arrays::points3("points", points)?;
-    let plane = free(py, || sixfold_geometry::fit_plane(&points))?;
+    let plane = free(py, || sixfold::geometry::fit_plane(&points))?;
     let found = format!("{} points that do not fix a plane", points.len());
     plane.map(PyPlane).ok_or_else(|| bad("points", "at least three points that are not on one line", found))
 }
@@ -211,6 +211,6 @@ pub(crate) fn sphere_directions<'py>(py: Python<'py>, count: i64) -> PyResult<Bo
     if count > 1 << 26 {
         return Err(bad("count", "at most 67108864", count.to_string()));
     }
-    let directions: Vec<Vec3> = free(py, || sixfold_geometry::sphere_directions(count))?;
+    let directions: Vec<Vec3> = free(py, || sixfold::geometry::sphere_directions(count))?;
     arrays::from_points3(py, &directions)
 }

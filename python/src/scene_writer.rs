@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 
 use pyo3::prelude::*;
-use sixfold_bop::{
+use sixfold::bop::{
     GroundTruth, NewImage, SceneWriter, Target, TargetObject, VISIBILITY_DELTA, ground_truth_visibility,
 };
-use sixfold_mesh::{ModelsInfo, PlyFormat, Unit, write_ply};
+use sixfold::mesh::{ModelsInfo, PlyFormat, Unit, write_ply};
 
 use crate::arrays::{self, bad, id, positive, whole};
 use crate::camera::PyCamera;
@@ -181,7 +181,7 @@ fn write_targets(py: Python<'_>, path: PathBuf, targets: Vec<(i64, i64, i64, i64
         Ok(Target { scene_id, im_id, object: Some(object) })
     };
     let targets = targets.into_iter().map(target).collect::<PyResult<Vec<_>>>()?;
-    free(py, || sixfold_bop::write_targets(&path, &targets))?.map_err(dataset_error)
+    free(py, || sixfold::bop::write_targets(&path, &targets))?.map_err(dataset_error)
 }
 
 /// Writes the camera.json of the dataset in a folder; mm_per_unit is BOP's depth_scale.
@@ -192,7 +192,7 @@ fn write_targets(py: Python<'_>, path: PathBuf, targets: Vec<(i64, i64, i64, i64
 #[pyfunction]
 fn write_camera(py: Python<'_>, path: PathBuf, camera: PyCamera, mm_per_unit: f64) -> PyResult<()> {
     let (camera, scale) = (camera.pinhole()?, positive("mm_per_unit", mm_per_unit)? / 1000.0);
-    free(py, || sixfold_bop::write_camera(&path, &camera, scale))?.map_err(dataset_error)
+    free(py, || sixfold::bop::write_camera(&path, &camera, scale))?.map_err(dataset_error)
 }
 
 /// Adds what is in this file to `sixfold.bop`.

@@ -7,12 +7,12 @@ use std::path::PathBuf;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sixfold_data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
-use sixfold_mesh::ModelInfo;
-use sixfold_nn::choice::Choice;
-use sixfold_nn::recipe::{Recipe, Session, Trained, TrainingEvent, train};
-use sixfold_nn::training::Outcome;
-use sixfold_nn::training_log::TrainingRecord;
+use sixfold::data::{FrameId, FrameSelection, TrainingSet, TrainingSetError};
+use sixfold::mesh::ModelInfo;
+use sixfold::nn::choice::Choice;
+use sixfold::nn::recipe::{Recipe, Session, Trained, TrainingEvent, train};
+use sixfold::nn::training::Outcome;
+use sixfold::nn::training_log::TrainingRecord;
 
 use crate::arrays::{self, bad, whole};
 use crate::bop::PyDataset;
@@ -156,7 +156,7 @@ pub(crate) fn single(value: Option<f64>, default: f32) -> f32 {
 /// A BOP dataset by its folder, an opened one, or meshes by their ids.
 pub(crate) enum Source {
     Dataset { root: PathBuf, split: String, ids: Vec<u32>, frames: FrameSelection },
-    Meshes(Vec<(u32, sixfold_mesh::Mesh, ModelInfo)>),
+    Meshes(Vec<(u32, sixfold::mesh::Mesh, ModelInfo)>),
 }
 
 impl Source {

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use numpy::PyArray2;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use sixfold_geometry::Pose;
-use sixfold_mesh::Mesh;
-use sixfold_simulation::{
+use sixfold::geometry::Pose;
+use sixfold::mesh::Mesh;
+use sixfold::simulation::{
     ConvexParts, Outcome, PartsOptions, SimulationError, TrialOptions, TrialReport, settle_at_centre,
     try_grasp as try_one,
 };
@@ -176,11 +176,11 @@ pub(crate) fn gripper_pose<'py>(
     approach: Option<&Bound<'py, PyAny>>,
     closing: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    use sixfold_geometry::Vec3;
+    use sixfold::geometry::Vec3;
     let tip = arrays::vector3("tip", tip)?;
     let approach = approach.map_or(Ok(-Vec3::z()), |d| arrays::vector3("approach", d))?;
     let closing = closing.map_or(Ok(Vec3::x()), |d| arrays::vector3("closing", d))?;
-    let pose = sixfold_grasp::gripper_pose(&tip, &approach, &closing).ok_or_else(|| {
+    let pose = sixfold::grasp::gripper_pose(&tip, &approach, &closing).ok_or_else(|| {
         let found = format!("{:?} and {:?}", approach.as_slice(), closing.as_slice());
         bad("approach, closing", "two different directions", found)
     })?;

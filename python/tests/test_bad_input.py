@@ -309,6 +309,42 @@ def test_files_that_are_missing_or_broken(tmp_path):
         bop.read_rgb(tmp_path / "image.png")
 
 
+def test_impossible_cameras_are_refused_with_advice(tmp_path):
+    for numbers, words in [
+        ((0.5, 0.5, 319.5, 239.5), "millimetres"),
+        ((0.9, 1.2, 0.5, 0.5), "normalised"),
+        ((572.4, 57.24, 325.3, 242.0), "factor of 2"),
+        ((572.4, 573.6, 1e9, 242.0), "another resolution"),
+    ]:
+        with pytest.raises(ValueError, match=f"field.*{words}"):
+            sixfold.Camera(*numbers, 640, 480)
+    with pytest.raises(ValueError, match="field"):
+        CAMERA.crop((1e6, 0, 100, 100))
+    with pytest.raises(ValueError, match="factor of 2"):
+        CAMERA.resize(2000, 480)
+    file = tmp_path / "camera.json"
+    file.write_text('{"fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "width": 640, "height": 480, "lens": 1}')
+    with pytest.raises(ValueError, match=r"camera\.json.*field lens is unknown; known are fx"):
+        sixfold.Camera.load(file)
+    file.write_text("height: 480\nwidth: 640\nK: [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]\nD: [0.1, 0, 0, 0, 0]\n")
+    camera, _ = sixfold.Camera.load(file)
+    assert camera.distortion == (0.1, 0, 0, 0, 0) and camera.fx == 572.4
+
+
+def test_images_above_the_limit_are_refused(tmp_path):
+    bop.write_rgb(tmp_path / "rgb.png", np.zeros((30, 40, 3), np.uint8))
+    try:
+        bop.set_max_pixels(1199)
+        with pytest.raises(ValueError, match=r"rgb\.png.*40x30.*set_max_pixels"):
+            bop.read_rgb(tmp_path / "rgb.png")
+        bop.set_max_pixels(1200)
+        assert bop.read_rgb(tmp_path / "rgb.png").shape == (30, 40, 3)
+    finally:
+        bop.set_max_pixels(100_000_000)
+    with pytest.raises(ValueError, match="^pixels"):
+        bop.set_max_pixels(0)
+
+
 def test_scalars_of_a_wrong_type_are_type_errors():
     with pytest.raises(TypeError):
         sixfold.Camera("500", 500, 320, 240, 640, 480)

@@ -76,6 +76,37 @@ def test_an_error_of_the_callback_stops_and_keeps(colored, tmp_path):
     assert trained["model"].read_bytes() == whole["model"].read_bytes()
 
 
+def test_other_data_are_another_training(demo, colored, tmp_path):
+    options = {"steps": 1, **SMALL}
+    of = {"ids": [8], "frames": [(2, 3)]}
+    trained = sixfold.train_pix2pose(demo, tmp_path, **of, **options)
+    before = trained["model"].read_bytes()
+    for other, words in [
+        ({**of, "ids": [5]}, 'ids was "8", is "5"'),
+        ({**of, "renders_only": True, "frames": None}, 'frames was "2/3", is "none"'),
+        ({**of, "rotation": 0.1}, "rotation was"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            sixfold.train_pix2pose(demo, tmp_path, **other, **options)
+    with pytest.raises(ValueError, match="mesh of object 8 was"):
+        sixfold.train_pix2pose({8: colored}, tmp_path, **options)
+    with pytest.raises(ValueError, match="object 8 is named more than once"):
+        sixfold.train_pix2pose(demo, tmp_path / "twice", ids=[8, 8], frames=[(2, 3)], **options)
+    assert trained["model"].read_bytes() == before
+
+
+def test_two_at_once_in_one_folder(colored, tmp_path):
+    refused = []
+
+    def again(news):
+        with pytest.raises(ValueError, match="another process") as error:
+            sixfold.train_pix2pose({5: colored}, tmp_path, steps=1, **SMALL)
+        refused.append(error)
+
+    sixfold.train_pix2pose({5: colored}, tmp_path, steps=1, progress=again, **SMALL)
+    assert refused
+
+
 def test_the_detector_learns(demo, tmp_path):
     dataset = sixfold.bop.Dataset(demo)
     trained = sixfold.train_detector(dataset, tmp_path, ids=[8, 9], frames=[(2, 3)], steps=2, batch=1, size=96)
@@ -117,7 +148,7 @@ def test_the_network_for_templates_learns(colored, tmp_path):
     before = trained["model"].read_bytes()
     trained["model"].unlink()
     assert sixfold.train_mttm(tmp_path, **options)["model"].read_bytes() == before
-    with pytest.raises(ValueError, match="anchors.:4.*, is .*anchors.:5"):
+    with pytest.raises(ValueError, match="batch.anchors was 4, is 5"):
         sixfold.train_mttm(tmp_path, **{**options, "anchors": 5})
 
 

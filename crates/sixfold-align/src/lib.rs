@@ -12,7 +12,7 @@ pub mod verification;
 pub mod verify;
 
 pub use depth_icp::{AlignedToDepth, align_to_depth};
-pub use mesh::{VerificationMesh, verification_mesh};
+pub use mesh::{VerificationMesh, could_be_simplified, verification_mesh};
 pub use prepared::{DepthOptions, DepthRegion, PreparedDepth, PreparedDepthError};
 pub use verification::{VerificationOptions, VerificationScore, Verifier};
 pub use verify::{VerifiedPose, refine, verify};

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::Vec3;
+use sixfold_io::{limits, read_regular, write_atomically};
 use sixfold_mesh::{Mesh, MeshError, simplify};
 use thiserror::Error;
 
@@ -18,6 +19,22 @@ const RENDERED_FACES: usize = 4000;
 pub fn verification_mesh(mesh: &Mesh) -> Result<Mesh, MeshError> {
     let bare = Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())?;
     Ok(if bare.faces().len() > RENDERED_FACES { simplify(&bare, RENDERED_FACES) } else { bare })
+}
+
+/// How far outside of the mesh's box its simplified form may reach, as a fraction of the box's diagonal: collapsed edges move a
+/// little.
+const OVERHANG: f64 = 0.5;
+
+/// Whether `simple` can be what is kept of `mesh` after simplification: it has a surface, no more faces, and lies where the mesh
+/// lies. What a file says is held against this before it is used.
+pub fn could_be_simplified(simple: &Mesh, mesh: &Mesh) -> bool {
+    let (low, high) = mesh.bounding_box();
+    let margin = Vec3::repeat(OVERHANG * (high - low).norm());
+    let (simple_low, simple_high) = simple.bounding_box();
+    !simple.faces().is_empty()
+        && simple.faces().len() <= mesh.faces().len()
+        && simple_low >= low - margin
+        && simple_high <= high + margin
 }
 
 const MAGIC: &[u8; 8] = b"SIXFVMSH";
@@ -65,8 +82,8 @@ impl VerificationMesh {
         };
         let key = fingerprint(mesh);
         let mut note = None;
-        match std::fs::read(path) {
-            Ok(bytes) => match decode(&bytes, key) {
+        match read_regular(path, limits::DERIVED) {
+            Ok(bytes) => match decode(&bytes, key).filter(|kept| could_be_simplified(kept, mesh)) {
                 Some(mesh) => return Ok(VerificationMesh { mesh, note: None }),
                 None => note = Some(VerificationMeshError::Unusable { path: path.into() }),
             },
@@ -74,20 +91,11 @@ impl VerificationMesh {
             Err(source) => note = Some(VerificationMeshError::Io { path: path.into(), source }),
         }
         let mesh = verification_mesh(mesh)?;
-        if let Err(source) = write(path, &encode(&mesh, key)) {
+        if let Err(source) = write_atomically(path, &encode(&mesh, key)) {
             note = Some(VerificationMeshError::Io { path: path.into(), source });
         }
         Ok(VerificationMesh { mesh, note })
     }
-}
-
-fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    // Under a name of its own first: a reader, or a crash, never sees half a file.
-    let temporary = path.with_extension(format!("{}.tmp", std::process::id()));
-    std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path))
 }
 
 /// FNV-1a (Fowler, Noll, Vo).
@@ -178,6 +186,15 @@ mod tests {
             let again = VerificationMesh::cached(Some(&file), &mesh).unwrap();
             assert!(same(&again) && again.note.is_some());
             assert_eq!(std::fs::read(&file).unwrap(), kept);
+        }
+        // Whole and of this mesh, as it says, but with a vertex far away, or with nothing to see.
+        for (shift, faces) in [(9.0, expected.faces()), (0.0, &[])] {
+            let mut vertices = expected.vertices().to_vec();
+            vertices[0].x += shift;
+            let forged = Mesh::new(vertices, faces.to_vec()).unwrap();
+            std::fs::write(&file, encode(&forged, fingerprint(&mesh))).unwrap();
+            let again = VerificationMesh::cached(Some(&file), &mesh).unwrap();
+            assert!(same(&again) && again.note.is_some());
         }
         // Of another mesh.
         let moved: Vec<Vec3> = mesh.vertices().iter().map(|v| v * 1.01).collect();

@@ -121,7 +121,7 @@ impl PreparedDepth {
         options: &DepthOptions,
     ) -> Result<Arc<PreparedDepth>, PreparedDepthError> {
         options.check()?;
-        camera.check()?;
+        camera.check_lens()?;
         camera.check_image(depth.width(), depth.height())?;
         let depth = usable_depth(depth)?;
         let filled = inpaint_depth(&depth, options.inpaint_rounds);

@@ -10,6 +10,7 @@ use serde_json::{Map, Value, json};
 use sixfold_geometry::Rect;
 use sixfold_io::write_atomically;
 
+use crate::dataset::{BopDataset, list_ids};
 use crate::dataset_error::DatasetError;
 use crate::json::{At, describe, parse};
 use crate::rle::Rle;
@@ -42,6 +43,8 @@ pub enum Adjustment {
     Outside,
     /// The detection is broken and was left out (lenient reading only).
     Broken,
+    /// Detections that name no scene were taken for the only one of a dataset ([`BopDataset::detections`]).
+    Scene,
 }
 
 /// A detection that was changed or left out on reading.
@@ -62,6 +65,8 @@ pub struct Detections {
     pub detections: Vec<Detection>,
     /// What was clipped or left out.
     pub adjusted: Vec<AdjustedDetection>,
+    /// Places in `detections` of those that name no scene, as in COCO's own files; their scene is 0.
+    pub without_scene: Vec<usize>,
 }
 
 /// How detections are read.
@@ -78,7 +83,8 @@ pub struct ReadDetections {
 /// # Errors
 /// [`DatasetError`] naming file, entry and field.
 pub fn read_detections(path: &Path, options: &ReadDetections) -> Result<Detections, DatasetError> {
-    let text = std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+    let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
     parse_detections(&text, path, options)
 }
 
@@ -132,9 +138,48 @@ pub fn parse_detections(
             report(Adjustment::Outside, &format!("the box {} is empty", show(&bbox)));
             continue;
         }
+        if value.get("scene_id").is_none() {
+            out.without_scene.push(out.detections.len());
+        }
         out.detections.push(detection);
     }
     Ok(out)
+}
+
+impl BopDataset {
+    /// Reads a file of detections in this dataset's images. COCO knows no scenes: detections that name none are those of the
+    /// dataset's only scene, which is reported, and refused where it has several.
+    ///
+    /// # Errors
+    /// [`DatasetError`] naming file, entry and field.
+    pub fn detections(&self, file: &Path, lenient: bool) -> Result<Detections, DatasetError> {
+        let options = ReadDetections { lenient, image_size: self.image_size() };
+        let mut read = read_detections(file, &options)?;
+        let (Some(&first), scenes) = (read.without_scene.first(), self.scene_ids()) else { return Ok(read) };
+        if scenes.contains(&0) {
+            return Ok(read);
+        }
+        let [scene_id] = scenes[..] else {
+            let (count, all) = (read.without_scene.len(), read.detections.len());
+            let found = format!(
+                "nothing in {count} of {all} detections, the first of image {}",
+                read.detections[first].image_id
+            );
+            let known = list_ids(scenes.iter());
+            let expected = format!("the scene of each: add \"scene_id\", one of {known}");
+            return Err(At::file(file).error("scene_id", found, expected));
+        };
+        for &place in &read.without_scene {
+            read.detections[place].scene_id = scene_id;
+        }
+        let message = format!(
+            "{}: {} detections name no scene_id and are taken for scene {scene_id}, the only one of the dataset",
+            file.display(),
+            read.without_scene.len()
+        );
+        read.adjusted.push(AdjustedDetection { index: first, adjustment: Adjustment::Scene, message });
+        Ok(read)
+    }
 }
 
 fn show(r: &Rect) -> String {

@@ -75,7 +75,7 @@ struct ImageResult {
     positives: usize,
 }
 
-/// Scores detections. Images and objects without ground truth entries in `ground_truth` are not looked at.
+/// Scores detections. Images and objects without ground truth entries in `ground_truth` are left out.
 pub fn evaluate_coco(
     ground_truth: &CocoGroundTruth,
     detections: &[Detection],

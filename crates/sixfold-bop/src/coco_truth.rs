@@ -1,7 +1,7 @@
 //! Ground truth of 2D detection from poses, for datasets without `scene_gt_coco.json`, and scores of detections that
 //! look at how much of an object is visible.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde::Serialize;
@@ -10,6 +10,7 @@ use sixfold_io::write_atomically;
 use sixfold_mesh::Mesh;
 
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
+use crate::coco_score::{CocoScores, IouType, evaluate_coco};
 use crate::dataset::{BopDataset, MaskKind, Models};
 use crate::dataset_error::DatasetError;
 use crate::rle::Rle;
@@ -29,6 +30,30 @@ pub struct VisibleTruth {
 }
 
 impl VisibleTruth {
+    /// The ground truth of these images (scene, image): as the scenes' `scene_gt_coco.json` say, where all have one, otherwise
+    /// from poses ([`VisibleTruth::of_poses`]). Those files do not say how much of an object is visible.
+    ///
+    /// # Errors
+    /// [`DatasetError`].
+    pub fn of_images(dataset: &BopDataset, images: &BTreeSet<(u32, u32)>) -> Result<Self, DatasetError> {
+        let mut files = vec![];
+        for scene_id in dataset.scene_ids() {
+            files.push((scene_id, dataset.scene(scene_id)?.dir().join("scene_gt_coco.json")));
+        }
+        if !files.iter().all(|(_, file)| file.is_file()) {
+            return VisibleTruth::of_poses(dataset, &images.iter().copied().collect::<Vec<_>>());
+        }
+        let mut truth = CocoGroundTruth::default();
+        for (scene_id, file) in files {
+            let text =
+                std::fs::read(&file).map_err(|source| DatasetError::Read { path: file.clone(), source })?;
+            truth.add_scene(scene_id, &text, &file)?;
+        }
+        truth.images.retain(|image| images.contains(image));
+        truth.annotations.retain(|a| images.contains(&(a.scene_id, a.image_id)));
+        Ok(VisibleTruth { truth, visible: vec![] })
+    }
+
     /// The ground truth of these images (scene, image): boxes as `bbox_visib` (first pixel, last minus first), masks of
     /// what is visible. Where a scene has no masks or no `scene_gt_info.json`, all annotated objects of an image are
     /// rendered together (with its depth image, if there is one); what is annotated nowhere and hides an object is then
@@ -108,8 +133,12 @@ impl CocoGroundTruth {
         let mut categories: Vec<u32> = self.annotations.iter().map(|a| a.category_id).collect();
         categories.sort_unstable();
         categories.dedup();
+        let mut first: BTreeMap<u32, &Annotation> = BTreeMap::new();
+        for annotation in &self.annotations {
+            first.entry(annotation.image_id).or_insert(annotation);
+        }
         let size = |im_id: u32| {
-            let of = self.annotations.iter().find(|a| a.image_id == im_id)?.segmentation.as_ref()?;
+            let of = first.get(&im_id)?.segmentation.as_ref()?;
             Some((of.width(), of.height()))
         };
         let images: Vec<_> = self
@@ -180,16 +209,19 @@ pub fn found_at_half(
     let mut taken = vec![false; annotations.len()];
     let mut wrong = 0usize;
     let images = truth.truth.images.len();
+    let known: BTreeSet<(u32, u32)> = truth.truth.images.iter().copied().collect();
+    let mut of_kind: BTreeMap<(u32, u32, u32), Vec<usize>> = BTreeMap::new();
+    for (i, a) in annotations.iter().enumerate() {
+        of_kind.entry((a.scene_id, a.image_id, a.category_id)).or_default().push(i);
+    }
     for d in order {
-        if !truth.truth.images.contains(&(d.scene_id, d.image_id)) {
+        if !known.contains(&(d.scene_id, d.image_id)) {
             continue;
         }
         let Some(bbox) = d.bbox.or_else(|| d.segmentation.as_ref().map(Rle::bounding_box)) else { continue };
-        let of_kind = annotations.iter().enumerate().filter(|(_, a)| {
-            (a.scene_id, a.image_id, a.category_id) == (d.scene_id, d.image_id, d.category_id)
-        });
+        let of_kind = of_kind.get(&(d.scene_id, d.image_id, d.category_id)).into_iter().flatten();
         let overlapping: Vec<(usize, f64)> =
-            of_kind.map(|(i, a)| (i, a.bbox.iou(&bbox))).filter(|(_, iou)| *iou >= 0.5).collect();
+            of_kind.map(|&i| (i, annotations[i].bbox.iou(&bbox))).filter(|(_, iou)| *iou >= 0.5).collect();
         let free = overlapping.iter().filter(|(i, _)| !taken[*i]).max_by(|a, b| a.1.total_cmp(&b.1));
         match free {
             Some((index, _)) => taken[*index] = true,
@@ -212,6 +244,34 @@ pub fn found_at_half(
         recall_of: counts.iter().map(|(id, (f, n))| (*id, *f as f64 / *n as f64)).collect(),
         false_per_image: wrong as f64 / images.max(1) as f64,
     }
+}
+
+/// Scores of detections in COCO's terms, with what is found of objects by how visible they are.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DetectionScores {
+    /// Images with ground truth.
+    pub images: usize,
+    /// Average precision of boxes.
+    #[serde(rename = "box")]
+    pub boxes: CocoScores,
+    /// Average precision of masks, where both sides have some.
+    #[serde(rename = "mask")]
+    pub masks: Option<CocoScores>,
+    /// Of objects at least 10 % and 40 % visible, where the ground truth says how much they are.
+    pub found_at_half: Vec<FoundAtHalf>,
+}
+
+/// Scores detections by boxes, by masks where both sides have some, and by what is found from `min_score` on.
+pub fn score_detections(truth: &VisibleTruth, detections: &[Detection], min_score: f64) -> DetectionScores {
+    let boxes = evaluate_coco(&truth.truth, detections, IouType::Box);
+    let with_masks = detections.iter().any(|d| d.segmentation.is_some())
+        && truth.truth.annotations.iter().any(|a| a.segmentation.is_some());
+    let masks = with_masks.then(|| evaluate_coco(&truth.truth, detections, IouType::Mask));
+    let known = truth.visible.len() == truth.truth.annotations.len();
+    let min_visibility: &[f64] = if known { &[0.1, 0.4] } else { &[] };
+    let found_at_half =
+        min_visibility.iter().map(|v| found_at_half(truth, detections, min_score, *v)).collect();
+    DetectionScores { images: truth.truth.images.len(), boxes, masks, found_at_half }
 }
 
 #[cfg(test)]

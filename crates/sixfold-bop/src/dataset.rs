@@ -2,12 +2,13 @@
 //! read when they are asked for. What a dataset leaves out (depth, masks, ground truth, models) is `None`, what is
 //! broken is an error.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
-use sixfold_io::{ImageFile, ImageFileError};
+use sixfold_io::{ImageFile, ImageFileError, check_pixels, max_pixels};
 use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh};
 
 use crate::dataset_error::DatasetError;
@@ -37,6 +38,8 @@ pub struct BopDataset {
     split_dir: PathBuf,
     size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
+    /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
+    infos: Arc<[OnceLock<Option<(String, ModelsInfo)>>; 2]>,
 }
 
 impl BopDataset {
@@ -50,7 +53,8 @@ impl BopDataset {
         if dir.join("scene_camera.json").is_file() {
             let name = dir.file_name().and_then(|n| n.to_str()).and_then(|n| n.parse().ok());
             let scenes = BTreeMap::from([(name.unwrap_or(0), dir.to_owned())]);
-            return Ok(BopDataset { root: dir.to_owned(), split_dir: dir.to_owned(), size, scenes });
+            let (root, split_dir) = (dir.to_owned(), dir.to_owned());
+            return Ok(BopDataset { root, split_dir, size, scenes, infos: Arc::default() });
         }
         if !dir.is_dir() {
             return Err(DatasetError::Missing {
@@ -80,7 +84,7 @@ impl BopDataset {
         if scenes.is_empty() {
             return Err(missing("a scene folder"));
         }
-        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes })
+        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes, infos: Arc::default() })
     }
 
     /// The dataset's folder.
@@ -125,28 +129,61 @@ impl BopDataset {
     /// # Errors
     /// [`DatasetError::Model`] when the file is broken.
     pub fn models_info(&self, models: Models) -> Result<Option<ModelsInfo>, DatasetError> {
+        Ok(self.named_models_info(models)?.as_ref().map(|(_, infos)| infos.clone()))
+    }
+
+    /// The same with the name of its file, read once.
+    pub(crate) fn named_models_info(
+        &self,
+        models: Models,
+    ) -> Result<&Option<(String, ModelsInfo)>, DatasetError> {
+        let place = match models {
+            Models::Evaluation => &self.infos[0],
+            Models::Rendering => &self.infos[1],
+        };
+        if let Some(read) = place.get() {
+            return Ok(read);
+        }
+        let read = self.read_models_info(models)?;
+        Ok(place.get_or_init(|| read))
+    }
+
+    fn read_models_info(&self, models: Models) -> Result<Option<(String, ModelsInfo)>, DatasetError> {
         let first = self.models_dir(models);
         let other = self.models_dir(Models::Rendering);
         for dir in [first, other].into_iter().flatten() {
             let path = dir.join("models_info.json");
             if path.is_file() {
-                return ModelsInfo::read(&path).map(Some).map_err(|e| DatasetError::Model(Box::new(e)));
+                let infos = ModelsInfo::read(&path).map_err(|e| DatasetError::Model(Box::new(e)))?;
+                return Ok(Some((path.display().to_string(), infos)));
             }
         }
         Ok(None)
     }
 
+    /// Where the model of an object is, or would be.
+    pub fn model_path(&self, obj_id: u32, models: Models) -> PathBuf {
+        let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
+        dir.join(format!("obj_{obj_id:06}.ply"))
+    }
+
     /// Reads the model of an object, in metres.
     ///
     /// # Errors
-    /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken.
+    /// [`DatasetError::NoModel`] when there is no such file, [`DatasetError::Model`] when it is broken or `models_info.json`
+    /// does not describe it.
     pub fn model(&self, obj_id: u32, models: Models) -> Result<Mesh, DatasetError> {
-        let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
-        let path = dir.join(format!("obj_{obj_id:06}.ply"));
+        let path = self.model_path(obj_id, models);
         if !path.is_file() {
+            let dir = path.parent().unwrap_or(&path).to_owned();
             return Err(DatasetError::NoModel { path: dir, obj_id });
         }
-        read_mesh(&path, Unit::Millimetre).map_err(|e| DatasetError::Model(Box::new(e)))
+        let model = |error| DatasetError::Model(Box::new(error));
+        let mesh = read_mesh(&path, Unit::Millimetre).map_err(model)?;
+        if let Some((file, infos)) = self.named_models_info(models)? {
+            infos.check_mesh(obj_id, &mesh, file).map_err(model)?;
+        }
+        Ok(mesh)
     }
 
     /// What has to be found: from `file`, or the dataset's `test_targets_bop19.json`, or where neither exists every
@@ -157,10 +194,9 @@ impl BopDataset {
     /// # Errors
     /// [`DatasetError`] when a file is missing or broken.
     pub fn targets(&self, file: Option<&Path>) -> Result<Vec<Target>, DatasetError> {
-        let default = self.root.join("test_targets_bop19.json");
-        let path = match file {
+        let default = self.targets_file();
+        let path = match file.or(default.as_deref()) {
             Some(path) => path,
-            None if default.is_file() => &default,
             None => {
                 let mut targets = Vec::new();
                 for scene_id in self.scene_ids() {
@@ -171,9 +207,29 @@ impl BopDataset {
                 return self.object_targets(&targets);
             }
         };
-        let text =
-            std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+        let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+            .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
         parse_targets(&text, path)
+    }
+
+    /// The images (scene, image) of the targets in `file`, ascending, or all of the split without a file.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when a file is missing or broken.
+    pub fn images(&self, file: Option<&Path>) -> Result<BTreeSet<(u32, u32)>, DatasetError> {
+        if let Some(file) = file {
+            return Ok(self.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id)).collect());
+        }
+        let mut images = BTreeSet::new();
+        for scene_id in self.scene_ids() {
+            images.extend(self.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
+        }
+        Ok(images)
+    }
+
+    /// The dataset's own file of targets, `test_targets_bop19.json`, where it has one.
+    pub fn targets_file(&self) -> Option<PathBuf> {
+        Some(self.root.join("test_targets_bop19.json")).filter(|path| path.is_file())
     }
 
     /// Targets with an object each: those of a whole image become one per object with ground truth there that is at
@@ -209,7 +265,7 @@ impl BopDataset {
     }
 }
 
-fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
+pub(crate) fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> String {
     const SHOWN: usize = 12;
     let more = ids.len().saturating_sub(SHOWN);
     let mut text = ids.take(SHOWN).map(u32::to_string).collect::<Vec<_>>().join(", ");
@@ -224,11 +280,17 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read(path).map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
+    let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
     let json = parse(&text, path)?;
     let at = At::file(path);
     let map = at.object(&json)?;
-    let (Some(width), Some(height)) = (map.get("width"), map.get("height")) else { return Ok(None) };
+    let (width, height) = match (map.get("width"), map.get("height")) {
+        (Some(width), Some(height)) => (width, height),
+        (None, None) => return Ok(None),
+        (None, Some(_)) => return Err(at.error("width", "nothing", "both width and height, or neither")),
+        (Some(_), None) => return Err(at.error("height", "nothing", "both width and height, or neither")),
+    };
     let side = |field: &str, value| {
         let side = at.id(field, value)?;
         if side == 0 || side > 1 << 15 {
@@ -236,7 +298,10 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
         }
         Ok(side as usize)
     };
-    Ok(Some(((side("width", width)?, side("height", height)?), path.to_owned())))
+    let size = (side("width", width)?, side("height", height)?);
+    let large = |reason: String| at.error("width, height", reason, "the size of an image");
+    check_pixels(size.0, size.1, max_pixels()).map_err(large)?;
+    Ok(Some((size, path.to_owned())))
 }
 
 /// One image of a scene: what the text files say of it.
@@ -286,7 +351,7 @@ impl Scene {
     fn read(scene_id: u32, dir: &Path, size: Option<StatedSize>) -> Result<Self, DatasetError> {
         let read = |name: &str| -> Result<Option<(Vec<u8>, PathBuf)>, DatasetError> {
             let path = dir.join(name);
-            match std::fs::read(&path) {
+            match sixfold_io::read_regular(&path, sixfold_io::limits::LARGE_TEXT) {
                 Ok(text) => Ok(Some((text, path))),
                 Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
                 Err(source) => Err(DatasetError::Read { path, source }),
@@ -388,7 +453,10 @@ impl Scene {
         let k = image.camera;
         let camera = Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
         let path = self.dir.join("scene_camera.json");
-        camera.check().map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera"))?;
+        // Also that of a crop: its principal point may lie outside.
+        camera
+            .check_lens()
+            .map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera of this image"))?;
         Ok(camera)
     }
 

@@ -92,6 +92,16 @@ pub enum DatasetError {
         /// What is wrong.
         reason: String,
     },
+    /// Which pixels of an image file are a mask is not clear.
+    #[error("{}: im_id {im_id}: mask: {reason}", path.display())]
+    Mask {
+        /// The file.
+        path: PathBuf,
+        /// The image.
+        im_id: u32,
+        /// What was found and expected, and what to do.
+        reason: String,
+    },
     /// An image has another size than the camera.
     #[error(
         "{}: im_id {im_id}: the image is {}x{}, expected {}x{} from {size_from}; the intrinsics belong to \
@@ -160,6 +170,7 @@ impl DatasetError {
             ImageFileError::Read { path, source } => DatasetError::Read { path, source },
             ImageFileError::Write { path, source } => DatasetError::Write { path, source },
             ImageFileError::Content { path, reason } => DatasetError::Image { path, im_id, reason },
+            ImageFileError::Mask { path, reason } => DatasetError::Mask { path, im_id, reason },
             ImageFileError::Size { path, expected, found, size_from } => {
                 DatasetError::ImageSize { path, im_id, expected, found, size_from }
             }

@@ -233,7 +233,7 @@ struct Prepared<'a> {
     images: Vec<ImageTasks<'a>>,
 }
 
-/// Which ground truth counts and how many estimates are looked at.
+/// Which ground truth counts and how many estimates are scored.
 enum Mode {
     Localisation { visib_gt_min: Option<f64> },
     Detection,
@@ -320,7 +320,7 @@ fn prepare<'a>(
     }
 
     let ids: BTreeSet<u32> = images.iter().flat_map(|i| i.tasks.iter().map(|t| t.obj_id)).collect();
-    let info = dataset.models_info(models)?;
+    let info = dataset.named_models_info(models)?;
     let mut objects = BTreeMap::new();
     let mut unusable = BTreeMap::new();
     let loaded: Vec<_> = ids.into_par_iter().map(|id| (id, dataset.model(id, models))).collect();
@@ -333,7 +333,11 @@ fn prepare<'a>(
             }
             Err(error) => return Err(error.into()),
         };
-        let known: Option<&ModelInfo> = info.as_ref().and_then(|i| i.0.get(&obj_id));
+        if let Some((file, infos)) = info {
+            // A symmetry that the object does not have makes wrong poses right.
+            infos.check_symmetries(obj_id, &mesh, file).map_err(|e| DatasetError::Model(Box::new(e)))?;
+        }
+        let known: Option<&ModelInfo> = info.as_ref().and_then(|(_, i)| i.0.get(&obj_id));
         let (Some(known), Some(points)) = (known, ModelPoints::new(mesh.vertices())) else {
             let reason = format!("models_info.json has no object {obj_id}: diameter and symmetries unknown");
             unusable.insert(obj_id, reason);

@@ -19,6 +19,7 @@ mod results;
 mod rle;
 mod scene_files;
 mod score;
+mod table;
 mod visibility;
 mod write;
 
@@ -27,7 +28,7 @@ pub use coco::{
     parse_detections, read_detections, write_detections,
 };
 pub use coco_score::{CocoScores, IouType, evaluate_coco};
-pub use coco_truth::{FoundAtHalf, VisibleTruth, found_at_half};
+pub use coco_truth::{DetectionScores, FoundAtHalf, VisibleTruth, found_at_half, score_detections};
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{
@@ -52,5 +53,6 @@ pub use scene_files::{
 pub use score::{
     area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
 };
+pub use table::{detection_score_table, score_table};
 pub use visibility::{ObjectVisibility, VISIBILITY_DELTA, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

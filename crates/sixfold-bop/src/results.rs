@@ -118,7 +118,8 @@ pub fn read_results(path: &Path) -> Result<Vec<Estimate>, ResultsError> {
 /// # Errors
 /// [`ResultsError::Read`] and [`ResultsError::NotText`] only.
 pub fn read_results_lenient(path: &Path) -> Result<(Vec<Estimate>, Vec<BadRow>), ResultsError> {
-    let bytes = std::fs::read(path).map_err(|source| ResultsError::Read { path: path.to_owned(), source })?;
+    let bytes = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
+        .map_err(|source| ResultsError::Read { path: path.to_owned(), source })?;
     let text = std::str::from_utf8(&bytes).map_err(|e| ResultsError::NotText {
         path: path.to_owned(),
         line: 1 + bytes[..e.valid_up_to()].iter().filter(|&&b| b == b'\n').count(),
@@ -239,7 +240,7 @@ pub struct ResultsAppender {
 
 impl ResultsAppender {
     /// Opens or creates the file and reads what is there. A last line without line break is taken for torn and cut
-    /// off the file: what it said can be computed again, half a number cannot be told from a whole one.
+    /// off the file: what it said can be computed again, half a number cannot be distinguished from a whole one.
     ///
     /// # Errors
     /// [`ResultsError`]; a bad row that is not the torn last one is an error, as in [`read_results`].

@@ -6,12 +6,15 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 use sixfold_geometry::{Mat3, Pose, Rect};
 
 use crate::dataset_error::DatasetError;
 use crate::errors::Placement;
 use crate::json::{At, by_image, describe, parse};
+
+/// Most instances of an object in one image that targets may ask for: all of them are searched for, and scored.
+const MAX_INSTANCES: usize = 1000;
 
 /// Intrinsics of one image without its size, and what turns a depth pixel into metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -113,6 +116,12 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
                 return Err(at.error(field, format!("{found}"), format!("K[{i}] above zero")));
             }
         }
+        let ratio = k[0] / k[4];
+        if !(0.5..=2.0).contains(&ratio) {
+            let expected = "focal lengths in pixels within a factor of 2 of each other: is a digit lost?";
+            return Err(at.error("cam_K (fx, fy)", format!("{} and {}", k[0], k[4]), expected));
+        }
+        check_lens_keys(&at, map)?;
         // A skew is a number in some files' rounding; anything above a thousandth of a pixel is a real one.
         for (i, expected) in [(1, 0.0), (3, 0.0), (6, 0.0), (7, 0.0), (8, 1.0)] {
             if (k[i] - expected).abs() > 1e-3 {
@@ -150,6 +159,28 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
         );
     }
     Ok(cameras)
+}
+
+/// Refuses what changes where a point is seen and is not read: a lens that is no pinhole. Other keys are notes on how an image
+/// was taken.
+fn check_lens_keys(at: &At<'_>, map: &Map<String, Value>) -> Result<(), DatasetError> {
+    let pinhole = |value: &Value| value.is_null() || value.as_str() == Some("pinhole");
+    if let Some(model) = map.get("cam_model").filter(|value| !pinhole(value)) {
+        let expected = "\"pinhole\": undistort the images before, as those of BOP are";
+        return Err(at.error("cam_model", describe(model), expected));
+    }
+    for (key, value) in map {
+        let plain = key.to_lowercase();
+        let of_lens = plain.contains("dist") || plain.contains("coeff") || plain == "d";
+        let zero = |v: &Value| v.is_null() || v.as_f64() == Some(0.0);
+        let without = zero(value) || value.as_array().is_some_and(|list| list.iter().all(zero));
+        if of_lens && !without {
+            let expected =
+                "images without lens distortion, as BOP's are: undistort them and remove the field";
+            return Err(at.error(key.as_str(), describe(value), expected));
+        }
+    }
+    Ok(())
 }
 
 /// Parses `scene_gt.json`; `path` is for messages.
@@ -238,7 +269,14 @@ pub fn parse_targets(text: &[u8], path: &Path) -> Result<Vec<Target>, DatasetErr
                 obj_id: at.id("obj_id", value)?,
                 inst_count: match map.get("inst_count") {
                     None => 1,
-                    Some(value) => at.id("inst_count", value)? as usize,
+                    Some(value) => match at.id("inst_count", value)? as usize {
+                        count if count <= MAX_INSTANCES => count,
+                        count => {
+                            let expected =
+                                format!("up to {MAX_INSTANCES} instances of an object in one image");
+                            return Err(at.error("inst_count", count.to_string(), expected));
+                        }
+                    },
                 },
             }),
         };
@@ -312,6 +350,12 @@ mod tests {
             (CAMERA.replace("\"depth_scale\": 0.1", "\"depth_scale\": 0.0"), "depth_scale: found 0"),
             (CAMERA.replace("\"depth_scale\": 0.1", "\"depth_scale\": 1e-6"), "depth_scale"),
             (CAMERA.replace("cam_K", "cam_model"), "only pinhole"),
+            (CAMERA.replace("572.4", "57.24"), "is a digit lost"),
+            (
+                CAMERA.replace("\"depth_scale\"", "\"dist_coeffs\": [0.1, 0, 0, 0], \"depth_scale\""),
+                "dist_coeffs",
+            ),
+            (CAMERA.replace("\"depth_scale\"", "\"cam_model\": \"fisheye\", \"depth_scale\""), "pinhole"),
         ] {
             let message = parse_scene_camera(text.as_bytes(), path()).unwrap_err().to_string();
             assert!(message.contains(part), "{message} lacks {part}");

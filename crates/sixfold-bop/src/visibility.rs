@@ -97,6 +97,22 @@ pub fn ground_truth_visibility(
         .collect()
 }
 
+impl GroundTruthInfo {
+    /// Of an object whose silhouette lies within the image, every pixel of it measured.
+    pub fn of_masks(whole: &Mask, visible: &Mask) -> Self {
+        let count = |mask: &Mask| mask.as_slice().iter().filter(|v| **v).count() as u64;
+        let (all, seen) = (count(whole), count(visible));
+        GroundTruthInfo {
+            bbox_obj: bounding_box(whole, 0, 0),
+            bbox_visib: bounding_box(visible, 0, 0),
+            px_count_all: Some(all),
+            px_count_valid: Some(all),
+            px_count_visib: Some(seen),
+            visib_fract: if all > 0 { (seen as f64 / all as f64).min(1.0) } else { 0.0 },
+        }
+    }
+}
+
 /// First pixel, and last minus first pixel, as BOP writes boxes into `scene_gt_info.json`.
 fn bounding_box(mask: &Mask, left: usize, top: usize) -> Option<Rect> {
     let (mut low, mut high) = ([usize::MAX; 2], [0; 2]);
@@ -188,5 +204,13 @@ mod tests {
         let mesh = square();
         let found = &ground_truth_visibility(&[(&mesh, at(0.0, -1.0))], &camera(), None, VISIBILITY_DELTA)[0];
         assert_eq!((found.info.bbox_obj, found.info.visib_fract), (None, 0.0));
+    }
+
+    #[test]
+    fn boxes_are_as_bop_writes_them() {
+        let mask = Mask::from_fn(10, 8, |x, y| (2..5).contains(&x) && (3..4).contains(&y));
+        let found = bounding_box(&mask, 0, 0).unwrap();
+        assert_eq!([found.x, found.y, found.width, found.height], [2.0, 3.0, 2.0, 0.0]);
+        assert!(bounding_box(&Mask::filled(3, 3, false), 0, 0).is_none());
     }
 }

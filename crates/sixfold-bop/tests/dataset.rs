@@ -295,6 +295,19 @@ fn broken_datasets_are_named() {
     assert!(message(result).contains("scene_gt.json: the ground truth is missing"));
     std::fs::write(root.join("camera.json"), r#"{"width": 0, "height": 480}"#).unwrap();
     assert!(message(BopDataset::open(root, "test")).contains("field width: found 0"));
+    std::fs::write(root.join("camera.json"), r#"{"width": 640}"#).unwrap();
+    assert!(message(BopDataset::open(root, "test")).contains("field height: found nothing"));
+    std::fs::write(root.join("camera.json"), r#"{"width": 32768, "height": 32768}"#).unwrap();
+    assert!(message(BopDataset::open(root, "test")).contains("megapixels"));
+
+    // A focal length in millimetres, where pixels are expected.
+    std::fs::write(root.join("camera.json"), r#"{"width": 160, "height": 120}"#).unwrap();
+    let cameras = r#"{"3": {"cam_K": [1.88, 0, 79.5, 0, 1.88, 59.5, 0, 0, 1], "depth_scale": 1}}"#;
+    std::fs::write(file("scene_camera.json"), cameras).unwrap();
+    let error = message(BopDataset::open(root, "test").unwrap().scene(2).unwrap().camera(3));
+    for part in ["scene_camera.json", "im_id 3", "cam_K", "1.88", "millimetres"] {
+        assert!(error.contains(part), "{error} lacks {part}");
+    }
 }
 
 #[test]

@@ -3,6 +3,9 @@
 use std::num::NonZeroUsize;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::meshes::MeshArguments;
+
+use sixfold_shell::PixelLimit;
 
 use crate::commands::NETWORKS;
 use crate::commands::completions::CompletionsArguments;
@@ -17,6 +20,7 @@ use crate::commands::render::RenderArguments;
 use crate::commands::simulate::SimulateArguments;
 use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
 use crate::commands::train::TrainArguments;
+use sixfold_shell::ranges::threads;
 
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]
@@ -27,8 +31,12 @@ use crate::commands::train::TrainArguments;
 )]
 pub(crate) struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
-    #[arg(long, global = true, value_name = "N")]
+    #[arg(long, global = true, value_name = "N", value_parser = threads)]
     pub threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    pub images: PixelLimit,
+    #[command(flatten)]
+    pub meshes: MeshArguments,
     #[command(subcommand)]
     pub command: Command,
 }

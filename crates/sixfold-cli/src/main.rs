@@ -2,22 +2,30 @@
 //!
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
+// What is printed goes through `sixfold_shell::screen`: its macros take the place of the standard ones.
+#[macro_use]
+extern crate sixfold_shell;
+
 mod arguments;
 mod commands;
 
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
-use sixfold_shell::progress;
-use sixfold_shell::{end_with_the_reader, exit_code, use_threads};
+use clap::CommandFactory;
+use sixfold_shell::screen::parse;
+use sixfold_shell::{exit_code, progress, use_threads};
 
 use crate::arguments::{Arguments, Command};
 
 fn main() -> ExitCode {
-    end_with_the_reader();
-    let arguments = Arguments::parse();
+    let arguments = match parse::<Arguments>() {
+        Ok(arguments) => arguments,
+        Err(code) => return code,
+    };
     progress::catch_interrupts();
     use_threads(arguments.threads);
+    arguments.images.set();
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) => commands::estimate::run(a),

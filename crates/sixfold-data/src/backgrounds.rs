@@ -1,6 +1,6 @@
 //! What training images show behind their objects.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use sixfold_geometry::{Rect, Vec3};
@@ -18,6 +18,14 @@ pub fn plain_backgrounds(folder: Option<&Path>) -> Result<(Backgrounds, f32), Au
         Some(folder) => (Backgrounds::from_folder(folder, &PhotographOptions::default())?, 0.1),
         None => (Backgrounds::procedural(), 0.6),
     })
+}
+
+/// The photographs that [`plain_backgrounds`] reads, in its order; none without a folder.
+///
+/// # Errors
+/// [`AugmentError`] for a folder that cannot be listed.
+pub fn background_files(folder: Option<&Path>) -> Result<Vec<PathBuf>, AugmentError> {
+    folder.map_or(Ok(vec![]), |folder| Backgrounds::files(folder, &PhotographOptions::default()))
 }
 
 /// As [`plain_backgrounds`], and always the training images themselves away from their objects.

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use sixfold_bop::DatasetError;
 use sixfold_geometry::{CameraError, FrameId};
+use sixfold_io::{CameraFileError, ImageFileError};
+use sixfold_mesh::MeshFileError;
 use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
@@ -77,6 +79,29 @@ pub enum TrainingSetError {
     /// An image of the dataset cannot be used.
     #[error(transparent)]
     Image(#[from] PosedImageError),
+    /// A mesh cannot be read.
+    #[error(transparent)]
+    Mesh(#[from] MeshFileError),
+    /// An image file cannot be read.
+    #[error(transparent)]
+    ImageFile(#[from] ImageFileError),
+    /// A camera file cannot be read, or is not of the image.
+    #[error(transparent)]
+    CameraFile(#[from] CameraFileError),
+    /// An image does not belong to its camera.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The detector cannot search an image.
+    #[error("detector: {0}")]
+    Detector(Box<dyn std::error::Error + Send + Sync>),
+    /// A file that names photographs is broken.
+    #[error("{}: {reason}", path.display())]
+    Photographs {
+        /// The file.
+        path: PathBuf,
+        /// Field, found and expected.
+        reason: String,
+    },
     /// A frame of the dataset has no colour image.
     #[error("scene {}, image {}: there is no colour image; leave this frame out", frame.scene_id, frame.im_id)]
     NoColorImage {
@@ -91,6 +116,12 @@ pub enum TrainingSetError {
     NoObjects {
         /// The dataset.
         root: PathBuf,
+    },
+    /// An object is named twice: a model would have it twice.
+    #[error("ids: object {id} is named more than once; name every object once")]
+    NamedTwice {
+        /// The object.
+        id: u32,
     },
     /// There is no colour image.
     #[error("{}: split {split} has no colour images to learn from", root.display())]

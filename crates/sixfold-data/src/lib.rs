@@ -5,16 +5,19 @@
 
 mod backgrounds;
 mod colors;
+mod contents;
 mod error;
+mod photograph_file;
 mod posed_image;
 mod poses;
 mod prepared_mesh;
 mod reading;
 mod rendering;
+mod rough_images;
 mod training_set;
 mod visible_mask;
 
-pub use backgrounds::{backgrounds_with_images, plain_backgrounds};
+pub use backgrounds::{background_files, backgrounds_with_images, plain_backgrounds};
 pub use colors::image_color_augmentation;
 pub use error::{PosedImageError, TrainingSetError};
 pub use posed_image::{MIN_PIXELS, PosedImage};
@@ -22,6 +25,7 @@ pub use poses::{DEFAULT_CAMERA, PoseRange, PoseVariation, default_distances, dis
 pub use prepared_mesh::{PreparedMesh, is_textured};
 pub use reading::read_posed_images;
 pub use rendering::{color_patch, colors, random_lights, random_material};
+pub use rough_images::{DetectMasks, RoughImage, RoughImageOptions, RoughImages, RoughObject};
 pub use sixfold_geometry::FrameId;
 pub use training_set::{FrameSelection, TrainingObject, TrainingSet};
 pub use visible_mask::VisibleMask;

@@ -39,7 +39,7 @@ impl PosedImage {
         camera_from_object: Pose,
     ) -> Result<Self, PosedImageError> {
         let name = name.into();
-        if let Err(source) = camera.check() {
+        if let Err(source) = camera.check_lens() {
             return Err(PosedImageError::Camera { name, source });
         }
         let posed = PosedImage {

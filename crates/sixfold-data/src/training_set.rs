@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use sixfold_bop::{BopDataset, Models};
+use sixfold_bop::{BopDataset, DatasetError, Models};
 use sixfold_geometry::FrameId;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::BoundingBoxScale;
@@ -72,6 +72,9 @@ impl TrainingSet {
         frames: &FrameSelection,
         min_visibility: f64,
     ) -> Result<TrainingSet, TrainingSetError> {
+        if let Some(id) = ids.iter().enumerate().find(|(i, id)| ids[..*i].contains(id)).map(|(_, id)| *id) {
+            return Err(TrainingSetError::NamedTwice { id });
+        }
         let dataset = BopDataset::open(root, split)?;
         let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
         let ids: Vec<u32> = if ids.is_empty() { infos.0.keys().copied().collect() } else { ids.to_vec() };
@@ -92,12 +95,7 @@ impl TrainingSet {
             FrameSelection::Listed(frames) => frames.clone(),
             FrameSelection::RendersOnly => vec![],
             FrameSelection::All => {
-                let mut all = vec![];
-                for scene_id in dataset.scene_ids() {
-                    let scene = dataset.scene(scene_id)?;
-                    let shown = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
-                    all.extend(shown.map(|im_id| FrameId { scene_id, im_id }));
-                }
+                let all = frames_with_colour(&dataset)?;
                 if all.is_empty() {
                     return Err(TrainingSetError::NoImages {
                         root: root.to_owned(),
@@ -132,4 +130,15 @@ impl TrainingSet {
             description: format!("renders of {names}"),
         }
     }
+}
+
+/// All frames with a colour image.
+pub(crate) fn frames_with_colour(dataset: &BopDataset) -> Result<Vec<FrameId>, DatasetError> {
+    let mut all = vec![];
+    for scene_id in dataset.scene_ids() {
+        let scene = dataset.scene(scene_id)?;
+        let shown = scene.image_ids().into_iter().filter(|id| scene.rgb_path(*id).is_some());
+        all.extend(shown.map(|im_id| FrameId { scene_id, im_id }));
+    }
+    Ok(all)
 }

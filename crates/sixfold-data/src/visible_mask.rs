@@ -43,6 +43,12 @@ impl VisibleMask {
         VisibleMask { size: mask.size(), x: x0, y: y0, width, height, data, pixels, outline }
     }
 
+    /// Box and pixels as bytes: what tells it from another mask.
+    pub(crate) fn parts(&self) -> [Vec<u8>; 2] {
+        let numbers = [self.size.0, self.size.1, self.x, self.y, self.width, self.height];
+        [numbers.iter().flat_map(|n| (*n as u64).to_le_bytes()).collect(), self.data.clone()]
+    }
+
     /// Columns and rows of the image that the mask is of.
     pub fn image_size(&self) -> (usize, usize) {
         self.size

@@ -6,6 +6,9 @@ use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
 use sixfold_synth::augment::{AffineMap, Patch};
 
+/// Most detections of an image, of one object or of all.
+const MOST_DETECTIONS: usize = 10_000;
+
 /// Which detections are given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DetectOptions {
@@ -44,11 +47,12 @@ impl DetectOptions {
                 return Err(format!("detection option {field}: found {value}, expected 0 to 1"));
             }
         }
-        if self.per_class == 0 || self.most == 0 {
-            let (a, b) = (self.per_class, self.most);
-            return Err(format!(
-                "detection options per_class and most: found {a} and {b}, expected at least 1"
-            ));
+        for (field, value) in [("per_class (--per-object)", self.per_class), ("most", self.most)] {
+            if !(1..=MOST_DETECTIONS).contains(&value) {
+                return Err(format!(
+                    "detection option {field}: found {value}, expected 1 to {MOST_DETECTIONS}"
+                ));
+            }
         }
         Ok(())
     }

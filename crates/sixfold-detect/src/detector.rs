@@ -25,6 +25,11 @@ impl TrainedDetector {
         Ok(TrainedDetector { model, options })
     }
 
+    /// A detector with options of one's own.
+    pub fn new(model: DetectorModel, options: DetectOptions) -> TrainedDetector {
+        TrainedDetector { model, options }
+    }
+
     /// The network.
     pub fn model(&self) -> &DetectorModel {
         &self.model

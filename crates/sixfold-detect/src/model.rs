@@ -247,23 +247,66 @@ fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
             serde_json::from_value(value.clone()).map_err(|e| wrong("objects", "an id", e.to_string()))
         })
         .collect::<Result<Vec<ClassEntry>, _>>()?;
+    for (place, class) in classes.iter().enumerate() {
+        if classes[..place].contains(class) {
+            return Err(wrong("objects", "every id once", format!("object {} twice", class.id)));
+        }
+    }
     let config: DetectorConfig = serde_json::from_value(card.extra["network"].clone())
         .map_err(|e| wrong("extra.network", "the network's sizes", e.to_string()))?;
     let usage: DetectorUse = serde_json::from_value(card.extra["use"].clone())
         .map_err(|e| wrong("extra.use", "longest_side and threshold", e.to_string()))?;
-    let sane = config.classes == classes.len()
-        && (1..=10_000).contains(&config.classes)
-        && (2..=4096).contains(&config.width)
-        && (2..=6).contains(&config.levels)
-        && config.shared + config.own <= 64
-        && (1..=1024).contains(&config.prototypes)
-        && (32..=16_384).contains(&usage.longest_side)
-        && (0.0..=1.0).contains(&usage.threshold)
-        && architecture(&config) == card.architecture;
-    if !sane {
-        let found = format!("{config:?}, {usage:?} for {} objects", classes.len());
-        return Err(wrong("extra", "sizes that fit each other", found));
+    let bytes = std::fs::metadata(path)
+        .map_err(|source| WeightsError::Read { file: path.to_path_buf(), source })?
+        .len();
+    check_sizes(&config, &usage, classes.len(), bytes)
+        .map_err(|(field, expected, found)| wrong(field, expected, found))?;
+    if architecture(&config) != card.architecture {
+        let expected = "lite0 for detect-compact, res_net50 for detect-retinanet";
+        return Err(wrong("extra.network.encoder", expected, card.architecture));
     }
     let (network, card) = load_weights(config.init(0, device), path, architecture(&config))?;
     Ok((network, config, classes, usage, card))
+}
+
+/// Whether numbers of a card can be those of a detector in a file of so many `bytes`; otherwise which field cannot, what it should hold,
+/// and what it holds. Nothing of their size is made before.
+fn check_sizes(
+    config: &DetectorConfig,
+    usage: &DetectorUse,
+    objects: usize,
+    bytes: u64,
+) -> Result<(), (&'static str, &'static str, String)> {
+    let DetectorConfig { classes, width, levels, shared, own, prototypes, .. } = *config;
+    if classes != objects {
+        return Err((
+            "extra.network.classes",
+            "as many as there are objects",
+            format!("{classes} for {objects} objects"),
+        ));
+    }
+    let ranges = [
+        ("extra.network.classes", classes, 1..=10_000, "1 to 10000"),
+        ("extra.network.width", width, 2..=1024, "2 to 1024"),
+        ("extra.network.levels", levels, 2..=6, "2 to 6"),
+        ("extra.network.shared", shared, 0..=16, "0 to 16"),
+        ("extra.network.own", own, 0..=16, "0 to 16"),
+        ("extra.network.prototypes", prototypes, 1..=1024, "1 to 1024"),
+        ("extra.use.longest_side", usage.longest_side, 32..=16_384, "32 to 16384 pixels"),
+    ];
+    for (field, value, range, expected) in ranges {
+        if !range.contains(&value) {
+            return Err((field, expected, value.to_string()));
+        }
+    }
+    if !(0.0..=1.0).contains(&usage.threshold) {
+        return Err(("extra.use.threshold", "0 to 1", usage.threshold.to_string()));
+    }
+    // Two bytes or more for each number of the 3x3 convolutions of the heads and of the scores.
+    let numbers = 9 * width * width * (shared + 2 * own) + width * classes;
+    if bytes < 2 * numbers as u64 {
+        let found = format!("{bytes} bytes for {numbers} numbers or more");
+        return Err(("extra.network", "sizes of a network that the file holds", found));
+    }
+    Ok(())
 }

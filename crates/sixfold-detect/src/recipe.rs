@@ -5,8 +5,9 @@ use std::f32::consts::PI;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
-use sixfold_data::{PosedImage, TrainingSet, plain_backgrounds};
+use sixfold_data::{PosedImage, TrainingSet, background_files, plain_backgrounds};
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
@@ -16,7 +17,7 @@ use sixfold_nn::weights::{ModelCard, training_frames};
 
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};
-use crate::samples::{TrainingImageOptions, TrainingImageSource};
+use crate::samples::{TrainingImageError, TrainingImageOptions, TrainingImageSource};
 use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Which network learns.
@@ -202,7 +203,32 @@ impl Recipe for DetectorRecipe {
         let wrong = self.encoder.is_some() && self.network == DetectorKind::Compact;
         let expected = "network retinanet; the compact network brings its ImageNet encoder along";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
+        if let Err(TrainingImageError::Option { field, found, expected }) = self.scenes().check() {
+            return Err(OptionError { field, found, expected });
+        }
         self.options().check()
+    }
+
+    /// How the detector is used later (`longest_side`, `threshold`) does not count: it may be exported again with others.
+    fn inputs(&self, material: &TrainingSet) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place.
+        #[rustfmt::skip]
+        let DetectorRecipe {
+            network, encoder, init, backgrounds,
+            // In the options of training and samples.
+            steps: _, batch: _, learning_rate: _, encoder_share: _, frozen_stages: _, size: _, photograph_share: _,
+            render_share: _, rotation: _, mesh_colors: _, seed: _,
+            // Change nothing.
+            longest_side: _, threshold: _, command: _,
+        } = self;
+        let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::method)?;
+        Fingerprint::of(&self.options())?
+            .merged(&Fingerprint::of(&serde_json::json!({ "samples": self.scenes() }))?)
+            .with("network", network.name())
+            .with_contents(material.contents())
+            .with_file("encoder", encoder.as_deref())?
+            .with_file("init", init.as_deref())?
+            .with_files("backgrounds", &backgrounds)
     }
 
     fn prepare(
@@ -210,7 +236,6 @@ impl Recipe for DetectorRecipe {
         material: TrainingSet,
         _: &mut Session<'_>,
     ) -> Result<Prepared<DetectorTraining, Context>, TrainError> {
-        self.scenes().check().map_err(TrainError::method)?;
         let ids: Vec<u32> = material.objects.iter().map(|o| o.id).collect();
         let device = Device::flex().autodiff();
         let (network, config) = self.network(&ids, &device)?;

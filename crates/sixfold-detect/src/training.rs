@@ -14,6 +14,9 @@ use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
+/// Stages of the encoder that the network uses: all of them may stay as they are.
+const ENCODER_STAGES: usize = 5;
+
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DetectorTrainingOptions {
@@ -24,7 +27,7 @@ pub struct DetectorTrainingOptions {
     pub batch: usize,
     /// The encoder's fraction of the learning rate, 0 to 1: it is pretrained.
     pub encoder_share: f64,
-    /// Stages of the encoder that stay as they are.
+    /// Stages of the encoder that stay as they are, 0 to 5.
     pub frozen_stages: usize,
 }
 
@@ -53,7 +56,13 @@ impl DetectorTrainingOptions {
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
-        OptionError::unless(self.batch > 0, "batch", self.batch, "1 or more")?;
+        OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
+        OptionError::unless(
+            self.frozen_stages <= ENCODER_STAGES,
+            "frozen_stages",
+            self.frozen_stages,
+            "0 to 5",
+        )?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }
 }

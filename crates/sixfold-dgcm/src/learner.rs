@@ -3,10 +3,13 @@
 //! Experience proposes where some is near enough, else geometry alone; the best grasps are tried until one holds, and a few
 //! others besides. What held becomes an experience, and every try an outcome. How a grasp is tried, in simulation or by a
 //! robot, is the caller's.
+//!
+//! What came of a task is stored at its end, all of it at once: a task that was interrupted has left nothing behind that would
+//! change what is tried when it is done again.
 
 use std::error::Error as StdError;
 
-use sixfold_experience::{Attempt, Crop, Experience, StoreError};
+use sixfold_experience::{Attempt, Crop, Experience, JournalEntry, StoreError, TaskRecord};
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps,
 };
@@ -87,6 +90,21 @@ pub enum LearnError {
 /// Tries a grasp: whether it held, and how it ended.
 pub type TryGrasp<'a, T> = dyn FnMut(&Grasp) -> Result<(bool, T), Box<dyn StdError + Send + Sync>> + 'a;
 
+/// The row that a journal gets for a task, with the number of the experience that came of it.
+pub struct JournalOf<'a, T> {
+    /// The journal's name, which no other has.
+    pub journal: &'a str,
+    /// The row.
+    pub row: &'a dyn Fn(&Learned<T>, Option<i64>) -> String,
+}
+
+/// What a task has led to so far.
+#[derive(Default)]
+struct Record {
+    attempts: Vec<Attempt>,
+    experience: Option<Experience>,
+}
+
 /// Whoever learns.
 pub struct Learner<'a> {
     /// Encodes what is seen.
@@ -100,14 +118,47 @@ pub struct Learner<'a> {
 }
 
 impl Learner<'_> {
-    /// Chooses grasps on what is seen, has them tried, and keeps what came of it.
+    /// Chooses grasps on what is seen, has them tried, and keeps what came of it. Where somebody keeps a journal of tasks, the
+    /// store keeps its row too, in the same step.
     ///
     /// # Errors
-    /// [`LearnError`]; what was tried before is kept.
+    /// [`LearnError`]; where a grasp could not be tried, the outcomes of those before are kept.
     pub fn learn<T>(
         &mut self,
         task: &GraspTask<'_>,
         try_grasp: &mut TryGrasp<'_, T>,
+        journal: Option<&JournalOf<'_, T>>,
+    ) -> Result<Learned<T>, LearnError> {
+        let mut record = Record::default();
+        let tried = self.try_grasps(task, try_grasp, &mut record);
+        if tried.is_err() && record.attempts.is_empty() {
+            return tried;
+        }
+        let row = |stored: Option<i64>| match (&tried, journal) {
+            (Ok(learned), Some(journal)) => (journal.row)(learned, stored),
+            _ => String::new(),
+        };
+        let entry = journal.filter(|_| tried.is_ok()).map(|j| JournalEntry { journal: j.journal, row: &row });
+        let experience = record.experience.as_ref();
+        let stored = self.memory.store().add_record(&TaskRecord {
+            attempts: &record.attempts,
+            experience,
+            journal: entry,
+        })?;
+        let mut learned = tried?;
+        learned.stored = stored;
+        if stored.is_some() {
+            self.memory.refresh()?;
+        }
+        Ok(learned)
+    }
+
+    /// Chooses grasps and has them tried.
+    fn try_grasps<T>(
+        &mut self,
+        task: &GraspTask<'_>,
+        try_grasp: &mut TryGrasp<'_, T>,
+        record: &mut Record,
     ) -> Result<Learned<T>, LearnError> {
         let mut geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
         if let (Some(part_of), Some(part)) = (task.part_of, &self.options.part) {
@@ -121,12 +172,12 @@ impl Learner<'_> {
         let mut learned = Learned { nearest, from_experience, last: None, held: false, stored: None };
         let mut left = 0;
         for (number, candidate) in ranked.iter().take(self.options.tries).enumerate() {
-            let (held, ending) = self.execute(task, &fitter, candidate, number, try_grasp)?;
+            let (held, ending) = self.execute(task, &fitter, candidate, number, try_grasp, record)?;
             learned.last = Some((number, ending));
             left = number + 1;
             if held {
                 learned.held = true;
-                learned.stored = self.remember(task, &candidate.grasp)?;
+                record.experience = self.experience(task, &candidate.grasp);
                 break;
             }
         }
@@ -135,7 +186,7 @@ impl Learner<'_> {
         let count = self.options.explore.min(others.len());
         for k in 0..count {
             let number = k * others.len() / count;
-            self.execute(task, &fitter, &others[number], left + number, try_grasp)?;
+            self.execute(task, &fitter, &others[number], left + number, try_grasp, record)?;
         }
         Ok(learned)
     }
@@ -177,17 +228,18 @@ impl Learner<'_> {
         }
     }
 
-    /// Has one grasp tried and keeps what came of it.
+    /// Has one grasp tried and records what came of it.
     fn execute<T>(
-        &mut self,
+        &self,
         task: &GraspTask<'_>,
         fitter: &GraspFitter<'_>,
         candidate: &Ranked,
         rank: usize,
         try_grasp: &mut TryGrasp<'_, T>,
+        record: &mut Record,
     ) -> Result<(bool, T), LearnError> {
         let (held, ending) = try_grasp(&candidate.grasp).map_err(LearnError::Try)?;
-        let tried = Attempt {
+        record.attempts.push(Attempt {
             description: fitter.describe(&candidate.grasp),
             share: candidate.experience,
             transferred: candidate.kind == Kind::Experience,
@@ -196,19 +248,18 @@ impl Learner<'_> {
             object: task.object.to_owned(),
             time: (task.now)(),
             provenance: format!("{}, rank {rank}", task.provenance),
-        };
-        self.memory.store().add_attempt(&tried)?;
+        });
         Ok((held, ending))
     }
 
-    /// Stores a grasp that held; nothing where the object cannot be cut out.
-    fn remember(&mut self, task: &GraspTask<'_>, grasp: &Grasp) -> Result<Option<i64>, LearnError> {
-        let Ok(crop) = Crop::of_view(task.view, self.network.crop_options()) else { return Ok(None) };
+    /// The experience of a grasp that held; none where the object cannot be cut out.
+    fn experience(&self, task: &GraspTask<'_>, grasp: &Grasp) -> Option<Experience> {
+        let crop = Crop::of_view(task.view, self.network.crop_options()).ok()?;
         let part = match task.part_of {
             Some(part_of) => part_of(grasp),
             None => self.options.part.as_deref(),
         };
-        let experience = Experience::new(
+        Some(Experience::new(
             self.network,
             crop,
             grasp,
@@ -217,9 +268,6 @@ impl Learner<'_> {
             part,
             (task.now)(),
             task.provenance,
-        );
-        let (id, _) = self.memory.store().add(&experience)?;
-        self.memory.refresh()?;
-        Ok(Some(id))
+        ))
     }
 }

@@ -95,20 +95,16 @@ impl DgcmModel {
     ) -> Result<(Network, CropOptions), ModelError> {
         let wrong =
             |field, expected, found| ModelError::Card { file: path.to_path_buf(), field, expected, found };
-        let network = Network::of_architecture(&card.architecture, device)
-            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
         let crop: CropOptions = serde_json::from_value(card.extra["crop"].clone())
             .map_err(|e| wrong("extra.crop", "how objects are cut out", e.to_string()))?;
-        let sane = crop.side == network.side()
-            && crop.size > 0.01
-            && crop.size < 5.0
-            && (1..=50).contains(&crop.normal_radius)
-            && (0.0..0.5).contains(&crop.trim);
-        if !sane {
+        check_crop(&crop).map_err(|(field, expected, found)| wrong(field, expected, found))?;
+        let network = Network::of_architecture(&card.architecture, device)
+            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
+        if crop.side != network.side() {
             return Err(wrong(
-                "extra.crop",
-                "the network's side, a size of 0.01 to 5 m",
-                format!("{crop:?}"),
+                "extra.crop.side",
+                "the side of the network's input, pixels",
+                crop.side.to_string(),
             ));
         }
         Ok((network, crop))
@@ -177,6 +173,27 @@ impl DgcmModel {
     }
 }
 
+/// Whether numbers of a card can be those of a crop; otherwise which field cannot, what it should hold, and what it holds.
+fn check_crop(crop: &CropOptions) -> Result<(), (&'static str, &'static str, String)> {
+    if !(crop.size > 0.01 && crop.size < 5.0) {
+        return Err(("extra.crop.size", "0.01 to 5 m", crop.size.to_string()));
+    }
+    if !(1..=50).contains(&crop.normal_radius) {
+        return Err(("extra.crop.normal_radius", "1 to 50 pixels", crop.normal_radius.to_string()));
+    }
+    if !(0.0..0.5).contains(&crop.trim) {
+        return Err(("extra.crop.trim", "0 up to 0.5", crop.trim.to_string()));
+    }
+    if !(8..=1024).contains(&crop.side) {
+        return Err(("extra.crop.side", "8 to 1024 pixels", crop.side.to_string()));
+    }
+    let pixels = crop.side * crop.side;
+    if !(1..=pixels).contains(&crop.min_pixels) {
+        return Err(("extra.crop.min_pixels", "1 to the pixels of the crop", crop.min_pixels.to_string()));
+    }
+    Ok(())
+}
+
 fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
@@ -216,5 +233,42 @@ mod tests {
         assert!(missing.contains("none.safetensors"), "{missing}");
         let error = DgcmModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
         assert!(error.contains("dgcm.safetensors"), "{error}");
+    }
+
+    #[test]
+    fn cards_with_impossible_numbers_are_refused() {
+        use serde_json::{Value, json};
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("dgcm.safetensors");
+        let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
+        let whole = DgcmModel::new(network.clone(), CropOptions::compact(), ModelCard::new("", "test")).card;
+        let crop: [(&str, Value, &str); 9] = [
+            ("side", json!(0), "extra.crop.side"),
+            ("side", json!(1u64 << 63), "extra.crop.side"),
+            ("side", json!(128), "extra.crop.side"),
+            ("size", json!(1e300), "extra.crop.size"),
+            ("size", json!(-0.3), "extra.crop.size"),
+            ("normal_radius", json!(u64::MAX), "extra.crop.normal_radius"),
+            ("trim", json!(0.5), "extra.crop.trim"),
+            ("min_pixels", json!(0), "extra.crop.min_pixels"),
+            ("min_pixels", json!(u64::MAX), "extra.crop.min_pixels"),
+        ];
+        let refused = |card: &ModelCard, field: &str| {
+            save_weights(&network, card, &file).unwrap();
+            let bytes = std::fs::read(&file).unwrap();
+            for error in
+                [DgcmModel::load(&file).unwrap_err(), DgcmModel::from_bytes(&file, &bytes).unwrap_err()]
+            {
+                let error = error.to_string();
+                assert!(error.contains("dgcm.safetensors") && error.contains(field), "{field}: {error}");
+            }
+        };
+        for (name, value, field) in crop {
+            let mut card = whole.clone();
+            card.extra["crop"][name] = value;
+            refused(&card, field);
+        }
+        refused(&ModelCard { extra: Value::Null, ..whole.clone() }, "extra.crop");
+        refused(&ModelCard { architecture: "dgcm".to_owned(), ..whole }, "dgcm-compact");
     }
 }

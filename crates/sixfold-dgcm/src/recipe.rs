@@ -5,6 +5,7 @@ use std::sync::Mutex;
 
 use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
@@ -139,6 +140,16 @@ impl Recipe for DgcmRecipe {
         let expected = "network paper; the compact network starts from random weights";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
         self.options().check()
+    }
+
+    fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        #[rustfmt::skip]
+        let DgcmRecipe { network, encoder, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
+        Fingerprint::of(&self.options())?
+            .with("network", network.name())
+            .with("views", *views)
+            .with_file("encoder", encoder.as_deref())
     }
 
     fn prepare(

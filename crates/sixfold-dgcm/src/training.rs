@@ -71,7 +71,7 @@ impl DgcmTrainingOptions {
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
-        OptionError::unless(self.pairs > 0, "pairs", self.pairs, "1 or more")?;
+        OptionError::unless_samples("pairs", self.pairs, 1, "1 or more")?;
         OptionError::unless_weight("lambda", self.lambda)?;
         OptionError::unless_weight("cross_pairs", self.cross_pairs)
     }

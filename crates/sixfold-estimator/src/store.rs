@@ -2,15 +2,19 @@
 //!
 //! An object's folder holds `object.json` (format version, unit, symmetries, where it came from), `mesh.ply` (metres), and what
 //! methods derive from it (`ppf.bin`, `templates.bin`). An object added from depth images has templates and no mesh. A folder
-//! is written under another name first and moved into place as a whole.
+//! is written under another name first and moved into place as a whole; one that is replaced or removed is moved away first. One
+//! process at a time changes an object, and whoever comes after one that was killed tidies up.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Pose, PoseError};
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_io::{LockError, WriteLock, limits, read_regular_text, write_atomically};
 use sixfold_mesh::{
     ContinuousSymmetry, Mesh, MeshError, MeshFileError, ModelInfo, PlyFormat, Unit, read_mesh, write_ply,
 };
@@ -22,6 +26,21 @@ use crate::object::Object;
 
 /// The only version of `object.json` there is.
 const VERSION: u32 = 1;
+/// Diameters that an object known from depth images may have, metres: those of the tabletop objects that are taken as meshes.
+const DIAMETERS: std::ops::RangeInclusive<f64> =
+    sixfold_mesh::SMALLEST_DIAMETER..=sixfold_mesh::LARGEST_DIAMETER;
+/// How far the diameter in `object.json` may be off the mesh's, as a fraction: the mesh is stored in single precision.
+const SAME_DIAMETER: f64 = 1e-3;
+/// Most discrete symmetries (with the identity) times axes in `object.json`: a gear with 360 teeth has 360.
+const MAX_SYMMETRIES: usize = 1000;
+/// Furthest that a point on an axis, or the way of a symmetry, is from the origin, metres.
+const FURTHEST: f64 = 2.0 * sixfold_mesh::LARGEST_OFFSET;
+/// How long to wait for another process that has moved an object away and not yet put the new one in its place.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often the store is listed again at most until two listings are the same.
+const LISTINGS: usize = 5;
+/// How often an object is looked for at most while another process changes it.
+const ATTEMPTS: usize = 20;
 
 /// Why an object cannot be stored or loaded.
 #[derive(Debug, Error)]
@@ -51,17 +70,36 @@ pub enum StoreError {
         /// The store.
         folder: PathBuf,
     },
+    /// There is something of this name that is none.
+    #[error(
+        "{} is no stored object (it holds no object.json) and is left alone: give another name, or remove it yourself",
+        path.display()
+    )]
+    NotAnObject {
+        /// The file or folder.
+        path: PathBuf,
+    },
+    /// Another process changes the object.
+    #[error(transparent)]
+    Locked(#[from] LockError),
     /// `object.json` is not what it should be.
-    #[error("{}: {what}", path.display())]
+    #[error("{}: {what}; add the object again with `sixfold object add {name} ... --replace`", path.display())]
     Record {
+        /// The object.
+        name: String,
         /// The file.
         path: PathBuf,
         /// What is wrong.
         what: String,
     },
-    /// A symmetry in `object.json` is no rigid transformation.
-    #[error("field symmetries_discrete")]
-    Symmetry(#[from] PoseError),
+    /// The stored mesh cannot be read.
+    #[error("add the object again with `sixfold object add {name} MESH --unit UNIT --replace`")]
+    StoredMesh {
+        /// The object.
+        name: String,
+        /// Why.
+        source: MeshFileError,
+    },
     /// A mesh file needs a unit.
     #[error("{}: a mesh file does not say its unit: give --unit mm (or m, cm, in)", path.display())]
     NoUnit {
@@ -172,15 +210,53 @@ impl ObjectRecord {
         }
     }
 
-    fn info(&self, mesh: &Mesh) -> Result<ModelInfo, StoreError> {
+    /// Diameter, box and symmetries; what is wrong with the record beside this mesh otherwise.
+    fn info(&self, mesh: &Mesh) -> Result<ModelInfo, String> {
         let mut info = ModelInfo::of_mesh(mesh);
+        if !((self.diameter - info.diameter).abs() <= SAME_DIAMETER * info.diameter) {
+            return Err(format!(
+                "field diameter: found {} m, that of mesh.ply beside it is {} m",
+                self.diameter, info.diameter
+            ));
+        }
+        for (field, found, expected) in
+            [("vertices", self.vertices, mesh.vertices().len()), ("faces", self.faces, mesh.faces().len())]
+        {
+            if found != expected {
+                return Err(format!("field {field}: found {found}, mesh.ply beside it has {expected}"));
+            }
+        }
+        let (discrete, axes) = (self.symmetries_discrete.len() + 1, self.symmetries_continuous.len().max(1));
+        if discrete.saturating_mul(axes) > MAX_SYMMETRIES {
+            return Err(format!(
+                "fields symmetries_discrete and symmetries_continuous: found {discrete} times {axes}, expected up to \
+                 {MAX_SYMMETRIES}"
+            ));
+        }
         for rows in &self.symmetries_discrete {
             let flat: Vec<f64> = rows.iter().flatten().copied().collect();
-            info.symmetries_discrete.push(Pose::from_matrix(&Matrix4::from_row_slice(&flat))?);
+            let pose = Pose::from_matrix(&Matrix4::from_row_slice(&flat))
+                .map_err(|e| format!("field symmetries_discrete: {e}"))?;
+            if !(pose.translation().norm() <= FURTHEST) {
+                return Err(format!(
+                    "field symmetries_discrete: found one that moves the object by more than {FURTHEST} m"
+                ));
+            }
+            info.symmetries_discrete.push(pose);
         }
         for s in &self.symmetries_continuous {
-            let symmetry = ContinuousSymmetry { axis: s.axis.into(), offset: s.offset.into() };
-            info.symmetries_continuous.push(symmetry);
+            let axis = Vec3::from(s.axis).try_normalize(1e-9).filter(|a| (a.norm() - 1.0).abs() < 1e-9);
+            let axis = axis.ok_or_else(|| {
+                format!("field symmetries_continuous.axis: found {:?}, expected a direction", s.axis)
+            })?;
+            let offset = Vec3::from(s.offset);
+            if !(offset.norm() <= FURTHEST) {
+                return Err(format!(
+                    "field symmetries_continuous.offset: found {:?}, expected a point of the object in metres",
+                    s.offset
+                ));
+            }
+            info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
         }
         Ok(info)
     }
@@ -221,28 +297,86 @@ impl ObjectStore {
             return Err(StoreError::Name(name.to_owned()));
         }
         let place = self.folder.join(name);
-        if !place.exists() {
-            self.restore(name, &place);
-        }
-        Ok(place)
+        if place.exists() { Ok(place) } else { Ok(self.restored(name, place)) }
     }
 
-    /// Puts an object back whose replacement was interrupted between its two steps.
-    fn restore(&self, name: &str, place: &Path) {
-        let prefix = format!(".{name}.");
-        let entries = std::fs::read_dir(&self.folder).into_iter().flatten().flatten();
-        for path in entries.map(|e| e.path()) {
-            let found = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-            if found.starts_with(&prefix) && found.ends_with(".old") && path.join("object.json").is_file() {
-                // Another process may do the same: then the object is there already.
-                let _ = std::fs::rename(&path, place);
+    /// [`ObjectStore::place`] for who changes the object.
+    fn writable_place(&self, name: &str) -> Result<PathBuf, StoreError> {
+        let (found, place) = (self.place(name)?, self.folder.join(name));
+        if found == place {
+            return Ok(place);
+        }
+        // It is the only copy.
+        let what = format!("{} cannot be moved back there", found.display());
+        Err(StoreError::Io { path: place, source: io::Error::other(what) })
+    }
+
+    /// Where an object is that is not in its place. A process that was killed between the two steps of a replacement left it beside:
+    /// it is put back. One that is between them now is waited for.
+    fn restored(&self, name: &str, place: PathBuf) -> PathBuf {
+        let start = Instant::now();
+        loop {
+            let Some(old) = self.beside(name, OLD).into_iter().find(|p| is_object(p)) else { return place };
+            match WriteLock::take(&place) {
+                // The place may have been taken meanwhile, by a whole new object: that is then the one.
+                Ok(_lock) if place.exists() || std::fs::rename(&old, &place).is_ok() => return place,
+                Err(LockError::Taken { .. }) if start.elapsed() < PATIENCE => {
+                    std::thread::sleep(Duration::from_millis(5));
+                    if place.exists() {
+                        return place;
+                    }
+                }
+                // A store that may only be read.
+                _ => return old,
             }
+        }
+    }
+
+    /// What an unfinished change of an object left beside it: folders `.NAME.PROCESS.ENDING`.
+    fn beside(&self, name: &str, ending: &str) -> Vec<PathBuf> {
+        let (prefix, ending) = (format!(".{name}."), format!(".{ending}"));
+        let entries = std::fs::read_dir(&self.folder).into_iter().flatten().flatten().map(|e| e.path());
+        let of_this = |path: &PathBuf| {
+            let found = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+            let process = found.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix(&ending));
+            process.is_some_and(|p| p.parse::<u32>().is_ok())
+        };
+        entries.filter(of_this).collect()
+    }
+
+    /// A name beside an object's for this process.
+    fn own(&self, name: &str, ending: &str) -> PathBuf {
+        self.folder.join(format!(".{name}.{}.{ending}", std::process::id()))
+    }
+
+    /// Removes what killed processes left of an object that is in its place, or nowhere. The caller holds its lock.
+    fn tidy(&self, name: &str) {
+        for path in [NEW, OLD, GONE].into_iter().flat_map(|ending| self.beside(name, ending)) {
+            // What cannot be removed takes room, nothing else.
+            let _ = std::fs::remove_dir_all(path);
         }
     }
 
     /// Whether there is an object of this name.
     pub fn contains(&self, name: &str) -> bool {
-        self.place(name).is_ok_and(|p| p.join("object.json").is_file())
+        self.whole(name, |place| is_object(place).then_some(())).is_some()
+    }
+
+    /// What `read` finds in the object's folder. It may be moved away just then, by a replacement: then it is looked for again.
+    fn whole<T>(&self, name: &str, read: impl Fn(&Path) -> Option<T>) -> Option<T> {
+        for _ in 0..ATTEMPTS {
+            let found = self.place(name).ok().and_then(|place| read(&place));
+            if found.is_some() || !self.is_changing(name) {
+                return found;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        None
+    }
+
+    /// Whether a process replaces or removes the object now, or was killed while it did.
+    fn is_changing(&self, name: &str) -> bool {
+        self.folder.join(format!(".{name}.lock")).exists() || !self.beside(name, OLD).is_empty()
     }
 
     /// All names, sorted.
@@ -250,20 +384,54 @@ impl ObjectStore {
     /// # Errors
     /// [`StoreError::Io`] where the folder cannot be read.
     pub fn names(&self) -> Result<Vec<String>, StoreError> {
+        let mut names = self.names_once()?;
+        // A folder that is renamed while the store is listed may be met under neither name.
+        for _ in 0..LISTINGS {
+            let again = self.names_once()?;
+            if again == names {
+                break;
+            }
+            names = again;
+        }
+        Ok(names.into_iter().collect())
+    }
+
+    fn names_once(&self) -> Result<BTreeSet<String>, StoreError> {
         let entries = match std::fs::read_dir(&self.folder) {
             Ok(entries) => entries,
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(vec![]),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(BTreeSet::new()),
             Err(e) => return Err(self.io(e)),
         };
-        let mut names = vec![];
+        let mut names = BTreeSet::new();
         for entry in entries {
-            let name = entry.map_err(|e| self.io(e))?.file_name();
-            if let Some(name) = name.to_str().filter(|n| self.contains(n)) {
-                names.push(name.to_owned());
+            let entry = entry.map_err(|e| self.io(e))?.file_name();
+            let Some(entry) = entry.to_str() else { continue };
+            // Of `.NAME.PROCESS.old` the name: a replacement is under way, or was.
+            let name = match entry.strip_prefix('.') {
+                Some(rest) if entry.ends_with(OLD) => rest.split('.').next().unwrap_or_default(),
+                _ => entry,
+            };
+            if !names.contains(name) && self.contains(name) {
+                names.insert(name.to_owned());
             }
         }
-        names.sort();
         Ok(names)
+    }
+
+    /// All objects with their records, by name; one that another process removes meanwhile is left out.
+    ///
+    /// # Errors
+    /// As [`ObjectStore::names`] and [`ObjectStore::record`].
+    pub fn records(&self) -> Result<Vec<(String, ObjectRecord)>, StoreError> {
+        let mut records = vec![];
+        for name in self.names()? {
+            match self.record(&name) {
+                Ok(record) => records.push((name, record)),
+                Err(StoreError::Unknown { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(records)
     }
 
     /// An object's record.
@@ -272,18 +440,30 @@ impl ObjectStore {
     /// [`StoreError::Unknown`], with the names there are, and [`StoreError::Record`].
     pub fn record(&self, name: &str) -> Result<ObjectRecord, StoreError> {
         let path = self.place(name)?.join("object.json");
-        if !path.is_file() {
+        let text = self.whole(name, |place| {
+            match read_regular_text(&place.join("object.json"), limits::SMALL_TEXT) {
+                Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => None,
+                other => Some(other),
+            }
+        });
+        let wrong = |what: String| StoreError::Record { name: name.to_owned(), path: path.clone(), what };
+        let Some(text) = text else {
             let names = self.names()?;
             let there = if names.is_empty() { "there is none yet".into() } else { names.join(", ") };
             return Err(StoreError::Unknown { name: name.to_owned(), folder: self.folder.clone(), there });
-        }
-        let wrong = |what: String| StoreError::Record { path: path.clone(), what };
-        let text = std::fs::read_to_string(&path).map_err(|e| wrong(e.to_string()))?;
+        };
+        let text = text.map_err(|e| wrong(e.to_string()))?;
         let record: ObjectRecord = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
         if record.version != VERSION {
             return Err(wrong(format!(
                 "field version: found {}, expected {VERSION}: written by another version of sixfold",
                 record.version
+            )));
+        }
+        if record.without_mesh && !DIAMETERS.contains(&record.diameter) {
+            return Err(wrong(format!(
+                "field diameter: found {} m, expected {DIAMETERS:?}",
+                record.diameter
             )));
         }
         Ok(record)
@@ -294,8 +474,9 @@ impl ObjectStore {
     /// # Errors
     /// [`StoreError`].
     pub fn load(&self, name: &str) -> Result<Object, StoreError> {
-        let record = self.record(name)?;
-        loaded(name, &record, self.place(name)?)
+        let read = || loaded(name, &self.record(name)?, self.place(name)?);
+        // Replaced between its files: the second time they are of one object.
+        read().or_else(|_| read())
     }
 
     /// Stores an object. `derive` is called with it while it lies in a folder beside the store's others, and may keep there what
@@ -309,13 +490,18 @@ impl ObjectStore {
         new: NewObject<'_>,
         derive: impl FnOnce(&Object) -> Result<(), Source>,
     ) -> Result<(), StoreError> {
-        let place = self.place(name)?;
-        if place.exists() && !new.replace {
+        let place = self.writable_place(name)?;
+        std::fs::create_dir_all(&self.folder).map_err(|e| self.io(e))?;
+        let _lock = WriteLock::take(&place)?;
+        let replaced = place.exists();
+        if replaced && !is_object(&place) {
+            return Err(StoreError::NotAnObject { path: place });
+        }
+        if replaced && !new.replace {
             return Err(StoreError::Exists { name: name.to_owned(), folder: self.folder.clone() });
         }
-        std::fs::create_dir_all(&self.folder).map_err(|e| self.io(e))?;
-        let fresh = self.folder.join(format!(".{name}.{}.new", std::process::id()));
-        let old = self.folder.join(format!(".{name}.{}.old", std::process::id()));
+        self.tidy(name);
+        let fresh = self.own(name, NEW);
         let result = (|| -> Result<(), Source> {
             std::fs::create_dir_all(&fresh)?;
             if let Some(mesh) = new.mesh {
@@ -323,22 +509,18 @@ impl ObjectStore {
             }
             // From the stored mesh, whose numbers are rounded: that is what later runs compare them with.
             derive(&loaded(name, new.record, fresh.clone())?)?;
-            std::fs::write(fresh.join("object.json"), serde_json::to_string_pretty(new.record)?)?;
-            let replaced = place.exists();
-            if replaced {
-                std::fs::rename(&place, &old)?;
-            }
-            if let Err(error) = std::fs::rename(&fresh, &place) {
-                if replaced {
-                    std::fs::rename(&old, &place)?;
-                }
-                return Err(error.into());
-            }
-            Ok(())
+            write_atomically(
+                &fresh.join("object.json"),
+                serde_json::to_string_pretty(new.record)?.as_bytes(),
+            )?;
+            let away = if replaced { Some(self.own(name, OLD)) } else { None };
+            Ok(swap(&fresh, &place, away.as_deref(), |from, to| std::fs::rename(from, to))?)
         })();
-        let _ = std::fs::remove_dir_all(&fresh);
-        if result.is_ok() || place.exists() {
-            let _ = std::fs::remove_dir_all(&old);
+        if place.exists() {
+            self.tidy(name);
+        } else {
+            // The object may lie under its other name alone: it is put back when it is next asked for.
+            let _ = std::fs::remove_dir_all(&fresh);
         }
         result.map_err(|source| StoreError::Derive { path: place, source })
     }
@@ -346,11 +528,19 @@ impl ObjectStore {
     /// Removes an object.
     ///
     /// # Errors
-    /// [`StoreError`] where there is none, or it cannot be removed.
+    /// [`StoreError`] where there is none, another process changes it, or it cannot be removed.
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
-        self.record(name)?;
-        let place = self.place(name)?;
-        std::fs::remove_dir_all(&place).map_err(|source| StoreError::Io { path: place, source })
+        let place = self.writable_place(name)?;
+        if !is_object(&place) {
+            // The error says what there is.
+            self.record(name)?;
+        }
+        let _lock = WriteLock::take(&place)?;
+        self.tidy(name);
+        let gone = self.own(name, GONE);
+        // Away as a whole first: killed halfway, it is not half an object.
+        std::fs::rename(&place, &gone).map_err(|source| StoreError::Io { path: place, source })?;
+        std::fs::remove_dir_all(&gone).map_err(|source| StoreError::Io { path: gone, source })
     }
 
     /// The object that a user names: a stored one, or a mesh file in `unit`, whose derived data goes to `cache`. The second value
@@ -380,12 +570,50 @@ impl ObjectStore {
     }
 }
 
+/// Endings of the folders beside an object: one that is being written, one that is being replaced, one that is being removed.
+const NEW: &str = "new";
+const OLD: &str = "old";
+const GONE: &str = "gone";
+
+fn is_object(place: &Path) -> bool {
+    place.join("object.json").is_file()
+}
+
+/// Puts `fresh` in its place, and what is there before away. Where the second step fails the first is taken back; where that
+/// fails too, the object lies at `away`, where [`ObjectStore::restored`] finds it.
+fn swap(
+    fresh: &Path,
+    place: &Path,
+    away: Option<&Path>,
+    rename: impl Fn(&Path, &Path) -> io::Result<()>,
+) -> io::Result<()> {
+    if let Some(away) = away {
+        rename(place, away)?;
+    }
+    rename(fresh, place).inspect_err(|_| {
+        if let Some(away) = away {
+            // The first error is the one to report.
+            let _ = rename(away, place);
+        }
+    })
+}
+
 fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, StoreError> {
     let (mut mesh, mut info) = (None, None);
     if !record.without_mesh {
-        let (read, _) = with_surface(name, read_mesh(folder.join("mesh.ply"), Unit::Metre)?)?;
-        info = Some(record.info(&read)?);
-        mesh = Some(Arc::new(read));
+        let read = read_mesh(folder.join("mesh.ply"), Unit::Metre)
+            .map_err(|source| StoreError::StoredMesh { name: name.to_owned(), source })?;
+        let wrong =
+            |what| StoreError::Record { name: name.to_owned(), path: folder.join("object.json"), what };
+        let mut of_record = record.info(&read).map_err(wrong)?;
+        let (surface, laid) = with_surface(name, read)?;
+        if laid.is_some() {
+            // The surface that is laid through points has a box of its own.
+            let own = ModelInfo::of_mesh(&surface);
+            (of_record.diameter, of_record.min, of_record.size) = (own.diameter, own.min, own.size);
+        }
+        info = Some(of_record);
+        mesh = Some(Arc::new(surface));
     }
     Ok(Object { name: name.to_owned(), id: None, mesh, info, folder: Some(folder) })
 }
@@ -443,6 +671,138 @@ mod tests {
         assert!(store.load("part").unwrap().file("kept.bin").unwrap().is_file());
         // Nothing else is left in the store.
         assert_eq!(std::fs::read_dir(root.path().join("store")).unwrap().count(), 1);
+    }
+
+    /// Both kinds of end between the two renames: the second fails, and the process dies.
+    #[test]
+    fn a_replacement_that_ends_between_its_two_renames_loses_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        add(&store, 1.0, false, Ok(())).unwrap();
+        let diameter = || store.load("part").unwrap().mesh.unwrap().diameter();
+        let (place, away) = (root.path().join("part"), store.own("part", OLD));
+        let fresh = || {
+            let fresh = store.own("part", NEW);
+            std::fs::create_dir_all(&fresh).unwrap();
+            fresh
+        };
+        for failing in [1..2, 1..3] {
+            let calls = std::cell::Cell::new(0);
+            let result = swap(&fresh(), &place, Some(&away), |from, to| {
+                calls.set(calls.get() + 1);
+                if failing.contains(&(calls.get() - 1)) {
+                    return Err(io::Error::from(io::ErrorKind::StorageFull));
+                }
+                std::fs::rename(from, to)
+            });
+            assert_eq!(result.unwrap_err().kind(), io::ErrorKind::StorageFull);
+            // Where taking it back failed too, it is there under its other name alone.
+            assert_eq!(place.exists(), failing.len() == 1);
+            assert_eq!(store.names().unwrap(), ["part"]);
+            assert!((diameter() - mesh(1.0).diameter()).abs() < 1e-6 && place.exists());
+        }
+        // Killed between: the same folders, and the lock file of a process that is no more.
+        fresh();
+        std::fs::rename(&place, root.path().join(".part.1.old")).unwrap();
+        std::fs::write(root.path().join(".part.lock"), "1").unwrap();
+        assert_eq!(store.records().unwrap()[0].0, "part");
+        assert!((diameter() - mesh(1.0).diameter()).abs() < 1e-6);
+        // Killed behind: the new one stays, what is left of the old one never comes back.
+        std::fs::create_dir(root.path().join(".part.2.old")).unwrap();
+        std::fs::copy(place.join("object.json"), root.path().join(".part.2.old/object.json")).unwrap();
+        store.remove("part").unwrap();
+        assert_eq!(store.names().unwrap(), Vec::<String>::new());
+        assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn two_who_change_an_object_at_once_are_one_after_the_other_and_readers_see_one_or_the_other() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        add(&store, 1.0, false, Ok(())).unwrap();
+        let done = std::sync::atomic::AtomicUsize::new(0);
+        std::thread::scope(|scope| {
+            for k in 0..2 {
+                let (store, done) = (&store, &done);
+                scope.spawn(move || {
+                    for _ in 0..60 {
+                        match add(store, 1.0 + 0.1 * f64::from(k), true, Ok(())) {
+                            Ok(()) | Err(StoreError::Locked(LockError::Taken { .. })) => {}
+                            Err(error) => panic!("{error:?}"),
+                        }
+                    }
+                    done.fetch_add(1, std::sync::atomic::Ordering::SeqCst);
+                });
+            }
+            while done.load(std::sync::atomic::Ordering::SeqCst) < 2 {
+                let records = store.records().unwrap();
+                assert_eq!(records.iter().map(|r| r.0.as_str()).collect::<Vec<_>>(), ["part"]);
+            }
+        });
+        let found = store.load("part").unwrap().mesh.unwrap().diameter() / mesh(1.0).diameter();
+        assert!((found - 1.0).abs() < 1e-6 || (found - 1.1).abs() < 1e-6, "{found}");
+        assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 1);
+        let lock = WriteLock::take(&root.path().join("part")).unwrap();
+        for result in [add(&store, 1.0, true, Ok(())), store.remove("part")] {
+            assert!(matches!(result, Err(StoreError::Locked(_))), "{result:?}");
+        }
+        drop(lock);
+        store.remove("part").unwrap();
+    }
+
+    #[test]
+    fn a_folder_that_is_no_object_is_neither_replaced_nor_removed() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        std::fs::create_dir(root.path().join("part")).unwrap();
+        std::fs::write(root.path().join("part/photograph.png"), "of my grandmother").unwrap();
+        let error = add(&store, 1.0, true, Ok(())).unwrap_err();
+        assert!(matches!(error, StoreError::NotAnObject { .. }), "{error}");
+        assert!(matches!(store.remove("part"), Err(StoreError::Unknown { .. })));
+        assert!(root.path().join("part/photograph.png").is_file());
+    }
+
+    #[test]
+    fn a_broken_file_of_the_store_is_an_error_that_says_how_to_make_it_again() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        add(&store, 1.0, false, Ok(())).unwrap();
+        let file = root.path().join("part/object.json");
+        let good = std::fs::read_to_string(&file).unwrap();
+        let axis = |axis: &str, offset: &str| {
+            format!("\"symmetries_continuous\": [{{\"axis\": {axis}, \"offset\": {offset}}}]")
+        };
+        let none = "\"symmetries_continuous\": []";
+        let diameter = format!("\"diameter\": {}", mesh(1.0).diameter());
+        for (field, from, to) in [
+            ("diameter", diameter.as_str(), "\"diameter\": 12.5".to_owned()),
+            ("diameter", &diameter, "\"diameter\": 0".to_owned()),
+            ("faces", "\"faces\": 4", "\"faces\": 4000000000".to_owned()),
+            ("vertices", "\"vertices\": 4", "\"vertices\": 0".to_owned()),
+            ("axis", none, axis("[0, 0, 0]", "[0, 0, 0]")),
+            ("offset", none, axis("[0, 0, 1]", "[0, 0, 1e200]")),
+            (
+                "symmetries_discrete",
+                "\"symmetries_discrete\": []",
+                "\"symmetries_discrete\": [[[1,0,0,0],[0,1,0,0],[0,0,1,1e300],[0,0,0,1]]]".to_owned(),
+            ),
+            ("version", "\"version\": 1", "\"version\": 7".to_owned()),
+        ] {
+            assert!(good.contains(from), "{from}: {good}");
+            std::fs::write(&file, good.replacen(from, &to, 1)).unwrap();
+            let error = store.load("part").unwrap_err().to_string();
+            for part in [field, "object.json", "sixfold object add part", "--replace"] {
+                assert!(error.contains(part), "{part}: {error}");
+            }
+        }
+        std::fs::write(&file, &good).unwrap();
+        store.load("part").unwrap();
+        std::fs::write(root.path().join("part/mesh.ply"), "ply\n").unwrap();
+        let error = store.load("part").unwrap_err();
+        assert!(error.to_string().contains("object add part"), "{error}");
+        // An object that cannot be read can be removed.
+        std::fs::write(&file, "{").unwrap();
+        store.remove("part").unwrap();
     }
 
     #[test]

@@ -1,10 +1,12 @@
 //! Images and numbers as bytes: PNG for what people may want to look at, little-endian numbers for the rest.
 
 use std::io::Cursor;
+use std::path::Path;
 
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
+use sixfold_io::{ImageFile, ImageFileError};
 
 use super::StoreError;
 use crate::Attempt;
@@ -51,6 +53,11 @@ fn png(image: DynamicImage) -> Option<Vec<u8>> {
     Some(bytes.into_inner())
 }
 
+/// An image of a column, of the crop's size: nothing larger is decoded.
+fn stored<'a>(bytes: &'a [u8], field: &'static str, side: usize) -> ImageFile<'a> {
+    ImageFile::of_bytes(Path::new(field), bytes).with_limit((side * side) as u64)
+}
+
 /// The crop of stored images. Points follow from depth and camera; so does the extent, but it is stored, as it is what the
 /// VD-NOC was made with.
 pub(super) fn crop(
@@ -60,30 +67,29 @@ pub(super) fn crop(
     table: Option<Plane>,
 ) -> Result<Crop, (&'static str, String)> {
     let side = camera.width;
-    let read = |bytes: &[u8], field: &'static str| {
-        let image = image::load_from_memory_with_format(bytes, ImageFormat::Png)
-            .map_err(|e| (field, e.to_string()))?;
-        if (image.width() as usize, image.height() as usize) != (side, side) {
-            return Err((field, format!("{}x{} pixels, not {side}x{side}", image.width(), image.height())));
-        }
-        Ok(image)
+    let wrong = |field, error: ImageFileError| (field, error.to_string());
+    let sized = |field, size: (usize, usize)| match size {
+        (width, height) if (width, height) == (side, side) => Ok(()),
+        (width, height) => Err((field, format!("{width}x{height} pixels, not {side}x{side}"))),
     };
-    let depth = read(&images.depth, "depth")?.into_luma16();
+    let depth = stored(&images.depth, "depth", side).units().map_err(|e| wrong("depth", e))?;
+    sized("depth", depth.size())?;
     let color = |bytes: &[u8], field| -> Result<Vec<[f32; 3]>, (&'static str, String)> {
-        let image = read(bytes, field)?.into_rgb8();
-        Ok(image.pixels().map(|p| p.0.map(|v| (f32::from(v) - 127.5) / 127.5)).collect())
+        let image = stored(bytes, field, side).rgb().map_err(|e| wrong(field, e))?;
+        sized(field, image.size())?;
+        Ok(image.as_slice().iter().map(|p| p.map(|v| (f32::from(v) - 127.5) / 127.5)).collect())
     };
     let mut normals = color(&images.normals, "normals")?;
     let mut vd_noc = color(&images.vd_noc, "vd_noc")?;
     let total = side * side;
     let (mut mask, mut points) = (vec![false; total], vec![[0.0; 3]; total]);
-    for (i, pixel) in depth.pixels().enumerate() {
-        if pixel.0[0] == 0 {
+    for (i, &units) in depth.as_slice().iter().enumerate() {
+        if units == 0 {
             (normals[i], vd_noc[i]) = ([0.0; 3], [0.0; 3]);
             continue;
         }
         mask[i] = true;
-        let z = f64::from(pixel.0[0]) * DEPTH_STEP;
+        let z = f64::from(units) * DEPTH_STEP;
         let p = camera.unproject(&Vec2::new((i % side) as f64, (i / side) as f64), z);
         points[i] = [p.x as f32, p.y as f32, p.z as f32];
     }
@@ -168,12 +174,12 @@ pub(super) fn attempt(attempt: &Attempt) -> Result<([u8; 16], String), StoreErro
 }
 
 pub(super) fn from_attempt(id: i64, text: &str) -> Result<Attempt, StoreError> {
-    serde_json::from_str(text).map_err(|e| StoreError::Field {
-        id,
-        field: "attempt",
-        expected: "an attempt as this program writes it",
-        found: e.to_string(),
-    })
+    let attempt: Attempt =
+        serde_json::from_str(text).map_err(|e| StoreError::Attempt { id, reason: e.to_string() })?;
+    match attempt.check() {
+        Ok(()) => Ok(attempt),
+        Err(field) => Err(StoreError::Attempt { id, reason: format!("no finite number in {field}") }),
+    }
 }
 
 /// FNV-1a over 128 bits: the same bytes give the same key on every machine.

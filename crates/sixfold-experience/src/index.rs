@@ -38,6 +38,8 @@ pub struct FeatureIndex {
     exact: Vec<f32>,
     coarse: Vec<i16>,
     position: Position,
+    /// Experiences with something else in place of a feature.
+    unusable: Vec<i64>,
 }
 
 impl FeatureIndex {
@@ -49,7 +51,13 @@ impl FeatureIndex {
             exact: vec![],
             coarse: vec![],
             position: Position::default(),
+            unusable: vec![],
         }
+    }
+
+    /// Experiences that are not found, wholly or from some sides, as what stands in place of a feature is none; each once.
+    pub fn take_unusable(&mut self) -> Vec<i64> {
+        std::mem::take(&mut self.unusable)
     }
 
     /// Features in the index, in-plane copies included.
@@ -69,8 +77,14 @@ impl FeatureIndex {
     pub fn refresh(&mut self, store: &dyn ExperienceStore) -> Result<(), StoreError> {
         let changes = store.changes(self.position)?;
         for f in changes.features {
-            if f.network == self.network && f.feature.len() == FEATURE {
+            if f.network != self.network {
+                continue;
+            }
+            let finite = f.angle.is_finite() && f.feature.iter().all(|v| v.is_finite());
+            if finite && f.feature.len() == FEATURE {
                 self.insert(f.experience, f.angle, &f.feature);
+            } else if !self.unusable.contains(&f.experience) {
+                self.unusable.push(f.experience);
             }
         }
         if !changes.forgotten.is_empty() {

@@ -21,6 +21,8 @@ mod experience;
 mod index;
 #[cfg(feature = "sqlite")]
 mod outbox;
+#[cfg(feature = "postgres")]
+mod password_guard;
 mod place;
 #[cfg(feature = "postgres")]
 mod postgres;
@@ -88,7 +90,7 @@ pub enum StoreError {
     },
     /// The file is damaged.
     #[error(
-        "{}: the experience store is damaged ({reason}); what can still be read can be saved with `sixfold grasp store export`", file.display()
+        "{}: the experience store is damaged ({reason}); what can still be read of it goes into a new store with `sixfold grasp store merge NEW.db {}`, or else take a copy of it from a backup", file.display(), file.display()
     )]
     Broken {
         /// The file.
@@ -188,6 +190,14 @@ pub enum StoreError {
         /// What it holds.
         found: String,
     },
+    /// An attempt cannot be used.
+    #[error("attempt {id}: expected an attempt as this program writes it, found {reason}")]
+    Attempt {
+        /// Number of the attempt.
+        id: i64,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// Anything else.
     #[error("{}: {reason}", file.display())]
     Other {
@@ -210,6 +220,11 @@ impl StoreError {
                 | StoreError::Full { .. }
                 | StoreError::ReadOnly { .. }
         )
+    }
+
+    /// Whether it is the fault of one row, which can be left out or removed, and not of the whole store.
+    pub fn is_of_one_row(&self) -> bool {
+        matches!(self, StoreError::Field { .. } | StoreError::Attempt { .. })
     }
 }
 
@@ -267,6 +282,30 @@ pub struct Summary {
     pub provenance: String,
 }
 
+/// All that came of one task of grasping: stored whole or not at all, so that who is interrupted does the task again.
+#[derive(Clone, Copy, Default)]
+pub struct TaskRecord<'a> {
+    /// What was tried, in that order.
+    pub attempts: &'a [Attempt],
+    /// The grasp that held.
+    pub experience: Option<&'a Experience>,
+    /// The row that a journal keeps of the task.
+    pub journal: Option<JournalEntry<'a>>,
+}
+
+/// A row of a journal outside the store. The store keeps the row too, with what it is about: a journal can be completed from it
+/// after an interruption, and a journal whose store is another one is noticed.
+#[derive(Clone, Copy)]
+pub struct JournalEntry<'a> {
+    /// The journal's name, which no other has.
+    pub journal: &'a str,
+    /// The row, once the number of the stored experience is known.
+    pub row: &'a dyn Fn(Option<i64>) -> String,
+}
+
+/// An attempt with its number, or what is wrong with it.
+pub type AttemptRow = (i64, Result<Attempt, StoreError>);
+
 /// What a store of experiences does. Numbers of experiences are never used twice.
 pub trait ExperienceStore {
     /// Stores an experience with its in-plane copies and returns its number. When it returns, the experience survives
@@ -307,11 +346,61 @@ pub trait ExperienceStore {
     /// [`StoreError`]; nothing is stored then.
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError>;
 
-    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers.
+    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers. Those that cannot be
+    /// read are left out: [`ExperienceStore::attempt_rows`] has them.
     ///
     /// # Errors
     /// [`StoreError`].
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError>;
+
+    /// As [`ExperienceStore::attempts`], with what is wrong with those that cannot be read.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn attempt_rows(&self, after: i64) -> Result<Vec<AttemptRow>, StoreError> {
+        Ok(self.attempts(after)?.into_iter().map(|(id, attempt)| (id, Ok(attempt))).collect())
+    }
+
+    /// Forgets an attempt; false when there was none. Who has read it keeps it until its next start.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn forget_attempt(&mut self, id: i64) -> Result<bool, StoreError> {
+        let reason = format!("attempt {id} cannot be removed from a store of this kind");
+        Err(StoreError::Other { file: PathBuf::from("experience store"), reason })
+    }
+
+    /// Stores all that came of one task at once; the number of its experience. A store that keeps no journals stores one thing
+    /// after another.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing is stored then.
+    fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+        if record.journal.is_some() {
+            let reason = "a store of this kind keeps no journal".to_owned();
+            return Err(StoreError::Other { file: PathBuf::from("experience store"), reason });
+        }
+        for attempt in record.attempts {
+            self.add_attempt(attempt)?;
+        }
+        record.experience.map(|experience| Ok(self.add(experience)?.0)).transpose()
+    }
+
+    /// The rows that were stored for a journal ([`JournalEntry`]), in that order.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn journal(&self, _name: &str) -> Result<Vec<String>, StoreError> {
+        Ok(vec![])
+    }
+
+    /// The numbers of all experiences, in order, those that cannot be read included.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    fn numbers(&self) -> Result<Vec<i64>, StoreError> {
+        Ok(self.list()?.into_iter().map(|summary| summary.id).collect())
+    }
 
     /// A name that no other store has, where the store has one: a server's, so that its robots notice when another one answers.
     ///

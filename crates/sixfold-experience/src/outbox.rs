@@ -15,7 +15,10 @@ use rusqlite::{OptionalExtension, params};
 
 use crate::Attempt;
 
-use super::{Changes, Experience, ExperienceStore, Position, SqliteStore, StoreError, Stored, Summary};
+use super::{
+    AttemptRow, Changes, Experience, ExperienceStore, Position, SqliteStore, StoreError, Stored, Summary,
+    TaskRecord,
+};
 
 /// `delivered`: the server's number of an experience, or why the server will not have it. `followed`: which server, and how far;
 /// `followed_attempts`: the last attempt of the copy that the server has, and the last one of the server that the copy has.
@@ -71,6 +74,11 @@ pub enum Notice {
         /// The file, in which it stays.
         file: PathBuf,
     },
+    /// An attempt is left out: it cannot be read.
+    Attempt {
+        /// Which, and why.
+        reason: String,
+    },
     /// An experience of the server is left out.
     Unreadable {
         /// Its number on the server.
@@ -107,9 +115,10 @@ impl fmt::Display for Notice {
             }
             Notice::Refused { id, reason, file } => write!(
                 f,
-                "the server will not have experience {id} ({reason}); it stays in {} and is not offered again",
+                "experience {id} is not delivered to the server ({reason}); it stays in {} and is not offered again",
                 file.display()
             ),
+            Notice::Attempt { reason } => write!(f, "{reason}; it is left out"),
             Notice::Unreadable { number, reason } => {
                 write!(f, "experience {number} of the server is left out: {reason}")
             }
@@ -240,18 +249,26 @@ impl OutboxStore {
             .first()
             .copied()
             .unwrap_or_default();
-        let mine = self.copy.borrow().attempts(sent).map_err(Trouble::Here)?;
+        let mine = self.copy.borrow().attempt_rows(sent).map_err(Trouble::Here)?;
         for (id, attempt) in mine {
-            let answer = self.remote.borrow_mut().add_attempt(&attempt);
-            answer.map_err(Trouble::There)?;
+            if let Some(attempt) = self.readable(attempt) {
+                let answer = self.remote.borrow_mut().add_attempt(&attempt);
+                answer.map_err(Trouble::There)?;
+            }
             self.follow_attempts("sent", id)?;
         }
-        let theirs = self.remote.borrow().attempts(taken).map_err(Trouble::There)?;
+        let theirs = self.remote.borrow().attempt_rows(taken).map_err(Trouble::There)?;
         for (number, attempt) in theirs {
-            self.copy.borrow_mut().add_attempt(&attempt).map_err(Trouble::Here)?;
+            if let Some(attempt) = self.readable(attempt) {
+                self.copy.borrow_mut().add_attempt(&attempt).map_err(Trouble::Here)?;
+            }
             self.follow_attempts("taken", number)?;
         }
         Ok(())
+    }
+
+    fn readable(&self, attempt: Result<Attempt, StoreError>) -> Option<Attempt> {
+        attempt.map_err(|error| (self.listener)(&Notice::Attempt { reason: error.to_string() })).ok()
     }
 
     fn follow_attempts(&self, which: &str, number: i64) -> Result<(), Trouble> {
@@ -306,10 +323,15 @@ impl OutboxStore {
         let mut done = 0;
         let mut trouble = Ok(());
         for id in waiting {
-            let stored = self.copy.borrow().get(id).map_err(Trouble::Here)?;
-            // Another process forgot it.
-            let Some(stored) = stored else { continue };
-            let answer = self.remote.borrow_mut().add(&stored.experience);
+            let stored = self.copy.borrow().get(id);
+            let answer = match stored {
+                Ok(Some(stored)) => self.remote.borrow_mut().add(&stored.experience),
+                // Another process forgot it.
+                Ok(None) => continue,
+                // The others need not wait for one that cannot be read.
+                Err(error @ StoreError::Field { .. }) => Err(error),
+                Err(error) => return Err(Trouble::Here(error)),
+            };
             match answer {
                 Ok((number, _)) => {
                     self.note(id, Some(number), None)?;
@@ -462,8 +484,30 @@ impl ExperienceStore for OutboxStore {
         self.copy.borrow_mut().add_attempt(attempt)
     }
 
+    /// Delivered at the next contact, at once where there is an experience.
+    fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+        let id = self.copy.borrow_mut().add_record(record)?;
+        if id.is_some() {
+            self.synchronise(id)?;
+        }
+        Ok(id)
+    }
+
+    fn journal(&self, name: &str) -> Result<Vec<String>, StoreError> {
+        self.copy.borrow().journal(name)
+    }
+
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
         self.copy.borrow().attempts(after)
+    }
+
+    fn attempt_rows(&self, after: i64) -> Result<Vec<AttemptRow>, StoreError> {
+        self.copy.borrow().attempt_rows(after)
+    }
+
+    /// In the copy alone.
+    fn forget_attempt(&mut self, id: i64) -> Result<bool, StoreError> {
+        self.copy.borrow_mut().forget_attempt(id)
     }
 
     fn changes(&self, since: Position) -> Result<Changes, StoreError> {

@@ -1,4 +1,7 @@
 //! Where a store lies, as a user writes it: a file, or the address of a server.
+//!
+//! This is the only parser of such places. A text that looks like an address and cannot be one is refused rather than taken for
+//! the name of a file, and no form of it, right or wrong, is shown with its password.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -15,15 +18,24 @@ pub enum StorePlace {
     File(PathBuf),
     /// A PostgreSQL server: `postgres://user@host:port/database`.
     Server(String),
+    /// What looks like the address of a server and is none: it cannot be opened.
+    Unusable {
+        /// What of it can be shown.
+        shown: String,
+        /// What is wrong.
+        reason: String,
+    },
 }
 
 impl From<OsString> for StorePlace {
     fn from(text: OsString) -> StorePlace {
-        match text.to_str() {
-            Some(url) if url.starts_with("postgres://") || url.starts_with("postgresql://") => {
-                StorePlace::Server(url.to_owned())
-            }
-            _ => StorePlace::File(text.into()),
+        let readable = text.to_string_lossy();
+        if !looks_like_an_address(&readable) {
+            return StorePlace::File(text.into());
+        }
+        match address(&readable) {
+            Ok(url) => StorePlace::Server(url),
+            Err(reason) => StorePlace::Unusable { shown: shown(&readable), reason },
         }
     }
 }
@@ -39,6 +51,7 @@ impl fmt::Display for StorePlace {
         match self {
             StorePlace::File(path) => write!(f, "{}", path.display()),
             StorePlace::Server(url) => f.write_str(&shown(url)),
+            StorePlace::Unusable { shown, .. } => f.write_str(shown),
         }
     }
 }
@@ -54,6 +67,7 @@ impl Serialize for StorePlace {
         match self {
             StorePlace::File(path) => path.serialize(serializer),
             StorePlace::Server(url) => shown(url).serialize(serializer),
+            StorePlace::Unusable { shown, .. } => shown.serialize(serializer),
         }
     }
 }
@@ -76,6 +90,20 @@ impl StorePlace {
             StorePlace::Server(url) => Ok(Box::new(super::PostgresStore::open(url)?)),
             #[allow(unreachable_patterns)]
             _ => Err(self.not_built()),
+        }
+    }
+
+    /// Opens a store to save what is in it: of a damaged file whatever can still be read.
+    ///
+    /// # Errors
+    /// As [`StorePlace::open`].
+    pub fn open_to_save(&self) -> Result<Box<dyn ExperienceStore + Send>, StoreError> {
+        match (self.open(), self) {
+            #[cfg(feature = "sqlite")]
+            (Err(StoreError::Broken { .. }), StorePlace::File(path)) => {
+                Ok(Box::new(super::SqliteStore::open_damaged(path)?))
+            }
+            (opened, _) => opened,
         }
     }
 
@@ -119,28 +147,179 @@ impl StorePlace {
         }
     }
 
+    /// Why it cannot be opened: it is no place, or this program was built without its kind of store.
     fn not_built(&self) -> StoreError {
         let feature = match self {
             StorePlace::File(_) => "sqlite",
             StorePlace::Server(_) => "postgres",
+            StorePlace::Unusable { shown, reason } => {
+                return StoreError::Address { server: shown.clone(), reason: reason.clone() };
+            }
         };
         StoreError::Feature { place: self.to_string(), feature }
     }
 }
 
-/// A server's address without what may be a password: user, host, port and database, no parameters. Of one that is not clear in
-/// that, nothing.
-pub(super) fn shown(url: &str) -> String {
-    let (scheme, rest) = url.split_once("://").unwrap_or(("postgres", ""));
-    let user_and_host = match rest.split_once('@') {
-        _ if rest.matches('@').count() > 1 || rest.to_lowercase().contains("password") => None,
-        None => Some((None, rest)),
-        Some((user, host)) => Some((user.split(':').next(), host)),
+/// Words before an equals sign in `host=server user=robot password=..` and its like.
+const KEYWORDS: [&str; 15] = [
+    "host", "hostaddr", "port", "user", "password", "dbname", "database", "service", "passfile", "sslmode",
+    "server", "username", "uid", "pwd", "passwd",
+];
+
+/// Whether a text is meant to be the address of a server. A path that begins like one (`/`, `./`, `../`) never is.
+fn looks_like_an_address(text: &str) -> bool {
+    let text = text.trim_start_matches(|c: char| c.is_whitespace() || c.is_control()).to_ascii_lowercase();
+    let absolute = text.starts_with('/') && !text.starts_with("//");
+    if absolute || text.starts_with("./") || text.starts_with("../") || text.starts_with("~/") {
+        return false;
+    }
+    // A drive's letter is no scheme.
+    let text = match text.as_bytes() {
+        [drive, b':', b'\\' | b'/', ..] if drive.is_ascii_alphabetic() => &text[2..],
+        _ => &text[..],
     };
-    let Some((user, host)) = user_and_host else { return format!("{scheme}://(not shown)") };
-    let host = host.split('?').next().unwrap_or_default();
+    let of_postgres = text.split_once(':').is_some_and(|(scheme, _)| scheme.starts_with("postgres"));
+    let credentials =
+        text.split_once('@').is_some_and(|(before, _)| before.contains(':') || before.contains("%3a"));
+    let word_before = |text: &str| {
+        let word = text.trim_end().rsplit(|c: char| !c.is_ascii_alphanumeric()).next();
+        word.is_some_and(|word| KEYWORDS.contains(&word))
+    };
+    let keywords = text.rsplit('=').skip(1).any(word_before);
+    text.contains("://") || of_postgres || credentials || keywords
+}
+
+/// The address in a text, its scheme in small letters and without blanks around it.
+///
+/// # Errors
+/// What is wrong with it, without any part of it.
+pub(super) fn address(text: &str) -> Result<String, String> {
+    let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
+    const FILE: &str = "if it is the name of a file, write ./ before it";
+    let Some((scheme, rest)) = text.split_once("://") else {
+        return Err(format!(
+            "it looks like the address of a server, but does not begin with postgres://; {FILE}"
+        ));
+    };
+    let scheme = scheme.to_ascii_lowercase();
+    if scheme != "postgres" && scheme != "postgresql" {
+        return Err(format!("this kind of address is not known, only postgres:// is; {FILE}"));
+    }
+    if rest.matches('@').count() > 1 {
+        return Err("there is more than one @; within a password it is written %40".to_owned());
+    }
+    if let Some((credentials, _)) = rest.split_once('@') {
+        let user = credentials.split(':').next().unwrap_or_default().to_ascii_lowercase();
+        if user.contains("%3a") {
+            return Err("the colon between user and password is written : and not %3A".to_owned());
+        }
+    }
+    Ok(format!("{scheme}://{rest}"))
+}
+
+/// A server's address without what may be a password: user, host, port and database, no parameters. Of one that is not clear in
+/// that, nothing but the scheme.
+pub(super) fn shown(text: &str) -> String {
+    let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
+    let plain = |part: &str, more: &str| {
+        part.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c) || more.contains(c))
+    };
+    let Some((scheme, rest)) = text.split_once("://").filter(|(scheme, _)| plain(scheme, "+")) else {
+        return "(an address that is not shown)".to_owned();
+    };
+    let hidden = format!("{scheme}://(not shown)");
+    let (user, rest) = match rest.split_once('@') {
+        Some((credentials, rest)) => (credentials.split(':').next(), rest),
+        None => (None, rest),
+    };
+    let place = rest.split(['?', '#']).next().unwrap_or_default();
+    let (hosts, database) = place.split_once('/').unwrap_or((place, ""));
+    // What stands behind a host's colon is a port, or else a password whose @ is missing.
+    let of_a_host = |host: &str| {
+        let behind = host.rsplit(']').next().unwrap_or(host);
+        let port = behind.split_once(':').map_or("", |(_, port)| port);
+        plain(host, ":[]%") && port.chars().all(|c| c.is_ascii_digit())
+    };
+    let lower = rest.to_ascii_lowercase();
+    let clear = !["password", "%3a", "%40", "@"].iter().any(|word| lower.contains(word))
+        && hosts.split(',').all(of_a_host)
+        && plain(database, "")
+        && plain(user.unwrap_or_default(), "");
     match user {
-        Some(user) => format!("{scheme}://{user}@{host}"),
-        None => format!("{scheme}://{host}"),
+        _ if !clear => hidden,
+        Some(user) => format!("{scheme}://{user}@{place}"),
+        None => format!("{scheme}://{place}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_form_of_an_address_shows_its_password_or_becomes_a_file() {
+        for text in [
+            "Postgres://robot:secret@127.0.0.1:1/fleet",
+            "POSTGRESQL://robot:secret@127.0.0.1:1/fleet",
+            "postgresql+psycopg://robot:secret@host/fleet",
+            "postgres+ssl://secret@host/fleet",
+            "host=server user=robot password=secret dbname=fleet",
+            "user=robot password = 'secret'",
+            "Server=host;Database=fleet;Uid=robot;Pwd=secret;",
+            " postgres://robot:secret@127.0.0.1:1/fleet",
+            "\tpostgres://robot:secret@127.0.0.1:1/fleet\n",
+            "postgres://robot%3Asecret@127.0.0.1:1/fleet",
+            "postgres://robot%3asecret:x@127.0.0.1:1/fleet",
+            "user%3Asecret@host/fleet",
+            "robot:secret@host/fleet",
+            "//robot:secret@host/fleet",
+            "postgres:robot:secret@host/fleet",
+            "postgres:/robot:secret@host/fleet",
+            "postgres://robot:secret",
+            "postgres://robot:se@secret@host/fleet",
+            "postgres://robot/secret@host/fleet",
+            "postgres://host:1/fleet?password=secret",
+            "postgres://host:1/fleet;password=secret",
+            "postgres://robot%3Asecret%40host/fleet",
+            "postgres://127.0.0.1:1/fleet?passw%6Frd=secret#secret",
+            "jdbc:postgresql://host/fleet?user=robot&password=secret",
+            "mysql://robot:secret@host/fleet",
+            "https://robot:secret@host/fleet",
+        ] {
+            let place = StorePlace::from(text);
+            assert!(!matches!(place, StorePlace::File(_)), "{text:?} is taken for a file");
+            let serialised = serde_json::to_string(&place).unwrap();
+            let errors = [place.open().err(), place.create().err(), place.open_to_save().err()];
+            for shown in [format!("{place} {place:?} {serialised}"), format!("{errors:?}")]
+                .into_iter()
+                .chain(errors.iter().map(|e| e.as_ref().expect("nobody is there").to_string()))
+            {
+                assert!(!shown.contains("secret"), "{text:?} is shown as {shown}");
+            }
+        }
+    }
+
+    #[test]
+    fn files_are_files_and_servers_are_servers() {
+        for text in [
+            "a.db",
+            "out/experience.db",
+            "./host=1.db",
+            "/data/robot:1@home.db",
+            "robot@home.db",
+            "C:\\a@b\\c.db",
+        ] {
+            assert_eq!(StorePlace::from(text), StorePlace::File(text.into()), "{text}");
+        }
+        for (text, shown) in [
+            ("postgres://robot:secret@server:5432/fleet", "postgres://robot@server:5432/fleet"),
+            ("Postgres://robot@server/fleet", "postgres://robot@server/fleet"),
+            ("postgresql://robot@[::1]:5432/fleet?connect_timeout=3", "postgresql://robot@[::1]:5432/fleet"),
+            ("postgres://a:1,b:2/fleet", "postgres://a:1,b:2/fleet"),
+        ] {
+            let place = StorePlace::from(text);
+            assert!(matches!(place, StorePlace::Server(_)), "{text}");
+            assert_eq!(place.to_string(), shown);
+        }
     }
 }

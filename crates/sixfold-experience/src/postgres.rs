@@ -4,7 +4,8 @@
 //! lock within their transaction. Without it two of them could commit in another order than that in which they drew their
 //! numbers, and a reader that has gone on to the higher number would never see the lower one.
 //!
-//! The connection is not encrypted: over a network that is not trusted it needs a tunnel.
+//! The connection is not encrypted: over a network that is not trusted it needs a tunnel. The password itself is never sent:
+//! a server that asks for it in clear text is refused.
 
 use std::cell::{Cell, RefCell};
 use std::error::Error as _;
@@ -12,16 +13,17 @@ use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use postgres::config::SslMode;
+use postgres::config::{Host, SslMode, SslNegotiation};
 use postgres::error::SqlState;
 use postgres::{Client, Config, Error, IsolationLevel, NoTls, Row, Transaction};
 
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
 use super::index::{Match, distance};
-use super::place::shown;
+use super::password_guard::{ASKED, PasswordGuard};
+use super::place::{address, shown};
 use super::row::{self, Raw};
-use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
+use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord};
 use crate::Attempt;
 use crate::FEATURE;
 
@@ -94,9 +96,7 @@ impl PostgresStore {
     pub fn at(url: &str) -> Result<PostgresStore, StoreError> {
         let server = shown(url);
         let wrong = |reason: &str| StoreError::Address { server: server.clone(), reason: reason.to_owned() };
-        if url.matches('@').count() > 1 {
-            return Err(wrong("there is more than one @; within a password it is written %40"));
-        }
+        let url = address(url).map_err(|reason| wrong(&reason))?;
         let mut config: Config = url.parse().map_err(|e: Error| {
             // Its cause names a parameter, never a value.
             wrong(&e.source().map_or_else(|| e.to_string(), |cause| format!("{e}: {cause}")))
@@ -202,8 +202,24 @@ impl PostgresStore {
         Ok(found)
     }
 
+    /// A connection on which no password is sent in clear text.
+    fn dial(&self) -> Result<Client, Error> {
+        let mut config = self.config.clone();
+        if config.get_hosts().iter().any(|host| !matches!(host, Host::Tcp(_))) {
+            // A socket of this machine, on which nobody listens.
+            return config.connect(NoTls);
+        }
+        if config.get_hosts().is_empty() {
+            for address in config.get_hostaddrs().to_vec() {
+                config.host(&address.to_string());
+            }
+        }
+        // Not encryption, but the way in which a wrapper around the connection is asked for.
+        config.ssl_mode(SslMode::Require).ssl_negotiation(SslNegotiation::Direct).connect(PasswordGuard)
+    }
+
     fn connect(&self) -> Result<Client, StoreError> {
-        let mut client = self.config.connect(NoTls).map_err(|e| match self.error(&e) {
+        let mut client = self.dial().map_err(|e| match self.error(&e) {
             // Nothing was asked yet.
             StoreError::Lost { server, reason } => StoreError::Unreachable { server, reason },
             error => error,
@@ -378,6 +394,9 @@ impl PostgresStore {
             (None, Some(cause)) => format!("{error}: {cause}"),
             (None, None) => error.to_string(),
         };
+        if reason.ends_with(ASKED) {
+            return StoreError::Refused { server, reason: ASKED.to_owned() };
+        }
         if is_lost(error) {
             return StoreError::Lost { server, reason };
         }
@@ -476,11 +495,18 @@ fn raw(row: &Row) -> Result<Raw, Error> {
     })
 }
 
-impl ExperienceStore for PostgresStore {
-    fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
-        let e = experience;
-        let (images, key) = row::prepare(e)?;
-        if let Some(copy) = e.copies.iter().find(|c| c.feature.len() != FEATURE) {
+/// An experience, and what it is stored by.
+struct Prepared<'a> {
+    experience: &'a Experience,
+    images: Images,
+    key: [u8; 16],
+}
+
+impl Prepared<'_> {
+    /// Tests what the server would refuse.
+    fn new(experience: &Experience) -> Result<Prepared<'_>, StoreError> {
+        let (images, key) = row::prepare(experience)?;
+        if let Some(copy) = experience.copies.iter().find(|c| c.feature.len() != FEATURE) {
             return Err(StoreError::Field {
                 id: 0,
                 field: "feature",
@@ -488,6 +514,12 @@ impl ExperienceStore for PostgresStore {
                 found: copy.feature.len().to_string(),
             });
         }
+        Ok(Prepared { experience, images, key })
+    }
+
+    /// Its number, and whether it is new.
+    fn insert(&self, t: &mut Transaction<'_>) -> Result<(i64, bool), Error> {
+        let Prepared { experience: e, images, key } = self;
         let key = key.as_slice();
         let gripper = row::gripper_text(&e.gripper);
         let pose = encode::pose(&e.camera_from_gripper);
@@ -498,43 +530,70 @@ impl ExperienceStore for PostgresStore {
         let table_plane = e.crop.table.as_ref().map(encode::plane);
         let angles: Vec<f64> = e.copies.iter().map(|c| c.angle).collect();
         let features: Vec<f32> = e.copies.iter().flat_map(|c| c.feature.iter().copied()).collect();
+        if let Some(row) = t.query_opt("SELECT id FROM experience WHERE key = $1", &[&key])? {
+            return Ok((row.try_get(0)?, false));
+        }
+        let row = t.query_one(
+            "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
+             extent, depth, normals, vd_noc, region, network, provenance, table_plane)
+             VALUES ($1,$2,$3,$4,$5,$6,$7,$8,$9,$10,$11,$12,$13,$14,$15,$16,$17,$18) RETURNING id",
+            &[
+                &key,
+                &e.time,
+                &e.object,
+                &e.part,
+                &gripper,
+                &e.opening,
+                &e.width,
+                &pose,
+                &camera,
+                &side,
+                &extent,
+                &images.depth,
+                &images.normals,
+                &images.vd_noc,
+                &region,
+                &e.network,
+                &e.provenance,
+                &table_plane,
+            ],
+        )?;
+        let id: i64 = row.try_get(0)?;
+        t.execute(
+            "INSERT INTO feature (experience, angle, feature)
+             SELECT $1, ($2::double precision[])[k], (($3::real[])[256 * (k - 1) + 1 : 256 * k])::vector
+             FROM generate_series(1, cardinality($2::double precision[])) k ORDER BY k",
+            &[&id, &angles, &features],
+        )?;
+        Ok((id, true))
+    }
+}
+
+fn insert_attempt(t: &mut Transaction<'_>, key: &[u8], text: &str) -> Result<u64, Error> {
+    t.execute(
+        "INSERT INTO attempt (key, attempt) SELECT $1, $2 WHERE NOT EXISTS (SELECT FROM attempt WHERE key = $1)",
+        &[&key, &text],
+    )
+}
+
+impl ExperienceStore for PostgresStore {
+    fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
+        let prepared = Prepared::new(experience)?;
+        self.transaction(Access::Write, |t| prepared.insert(t))
+    }
+
+    fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+        if record.journal.is_some() {
+            let reason = "a server keeps no journal, the robot's copy of its store does".to_owned();
+            return Err(StoreError::Other { file: self.place(), reason });
+        }
+        let attempts = record.attempts.iter().map(encode::attempt).collect::<Result<Vec<_>, _>>()?;
+        let prepared = record.experience.map(Prepared::new).transpose()?;
         self.transaction(Access::Write, |t| {
-            if let Some(row) = t.query_opt("SELECT id FROM experience WHERE key = $1", &[&key])? {
-                return Ok((row.try_get(0)?, false));
+            for (key, text) in &attempts {
+                insert_attempt(t, key, text)?;
             }
-            let row = t.query_one(
-                "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
-                 extent, depth, normals, vd_noc, region, network, provenance, table_plane)
-                 VALUES ($1,$2,$3,$4,$5,$6,$7,$8,$9,$10,$11,$12,$13,$14,$15,$16,$17,$18) RETURNING id",
-                &[
-                    &key,
-                    &e.time,
-                    &e.object,
-                    &e.part,
-                    &gripper,
-                    &e.opening,
-                    &e.width,
-                    &pose,
-                    &camera,
-                    &side,
-                    &extent,
-                    &images.depth,
-                    &images.normals,
-                    &images.vd_noc,
-                    &region,
-                    &e.network,
-                    &e.provenance,
-                    &table_plane,
-                ],
-            )?;
-            let id: i64 = row.try_get(0)?;
-            t.execute(
-                "INSERT INTO feature (experience, angle, feature)
-                 SELECT $1, ($2::double precision[])[k], (($3::real[])[256 * (k - 1) + 1 : 256 * k])::vector
-                 FROM generate_series(1, cardinality($2::double precision[])) k ORDER BY k",
-                &[&id, &angles, &features],
-            )?;
-            Ok((id, true))
+            prepared.as_ref().map(|prepared| Ok(prepared.insert(t)?.0)).transpose()
         })
     }
 
@@ -620,24 +679,26 @@ impl ExperienceStore for PostgresStore {
 
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
         let (key, text) = encode::attempt(attempt)?;
-        let key = key.as_slice();
-        self.transaction(Access::Write, |t| {
-            let rows = t.execute(
-                "INSERT INTO attempt (key, attempt) SELECT $1, $2 WHERE NOT EXISTS (SELECT FROM attempt WHERE key = $1)",
-                &[&key, &text],
-            )?;
-            Ok(rows > 0)
-        })
+        self.transaction(Access::Write, |t| Ok(insert_attempt(t, &key, &text)? > 0))
     }
 
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+        let rows = self.attempt_rows(after)?.into_iter();
+        Ok(rows.filter_map(|(id, attempt)| Some((id, attempt.ok()?))).collect())
+    }
+
+    fn attempt_rows(&self, after: i64) -> Result<Vec<AttemptRow>, StoreError> {
         let rows = self.transaction(Access::Read, |t| {
             t.query("SELECT id, attempt FROM attempt WHERE id > $1 ORDER BY id", &[&after])?
                 .iter()
                 .map(|row| Ok((row.try_get(0)?, row.try_get(1)?)))
                 .collect::<Result<Vec<(i64, String)>, Error>>()
         })?;
-        rows.into_iter().map(|(id, text)| Ok((id, encode::from_attempt(id, &text)?))).collect()
+        Ok(rows.into_iter().map(|(id, text)| (id, encode::from_attempt(id, &text))).collect())
+    }
+
+    fn forget_attempt(&mut self, id: i64) -> Result<bool, StoreError> {
+        self.transaction(Access::Write, |t| Ok(t.execute("DELETE FROM attempt WHERE id = $1", &[&id])? > 0))
     }
 
     fn identity(&self) -> Result<Option<String>, StoreError> {

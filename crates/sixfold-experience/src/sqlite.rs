@@ -7,12 +7,13 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Row, params};
+use rusqlite::types::ValueRef;
+use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Row, Transaction, params};
 
 use super::encode::{self, Images};
 use super::experience::{Copy, Experience, Stored};
 use super::row::{self, Raw};
-use super::{Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary};
+use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord};
 use crate::Attempt;
 
 /// Says that a SQLite file is one of ours: "6fEx".
@@ -36,6 +37,30 @@ const TABLES: &str = "
 const ATTEMPTS: &str = "
     CREATE TABLE attempt (id INTEGER PRIMARY KEY AUTOINCREMENT, key BLOB NOT NULL UNIQUE, attempt TEXT NOT NULL);
 ";
+/// Rows of journals outside; made by who keeps a journal, so that others need not know of it.
+const JOURNAL: &str = "
+    CREATE TABLE IF NOT EXISTS journal (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, row TEXT NOT NULL);
+";
+/// What an experience is read from.
+const COLUMNS: [&str; 17] = [
+    "time",
+    "object",
+    "part",
+    "gripper",
+    "opening",
+    "width",
+    "camera_from_gripper",
+    "camera",
+    "side",
+    "extent",
+    "depth",
+    "normals",
+    "vd_noc",
+    "region",
+    "network",
+    "provenance",
+    "table_plane",
+];
 
 /// A store in a file.
 #[derive(Debug)]
@@ -86,14 +111,64 @@ impl SqliteStore {
             });
         }
         // A reader of a write-ahead log takes part in it, so it opens for writing where it may.
-        let store = Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE)?;
-        store.check_version()?;
-        Ok(store)
+        let checked = |store: SqliteStore| store.check_version().map(|()| store);
+        match Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE).and_then(checked) {
+            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. }) => {
+                checked(Self::connect_to_unchanging(path)?)
+            }
+            opened => opened,
+        }
+    }
+
+    /// Opens a damaged store, to save what can still be read: every call may fail for some rows and not for others. The file is
+    /// not changed.
+    ///
+    /// # Errors
+    /// [`StoreError`] where nothing can be read.
+    pub fn open_damaged(path: &Path) -> Result<SqliteStore, StoreError> {
+        // SQLite refuses a file that is shorter than its header says, but not to who may repair it.
+        let lenient = |store: SqliteStore| {
+            store.run("PRAGMA writable_schema=ON")?;
+            store.check_version().map(|()| store)
+        };
+        Self::connect(path, OpenFlags::SQLITE_OPEN_READ_ONLY)
+            .and_then(lenient)
+            .or_else(|_| Self::connect_to_unchanging(path).and_then(lenient))
+    }
+
+    /// Opens a file where no files may be made beside it, as a write-ahead log needs.
+    fn connect_to_unchanging(path: &Path) -> Result<SqliteStore, StoreError> {
+        let mut log = path.as_os_str().to_owned();
+        log.push("-wal");
+        if std::fs::metadata(&log).is_ok_and(|log| log.len() > 0) {
+            return Err(StoreError::Open {
+                file: path.to_path_buf(),
+                reason: format!(
+                    "it may only be read, and what was stored last is in {} beside it: copy both files into a folder that may be written",
+                    Path::new(&log).display()
+                ),
+            });
+        }
+        let mut uri = "file:".to_owned();
+        for byte in path.to_string_lossy().bytes() {
+            match byte {
+                b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => uri.push(byte.into()),
+                _ => uri.push_str(&format!("%{byte:02X}")),
+            }
+        }
+        uri.push_str("?immutable=1");
+        let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI;
+        Self::connect_as(Path::new(&uri), path, flags)
     }
 
     fn connect(path: &Path, flags: OpenFlags) -> Result<SqliteStore, StoreError> {
-        let file = path.to_path_buf();
-        let connection = Connection::open_with_flags(path, flags | OpenFlags::SQLITE_OPEN_NO_MUTEX)
+        Self::connect_as(path, path, flags)
+    }
+
+    /// `file` is for the errors.
+    fn connect_as(place: &Path, file: &Path, flags: OpenFlags) -> Result<SqliteStore, StoreError> {
+        let file = file.to_path_buf();
+        let connection = Connection::open_with_flags(place, flags | OpenFlags::SQLITE_OPEN_NO_MUTEX)
             .map_err(|e| StoreError::Open { file: file.clone(), reason: e.to_string() })?;
         let store = SqliteStore { connection, file };
         store.checked(store.connection.busy_timeout(Duration::from_secs(20)))?;
@@ -195,50 +270,119 @@ impl SqliteStore {
         })
     }
 
-    fn insert(&mut self, e: &Experience, key: &[u8], images: &Images) -> rusqlite::Result<(i64, bool)> {
-        let transaction =
-            self.connection.transaction_with_behavior(rusqlite::TransactionBehavior::Immediate)?;
-        let known: Option<i64> = transaction
-            .query_row("SELECT id FROM experience WHERE key=?1", [key], |row| row.get(0))
-            .optional()?;
-        if let Some(id) = known {
-            return Ok((id, false));
-        }
-        transaction.execute(
-            "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
-             extent, depth, normals, vd_noc, region, network, provenance, table_plane)
-             VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18)",
-            params![
-                key,
-                e.time,
-                e.object,
-                e.part,
-                row::gripper_text(&e.gripper),
-                e.opening,
-                e.width,
-                encode::pose(&e.camera_from_gripper),
-                encode::camera(&e.crop.camera),
-                e.crop.side as i64,
-                encode::vectors(&[e.crop.extent.centre, e.crop.extent.half]),
-                images.depth,
-                images.normals,
-                images.vd_noc,
-                encode::bits(&e.region),
-                e.network,
-                e.provenance,
-                e.crop.table.as_ref().map(encode::plane)
-            ],
-        )?;
-        let id = transaction.last_insert_rowid();
-        for copy in &e.copies {
-            transaction.execute(
-                "INSERT INTO feature (experience, angle, feature) VALUES (?1,?2,?3)",
-                params![id, copy.angle, encode::floats(&copy.feature)],
-            )?;
-        }
-        transaction.commit()?;
-        Ok((id, true))
+    /// Rows of a table that are read one at a time, where reading all at once fails: the numbers up to the last one that was ever
+    /// given or, where that cannot be read either, that the file has room for.
+    fn candidates(&self, table: &str) -> std::ops::RangeInclusive<i64> {
+        let last: Result<Option<i64>, _> = self
+            .connection
+            .query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| r.get(0))
+            .optional();
+        // No row takes fewer bytes.
+        let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 256) as i64;
+        1..=last.map_or(room, |last| last.unwrap_or(0).min(room))
     }
+
+    /// The same for an experience that is not understood as for one that is: an error of one row.
+    fn of_row<T>(&self, id: i64, result: rusqlite::Result<T>) -> Result<T, StoreError> {
+        match result {
+            Err(error) if error.sqlite_error_code().is_none() => {
+                let column = match &error {
+                    rusqlite::Error::InvalidColumnType(column, ..)
+                    | rusqlite::Error::FromSqlConversionFailure(column, ..)
+                    | rusqlite::Error::IntegralValueOutOfRange(column, _) => COLUMNS.get(*column).copied(),
+                    _ => None,
+                };
+                Err(StoreError::Field {
+                    id,
+                    field: column.unwrap_or("feature"),
+                    expected: "a value of its column's kind",
+                    found: error.to_string(),
+                })
+            }
+            result => self.checked(result),
+        }
+    }
+
+    /// The attempts of a damaged file.
+    fn attempts_one_by_one(&self, after: i64) -> Vec<AttemptRow> {
+        let read = |id: i64| {
+            let row =
+                self.connection.query_row("SELECT attempt FROM attempt WHERE id=?1", [id], |r| text(r, 0));
+            match self.checked(row.optional()) {
+                Ok(text) => Some((id, encode::from_attempt(id, &text?))),
+                Err(error) => Some((id, Err(error))),
+            }
+        };
+        self.candidates("attempt").filter(|id| *id > after).filter_map(read).collect()
+    }
+
+    fn read_attempts(&self, after: i64) -> rusqlite::Result<Vec<(i64, String)>> {
+        let mut query =
+            self.connection.prepare("SELECT id, attempt FROM attempt WHERE id > ?1 ORDER BY id")?;
+        query.query_map([after], |row| Ok((row.get(0)?, text(row, 1)?)))?.collect()
+    }
+}
+
+fn insert_experience(
+    transaction: &Transaction<'_>,
+    e: &Experience,
+    key: &[u8],
+    images: &Images,
+) -> rusqlite::Result<(i64, bool)> {
+    let known: Option<i64> = transaction
+        .query_row("SELECT id FROM experience WHERE key=?1", [key], |row| row.get(0))
+        .optional()?;
+    if let Some(id) = known {
+        return Ok((id, false));
+    }
+    transaction.execute(
+        "INSERT INTO experience (key, time, object, part, gripper, opening, width, camera_from_gripper, camera, side,
+         extent, depth, normals, vd_noc, region, network, provenance, table_plane)
+         VALUES (?1,?2,?3,?4,?5,?6,?7,?8,?9,?10,?11,?12,?13,?14,?15,?16,?17,?18)",
+        params![
+            key,
+            e.time,
+            e.object,
+            e.part,
+            row::gripper_text(&e.gripper),
+            e.opening,
+            e.width,
+            encode::pose(&e.camera_from_gripper),
+            encode::camera(&e.crop.camera),
+            e.crop.side as i64,
+            encode::vectors(&[e.crop.extent.centre, e.crop.extent.half]),
+            images.depth,
+            images.normals,
+            images.vd_noc,
+            encode::bits(&e.region),
+            e.network,
+            e.provenance,
+            e.crop.table.as_ref().map(encode::plane)
+        ],
+    )?;
+    let id = transaction.last_insert_rowid();
+    for copy in &e.copies {
+        transaction.execute(
+            "INSERT INTO feature (experience, angle, feature) VALUES (?1,?2,?3)",
+            params![id, copy.angle, encode::floats(&copy.feature)],
+        )?;
+    }
+    Ok((id, true))
+}
+
+fn insert_attempt(connection: &Connection, key: &[u8], text: &str) -> rusqlite::Result<usize> {
+    connection.execute(
+        "INSERT INTO attempt (key, attempt) VALUES (?1,?2) ON CONFLICT(key) DO NOTHING",
+        params![key, text],
+    )
+}
+
+/// A text, or what stands in its place: a list shows broken rows too.
+fn text(row: &Row<'_>, column: usize) -> rusqlite::Result<String> {
+    Ok(match row.get_ref(column)? {
+        ValueRef::Text(bytes) => String::from_utf8_lossy(bytes).into_owned(),
+        other => format!("(not a text: {})", other.data_type()),
+    })
 }
 
 fn raw(row: &Row<'_>) -> rusqlite::Result<Raw> {
@@ -265,28 +409,88 @@ impl ExperienceStore for SqliteStore {
     fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
         let (images, key) = row::prepare(experience)?;
         self.bring_up_to_write()?;
-        let inserted = self.insert(experience, &key, &images);
+        let inserted = (|| {
+            let transaction =
+                self.connection.transaction_with_behavior(rusqlite::TransactionBehavior::Immediate)?;
+            let inserted = insert_experience(&transaction, experience, &key, &images)?;
+            transaction.commit()?;
+            Ok(inserted)
+        })();
         self.checked(inserted)
+    }
+
+    fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+        let attempts = record.attempts.iter().map(encode::attempt).collect::<Result<Vec<_>, _>>()?;
+        let prepared = record.experience.map(row::prepare).transpose()?;
+        self.bring_up_to_write()?;
+        let stored = (|| {
+            let transaction =
+                self.connection.transaction_with_behavior(rusqlite::TransactionBehavior::Immediate)?;
+            for (key, text) in &attempts {
+                insert_attempt(&transaction, key, text)?;
+            }
+            let mut id = None;
+            if let (Some(experience), Some((images, key))) = (record.experience, &prepared) {
+                id = Some(insert_experience(&transaction, experience, key, images)?.0);
+            }
+            if let Some(entry) = &record.journal {
+                transaction.execute_batch(JOURNAL)?;
+                transaction.execute(
+                    "INSERT INTO journal (name, row) VALUES (?1, ?2)",
+                    params![entry.journal, (entry.row)(id)],
+                )?;
+            }
+            transaction.commit()?;
+            Ok(id)
+        })();
+        self.checked(stored)
+    }
+
+    fn journal(&self, name: &str) -> Result<Vec<String>, StoreError> {
+        if self.number("SELECT count(*) FROM sqlite_master WHERE name='journal'")? == 0 {
+            return Ok(vec![]);
+        }
+        self.checked((|| {
+            let mut query = self.connection.prepare("SELECT row FROM journal WHERE name=?1 ORDER BY id")?;
+            query.query_map([name], |row| text(row, 0))?.collect()
+        })())
+    }
+
+    fn numbers(&self) -> Result<Vec<i64>, StoreError> {
+        match self.list() {
+            Err(StoreError::Broken { .. }) => {
+                // An experience that is not there can be told from one that is broken.
+                let there = |id: &i64| !matches!(self.get(*id), Ok(None));
+                Ok(self.candidates("experience").filter(there).collect())
+            }
+            listed => Ok(listed?.into_iter().map(|summary| summary.id).collect()),
+        }
     }
 
     fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
         let plane = if self.number("PRAGMA user_version")? < VERSION { "NULL" } else { "table_plane" };
         let question = format!(
-            "SELECT time, object, part, gripper, opening, width, camera_from_gripper, camera, side, extent, depth,
-             normals, vd_noc, region, network, provenance, {plane} FROM experience WHERE id=?1"
+            "SELECT {}, {plane} FROM experience WHERE id=?1",
+            COLUMNS[..COLUMNS.len() - 1].join(", ")
         );
-        let raw = self.checked(self.connection.query_row(&question, [id], raw).optional())?;
+        let raw = self.of_row(id, self.connection.query_row(&question, [id], raw).optional())?;
         let Some(raw) = raw else { return Ok(None) };
-        let copies = self.checked((|| {
-            let mut query = self
-                .connection
-                .prepare("SELECT angle, feature FROM feature WHERE experience=?1 ORDER BY id")?;
-            query
-                .query_map([id], |row| {
-                    Ok(Copy { angle: row.get(0)?, feature: encode::from_floats(&row.get::<_, Vec<u8>>(1)?) })
-                })?
-                .collect::<rusqlite::Result<Vec<Copy>>>()
-        })())?;
+        let copies = self.of_row(
+            id,
+            (|| {
+                let mut query = self
+                    .connection
+                    .prepare("SELECT angle, feature FROM feature WHERE experience=?1 ORDER BY id")?;
+                query
+                    .query_map([id], |row| {
+                        Ok(Copy {
+                            angle: row.get(0)?,
+                            feature: encode::from_floats(&row.get::<_, Vec<u8>>(1)?),
+                        })
+                    })?
+                    .collect::<rusqlite::Result<Vec<Copy>>>()
+            })(),
+        )?;
         Ok(Some(Stored { id, experience: raw.understand(id, copies)? }))
     }
 
@@ -297,16 +501,18 @@ impl ExperienceStore for SqliteStore {
             )?;
             query
                 .query_map([], |row| {
-                    let gripper: String = row.get(4)?;
                     Ok(Summary {
                         id: row.get(0)?,
-                        time: row.get(1)?,
-                        object: row.get(2)?,
-                        part: row.get(3)?,
-                        gripper: row::gripper_name(&gripper),
-                        width: row.get(5)?,
-                        network: row.get(6)?,
-                        provenance: row.get(7)?,
+                        time: row.get_ref(1)?.as_i64().unwrap_or(0),
+                        object: text(row, 2)?,
+                        part: match row.get_ref(3)? {
+                            ValueRef::Null => None,
+                            _ => Some(text(row, 3)?),
+                        },
+                        gripper: row::gripper_name(&text(row, 4)?),
+                        width: row.get_ref(5)?.as_f64().unwrap_or(0.0),
+                        network: text(row, 6)?,
+                        provenance: text(row, 7)?,
                     })
                 })?
                 .collect()
@@ -330,23 +536,31 @@ impl ExperienceStore for SqliteStore {
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
         let (key, text) = encode::attempt(attempt)?;
         self.bring_up_to_write()?;
-        self.checked(self.connection.execute(
-            "INSERT INTO attempt (key, attempt) VALUES (?1,?2) ON CONFLICT(key) DO NOTHING",
-            params![key, text],
-        ))
-        .map(|rows| rows > 0)
+        self.checked(insert_attempt(&self.connection, &key, &text)).map(|rows| rows > 0)
     }
 
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+        let rows = self.attempt_rows(after)?.into_iter();
+        Ok(rows.filter_map(|(id, attempt)| Some((id, attempt.ok()?))).collect())
+    }
+
+    fn attempt_rows(&self, after: i64) -> Result<Vec<AttemptRow>, StoreError> {
         if self.number("PRAGMA user_version")? < VERSION {
             return Ok(vec![]);
         }
-        let rows: Vec<(i64, String)> = self.checked((|| {
-            let mut query =
-                self.connection.prepare("SELECT id, attempt FROM attempt WHERE id > ?1 ORDER BY id")?;
-            query.query_map([after], |row| Ok((row.get(0)?, row.get(1)?)))?.collect()
-        })())?;
-        rows.into_iter().map(|(id, text)| Ok((id, encode::from_attempt(id, &text)?))).collect()
+        let rows = match self.checked(self.read_attempts(after)) {
+            Err(StoreError::Broken { .. }) => return Ok(self.attempts_one_by_one(after)),
+            rows => rows?,
+        };
+        Ok(rows.into_iter().map(|(id, text)| (id, encode::from_attempt(id, &text))).collect())
+    }
+
+    fn forget_attempt(&mut self, id: i64) -> Result<bool, StoreError> {
+        if self.number("PRAGMA user_version")? < VERSION {
+            return Ok(false);
+        }
+        let removed = self.connection.execute("DELETE FROM attempt WHERE id=?1", [id]);
+        self.checked(removed).map(|rows| rows > 0)
     }
 
     fn changes(&self, since: Position) -> Result<Changes, StoreError> {
@@ -361,11 +575,13 @@ impl ExperienceStore for SqliteStore {
             let mut rows = query.query([since.feature])?;
             while let Some(row) = rows.next()? {
                 changes.position.feature = row.get(0)?;
+                // What is no feature becomes one of no length, which the index names.
+                let feature = row.get_ref(3)?.as_blob().map(encode::from_floats).unwrap_or_default();
                 changes.features.push(StoredFeature {
                     experience: row.get(1)?,
-                    angle: row.get(2)?,
-                    feature: encode::from_floats(&row.get::<_, Vec<u8>>(3)?),
-                    network: row.get(4)?,
+                    angle: row.get_ref(2)?.as_f64().unwrap_or(f64::NAN),
+                    feature,
+                    network: text(row, 4)?,
                 });
             }
             let mut query =

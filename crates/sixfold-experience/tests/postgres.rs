@@ -285,6 +285,43 @@ fn what_is_wrong_is_named_and_no_password_with_it() {
 }
 
 #[test]
+fn a_password_is_never_sent_in_clear_text() {
+    let Some(server) = Server::start() else { return };
+    server.database("guarded");
+    server
+        .client("postgres")
+        .batch_execute("CREATE USER guard SUPERUSER PASSWORD 'secret'; CREATE DATABASE in_clear")
+        .unwrap();
+    // With the right password: a server that is told it would let us in.
+    let error = PostgresStore::create(&server.url_as("guard:secret", "in_clear")).unwrap_err();
+    assert!(matches!(error, StoreError::Refused { .. }) && !error.is_passing(), "{error:?}");
+    let text = format!("{error} {error:?}");
+    assert!(text.contains("clear text") && !text.contains("secret"), "{text}");
+    // Asked in another way it is answered.
+    assert!(PostgresStore::create(&server.url_as("guard:secret", "guarded")).is_ok());
+    // A server that asks for it is told nothing, not even a wrong one.
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let heard = std::thread::spawn(move || {
+        use std::io::Read;
+        let mut heard = vec![];
+        let mut stream = listener.accept().unwrap().0;
+        let mut startup = [0; 4];
+        stream.read_exact(&mut startup).unwrap();
+        stream.read_exact(&mut vec![0; u32::from_be_bytes(startup) as usize - 4]).unwrap();
+        for byte in [b'R', 0, 0, 0, 8, 0, 0, 0, 3] {
+            stream.write_all(&[byte]).unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let _ = stream.read_to_end(&mut heard);
+        heard
+    });
+    let error = PostgresStore::open(&format!("postgres://guard:secret@127.0.0.1:{port}/fleet")).unwrap_err();
+    assert!(error.to_string().contains("clear text"), "{error}");
+    assert_eq!(heard.join().unwrap(), b"");
+}
+
+#[test]
 fn nothing_acknowledged_is_lost_when_the_server_is_killed() {
     let Some(mut server) = Server::start() else { return };
     let kills = kills(3);

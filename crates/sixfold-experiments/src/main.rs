@@ -3,6 +3,10 @@
 //!
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
+// What is printed goes through `sixfold_shell::screen`: its macros take the place of the standard ones.
+#[macro_use]
+extern crate sixfold_shell;
+
 mod grasp;
 mod reproduce;
 
@@ -10,7 +14,10 @@ use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use sixfold_shell::{end_with_the_reader, exit_code, progress, use_threads};
+use sixfold_shell::meshes::MeshArguments;
+use sixfold_shell::ranges::threads;
+use sixfold_shell::screen::parse;
+use sixfold_shell::{PixelLimit, exit_code, progress, use_threads};
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
 #[derive(Debug, Parser)]
@@ -22,8 +29,12 @@ use sixfold_shell::{end_with_the_reader, exit_code, progress, use_threads};
 )]
 struct Arguments {
     /// Use this many threads (default: all cores); the results are the same for any number
-    #[arg(long, global = true, value_name = "N")]
+    #[arg(long, global = true, value_name = "N", value_parser = threads)]
     threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    images: PixelLimit,
+    #[command(flatten)]
+    meshes: MeshArguments,
     #[command(subcommand)]
     command: Command,
 }
@@ -40,10 +51,14 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    end_with_the_reader();
-    let arguments = Arguments::parse();
+    let arguments = match parse::<Arguments>() {
+        Ok(arguments) => arguments,
+        Err(code) => return code,
+    };
     progress::catch_interrupts();
     use_threads(arguments.threads);
+    arguments.images.set();
+    arguments.meshes.apply();
     exit_code(&match &arguments.command {
         Command::Reproduce(a) => reproduce::run(a),
         Command::Grasp(a) => grasp::run(a),

@@ -61,6 +61,24 @@ pub fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes
 }
 
+/// The bytes with the right checksum behind every chunk of a PNG: the same for images.
+pub fn with_png_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
+    let mut at = 8;
+    while let Some(head) = bytes.get(at..at + 4) {
+        let length = u32::from_be_bytes([head[0], head[1], head[2], head[3]]) as usize;
+        let end = at + 8 + length;
+        let Some(content) = bytes.get(at + 4..end) else { break };
+        let sum = !content.iter().fold(!0u32, |sum, b| {
+            (0..8).fold(sum ^ u32::from(*b), |c, _| if c & 1 == 1 { 0xedb8_8320 ^ (c >> 1) } else { c >> 1 })
+        });
+        if let Some(place) = bytes.get_mut(end..end + 4) {
+            place.copy_from_slice(&sum.to_be_bytes());
+        }
+        at = end + 4;
+    }
+    bytes
+}
+
 /// A part of the bytes, empty where there are none.
 fn part(bytes: &[u8], longest: usize, random: &mut ChaCha8Rng) -> std::ops::Range<usize> {
     if bytes.is_empty() {

@@ -40,6 +40,9 @@ pub fn readers() -> Vec<Reader> {
         fast("camera", seeds::camera, checks::camera),
         slow(2, fast("images", seeds::images, checks::images)),
         slow(20, summed(fast("ppf", seeds::ppf, checks::ppf))),
+        slow(20, summed(fast("verification-mesh", seeds::verification_mesh, checks::verification_mesh))),
+        slow(2, fast("object-record", seeds::object_record, checks::object_record)),
+        slow(2, fast("object-mesh", seeds::object_mesh, checks::object_mesh)),
         fast("gripper", seeds::gripper, checks::gripper),
     ];
     #[cfg(feature = "networks")]

@@ -1,6 +1,9 @@
 //! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
 
+use image::{DynamicImage, GrayAlphaImage, ImageBuffer, ImageFormat, LumaA, Rgb, Rgba, RgbaImage};
+use sixfold_align::VerificationMesh;
 use sixfold_bop::Rle;
+use sixfold_estimator::ObjectRecord;
 #[cfg(feature = "networks")]
 use sixfold_experience::{Copy, Experience, ExperienceStore, SqliteStore};
 #[cfg(feature = "networks")]
@@ -11,7 +14,7 @@ use sixfold_geometry::{Image, Mask, Vec3};
 #[cfg(feature = "networks")]
 use sixfold_grasp::Gripper;
 use sixfold_io::{write_depth, write_mask, write_rgb};
-use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes};
+use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, PlyFormat, Unit, ply_bytes};
 #[cfg(feature = "networks")]
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 use sixfold_ppf::{ModelOptions, ObjectModel};
@@ -171,7 +174,24 @@ pub(crate) fn camera() -> Vec<Vec<u8>> {
         r#"{"width": 640, "height": 480, "fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "depth_scale": 1.0}"#,
         r#"{"cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1], "distortion": [0.1, -0.2, 0.001, 0.0, 0.05]}"#,
         r#"{"3": {"cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1], "depth_scale": 0.1}}"#,
+        r#"{"camera_matrix": [[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]], "dist_coeffs": [[0.1, -0.2, 0.001, 0, 0.05]]}"#,
+        "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   \
+         data: [ 572.4, 0., 325.3, 0.,\n       573.6, 242., 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n   rows: 5\n   \
+         cols: 1\n   dt: d\n   data: [ 0.1, -0.2, 1.0e-03, 0., 0.05 ]\n",
+        "<?xml version=\"1.0\"?>\n<opencv_storage>\n<camera_matrix type_id=\"opencv-matrix\">\n<rows>3</rows><cols>3</cols><dt>d</dt>\n\
+         <data>572.4 0. 325.3 0. 573.6 242. 0. 0. 1.</data></camera_matrix>\n<dist_coeffs>0.1 -0.2 0.001 0. 0.05</dist_coeffs>\n\
+         </opencv_storage>\n",
+        "header:\n  stamp: {sec: 1, nanosec: 2}\n  frame_id: \"camera\" # comment\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\n\
+         d:\n- 0.1\n- -0.2\n- 0.001\n- 0.0\n- 0.05\nk:\n  - 572.4\n  - 0.0\n  - 325.3\n  - 0.0\n  - 573.6\n  - 242.0\n  - 0.0\n  \
+         - 0.0\n  - 1.0\nbinning_x: 0\nroi: {x_offset: 0, do_rectify: false}\n---\n",
     ])
+}
+
+/// The bytes of an image file.
+fn encoded(image: DynamicImage, format: ImageFormat) -> Vec<u8> {
+    let mut bytes = std::io::Cursor::new(vec![]);
+    image.write_to(&mut bytes, format).expect("a small image can be encoded");
+    bytes.into_inner()
 }
 
 pub(crate) fn images() -> Vec<Vec<u8>> {
@@ -184,6 +204,14 @@ pub(crate) fn images() -> Vec<Vec<u8>> {
             write_depth(p, &Image::from_fn(9, 7, |x, _| x as f32 * 0.1), 0.001).expect(written)
         }),
         made("a.png", |p| write_mask(p, &Mask::from_fn(9, 7, |x, y| x > y)).expect(written)),
+        encoded(
+            RgbaImage::from_fn(9, 7, |x, y| Rgba([x as u8, 9, 0, 40 * y as u8])).into(),
+            ImageFormat::Png,
+        ),
+        encoded(GrayAlphaImage::from_fn(9, 7, |x, y| LumaA([x as u8, 9 * y as u8])).into(), ImageFormat::Png),
+        encoded(ImageBuffer::from_fn(9, 7, |x, _| Rgb([256 * x as u16, 0, 0])).into(), ImageFormat::Png),
+        encoded(ImageBuffer::from_fn(9, 7, |x, _| Rgba([256 * x as u16, 0, 0, 1])).into(), ImageFormat::Png),
+        encoded(image::RgbImage::from_fn(16, 8, |x, y| Rgb([x as u8, y as u8, 7])).into(), ImageFormat::Jpeg),
     ]
 }
 
@@ -212,6 +240,40 @@ pub(crate) fn ppf() -> Vec<Vec<u8>> {
         ObjectModel::cached(path, &tetrahedron(), &[], &coarse()).expect("a tetrahedron can be described");
     });
     vec![description]
+}
+
+/// A wavy sheet of a few more faces than are rendered.
+pub(crate) fn fine() -> Mesh {
+    let side = 46u32;
+    let at = |i: u32| {
+        let (x, y) = (f64::from(i % side) * 1e-3, f64::from(i / side) * 1e-3);
+        Vec3::new(x, y, 0.002 * (300.0 * x).sin() * (200.0 * y).cos())
+    };
+    let faces = (0..(side - 1) * (side - 1)).flat_map(|k| {
+        let i = k / (side - 1) * side + k % (side - 1);
+        [[i, i + 1, i + side], [i + 1, i + side + 1, i + side]]
+    });
+    Mesh::new((0..side * side).map(at).collect(), faces.collect()).expect("a sheet is a mesh")
+}
+
+pub(crate) fn verification_mesh() -> Vec<Vec<u8>> {
+    let kept = made("verification-mesh.bin", |path| {
+        VerificationMesh::cached(Some(path), &fine()).expect("a sheet has a surface");
+    });
+    vec![kept]
+}
+
+pub(crate) fn object_record() -> Vec<Vec<u8>> {
+    let mesh = tetrahedron();
+    let mut info = ModelInfo::of_mesh(&mesh);
+    info.symmetries_discrete.push(sixfold_geometry::Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 3.0].into()));
+    info.symmetries_continuous.push(ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::zeros() });
+    let record = ObjectRecord::of_mesh("a.ply".as_ref(), Unit::Metre, &mesh, &info);
+    vec![serde_json::to_vec_pretty(&record).expect("a record can be written")]
+}
+
+pub(crate) fn object_mesh() -> Vec<Vec<u8>> {
+    vec![ply_bytes(&tetrahedron(), Unit::Metre, PlyFormat::BinaryLittleEndian, None)]
 }
 
 #[cfg(feature = "networks")]

@@ -1,5 +1,8 @@
 //! The pinhole camera, with Brown-Conrady distortion that is undone at the edge of the system.
 //!
+//! [`Camera::check`] refuses numbers that are no camera, [`Camera::check_lens`] a camera that no lens makes, and
+//! [`Camera::check_whole_image`] one that is not that of a whole image: intrinsics in a wrong unit or of another resolution.
+//!
 //! Distortion after Brown (1966) with the coefficients `k1 k2 p1 p2 k3` in OpenCV's order. Only
 //! [`Camera::undistort_point`] and [`Camera::distort_point`] know it: everything behind the edge works with pinhole pixels.
 
@@ -7,6 +10,24 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::{Mat3, Rect, Vec2, Vec3};
+
+/// No edge of an image lies further from the optical axis than this, degrees: a centred image sees up to twice of it. A pinhole
+/// image of more has no finite size at 90.
+const MAX_OFF_AXIS: f64 = 85.0;
+/// Largest ratio of the focal lengths, either way: pixels of sensors are square, and images are rarely stretched by more.
+const MAX_RATIO: f64 = 2.0;
+/// Longest focal length, pixels: a telescope's. A pixel of it sees a micrometre at a metre.
+const MAX_FOCAL_LENGTH: f64 = 1e6;
+/// Smallest field of view along the longer side of a whole image, degrees: a lens of 2 metres before a full-frame sensor.
+const MIN_FIELD_OF_VIEW: f64 = 1.0;
+/// The principal point of a whole image lies within this part of its width and height.
+const CENTRE: std::ops::RangeInclusive<f64> = 0.1..=0.9;
+/// A principal point nearer than this to one corner, in width and in height, is the centre of a smaller (left and top) image.
+const CORNER: f64 = 0.35;
+/// A lens moves the middle of an image's edge by no more than this factor, towards or away from the optical axis.
+const MAX_DISTORTION: f64 = 5.0;
+/// Most pixels of an image that a camera is for: what is rendered for it takes 8 bytes a pixel.
+const MAX_PIXELS: usize = 1 << 28;
 
 /// Why a camera is not usable.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -21,6 +42,18 @@ pub enum CameraError {
         found: f64,
         /// What it should hold.
         expected: &'static str,
+    },
+    /// No lens has these parameters, or not with an image of this size.
+    #[error("camera {fields}: found {found}, expected {expected}; {advice}")]
+    Implausible {
+        /// Names of the fields.
+        fields: &'static str,
+        /// What they hold and what that would mean.
+        found: String,
+        /// What they should hold.
+        expected: &'static str,
+        /// What to do.
+        advice: &'static str,
     },
     /// The intrinsics belong to an image of another size.
     #[error(
@@ -53,6 +86,16 @@ pub struct BrownConrady {
     /// Radial, sixth order.
     #[serde(default)]
     pub k3: f64,
+}
+
+impl CameraError {
+    /// Names the image's size in what was found.
+    fn of_image(mut self, camera: &Camera) -> Self {
+        if let CameraError::Implausible { found, .. } = &mut self {
+            found.push_str(&format!(" for an image of {}x{}", camera.width, camera.height));
+        }
+        self
+    }
 }
 
 impl BrownConrady {
@@ -150,7 +193,142 @@ impl Camera {
                 });
             }
         }
+        if self.width * self.height > MAX_PIXELS {
+            return Err(CameraError::Field {
+                field: "width x height",
+                found: self.width as f64 * self.height as f64,
+                expected: "at most 268435456 pixels in all",
+            });
+        }
         Ok(())
+    }
+
+    /// Tests that a lens can have these parameters, of a whole image or of a crop: every edge of the image within 85 degrees of the
+    /// optical axis (a field of view of 170 degrees), focal lengths up to a million pixels and within a factor of 2 of each other,
+    /// and a distortion that moves no edge by more than a factor of 5.
+    ///
+    /// # Errors
+    /// As [`Camera::check`]; [`CameraError::Implausible`], with what the numbers may be instead.
+    pub fn check_lens(&self) -> Result<(), CameraError> {
+        self.check()?;
+        let ratio = self.fx / self.fy;
+        if !(1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio) {
+            return Err(CameraError::Implausible {
+                fields: "fields fx, fy",
+                found: format!("{} and {}", self.fx, self.fy),
+                expected: "focal lengths in pixels within a factor of 2 of each other",
+                advice: "pixels are square or nearly so: is a digit lost? Scale a stretched image back first",
+            });
+        }
+        let axes = [
+            ("fields fx, cx", self.fx, self.cx, self.width),
+            ("fields fy, cy", self.fy, self.cy, self.height),
+        ];
+        for (fields, focal, centre, side) in axes {
+            let last = side as f64 - 1.0;
+            let off_axis = centre.abs().max((last - centre).abs());
+            if off_axis > focal * MAX_OFF_AXIS.to_radians().tan() {
+                let degrees = (off_axis / focal).atan().to_degrees();
+                return Err(CameraError::Implausible {
+                    fields,
+                    found: format!(
+                        "{focal} and {centre}, which puts an edge of the {}x{} image {degrees:.2} degrees off the optical axis",
+                        self.width, self.height
+                    ),
+                    expected: "pixels, with every edge within 85 degrees",
+                    advice: self.unit_advice(),
+                });
+            }
+            if focal > MAX_FOCAL_LENGTH {
+                return Err(CameraError::Implausible {
+                    fields,
+                    found: format!("{focal} and {centre}"),
+                    expected: "a focal length of at most 1000000 pixels",
+                    advice: "give it in pixels: millimetres times the image's width over the sensor's width",
+                });
+            }
+        }
+        self.check_distortion()
+    }
+
+    /// Tests that this is the camera of a whole image: as [`Camera::check_lens`], and a field of view of at least a degree along
+    /// the longer side, with the principal point in the middle 80 percent of width and height and not as far towards a corner as
+    /// that of an image of another resolution.
+    ///
+    /// # Errors
+    /// As [`Camera::check_lens`].
+    pub fn check_whole_image(&self) -> Result<(), CameraError> {
+        self.check_lens()?;
+        let (x, y) = (self.cx / self.width as f64, self.cy / self.height as f64);
+        let off = !CENTRE.contains(&x) || !CENTRE.contains(&y);
+        if off || x.max(y) < CORNER || x.min(y) > 1.0 - CORNER {
+            return Err(CameraError::Implausible {
+                fields: "fields cx, cy",
+                found: format!("{}, {}", self.cx, self.cy),
+                expected: "pixels near the centre of the image",
+                advice: "intrinsics of another resolution? Scale them, or give the right image",
+            }
+            .of_image(self));
+        }
+        let extent = (self.width as f64 / self.fx).max(self.height as f64 / self.fy);
+        let degrees = 2.0 * (0.5 * extent).atan().to_degrees();
+        if degrees < MIN_FIELD_OF_VIEW {
+            return Err(CameraError::Implausible {
+                fields: "fields fx, fy",
+                found: format!("{} and {}, a field of view of {degrees:.3} degrees", self.fx, self.fy),
+                expected: "pixels, with a field of view of at least 1 degree",
+                advice: "give focal lengths in pixels, and the camera of this image",
+            }
+            .of_image(self));
+        }
+        Ok(())
+    }
+
+    fn check_distortion(&self) -> Result<(), CameraError> {
+        let Some(d) = &self.distortion else { return Ok(()) };
+        let coefficients = [("k1", d.k1), ("k2", d.k2), ("p1", d.p1), ("p2", d.p2), ("k3", d.k3)];
+        for (field, found) in coefficients {
+            if !found.is_finite() {
+                return Err(CameraError::Field { field, found, expected: "a finite number" });
+            }
+        }
+        let (right, bottom) = (self.width as f64 - 1.0, self.height as f64 - 1.0);
+        for (x, y) in [(0.0, self.cy), (right, self.cy), (self.cx, 0.0), (self.cx, bottom)] {
+            let p = Vec2::new((x - self.cx) / self.fx, (y - self.cy) / self.fy);
+            let (before, after) = (p.norm(), d.distort(&p).norm());
+            let along = d.distort(&p).dot(&p);
+            let fits = along > 0.0 && after < MAX_DISTORTION * before && after * MAX_DISTORTION > before;
+            if before > 0.0 && !fits {
+                return Err(CameraError::Implausible {
+                    fields: "field distortion",
+                    found: format!(
+                        "k1 {}, k2 {}, p1 {}, p2 {}, k3 {}, which move pixel ({x:.0}, {y:.0}) by a factor of {:.3}",
+                        d.k1,
+                        d.k2,
+                        d.p1,
+                        d.p2,
+                        d.k3,
+                        along / (before * before)
+                    ),
+                    expected: "a factor between 0.2 and 5 at the edges of the image",
+                    advice: "the coefficients are OpenCV's, in its order k1, k2, p1, p2, k3",
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// What a focal length that is far too short may be.
+    fn unit_advice(&self) -> &'static str {
+        let longest = self.fx.max(self.fy);
+        if longest < 10.0 && self.cx.abs() <= 2.0 && self.cy.abs() <= 2.0 {
+            "these look normalised by the image's size: multiply fx and cx by its width, fy and cy by its height"
+        } else if longest < 0.1 * self.width.max(self.height) as f64 {
+            "a focal length in millimetres? In pixels it is millimetres times the image's width over the sensor's width; \
+             intrinsics of another resolution have to be scaled"
+        } else {
+            "intrinsics of another resolution? Scale them, or give the right image; fisheye images have to be undistorted first"
+        }
     }
 
     /// Tests that an image has the size that the intrinsics are for.
@@ -281,6 +459,55 @@ mod tests {
     fn points_behind_the_camera_are_not_projected() {
         assert!(camera().project(&Vec3::new(0.0, 0.0, 0.0)).is_none());
         assert!(camera().project(&Vec3::new(0.1, 0.0, -1.0)).is_none());
+    }
+
+    #[test]
+    fn impossible_cameras_are_refused_with_advice() {
+        let of = |fx: f64, fy: f64, cx: f64, cy: f64| Camera::new(fx, fy, cx, cy, 640, 480).unwrap();
+        let cases = [
+            (of(0.5, 0.5, 319.5, 239.5), "millimetres"),
+            (of(1e-5, 1e-5, 319.5, 239.5), "millimetres"),
+            (of(0.9, 1.2, 0.5, 0.5), "normalised"),
+            (of(572.4, 57.36, 325.3, 242.0), "a factor of 2"),
+            (of(572.4, 0.5, 325.3, 242.0), "a factor of 2"),
+            (of(572.4, 573.6, 1e9, 242.0), "another resolution"),
+            (of(1e9, 1e9, 319.5, 239.5), "1000000 pixels"),
+        ];
+        for (camera, words) in cases {
+            let error = camera.check_lens().unwrap_err().to_string();
+            assert!(error.contains(words) && error.contains("field"), "{error}");
+            assert!(camera.check_whole_image().is_err());
+        }
+        // Full-HD intrinsics for a VGA image and the other way round, a telescope.
+        for camera in [
+            of(1390.5, 1387.0, 965.0, 522.6),
+            of(572.4, 573.6, 325.3, 242.0).crop(&Rect { x: 0.0, y: 0.0, width: 1920.0, height: 1080.0 }),
+            of(60000.0, 60000.0, 319.5, 239.5),
+        ] {
+            assert_eq!(camera.check_lens(), Ok(()));
+            let error = camera.check_whole_image().unwrap_err().to_string();
+            assert!(error.contains(&format!("{}x{}", camera.width, camera.height)), "{error}");
+        }
+        let folded = Camera { distortion: Some(BrownConrady { k1: -9.0, ..Default::default() }), ..camera() };
+        assert!(folded.check_lens().unwrap_err().to_string().contains("k1, k2, p1, p2, k3"));
+        let large = Camera::new(5e5, 5e5, 5e5, 5e5, 1 << 20, 1 << 20).unwrap_err();
+        assert!(large.to_string().contains("width x height"), "{large}");
+    }
+
+    #[test]
+    fn wide_and_long_lenses_pass() {
+        let of = |f: f64, w: usize, h: usize| {
+            Camera::new(f, f, (w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0, w, h).unwrap()
+        };
+        // 165 degrees wide; a lens of 600 mm before a sensor of 36 mm; 1024 pixels at 1.2 degrees; a bin-picking camera.
+        for camera in
+            [of(42.2, 640, 480), of(100_000.0, 6000, 4000), of(48_900.0, 1024, 768), of(2992.6, 1280, 960)]
+        {
+            assert_eq!(camera.check_whole_image(), Ok(()));
+        }
+        let action = BrownConrady { k1: -0.25, k2: 0.07, p1: 2e-4, p2: -1e-4, k3: -0.008 };
+        let wide = Camera { distortion: Some(action), ..of(870.0, 1920, 1080) };
+        assert_eq!(wide.check_whole_image(), Ok(()));
     }
 
     #[test]

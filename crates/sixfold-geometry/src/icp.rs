@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_are_told() {
+    fn failures_are_reported() {
         let target = IndexedCloud::new(box_cloud(0.01)).unwrap();
         let far = Pose::from_translation(Vec3::new(1.0, 0.0, 0.0));
         let options = IcpOptions::coarse_to_fine(0.02);

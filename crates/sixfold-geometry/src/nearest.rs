@@ -122,6 +122,17 @@ impl KdTree {
         Some(Neighbour { index: search.index, distance: search.squared.sqrt() })
     }
 
+    /// The `count` nearest points (all, where there are fewer), the nearest first, of equally near ones those of the lowest
+    /// indices. The time grows with `count` times the logarithm of the points, however many of them are equal.
+    pub fn nearest_several(&self, p: &Vec3, count: usize) -> Vec<Neighbour> {
+        let Some(p) = finite(p).filter(|_| count > 0 && !self.original.is_empty()) else {
+            return vec![];
+        };
+        let mut search = Several { count, found: Vec::with_capacity(count.min(self.original.len()) + 1) };
+        self.search(&p, &mut search, 0, self.bounds.off(&p));
+        search.found
+    }
+
     /// All points within `radius` metres, in the order of their indices.
     pub fn within(&self, p: &Vec3, radius: f64) -> Vec<Neighbour> {
         let Some(p) = finite(p) else {
@@ -150,7 +161,12 @@ impl KdTree {
             return;
         };
         let difference = p[inner.axis] - inner.cut;
-        let near = usize::from(!(difference < 0.0));
+        // Of two cells equally far away that with the lowest index first: of many equal points only a few are then looked at.
+        let near = if difference.abs() == off[inner.axis].abs() {
+            usize::from(inner.lowest[1] < inner.lowest[0])
+        } else {
+            usize::from(!(difference < 0.0))
+        };
         self.search(p, search, 2 * node + 1 + near, off);
         let mut beyond = off;
         beyond[inner.axis] = difference;
@@ -188,6 +204,33 @@ impl Search for Nearest {
     fn point(&mut self, squared: f64, index: usize) {
         if self.reaches(squared, index) {
             *self = Nearest { squared, index };
+        }
+    }
+}
+
+struct Several {
+    count: usize,
+    /// In order.
+    found: Vec<Neighbour>,
+}
+
+impl Search for Several {
+    fn reaches(&self, squared: f64, lowest: usize) -> bool {
+        match self.found.last() {
+            Some(last) if self.found.len() == self.count => {
+                let distance = squared.sqrt();
+                distance < last.distance || (distance == last.distance && lowest < last.index)
+            }
+            _ => true,
+        }
+    }
+
+    fn point(&mut self, squared: f64, index: usize) {
+        if self.reaches(squared, index) {
+            let distance = squared.sqrt();
+            let before = |n: &Neighbour| n.distance < distance || (n.distance == distance && n.index < index);
+            self.found.insert(self.found.partition_point(before), Neighbour { index, distance });
+            self.found.truncate(self.count);
         }
     }
 }
@@ -246,6 +289,10 @@ mod tests {
             prop_assert!((tree.nearest(&query).unwrap().distance - best).abs() < 1e-12);
             let inside = points.iter().filter(|p| (*p - query).norm() <= radius).count();
             prop_assert_eq!(tree.within(&query, radius).len(), inside);
+            let mut all = tree.within(&query, 100.0);
+            all.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index)));
+            all.truncate(12);
+            prop_assert_eq!(tree.nearest_several(&query, 12), all);
         }
 
         /// On a lattice most distances are equal: index and distance are still those of a full search, to the last bit.
@@ -262,6 +309,10 @@ mod tests {
             let near = |q: &Vec3| squared_length(&[q.x - query.x, q.y - query.y, q.z - query.z]) <= radius * radius;
             let inside: Vec<usize> = (0..points.len()).filter(|&i| near(&points[i])).collect();
             prop_assert_eq!(tree.within(&query, radius).iter().map(|n| n.index).collect::<Vec<_>>(), inside);
+            let mut all = tree.within(&query, 100.0);
+            all.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index)));
+            all.truncate(8);
+            prop_assert_eq!(tree.nearest_several(&query, 8), all);
         }
     }
 
@@ -271,9 +322,22 @@ mod tests {
         assert_eq!(tree.nearest(&Vec3::new(0.9, 0.1, 0.0)).unwrap().index, 1);
         assert!(KdTree::new(&[]).nearest(&Vec3::x()).is_none());
         assert!(KdTree::new(&[]).within(&Vec3::x(), 1.0).is_empty());
-        // Thousands of equal points are no trouble.
-        let same = KdTree::new(&vec![Vec3::x(); 5000]);
+    }
+
+    #[test]
+    fn forty_thousand_equal_points_are_searched_at_once() {
+        // 40,000 searches for each of these took half a minute.
+        let same = KdTree::new(&vec![Vec3::x(); 40_000]);
+        let start = std::time::Instant::now();
+        for k in 0..40_000 {
+            let p = Vec3::new(f64::from(k % 3), f64::from(k % 5), 0.0);
+            assert_eq!(same.nearest(&p).map(|n| n.index), Some(0));
+            assert_eq!(same.nearest_several(&p, 12).len(), 12);
+        }
+        assert!(start.elapsed().as_secs_f64() < 10.0, "{:?}", start.elapsed());
         assert_eq!(same.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: 1.0 }));
+        let lowest: Vec<usize> = same.nearest_several(&Vec3::x(), 12).iter().map(|n| n.index).collect();
+        assert_eq!(lowest, (0..12).collect::<Vec<_>>());
         // Nor are distances whose squares overflow.
         let far = KdTree::new(&[Vec3::x() * 1e300, Vec3::y() * 1e300]);
         assert_eq!(far.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: f64::INFINITY }));

@@ -347,7 +347,7 @@ fn footprint(
 
 fn checked(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Result<DepthImage, ViewError> {
     options.check()?;
-    camera.check()?;
+    camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;
     let depth = usable_depth(depth)?;
     Ok(depth.map(|&z| if f64::from(z) <= options.max_depth { z } else { 0.0 }))

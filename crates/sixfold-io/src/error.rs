@@ -31,6 +31,14 @@ pub enum ImageFileError {
         /// What is wrong.
         reason: String,
     },
+    /// It is an image, but no mask, or which pixels are the mask is not clear.
+    #[error("{}: mask: {reason}", path.display())]
+    Mask {
+        /// The file.
+        path: PathBuf,
+        /// What was found and expected, and what to do.
+        reason: String,
+    },
     /// It has another size than the camera.
     #[error(
         "{}: the image is {}x{}, expected {}x{} from {size_from}; the intrinsics belong to another resolution: give the \

@@ -1,9 +1,11 @@
-//! Writing whole files: nothing is ever seen half-written.
+//! Writing whole files: nothing is ever seen half-written, and what a killed writer leaves behind goes with the next write.
 
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::lock::still_there;
 
 /// Writes `bytes` to a temporary file beside `path` and renames it: readers see the old or the new file. Folders on the way
 /// are made.
@@ -25,29 +27,72 @@ pub fn write_atomically_with(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> io::Result<()> {
-    let temporary = temporary_beside(path)?;
-    let result = (|| {
-        let mut file = BufWriter::new(File::create(&temporary)?);
-        write(&mut file)?;
-        file.flush()?;
-        file.get_ref().sync_all()?;
-        drop(file);
-        fs::rename(&temporary, path)
-    })();
-    if result.is_err() {
+    let (temporary, file) = temporary_beside(path)?;
+    let mut file = BufWriter::new(file);
+    // The file stays open, and so locked, until it has its name: until then nobody takes it for left behind.
+    let result = write(&mut file)
+        .and_then(|()| file.flush())
+        .and_then(|()| file.get_ref().sync_all())
+        .and_then(|()| fs::rename(&temporary, path));
+    match result {
+        Ok(()) => remove_left_behind(path),
         // The first error is the one to report; a temporary file left behind changes nothing.
-        let _ = fs::remove_file(&temporary);
+        Err(_) => drop(fs::remove_file(&temporary)),
     }
     result
 }
 
-fn temporary_beside(path: &Path) -> io::Result<PathBuf> {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
+/// The `number`th temporary file of a target, `.NAME.NUMBER.tmp`.
+fn temporary(path: &Path, number: usize) -> io::Result<PathBuf> {
     let name = path
         .file_name()
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path does not end in a file name"))?;
+    Ok(path.with_file_name(format!(".{}.{number}.tmp", name.to_string_lossy())))
+}
+
+/// An empty temporary file for `path`, locked: the first that no living writer holds, so that what a dead one left behind is used
+/// again rather than kept for ever.
+fn temporary_beside(path: &Path) -> io::Result<(PathBuf, File)> {
+    let mut number = 0;
+    loop {
+        let temporary = temporary(path, number)?;
+        let file = File::options().read(true).write(true).create(true).truncate(false).open(&temporary)?;
+        match file.try_lock() {
+            // Its holder may have renamed or removed it between opening and locking: then this is another file.
+            Ok(()) if still_there(&file, &temporary) => {
+                file.set_len(0)?;
+                return Ok((temporary, file));
+            }
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => number += 1,
+            // A file system without locks: a name that nobody else has.
+            Err(TryLockError::Error(_)) => {
+                drop(fs::remove_file(&temporary));
+                return unshared(path);
+            }
+        }
+    }
+}
+
+/// A temporary file under a name of this process and call.
+fn unshared(path: &Path) -> io::Result<(PathBuf, File)> {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
     let number = COUNTER.fetch_add(1, Ordering::Relaxed);
-    Ok(path.with_file_name(format!(".{}.{}.{number}.tmp", name.to_string_lossy(), std::process::id())))
+    let first = temporary(path, 0)?;
+    let temporary = first.with_extension(format!("{}.{number}.tmp", std::process::id()));
+    let file = File::create(&temporary)?;
+    Ok((temporary, file))
+}
+
+/// Removes what dead writers left of this target beyond the first temporary file, which the next write uses.
+fn remove_left_behind(path: &Path) {
+    for number in 1.. {
+        let Ok(temporary) = temporary(path, number) else { return };
+        let Ok(file) = File::open(&temporary) else { return };
+        if file.try_lock().is_ok() && still_there(&file, &temporary) {
+            drop(fs::remove_file(&temporary));
+        }
+    }
 }
 
 #[cfg(test)]
@@ -85,6 +130,53 @@ mod tests {
         .unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::StorageFull);
         assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_a_killed_writer_left_behind_goes_with_the_next_write() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("record.json");
+        for number in 0..3 {
+            fs::write(temporary(&path, number).unwrap(), b"half of the n").unwrap();
+        }
+        write_atomically(&path, b"new").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_living_writer_keeps_its_temporary_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("record.json");
+        write_atomically_with(&path, |file| {
+            file.write_all(b"the slower one")?;
+            write_atomically(&path, b"the faster one")?;
+            assert_eq!(fs::read(&path)?, b"the faster one");
+            Ok(())
+        })
+        .unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"the slower one");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn many_writers_of_one_file_never_mix() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("record.json");
+        std::thread::scope(|scope| {
+            for writer in 0..8u8 {
+                let path = &path;
+                scope.spawn(move || {
+                    for _ in 0..50 {
+                        write_atomically(path, &[writer; 5000]).unwrap();
+                        let read = fs::read(path).unwrap();
+                        assert!(read.len() == 5000 && read.iter().all(|b| *b == read[0]));
+                    }
+                });
+            }
+        });
+        write_atomically(&path, b"last").unwrap();
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 }

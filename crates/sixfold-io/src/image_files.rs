@@ -1,5 +1,9 @@
-//! Depth, masks and colour of image files, decoded without trusting their headers.
+//! Depth, masks and colour of image files: the one place where images are decoded, without trusting their headers.
+//!
+//! The size is read first and held against the limit in pixels; only then the pixels are decoded. What stands beside them in the file
+//! (text, colour profiles) may take [`BESIDE_PIXELS`] in all, which also bounds what is inflated from it.
 
+use std::borrow::Cow;
 use std::io::Cursor;
 use std::path::Path;
 
@@ -8,68 +12,128 @@ use sixfold_geometry::{DepthImage, Image, Mask, RgbImage};
 
 use crate::error::ImageFileError;
 use crate::files::write_atomically;
+use crate::limit::{check_pixels, max_pixels};
+use crate::mask_pixels;
 
 /// Neither PNG nor JPEG packs more than about this many bytes of pixels into one byte of file.
 const LARGEST_EXPANSION: u64 = 2048;
 const LARGEST_SIDE: u32 = 1 << 15;
+/// Most bytes of what is no pixel: colour profiles take up to 4 MB.
+const BESIDE_PIXELS: u64 = 32 << 20;
+/// Most bytes that a pixel takes, decoded: four channels of 16 bits. An image file of more bytes than that is no image.
+const BYTES_A_PIXEL: u64 = 8;
 
-/// An image file (PNG or JPEG) that is still to be read.
+/// An image (PNG or JPEG) that is still to be read: a file, or the bytes of one.
 #[derive(Debug, Clone)]
 pub struct ImageFile<'a> {
     path: &'a Path,
+    /// Its bytes, where they are in memory already.
+    bytes: Option<&'a [u8]>,
     /// Size the image must have and what says so.
     expected: Option<((usize, usize), String)>,
+    limit: u64,
 }
 
 impl<'a> ImageFile<'a> {
-    /// A file of any size.
+    /// A file of any size up to [`max_pixels`].
     pub fn new(path: &'a Path) -> Self {
-        ImageFile { path, expected: None }
+        ImageFile { path, bytes: None, expected: None, limit: max_pixels() }
     }
 
     /// A file that must be of this width and height; `size_from` is for the message: who says so.
     pub fn of_size(path: &'a Path, expected: (usize, usize), size_from: impl Into<String>) -> Self {
-        ImageFile { path, expected: Some((expected, size_from.into())) }
+        ImageFile { expected: Some((expected, size_from.into())), ..ImageFile::new(path) }
+    }
+
+    /// The bytes of a file, from within another one; `name` is for messages.
+    pub fn of_bytes(name: &'a Path, bytes: &'a [u8]) -> Self {
+        ImageFile { bytes: Some(bytes), ..ImageFile::new(name) }
+    }
+
+    /// The same with a limit of its own, in pixels, in place of [`max_pixels`].
+    pub fn with_limit(self, pixels: u64) -> Self {
+        ImageFile { limit: pixels, ..self }
     }
 
     fn error(&self, reason: impl Into<String>) -> ImageFileError {
         ImageFileError::Content { path: self.path.to_owned(), reason: reason.into() }
     }
 
-    fn bytes(&self) -> Result<Vec<u8>, ImageFileError> {
-        std::fs::read(self.path).map_err(|source| ImageFileError::Read { path: self.path.to_owned(), source })
+    fn bytes(&self) -> Result<Cow<'a, [u8]>, ImageFileError> {
+        if let Some(bytes) = self.bytes {
+            return Ok(bytes.into());
+        }
+        let most = self.limit.saturating_mul(BYTES_A_PIXEL).saturating_add(BESIDE_PIXELS);
+        match crate::read_regular(self.path, most) {
+            Ok(bytes) => Ok(bytes.into()),
+            Err(error) if error.kind() == std::io::ErrorKind::FileTooLarge => Err(self.error(format!(
+                "found more than {} MB, expected an image of at most {:.1} megapixels (--max-pixels, set_max_pixels)",
+                most / 1_000_000,
+                self.limit as f64 / 1e6
+            ))),
+            Err(source) => Err(ImageFileError::Read { path: self.path.to_owned(), source }),
+        }
     }
 
-    fn decode(&self) -> Result<DynamicImage, ImageFileError> {
-        let bytes = self.bytes()?;
-        let format = image::guess_format(&bytes).map_err(|_| self.error("neither PNG nor JPEG"))?;
+    /// The decoder of these bytes once their header was read, if the size is as expected and within the limit; and the format.
+    fn decoder<'b>(
+        &self,
+        bytes: &'b [u8],
+    ) -> Result<(impl ImageDecoder + use<'b>, ImageFormat), ImageFileError> {
+        let format = image::guess_format(bytes).map_err(|_| self.error("neither PNG nor JPEG"))?;
         if !matches!(format, ImageFormat::Png | ImageFormat::Jpeg) {
             return Err(self.error(format!("{format:?} is not supported, expected PNG or JPEG")));
         }
-        let mut reader = ImageReader::with_format(Cursor::new(&bytes), format);
+        let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
         let mut limits = Limits::default();
         limits.max_image_width = Some(LARGEST_SIDE);
         limits.max_image_height = Some(LARGEST_SIDE);
+        limits.max_alloc = Some(BESIDE_PIXELS);
         reader.limits(limits);
         let decoder = reader.into_decoder().map_err(|e| self.error(e.to_string()))?;
         let (width, height) = decoder.dimensions();
+        let size = (width as usize, height as usize);
         if let Some((expected, size_from)) = &self.expected
-            && *expected != (width as usize, height as usize)
+            && *expected != size
         {
             return Err(ImageFileError::Size {
                 path: self.path.to_owned(),
                 expected: *expected,
-                found: (width as usize, height as usize),
+                found: size,
                 size_from: size_from.clone(),
             });
         }
+        check_pixels(size.0, size.1, self.limit).map_err(|reason| self.error(reason))?;
         let length = bytes.len() as u64;
         if decoder.total_bytes() > length.saturating_mul(LARGEST_EXPANSION) {
             return Err(self.error(format!(
                 "the header says {width}x{height}, far more than a file of {length} bytes can hold: cut off"
             )));
         }
-        DynamicImage::from_decoder(decoder).map_err(|e| self.error(format!("{e} (cut off or damaged)")))
+        Ok((decoder, format))
+    }
+
+    fn decode(&self) -> Result<(DynamicImage, ImageFormat), ImageFileError> {
+        let bytes = self.bytes()?;
+        let (decoder, format) = self.decoder(&bytes)?;
+        let image = DynamicImage::from_decoder(decoder)
+            .map_err(|e| self.error(format!("{e} (cut off or damaged)")))?;
+        Ok((image, format))
+    }
+
+    fn image<T>(&self, width: u32, height: u32, data: Vec<T>) -> Result<Image<T>, ImageFileError> {
+        Image::from_vec(width as usize, height as usize, data).map_err(|e| self.error(e.to_string()))
+    }
+
+    /// The values of one channel of 16 bits.
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file.
+    pub fn units(&self) -> Result<Image<u16>, ImageFileError> {
+        let DynamicImage::ImageLuma16(pixels) = self.decode()?.0 else {
+            return Err(self.error("a depth image has one channel of 16 bits; this is an image of depth"));
+        };
+        self.image(pixels.width(), pixels.height(), pixels.into_raw())
     }
 
     /// Depth in metres, of one channel of 16 bits; zero where nothing was measured.
@@ -77,38 +141,35 @@ impl<'a> ImageFile<'a> {
     /// # Errors
     /// [`ImageFileError`] naming the file.
     pub fn depth(&self, metres_per_unit: f64) -> Result<DepthImage, ImageFileError> {
-        let DynamicImage::ImageLuma16(pixels) = self.decode()? else {
-            return Err(self.error("a depth image has one channel of 16 bits; this is an image of depth"));
-        };
-        let (width, height) = (pixels.width() as usize, pixels.height() as usize);
-        let data = pixels.as_raw().iter().map(|&v| (f64::from(v) * metres_per_unit) as f32).collect();
-        Image::from_vec(width, height, data).map_err(|e| self.error(e.to_string()))
+        Ok(self.units()?.map(|&v| (f64::from(v) * metres_per_unit) as f32))
     }
 
-    /// A mask: every pixel above zero belongs to it.
+    /// A mask: every pixel that is not zero. Grey of 1, 2, 4, 8 or 16 bits, a palette, or RGB with one colour besides black; alpha
+    /// that is not full everywhere is the mask itself.
     ///
     /// # Errors
-    /// [`ImageFileError`] naming the file.
+    /// [`ImageFileError`] naming the file: also for a JPEG, whose zeros are not exact, for several colours, and where alpha and
+    /// colour say different things.
     pub fn mask(&self) -> Result<Mask, ImageFileError> {
-        let pixels = self.decode()?.into_luma8();
-        let (width, height) = (pixels.width() as usize, pixels.height() as usize);
-        let data = pixels.as_raw().iter().map(|&v| v > 0).collect();
-        Image::from_vec(width, height, data).map_err(|e| self.error(e.to_string()))
+        let (image, format) = self.decode()?;
+        if format == ImageFormat::Jpeg {
+            return Err(ImageFileError::Mask {
+                path: self.path.to_owned(),
+                reason: "found a JPEG, whose zeros are not exact; write the mask as PNG".to_owned(),
+            });
+        }
+        let data = mask_pixels::inside(&image)
+            .map_err(|reason| ImageFileError::Mask { path: self.path.to_owned(), reason })?;
+        self.image(image.width(), image.height(), data)
     }
 
-    /// A colour image; grey becomes colour, alpha is dropped.
+    /// A colour image; grey becomes colour, alpha is dropped, and of 16 bits the upper eight are kept.
     ///
     /// # Errors
     /// [`ImageFileError`] naming the file.
     pub fn rgb(&self) -> Result<RgbImage, ImageFileError> {
-        let pixels = match self.decode()? {
-            // Sixteen bits of grey (some industrial cameras) keep their upper eight.
-            DynamicImage::ImageLuma16(p) => DynamicImage::ImageLuma16(p).into_rgb8(),
-            other => other.into_rgb8(),
-        };
-        let (width, height) = (pixels.width() as usize, pixels.height() as usize);
-        let data = pixels.as_raw().as_chunks::<3>().0.to_vec();
-        Image::from_vec(width, height, data).map_err(|e| self.error(e.to_string()))
+        let pixels = self.decode()?.0.into_rgb8();
+        self.image(pixels.width(), pixels.height(), pixels.as_raw().as_chunks::<3>().0.to_vec())
     }
 
     /// Width and height from the header alone.
@@ -116,9 +177,8 @@ impl<'a> ImageFile<'a> {
     /// # Errors
     /// [`ImageFileError`] naming the file.
     pub fn size(&self) -> Result<(usize, usize), ImageFileError> {
-        let read = |source| ImageFileError::Read { path: self.path.to_owned(), source };
-        let reader = ImageReader::open(self.path).map_err(read)?.with_guessed_format().map_err(read)?;
-        let (width, height) = reader.into_dimensions().map_err(|e| self.error(e.to_string()))?;
+        let bytes = self.bytes()?;
+        let (width, height) = self.decoder(&bytes)?.0.dimensions();
         Ok((width as usize, height as usize))
     }
 }
@@ -197,6 +257,9 @@ mod tests {
         std::fs::write(&path, &lying).unwrap();
         let message = file(&path).depth(1e-3).unwrap_err().to_string();
         assert!(message.contains("30000x30000"), "{message}");
+        let unlimited = ImageFile::new(&path).with_limit(u64::MAX);
+        let message = unlimited.depth(1e-3).unwrap_err().to_string();
+        assert!(message.contains("30000x30000") && message.contains("cut off"), "{message}");
 
         std::fs::write(&path, b"not an image").unwrap();
         assert!(file(&path).rgb().unwrap_err().to_string().contains("neither PNG nor JPEG"));
@@ -209,6 +272,125 @@ mod tests {
         let sized = ImageFile::of_size(&path, (640, 480), "camera.json");
         let message = sized.rgb().unwrap_err().to_string();
         assert!(message.contains("20x10") && message.contains("640x480"), "{message}");
+    }
+
+    /// 778 kB of zeros as PNG took 4.6 GB.
+    #[test]
+    fn an_image_bomb_is_refused_by_its_header() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("bomb.png");
+        let file = std::io::BufWriter::new(File::create(&path).unwrap());
+        let (width, height) = (20_000u32, 6_000u32);
+        let mut encoder = png::Encoder::new(file, width, height);
+        encoder.set_color(png::ColorType::Rgba);
+        encoder.set_depth(png::BitDepth::Eight);
+        let mut header = encoder.write_header().unwrap();
+        let mut stream = header.stream_writer().unwrap();
+        let row = vec![0; 4 * width as usize];
+        (0..height).for_each(|_| std::io::Write::write_all(&mut stream, &row).unwrap());
+        stream.finish().unwrap();
+        header.finish().unwrap();
+        for message in [
+            ImageFile::new(&path).rgb().unwrap_err().to_string(),
+            ImageFile::new(&path).mask().unwrap_err().to_string(),
+            ImageFile::new(&path).size().unwrap_err().to_string(),
+        ] {
+            assert!(message.contains("bomb.png") && message.contains("120.0 megapixels"), "{message}");
+            assert!(message.contains("at most 100.0") && message.contains("--max-pixels"), "{message}");
+        }
+        assert_eq!(ImageFile::new(&path).with_limit(120_000_000).size().unwrap(), (20_000, 6_000));
+        // A file that never ends.
+        #[cfg(target_os = "linux")]
+        {
+            let endless = ImageFile::new(Path::new("/dev/zero")).with_limit(1000);
+            assert!(endless.rgb().unwrap_err().to_string().contains("MB"));
+        }
+    }
+
+    /// What is inflated beside the pixels: a colour profile of 40 MB in 40 kB is left out.
+    #[test]
+    fn a_colour_profile_that_inflates_is_left_out() {
+        let mut info = png::Info::with_size(8, 8);
+        info.icc_profile = Some(vec![0u8; 40 << 20].into());
+        let mut bytes = vec![];
+        let encoder = png::Encoder::with_info(&mut bytes, info).unwrap();
+        encoder.write_header().unwrap().write_image_data(&[7; 64]).unwrap();
+        assert!(bytes.len() < 1 << 20);
+        let file = ImageFile::of_bytes(Path::new("profile.png"), &bytes);
+        assert_eq!(file.decoder(&bytes).unwrap().0.icc_profile().unwrap(), None);
+        assert_eq!(file.rgb().unwrap().size(), (8, 8));
+    }
+
+    fn mask_of(image: DynamicImage) -> Result<Vec<bool>, String> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("mask.png");
+        write_png(&path, image).unwrap();
+        file(&path).mask().map(|m| m.as_slice().to_vec()).map_err(|e| e.to_string())
+    }
+
+    /// A 16-bit mask lost its values below 129, a coloured one what was dark.
+    #[test]
+    fn every_pixel_that_is_not_zero_is_in_the_mask() {
+        let line = [false, true, true, true];
+        let grey8 = image::GrayImage::from_vec(4, 1, vec![0, 1, 128, 255]).unwrap();
+        let grey16 =
+            image::ImageBuffer::<image::Luma<u16>, _>::from_vec(4, 1, vec![0, 1, 128, 65535]).unwrap();
+        let blue = image::RgbImage::from_vec(4, 1, vec![0, 0, 0, 0, 0, 1, 0, 0, 1, 0, 0, 1]).unwrap();
+        let grey = image::RgbImage::from_vec(4, 1, vec![0, 0, 0, 1, 1, 1, 9, 9, 9, 255, 255, 255]).unwrap();
+        let dark = image::ImageBuffer::<image::Rgb<u16>, _>::from_vec(
+            4,
+            1,
+            vec![0, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0],
+        );
+        let rgba = |values: [[u8; 4]; 4]| image::RgbaImage::from_vec(4, 1, values.concat()).unwrap();
+        let opaque = rgba([[0, 0, 0, 255], [3, 0, 0, 255], [3, 0, 0, 255], [3, 0, 0, 255]]);
+        let cut_out = rgba([[9, 9, 9, 0], [200, 3, 0, 255], [3, 0, 70, 255], [3, 0, 0, 1]]);
+        let shape = rgba([[0, 0, 0, 0], [0, 0, 0, 255], [0, 0, 0, 255], [0, 0, 0, 9]]);
+        let grey_alpha = image::GrayAlphaImage::from_vec(4, 1, vec![0, 255, 1, 255, 2, 255, 3, 255]).unwrap();
+        let accepted: [DynamicImage; 9] = [
+            grey8.into(),
+            grey16.into(),
+            blue.into(),
+            grey.into(),
+            dark.unwrap().into(),
+            opaque.into(),
+            cut_out.into(),
+            shape.into(),
+            grey_alpha.into(),
+        ];
+        for image in accepted {
+            assert_eq!(mask_of(image.clone()).as_deref(), Ok(&line[..]), "{image:?}");
+        }
+        let labels = image::RgbImage::from_vec(4, 1, vec![0, 0, 0, 255, 0, 0, 0, 255, 0, 0, 255, 0]).unwrap();
+        let both = rgba([[0, 0, 0, 0], [0, 0, 0, 255], [255, 255, 255, 255], [0, 0, 0, 255]]);
+        for (image, words) in [(labels.into(), "several colours"), (both.into(), "in alpha")] {
+            let error = mask_of(image).unwrap_err();
+            assert!(error.contains("mask.png") && error.contains(words), "{error}");
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("mask.jpg");
+        image::GrayImage::new(8, 8).save(&path).unwrap();
+        assert!(file(&path).mask().unwrap_err().to_string().contains("PNG"));
+    }
+
+    /// Palettes and single bits, as drawing programs write masks.
+    #[test]
+    fn masks_of_palettes_and_of_single_bits() {
+        let dir = tempfile::tempdir().unwrap();
+        for (name, color, bytes) in [
+            ("bits.png", png::ColorType::Grayscale, [0b0110_0000]),
+            ("palette.png", png::ColorType::Indexed, [0b0110_0000]),
+        ] {
+            let path = dir.path().join(name);
+            let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 4, 1);
+            encoder.set_color(color);
+            encoder.set_depth(png::BitDepth::One);
+            if color == png::ColorType::Indexed {
+                encoder.set_palette(vec![0, 0, 0, 1, 0, 0]);
+            }
+            encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
+            assert_eq!(file(&path).mask().unwrap().as_slice(), [false, true, true, false], "{name}");
+        }
     }
 
     fn crc32(bytes: &[u8]) -> u32 {

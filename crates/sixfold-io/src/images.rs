@@ -23,7 +23,7 @@ pub fn read_depth(path: &Path, metres_per_unit: f64) -> Result<DepthImage, Image
     ImageFile::new(path).depth(metres_per_unit)
 }
 
-/// Reads a mask: every pixel above zero belongs to it.
+/// Reads a mask: every pixel that is not zero belongs to it ([`ImageFile::mask`]).
 ///
 /// # Errors
 /// [`ImageFileError`] naming the file.

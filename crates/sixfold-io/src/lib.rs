@@ -8,7 +8,10 @@ mod files;
 mod hash;
 mod image_files;
 mod images;
+mod limit;
 mod lock;
+mod mask_pixels;
+mod regular;
 
 pub use camera_file::{CameraFile, CameraFileError};
 pub use error::ImageFileError;
@@ -16,4 +19,6 @@ pub use files::{write_atomically, write_atomically_with};
 pub use hash::{Fnv1a, fnv1a, fnv1a_of_file};
 pub use image_files::ImageFile;
 pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
+pub use limit::{DEFAULT_MAX_PIXELS, check_pixels, max_pixels, set_max_pixels};
 pub use lock::{LockError, WriteLock};
+pub use regular::{limits, open_regular, read_regular, read_regular_text};

@@ -51,8 +51,13 @@ impl WriteLock {
             std::fs::create_dir_all(parent).map_err(io)?;
         }
         loop {
-            let mut file =
-                File::options().read(true).write(true).create(true).truncate(false).open(&lock).map_err(io)?;
+            let mut file = File::options()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .open(&lock)
+                .map_err(io)?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => {
@@ -67,7 +72,10 @@ impl WriteLock {
                 continue;
             }
             let id = format!("{}\n", std::process::id());
-            file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes())).map_err(io)?;
+            file.set_len(0)
+                .and_then(|()| file.rewind())
+                .and_then(|()| file.write_all(id.as_bytes()))
+                .map_err(io)?;
             return Ok(WriteLock { path: lock, _file: file });
         }
     }
@@ -90,8 +98,9 @@ fn lock_file(path: &Path) -> io::Result<PathBuf> {
     Ok(place.with_file_name(format!(".{}.lock", name.to_string_lossy())))
 }
 
+/// Whether `path` still names this open file.
 #[cfg(unix)]
-fn still_there(file: &File, path: &Path) -> bool {
+pub(crate) fn still_there(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     match (file.metadata(), std::fs::metadata(path)) {
         (Ok(mine), Ok(there)) => mine.ino() == there.ino() && mine.dev() == there.dev(),
@@ -99,8 +108,9 @@ fn still_there(file: &File, path: &Path) -> bool {
     }
 }
 
+/// Whether `path` still names a file; that it is this one cannot be told here.
 #[cfg(not(unix))]
-fn still_there(_: &File, path: &Path) -> bool {
+pub(crate) fn still_there(_: &File, path: &Path) -> bool {
     path.exists()
 }
 

@@ -4,6 +4,8 @@
 //! pair found cannot hold a better one, nor can two balls (the tighter bound on round objects). No convex hull, so flat, doubled or degenerate point sets need no
 //! special care.
 
+use std::cmp::Ordering;
+
 use sixfold_geometry::Vec3;
 
 use crate::Mesh;
@@ -11,9 +13,14 @@ use crate::Mesh;
 const LEAF: usize = 8;
 /// Keeps a bound above the truth whatever is lost to rounding.
 const ROUND_UP: f64 = 1.0 + 1e-12;
+/// So many pairs of boxes are compared for the exact diameter; then pairs that are longer by less than [`CLOSE`] are let go. Only
+/// shapes made for it come that far: all points of one part nearly as far from all points of another.
+const WORK: u32 = 30_000_000;
+/// Of squared distances.
+const CLOSE: f64 = 1.0 + 1e-6;
 
 impl Mesh {
-    /// The largest distance between two vertices, in metres: exact.
+    /// The largest distance between two vertices, in metres: exact (to a millionth for shapes that take too long).
     pub fn diameter(&self) -> f64 {
         diameter(self.vertices())
     }
@@ -38,10 +45,15 @@ pub(crate) fn diameter(points: &[Vec3]) -> f64 {
     if kept.is_empty() {
         return best.sqrt();
     }
+    // Thousands of points at each of two places would make all their pairs.
+    let order = |a: &Vec3, b: &Vec3| (0..3).fold(Ordering::Equal, |o, k| o.then(a[k].total_cmp(&b[k])));
+    kept.sort_unstable_by(order);
+    kept.dedup();
     let mut nodes = Vec::with_capacity(2 * kept.len() / LEAF + 1);
     let count = kept.len();
     build(&mut kept, 0, count, &mut nodes);
-    search(&nodes, &kept, 0, 0, &mut best);
+    let mut work = WORK;
+    search(&nodes, &kept, 0, 0, &mut best, &mut work);
     best.sqrt()
 }
 
@@ -114,9 +126,11 @@ impl Node {
 }
 
 /// Improves `best`, a squared distance, with pairs of one point in `a` and one in `b`.
-fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64) {
+fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64, work: &mut u32) {
     let (node_a, node_b) = (&nodes[a], &nodes[b]);
-    if node_a.bound(node_b) <= *best {
+    *work = work.saturating_sub(1);
+    let enough = if *work > 0 { *best } else { *best * CLOSE };
+    if node_a.bound(node_b) <= enough {
         return;
     }
     match (node_a.right, node_b.right) {
@@ -150,7 +164,7 @@ fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64) {
             pairs.sort_unstable_by(|x, y| y.0.total_cmp(&x.0));
             for (bound, i, j) in pairs {
                 if bound > *best {
-                    search(nodes, points, i, j, best);
+                    search(nodes, points, i, j, best, work);
                 }
             }
         }

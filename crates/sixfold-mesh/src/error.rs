@@ -50,6 +50,23 @@ pub enum MeshFileError {
         /// What is there.
         found: String,
     },
+    /// A `models_info.json` does not describe the mesh of an object.
+    #[error(
+        "{file}: object {object}, {field}: found {found}, expected {expected}; the file is of other meshes or in another unit \
+         (lengths are millimetres): put the file of these meshes there, or correct the field"
+    )]
+    Info {
+        /// The file.
+        file: String,
+        /// The object's id.
+        object: u32,
+        /// The field.
+        field: String,
+        /// What is there.
+        found: String,
+        /// What the mesh says.
+        expected: String,
+    },
     /// The arrays of the file do not form a mesh.
     #[error("{file}: {source}")]
     Mesh {

@@ -1,18 +1,55 @@
 //! The door for mesh files: format by ending, unit to metres, and the check for a wrong unit.
 
-use std::fs;
+use std::cell::Cell;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use sixfold_geometry::RgbImage;
-use sixfold_io::write_atomically_with;
+use sixfold_io::{ImageFile, ImageFileError, limits, read_regular, write_atomically_with};
 
+use crate::ply::shown_name;
 use crate::{Mesh, MeshFileError, Unit};
 
 /// Smallest diameter that [`read_mesh`] takes without asking, in metres.
 pub const SMALLEST_DIAMETER: f64 = 0.005;
 /// Largest diameter that [`read_mesh`] takes without asking, in metres.
 pub const LARGEST_DIAMETER: f64 = 5.0;
+
+/// Furthest from the origin of its frame that [`read_mesh`] takes an object without asking, in metres: single precision still
+/// tells a tenth of a millimetre there.
+pub const LARGEST_OFFSET: f64 = 1000.0;
+/// Largest area that [`read_mesh`] takes without asking, in squares of the diameter. Objects with all their inner walls have tens;
+/// faces that cover each other in thousands take minutes to render and are no object.
+pub const LARGEST_AREA: f64 = 1000.0;
+/// Most bytes of all files together that a mesh file names.
+const MOST_NAMED: u64 = 4 << 30;
+
+/// How [`read_mesh_with`] reads mesh files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MeshOptions {
+    /// Read textures, materials and buffers wherever the mesh file says, not only at or below its own folder: a mesh from
+    /// elsewhere could name any file of this machine.
+    pub allow_outside: bool,
+    /// Test the size: [`check_size`].
+    pub check_size: bool,
+}
+
+static ALLOW_OUTSIDE: AtomicBool = AtomicBool::new(false);
+
+impl Default for MeshOptions {
+    fn default() -> Self {
+        MeshOptions { allow_outside: ALLOW_OUTSIDE.load(Ordering::Relaxed), check_size: true }
+    }
+}
+
+impl MeshOptions {
+    /// Makes [`MeshOptions::allow_outside`] the default in this process, for meshes of datasets and stores as well: for programs
+    /// whose user asks for it.
+    pub fn allow_outside_everywhere() {
+        ALLOW_OUTSIDE.store(true, Ordering::Relaxed);
+    }
+}
 
 /// Gives the bytes of a file that a mesh file names (texture, material, buffer), by that name.
 pub type Resources<'a> = &'a dyn Fn(&str) -> io::Result<Vec<u8>>;
@@ -25,20 +62,12 @@ pub fn no_resources(_name: &str) -> io::Result<Vec<u8>> {
     Err(io::Error::new(io::ErrorKind::NotFound, "no such file"))
 }
 
-/// Reads a mesh and tests its size: [`read_mesh_unchecked`], then [`check_size`].
-///
-/// The format follows from the ending (`.ply .obj .stl .gltf .glb .xyz`, upper or lower case). The vertices come
-/// out in metres: the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, and
-/// `unit` multiplies all the same: give [`Unit::Metre`] for a file that keeps to it.
+/// Reads a mesh and tests its size: [`read_mesh_with`] and the default options.
 ///
 /// # Errors
-/// [`MeshFileError`], naming file, field, what was expected and found; [`MeshFileError::Size`] for a diameter
-/// outside 5 mm to 5 m.
+/// As [`read_mesh_with`].
 pub fn read_mesh(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileError> {
-    let path = path.as_ref();
-    let mesh = read_mesh_unchecked(path, unit)?;
-    check_size(&mesh, &path.display().to_string(), unit)?;
-    Ok(mesh)
+    read_mesh_with(path, unit, &MeshOptions::default())
 }
 
 /// Reads a mesh as [`read_mesh`] does, of whatever size.
@@ -46,6 +75,25 @@ pub fn read_mesh(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileErr
 /// # Errors
 /// [`MeshFileError`], but never [`MeshFileError::Size`].
 pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileError> {
+    read_mesh_with(path, unit, &MeshOptions { check_size: false, ..MeshOptions::default() })
+}
+
+/// Reads a mesh.
+///
+/// The format follows from the ending (`.ply .obj .stl .gltf .glb .xyz`, upper or lower case). The vertices come
+/// out in metres: the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, and
+/// `unit` multiplies all the same: give [`Unit::Metre`] for a file that keeps to it. The file itself, and those that it names,
+/// have to be regular files. Where so many faces cover each other that they have [`LARGEST_AREA`], those that are there several
+/// times are left out.
+///
+/// # Errors
+/// [`MeshFileError`], naming file, field, what was expected and found; [`MeshFileError::Size`] for a diameter
+/// outside 5 mm to 5 m, for an object far from the origin and for faces without end in one place.
+pub fn read_mesh_with(
+    path: impl AsRef<Path>,
+    unit: Unit,
+    options: &MeshOptions,
+) -> Result<Mesh, MeshFileError> {
     let path = path.as_ref();
     let file = path.display().to_string();
     let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
@@ -57,26 +105,69 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
         "xyz" => crate::parse_xyz,
         _ => return Err(MeshFileError::Format { file, found: ending }),
     };
-    let bytes = fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
-    let folder = path.parent().map(Path::to_path_buf).unwrap_or_default();
-    parse(&bytes, &file, unit, &|name| read_beside(&folder, name))
+    let bytes = read_regular(path, limits::MESH)
+        .map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
+    let beside = Beside { mesh: path, allow_outside: options.allow_outside, read: Cell::new(0) };
+    let mut mesh = parse(&bytes, &file, unit, &|name| beside.bytes(name))?;
+    if options.check_size {
+        let (low, high) = mesh.bounding_box();
+        if mesh.surface_area() > LARGEST_AREA * (high - low).amax().powi(2) {
+            mesh = mesh.without_repeated_faces();
+        }
+        check_size(&mesh, &file, unit)?;
+    }
+    Ok(mesh)
 }
 
-/// A named file relative to the mesh file's folder; a name that is a path of another machine is looked for
-/// by its last part.
-fn read_beside(folder: &Path, name: &str) -> io::Result<Vec<u8>> {
-    let direct = folder.join(PathBuf::from(name.replace('\\', "/")));
-    match fs::read(&direct) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {
-            let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
-            fs::read(folder.join(last)).map_err(|_| error)
+/// The files that a mesh file may name.
+struct Beside<'a> {
+    mesh: &'a Path,
+    allow_outside: bool,
+    /// Bytes read so far: a file may be named again and again.
+    read: Cell<u64>,
+}
+
+impl Beside<'_> {
+    /// A named file relative to the mesh file's folder; a name that is a path of another machine is looked for
+    /// by its last part.
+    fn bytes(&self, name: &str) -> io::Result<Vec<u8>> {
+        let folder = self.mesh.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let direct = folder.join(PathBuf::from(name.replace('\\', "/")));
+        match self.regular(&direct, folder) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
+                let found = self.regular(&folder.join(last), folder);
+                found.map_err(|e| if e.kind() == io::ErrorKind::NotFound { error } else { e })
+            }
+            other => other,
         }
-        other => other,
+    }
+
+    fn regular(&self, path: &Path, folder: &Path) -> io::Result<Vec<u8>> {
+        let real = path.canonicalize()?;
+        // Where the mesh file is a link, its own folder counts as well.
+        let within = |folder: io::Result<PathBuf>| folder.is_ok_and(|folder| real.starts_with(folder));
+        let target =
+            || self.mesh.canonicalize().map(|mesh| mesh.parent().map(Path::to_path_buf).unwrap_or(mesh));
+        if !self.allow_outside && !within(folder.canonicalize()) && !within(target()) {
+            let message = format!(
+                "{} lies outside the mesh's folder and is not read unless --allow-outside is given",
+                real.display()
+            );
+            return Err(io::Error::new(io::ErrorKind::PermissionDenied, message));
+        }
+        let bytes = read_regular(&real, limits::IMAGE)?;
+        self.read.set(self.read.get() + bytes.len() as u64);
+        if self.read.get() > MOST_NAMED {
+            let message = format!("the files that it names have more than {} MB in all", MOST_NAMED >> 20);
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, message));
+        }
+        Ok(bytes)
     }
 }
 
-/// Tests that a mesh read with `unit` has a diameter between 5 mm and 5 m; the error states in which unit it
-/// would have a sensible one.
+/// Tests that a mesh read with `unit` has a diameter between 5 mm and 5 m (the error states in which unit it would have a sensible
+/// one), lies within [`LARGEST_OFFSET`] of its origin and has no more than [`LARGEST_AREA`].
 ///
 /// # Errors
 /// [`MeshFileError::Size`].
@@ -84,7 +175,7 @@ pub fn check_size(mesh: &Mesh, name: &str, unit: Unit) -> Result<(), MeshFileErr
     let diameter = mesh.diameter();
     let sensible = SMALLEST_DIAMETER..=LARGEST_DIAMETER;
     if sensible.contains(&diameter) {
-        return Ok(());
+        return check_place_and_area(mesh, name, diameter);
     }
     let in_file = diameter / unit.to_metres();
     let better: Vec<String> = Unit::ALL
@@ -106,6 +197,27 @@ pub fn check_size(mesh: &Mesh, name: &str, unit: Unit) -> Result<(), MeshFileErr
         diameter,
         explanation: format!("the diameter would be {} as {}; {advice}", length(diameter), unit.plural()),
     })
+}
+
+fn check_place_and_area(mesh: &Mesh, name: &str, diameter: f64) -> Result<(), MeshFileError> {
+    let size = |explanation| Err(MeshFileError::Size { file: name.to_owned(), diameter, explanation });
+    let (low, high) = mesh.bounding_box();
+    let offset = low.abs().sup(&high.abs()).amax();
+    if offset > LARGEST_OFFSET {
+        return size(format!(
+            "the object lies {} from the origin of its frame, expected up to {}: move its origin into the object",
+            length(offset),
+            length(LARGEST_OFFSET)
+        ));
+    }
+    let area = mesh.surface_area() / diameter.powi(2);
+    if area > LARGEST_AREA {
+        return size(format!(
+            "the faces cover each other: their area is {area:.0} times the square of the diameter, expected up to \
+             {LARGEST_AREA}; remove faces that lie on or across each other"
+        ));
+    }
+    Ok(())
 }
 
 /// A length as people say it.
@@ -130,19 +242,12 @@ fn significant(value: f64) -> String {
     }
 }
 
-/// Decodes a PNG or JPEG texture; at most 16384 pixels a side.
+/// Decodes a PNG or JPEG texture, of at most so many pixels as any image.
 pub(crate) fn decode_texture(bytes: &[u8]) -> Result<RgbImage, String> {
-    let mut reader = image::ImageReader::new(io::Cursor::new(bytes))
-        .with_guessed_format()
-        .map_err(|error| error.to_string())?;
-    let mut limits = image::Limits::default();
-    limits.max_image_width = Some(1 << 14);
-    limits.max_image_height = Some(1 << 14);
-    reader.limits(limits);
-    let rgb = reader.decode().map_err(|error| error.to_string())?.into_rgb8();
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
-    let pixels = rgb.into_raw().chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
-    RgbImage::from_vec(width, height, pixels).map_err(|error| error.to_string())
+    ImageFile::of_bytes(Path::new("texture"), bytes).rgb().map_err(|error| match error {
+        ImageFileError::Content { reason, .. } => reason,
+        other => other.to_string(),
+    })
 }
 
 /// Reads and decodes a texture that `field` of `file` names.
@@ -155,7 +260,7 @@ pub(crate) fn load_texture(
     let error = |reason: String| MeshFileError::Named {
         file: file.to_owned(),
         field: field.to_owned(),
-        named: named.to_owned(),
+        named: shown_name(named),
         reason,
     };
     let bytes = resources(named).map_err(|e| error(e.to_string()))?;
@@ -170,6 +275,8 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), MeshFile
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use sixfold_geometry::Vec3;
 
@@ -195,6 +302,139 @@ mod tests {
         for metres in [0.005, 0.1, 5.0] {
             check_size(&two_points(metres), "o.ply", Unit::Inch).unwrap();
         }
+    }
+
+    /// What reading a mesh of these bytes says.
+    fn said(folder: &Path, name: &str, content: &str, options: &MeshOptions) -> String {
+        let path = folder.join(name);
+        fs::write(&path, content).unwrap();
+        let read = read_mesh_with(&path, Unit::Metre, options);
+        read.map_or_else(|e| e.to_string(), |mesh| format!("read {} faces", mesh.faces().len()))
+    }
+
+    const NAMING_OBJ: &str = "mtllib NAMED\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
+    const NAMING_PLY: &str = "ply\nformat ascii 1.0\ncomment TextureFile NAMED\nelement vertex 3\nproperty float x\n\
+        property float y\nproperty float z\nproperty float u\nproperty float v\nelement face 1\n\
+        property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n";
+    const NAMING_GLTF: &str = r#"{"asset":{"version":"2.0"},"nodes":[{"mesh":0}],"meshes":[{"primitives":[
+        {"attributes":{"POSITION":0}}]}],"accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3",
+        "min":[0,0,0],"max":[1,1,0]}],"bufferViews":[{"buffer":0,"byteLength":36}],
+        "buffers":[{"byteLength":36,"uri":"NAMED"}]}"#;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_mesh_that_names_any_file_of_the_machine_reads_none_outside_its_folder() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("meshes");
+        fs::create_dir_all(folder.join("below")).unwrap();
+        let mut png = io::Cursor::new(Vec::new());
+        image::RgbImage::new(2, 2).write_to(&mut png, image::ImageFormat::Png).unwrap();
+        let three: Vec<u8> =
+            [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].iter().flat_map(|v| v.to_le_bytes()).collect();
+        let content = |kind: &str| match kind {
+            "obj" => b"newmtl red\nKd 1 0 0\n".to_vec(),
+            "ply" => png.get_ref().clone(),
+            _ => three.clone(),
+        };
+        let strict = MeshOptions { allow_outside: false, check_size: true };
+        let open = MeshOptions { allow_outside: true, ..strict };
+        for (kind, template) in [("obj", NAMING_OBJ), ("ply", NAMING_PLY), ("gltf", NAMING_GLTF)] {
+            let name = format!("m.{kind}");
+            let with =
+                |named: &str, options| said(&folder, &name, &template.replace("NAMED", named), options);
+            let outside = root.path().join(format!("secret-{kind}"));
+            for place in [&outside, &folder.join("below/beside"), &folder.join("beside")] {
+                fs::write(place, content(kind)).unwrap();
+            }
+            let link = folder.join(format!("link-{kind}"));
+            std::os::unix::fs::symlink(&outside, &link).unwrap();
+            for named in
+                ["beside", "below/beside", "./below/../beside", &folder.join("beside").to_string_lossy()]
+            {
+                assert_eq!(with(named, &strict), "read 1 faces", "{kind} {named}");
+            }
+            let linked = format!("link-{kind}");
+            let above = format!("../secret-{kind}");
+            for named in [&above, &linked, &*outside.to_string_lossy()] {
+                let message = with(named, &strict);
+                for part in [&name, named, "--allow-outside", &format!("secret-{kind} lies outside")] {
+                    assert!(message.contains(part), "{kind} {named}: {message}");
+                }
+                assert_eq!(with(named, &open), "read 1 faces", "{kind} {named}");
+            }
+            assert!(with("/dev/zero", &strict).contains("--allow-outside"));
+            assert!(with("/dev/zero", &open).contains("found a device"));
+            let pipe = folder.join(format!("pipe-{kind}"));
+            assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+            let message = with(&format!("pipe-{kind}"), &strict);
+            assert!(message.contains("found a pipe, expected a regular file"), "{message}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_mesh_file_that_is_no_regular_file_is_refused() {
+        let root = tempfile::tempdir().unwrap();
+        let pipe = root.path().join("pipe.ply");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let zeros = root.path().join("zeros.stl");
+        std::os::unix::fs::symlink("/dev/zero", &zeros).unwrap();
+        let folder = root.path().join("folder.obj");
+        fs::create_dir(&folder).unwrap();
+        for (path, found) in [(&pipe, "a pipe"), (&zeros, "a device"), (&folder, "a folder")] {
+            let message = read_mesh(path, Unit::Metre).unwrap_err().to_string();
+            assert!(message.contains(found) && message.contains("expected a regular file"), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_library_that_is_named_without_end_and_a_thousand_materials_take_no_time() {
+        let root = tempfile::tempdir().unwrap();
+        fs::write(root.path().join("m.mtl"), "newmtl red\nKd 1 0 0\n").unwrap();
+        let mut text = "mtllib m.mtl\n".repeat(1000) + "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
+        // Looked up in a list, these took a minute.
+        (0..60_000).for_each(|k| text += &format!("usemtl material-{k}\nf 1 2 3\n"));
+        let start = std::time::Instant::now();
+        let options = MeshOptions { allow_outside: false, check_size: false };
+        assert_eq!(said(root.path(), "m.obj", &text, &options), "read 60000 faces");
+        assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
+    }
+
+    #[test]
+    fn degenerate_objects_are_explained_at_once() {
+        let explain = |points: Vec<Vec3>, faces: Vec<[u32; 3]>| {
+            let start = std::time::Instant::now();
+            let said = check_size(&Mesh::new(points, faces).unwrap(), "o.ply", Unit::Metre);
+            assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+            said.map_err(|e| e.to_string())
+        };
+        assert!(explain(vec![Vec3::x(); 400_000], vec![]).unwrap_err().contains("the same point"));
+        let two = |k: u32| if k % 2 == 0 { Vec3::zeros() } else { Vec3::x() };
+        explain((0..400_000).map(two).collect(), vec![]).unwrap();
+        // Nearly equal ones at two places: all of their pairs are nearly as long.
+        let nearly = |k: u32| two(k) + Vec3::new(0.0, f64::from(k / 2) * 1e-13, 0.0);
+        explain((0..400_000).map(nearly).collect(), vec![]).unwrap();
+        explain((0..400_000).map(|k| Vec3::x() * (f64::from(k) / 4e5)).collect(), vec![]).unwrap();
+        assert!(
+            explain(vec![Vec3::repeat(1e30), -Vec3::repeat(1e30)], vec![]).unwrap_err().contains("no unit")
+        );
+        assert!(explain(vec![Vec3::repeat(f64::MAX), -Vec3::repeat(f64::MAX)], vec![]).is_err());
+        let far = explain(vec![Vec3::x() * 1e6, Vec3::x() * 1e6 + Vec3::y()], vec![]).unwrap_err();
+        assert!(far.contains("1e6 m") || far.contains("from the origin"), "{far}");
+        let corners = vec![Vec3::zeros(), Vec3::x(), Vec3::y()];
+        let covered = explain(corners, vec![[0, 1, 2]; 200_000]).unwrap_err();
+        assert!(covered.contains("cover each other"), "{covered}");
+    }
+
+    #[test]
+    fn faces_that_are_there_two_hundred_thousand_times_are_read_once() {
+        let root = tempfile::tempdir().unwrap();
+        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n".to_owned()
+            + &"f 1 2 3\nf 3 1 2\n".repeat(100_000);
+        assert_eq!(said(root.path(), "m.obj", &text, &MeshOptions::default()), "read 2 faces");
+        // A few of them are left as they are.
+        let few = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 3 2 1\n";
+        assert_eq!(said(root.path(), "m.obj", few, &MeshOptions::default()), "read 2 faces");
     }
 
     #[test]

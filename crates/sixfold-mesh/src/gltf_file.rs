@@ -17,8 +17,8 @@ use sixfold_geometry::{RgbImage, Vec3};
 
 use crate::file::decode_texture;
 use crate::mesh::Parts;
-use crate::paint::{Paint, apply};
-use crate::ply::excerpt;
+use crate::paint::{MAX_PIXELS, Paint, apply};
+use crate::ply::{excerpt, shown_name};
 use crate::{Mesh, MeshFileError, Resources, Unit};
 
 /// Most vertices and faces that a file may give by using its meshes again and again.
@@ -70,6 +70,7 @@ pub fn parse_gltf(
         face_paints: Vec::new(),
         paints: Vec::new(),
         paint_of: HashMap::new(),
+        pixels: 0,
         scale: unit.to_metres(),
     };
     reader.walk(&document)?;
@@ -140,7 +141,7 @@ fn read_uri(uri: &str, file: &str, field: &str, resources: Resources<'_>) -> Res
     resources(&name).map_err(|error| MeshFileError::Named {
         file: file.to_owned(),
         field: field.to_owned(),
-        named: excerpt(&name),
+        named: shown_name(&name),
         reason: error.to_string(),
     })
 }
@@ -209,6 +210,8 @@ struct Reader<'a> {
     paints: Vec<Paint>,
     /// Paints by image and factor, so that a texture is decoded once.
     paint_of: HashMap<(Option<usize>, [u32; 3]), usize>,
+    /// Pixels of all textures so far.
+    pixels: usize,
     scale: f64,
 }
 
@@ -395,6 +398,14 @@ impl Reader<'_> {
                 Paint::Texture(texture)
             }
         };
+        if let Paint::Texture(texture) = &paint {
+            // One image under many factors is many textures.
+            self.pixels += texture.as_slice().len();
+            if self.pixels > MAX_PIXELS {
+                let expected = format!("at most {MAX_PIXELS} pixels in all");
+                return Err(self.error("textures", &expected, "more"));
+            }
+        }
         self.paints.push(paint);
         self.paint_of.insert(key, self.paints.len() - 1);
         Ok(self.paints.len() - 1)

@@ -21,6 +21,7 @@ mod file;
 mod gltf_file;
 mod measure;
 mod mesh;
+mod models_check;
 mod models_info;
 mod obj;
 mod paint;
@@ -35,14 +36,15 @@ mod xyz;
 
 pub use error::MeshFileError;
 pub use file::{
-    LARGEST_DIAMETER, Resources, SMALLEST_DIAMETER, check_size, no_resources, read_mesh, read_mesh_unchecked,
+    LARGEST_AREA, LARGEST_DIAMETER, LARGEST_OFFSET, MeshOptions, Resources, SMALLEST_DIAMETER, check_size,
+    no_resources, read_mesh, read_mesh_unchecked, read_mesh_with,
 };
 pub use gltf_file::parse_gltf;
 pub use mesh::{Mesh, MeshError};
 pub use models_info::{ContinuousSymmetry, ModelInfo, ModelsInfo};
 pub use obj::parse_obj;
 pub use ply::parse_ply;
-pub use ply_write::{PlyFormat, ply_bytes, write_ply};
+pub use ply_write::{PlyFormat, ply_bytes, ply_files, write_ply};
 pub use sample::SurfaceSamples;
 pub use simplify::simplify;
 pub use stl::parse_stl;

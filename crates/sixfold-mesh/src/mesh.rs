@@ -1,10 +1,12 @@
 //! The triangle mesh every other crate works on: checked once, in metres.
 
+use std::collections::HashSet;
+
 use sixfold_geometry::{RgbImage, Vec3};
 use thiserror::Error;
 
 use crate::MeshFileError;
-use crate::measure::computed_normals;
+use crate::measure::{computed_normals, position_key};
 
 /// Why arrays do not form a mesh.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -146,6 +148,19 @@ impl Mesh {
         self.texture.as_ref()
     }
 
+    /// The mesh without the faces that are there already: the same three vertices, whichever is named first and whichever way
+    /// round. The first of them stays.
+    pub fn without_repeated_faces(&self) -> Mesh {
+        let mut seen = HashSet::with_capacity(self.faces.len());
+        let place = |i: u32| position_key(&self.vertices[i as usize]);
+        let first = |face: &&[u32; 3]| {
+            let mut corners = face.map(place);
+            corners.sort_unstable();
+            seen.insert(corners)
+        };
+        Mesh { faces: self.faces.iter().filter(first).copied().collect(), ..self.clone() }
+    }
+
     /// A mesh with its vertices and normals mapped; faces, colours and texture stay.
     pub(crate) fn map_geometry(
         &self,
@@ -197,6 +212,11 @@ impl Mesh {
     }
 }
 
+/// A unit vector; `None` where the length is `least` or less, not finite or too large to be computed.
+pub(crate) fn direction(vector: &Vec3, least: f64) -> Option<Vec3> {
+    vector.try_normalize(least).filter(|n| (n.norm() - 1.0).abs() < 1e-6)
+}
+
 /// What a reader found in a file, before it is checked.
 #[derive(Debug, Default)]
 pub(crate) struct Parts {
@@ -219,7 +239,7 @@ impl Parts {
             mesh.check_length("normals", normals.len()).map_err(in_file)?;
             let mut missing = false;
             for normal in &mut normals {
-                let unit = normal.try_normalize(1e-12).filter(|n| n.iter().all(|c| c.is_finite()));
+                let unit = direction(normal, 1e-12);
                 missing |= unit.is_none();
                 *normal = unit.unwrap_or_default();
             }

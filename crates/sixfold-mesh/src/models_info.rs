@@ -14,6 +14,12 @@ use crate::file::write_atomically;
 use crate::{Mesh, MeshFileError};
 
 const MILLIMETRE: f64 = 1e-3;
+/// No number in the file is larger: a kilometre. What is larger loses its digits, or is none when it is squared.
+const LARGEST: f64 = 1e6;
+/// Most discrete symmetries of an object: nuts have 12, a dodecahedron 60.
+const MOST_DISCRETE: usize = 512;
+/// Most symmetries of an object when continuous ones are taken in BOP's steps: 12 discrete ones about four axes.
+const MOST_SYMMETRIES: usize = 16_384;
 
 /// A symmetry under every rotation about an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,6 +28,14 @@ pub struct ContinuousSymmetry {
     pub axis: Vec3,
     /// A point on the axis, in metres.
     pub offset: Vec3,
+}
+
+impl ContinuousSymmetry {
+    /// The rotation by an angle about the axis, radians.
+    pub fn rotation(&self, angle: f64) -> Pose {
+        let rotation = UnitQuaternion::from_axis_angle(&UnitVector::new_normalize(self.axis), angle);
+        Pose::new(rotation, self.offset - rotation * self.offset)
+    }
 }
 
 /// What BOP notes of one object model; lengths in metres.
@@ -74,11 +88,8 @@ impl ModelInfo {
         let steps = (std::f64::consts::PI / max_step).ceil().max(1.0) as usize;
         let mut turns = Vec::with_capacity(steps * self.symmetries_continuous.len());
         for symmetry in &self.symmetries_continuous {
-            let axis = UnitVector::new_normalize(symmetry.axis);
             for step in 0..steps {
-                let angle = step as f64 * (std::f64::consts::TAU / steps as f64);
-                let rotation = UnitQuaternion::from_axis_angle(&axis, angle);
-                turns.push(Pose::new(rotation, symmetry.offset - rotation * symmetry.offset));
+                turns.push(symmetry.rotation(step as f64 * (std::f64::consts::TAU / steps as f64)));
             }
         }
         if turns.is_empty() {
@@ -103,7 +114,8 @@ impl ModelsInfo {
     pub fn read(path: impl AsRef<Path>) -> Result<Self, MeshFileError> {
         let path = path.as_ref();
         let file = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
+        let bytes = sixfold_io::read_regular(path, sixfold_io::limits::SMALL_TEXT)
+            .map_err(|source| MeshFileError::Io { file: file.clone(), source })?;
         Self::parse(&bytes, &file)
     }
 
@@ -133,9 +145,14 @@ impl ModelsInfo {
     /// # Errors
     /// [`MeshFileError::Io`].
     pub fn write(&self, path: impl AsRef<Path>) -> Result<(), MeshFileError> {
+        write_atomically(path.as_ref(), self.to_text().as_bytes())
+    }
+
+    /// What [`ModelsInfo::write`] writes.
+    pub fn to_text(&self) -> String {
         let objects: Vec<String> =
             self.0.iter().map(|(id, info)| format!(" \"{id}\": {}", to_json(info))).collect();
-        write_atomically(path.as_ref(), format!("{{\n{}\n}}\n", objects.join(",\n")).as_bytes())
+        format!("{{\n{}\n}}\n", objects.join(",\n"))
     }
 }
 
@@ -200,7 +217,7 @@ impl Fields<'_> {
     fn length(&self, field: &str, expected: &str, valid: impl Fn(f64) -> bool) -> Result<f64, MeshFileError> {
         let value = self.value.get(field).ok_or_else(|| self.error(field, expected, "no such field"))?;
         match value.as_f64() {
-            Some(number) if valid(number) => Ok(number * MILLIMETRE),
+            Some(number) if valid(number) && number.abs() <= LARGEST => Ok(number * MILLIMETRE),
             _ => Err(self.error(field, expected, kind(value))),
         }
     }
@@ -214,13 +231,33 @@ impl Fields<'_> {
     }
 
     fn numbers<const N: usize>(&self, field: &str, value: Option<&Value>) -> Result<[f64; N], MeshFileError> {
-        let expected = format!("{N} numbers");
+        let expected = format!("{N} numbers of at most {LARGEST}");
         let Some(value) = value else { return Err(self.error(field, &expected, "no such field")) };
         value
             .as_array()
             .and_then(|items| items.iter().map(Value::as_f64).collect::<Option<Vec<f64>>>())
             .and_then(|numbers| <[f64; N]>::try_from(numbers).ok())
+            .filter(|numbers| numbers.iter().all(|v| v.abs() <= LARGEST))
             .ok_or_else(|| self.error(field, &expected, kind(value)))
+    }
+
+    /// Every symmetry is tried for every pose: a file may not ask for more than anyone can wait for.
+    fn check_counts(&self) -> Result<(), MeshFileError> {
+        let (discrete, continuous) =
+            (self.list("symmetries_discrete")?.len(), self.list("symmetries_continuous")?.len());
+        if discrete > MOST_DISCRETE {
+            let expected = format!("at most {MOST_DISCRETE} symmetries");
+            return Err(self.error("symmetries_discrete", &expected, discrete.to_string()));
+        }
+        let steps = (std::f64::consts::PI / ModelInfo::BOP_MAX_STEP).ceil() as usize;
+        let all = (1 + discrete).saturating_mul(continuous.saturating_mul(steps).max(1));
+        if all > MOST_SYMMETRIES {
+            let expected = format!(
+                "at most {MOST_SYMMETRIES} symmetries, with each discrete one at each step of each axis"
+            );
+            return Err(self.error("symmetries_continuous", &expected, all.to_string()));
+        }
+        Ok(())
     }
 
     fn info(&self) -> Result<ModelInfo, MeshFileError> {
@@ -234,6 +271,7 @@ impl Fields<'_> {
         };
         let min = corner("min", "a number, in millimetres", f64::is_finite)?;
         let size = corner("size", "a number of zero or more, in millimetres", |s| s >= 0.0)?;
+        self.check_counts()?;
         let mut symmetries_discrete = Vec::new();
         for (index, entry) in self.list("symmetries_discrete")?.iter().enumerate() {
             let field = format!("symmetries_discrete[{index}]");

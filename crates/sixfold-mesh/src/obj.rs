@@ -9,8 +9,8 @@ use sixfold_geometry::Vec3;
 
 use crate::file::load_texture;
 use crate::mesh::Parts;
-use crate::paint::{Paint, apply};
-use crate::ply::excerpt;
+use crate::paint::{MAX_PIXELS, Paint, apply};
+use crate::ply::{excerpt, shown_name};
 use crate::{Mesh, MeshFileError, Resources, Unit};
 
 /// The colour of a material that has none: the default of MTL, 0.8.
@@ -114,6 +114,7 @@ pub fn parse_obj(
     let mut library: HashMap<String, ObjMaterial> = HashMap::new();
     let mut has_library = false;
     let mut names: Vec<String> = vec![String::new()];
+    let mut number_of: HashMap<String, usize> = HashMap::from([(String::new(), 0)]);
     let mut material = 0;
     let mut corners: HashMap<Corner, u32> = HashMap::new();
     let mut order: Vec<Corner> = Vec::new();
@@ -171,7 +172,7 @@ pub fn parse_obj(
                 }
             }
             "usemtl" => {
-                material = names.iter().position(|name| name == rest).unwrap_or_else(|| {
+                material = *number_of.entry(rest.to_owned()).or_insert_with(|| {
                     names.push(rest.to_owned());
                     names.len() - 1
                 });
@@ -207,13 +208,20 @@ pub fn parse_obj(
         texture: None,
     };
     if has_library && !parts.faces.is_empty() {
-        let mut paints = Vec::new();
-        for (index, name) in names.iter().enumerate() {
-            let used = face_materials.contains(&index);
+        let (mut paints, mut pixels) = (Vec::new(), 0);
+        let mut used = vec![false; names.len()];
+        face_materials.iter().for_each(|&material| used[material] = true);
+        for (name, used) in names.iter().zip(used) {
             let material = library.get(name).cloned().unwrap_or_default();
             paints.push(match material.texture {
                 Some((texture, field)) if used && parts.texcoords.is_some() => {
-                    Paint::Texture(load_texture(file, &field, &texture, resources)?)
+                    let texture = load_texture(file, &field, &texture, resources)?;
+                    pixels += texture.as_slice().len();
+                    if pixels > MAX_PIXELS {
+                        let expected = format!("at most {MAX_PIXELS} pixels in all");
+                        return Err(MeshFileError::field(file, field, expected, "more"));
+                    }
+                    Paint::Texture(texture)
                 }
                 _ => Paint::Color(material.color.unwrap_or(PLAIN)),
             });
@@ -237,7 +245,7 @@ fn read_library(
     let named = |name: &str, error: std::io::Error| MeshFileError::Named {
         file: at.file.to_owned(),
         field: format!("line {}, mtllib", at.number),
-        named: name.to_owned(),
+        named: shown_name(name),
         reason: error.to_string(),
     };
     match resources(rest) {

@@ -7,8 +7,8 @@ use crate::mesh::Parts;
 
 /// Rows of repeated edge between the textures of an atlas, against bleeding when they are interpolated.
 const GUTTER: usize = 2;
-/// Maximum number of pixels of an atlas.
-const MAX_PIXELS: usize = 1 << 28;
+/// Maximum number of pixels of an atlas, and of all textures of a mesh.
+pub(crate) const MAX_PIXELS: usize = 1 << 28;
 
 /// What a material gives to a surface.
 #[derive(Debug, Clone)]

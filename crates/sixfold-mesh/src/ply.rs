@@ -196,8 +196,19 @@ fn parse_header(bytes: &[u8], file: &str) -> Result<Header, MeshFileError> {
 
 /// The first characters of a text, for messages.
 pub(crate) fn excerpt(text: &str) -> String {
-    let mut short: String = text.chars().take(60).collect();
-    if short.len() < text.len() {
+    shortened(text, 60)
+}
+
+/// A name in a file, for messages: long enough for any path.
+pub(crate) fn shown_name(text: &str) -> String {
+    shortened(text, 300)
+}
+
+/// At most `most` characters; control characters, which a terminal would obey, are replaced.
+fn shortened(text: &str, most: usize) -> String {
+    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let mut short: String = text.chars().take(most).map(shown).collect();
+    if text.chars().nth(most).is_some() {
         short.push_str("...");
     }
     short

@@ -1,7 +1,7 @@
 //! Writing PLY: ascii to read, binary little endian (32 bit floats) to ship.
 
 use std::io::Cursor;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use sixfold_geometry::RgbImage;
 
@@ -29,6 +29,22 @@ pub fn write_ply(
     unit: Unit,
     format: PlyFormat,
 ) -> Result<(), MeshFileError> {
+    for (path, bytes) in ply_files(path, mesh, unit, format)? {
+        write_atomically(&path, &bytes)?;
+    }
+    Ok(())
+}
+
+/// The files that [`write_ply`] writes, with their bytes: the texture first.
+///
+/// # Errors
+/// As [`write_ply`].
+pub fn ply_files(
+    path: impl AsRef<Path>,
+    mesh: &Mesh,
+    unit: Unit,
+    format: PlyFormat,
+) -> Result<Vec<(PathBuf, Vec<u8>)>, MeshFileError> {
     let path = path.as_ref();
     let file = path.display().to_string();
     let largest = mesh.vertices().iter().fold(0.0f64, |m, v| m.max(v.amax())) / unit.to_metres();
@@ -36,7 +52,7 @@ pub fn write_ply(
         let expected = format!("coordinates that fit a 32 bit float in {unit}");
         return Err(MeshFileError::field(&file, "element vertex", expected, format!("{largest:e}")));
     }
-    let mut texture_name = None;
+    let (mut files, mut texture_name) = (vec![], None);
     if let (Some(texture), Some(_)) = (mesh.texture(), mesh.texcoords()) {
         let texture_path = path.with_extension("png");
         let name = texture_path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -44,10 +60,11 @@ pub fn write_ply(
             file: texture_path.display().to_string(),
             source: std::io::Error::other(error),
         })?;
-        write_atomically(&texture_path, &png)?;
+        files.push((texture_path, png));
         texture_name = Some(name);
     }
-    write_atomically(path, &ply_bytes(mesh, unit, format, texture_name.as_deref()))
+    files.push((path.to_owned(), ply_bytes(mesh, unit, format, texture_name.as_deref())));
+    Ok(files)
 }
 
 fn encode_png(texture: &RgbImage) -> Result<Vec<u8>, image::ImageError> {

@@ -4,10 +4,12 @@
 //! Disks need no orientation and no topology, so thin walls and open shapes (mugs, pitchers) are no trouble; the renderer
 //! shows both sides. The surface is as rough as the points are sparse.
 
+use std::collections::HashSet;
 use std::f64::consts::TAU;
 
-use sixfold_geometry::{KdTree, Vec3, fit_plane};
+use sixfold_geometry::{KdTree, Neighbour, Vec3, fit_plane};
 
+use crate::measure::position_key;
 use crate::{Mesh, MeshError};
 
 /// Corners of a disk.
@@ -26,15 +28,15 @@ impl Mesh {
         let mut vertices = Vec::with_capacity(points.len() * CORNERS as usize);
         let mut faces = Vec::with_capacity(points.len() * (CORNERS as usize - 2));
         for p in points {
+            let mut near = tree.nearest_several(p, 12);
             // The neighbourhood grows until it holds enough points for a plane.
+            let squared = |n: &Neighbour| (points[n.index] - p).norm_squared();
+            let enough = near.get(7).or(near.last()).map_or(0.0, squared);
             let mut reach = 2.0 * typical;
-            let mut near = tree.within(p, reach);
-            while near.len() < 8 && near.len() < points.len() {
+            while reach * reach < enough {
                 reach *= 1.5;
-                near = tree.within(p, reach);
             }
-            near.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index)));
-            near.truncate(12);
+            near.retain(|n| squared(n) <= reach * reach);
             let neighbours: Vec<Vec3> = near.iter().map(|n| points[n.index]).collect();
             let Some(plane) = fit_plane(&neighbours) else { continue };
             let radius = 0.8 * near[near.len().min(7) - 1].distance;
@@ -52,31 +54,22 @@ impl Mesh {
     }
 }
 
-/// The median distance from a point to its nearest other point.
+/// The median distance from a point to the nearest one elsewhere.
 fn spacing(points: &[Vec3], tree: &KdTree) -> f64 {
-    let stride = points.len().div_ceil(500).max(1);
     let extent = points.iter().fold(0f64, |m, p| m.max((p - points[0]).norm()));
-    let mut distances: Vec<f64> = points
-        .iter()
-        .enumerate()
-        .step_by(stride)
-        .filter_map(|(i, p)| {
-            let mut reach = 0.01 * extent;
-            while reach > 0.0 && reach < 2.0 * extent {
-                let nearest = tree
-                    .within(p, reach)
-                    .iter()
-                    .filter(|n| n.index != i && n.distance > 0.0)
-                    .map(|n| n.distance)
-                    .fold(f64::INFINITY, f64::min);
-                if nearest.is_finite() {
-                    return Some(nearest);
-                }
-                reach *= 2.0;
-            }
-            None
-        })
-        .collect();
+    // Points at one place would be gone through for each of them.
+    let mut places = HashSet::with_capacity(points.len());
+    let unique: Vec<Vec3> = points.iter().filter(|p| places.insert(position_key(p))).copied().collect();
+    let of_unique;
+    let tree = if unique.len() == points.len() {
+        tree
+    } else {
+        of_unique = KdTree::new(&unique);
+        &of_unique
+    };
+    let stride = points.len().div_ceil(500).max(1);
+    let elsewhere = |p: &Vec3| tree.nearest_several(p, 2).iter().map(|n| n.distance).find(|d| *d > 0.0);
+    let mut distances: Vec<f64> = points.iter().step_by(stride).filter_map(elsewhere).collect();
     distances.sort_by(f64::total_cmp);
     distances.get(distances.len() / 2).copied().unwrap_or(extent.max(f64::MIN_POSITIVE))
 }
@@ -107,6 +100,19 @@ mod tests {
         }
         // Overlapping: the disks together are larger than the sphere.
         assert!(surface.surface_area() > 4.0 * std::f64::consts::PI * 0.01);
+    }
+
+    #[test]
+    fn forty_thousand_equal_points_take_no_time() {
+        let start = std::time::Instant::now();
+        let equal = vec![Vec3::new(0.1, 0.2, 0.3); 40_000];
+        assert_eq!(Mesh::new(equal.clone(), vec![]).unwrap().surfels(), Err(MeshError::Empty));
+        // Half of them at one place, the others around: the surface is that of the others.
+        let around =
+            (0..20_000).map(|k| Vec3::new(f64::from(k % 141) * 1e-3, f64::from(k / 141) * 1e-3, 0.0));
+        let mixed = Mesh::new(equal[..20_000].iter().copied().chain(around).collect(), vec![]).unwrap();
+        assert_eq!(mixed.surfels().unwrap().faces().len(), 20_000 * 4);
+        assert!(start.elapsed().as_secs() < 15, "{:?}", start.elapsed());
     }
 
     #[test]

@@ -4,6 +4,8 @@ use sixfold_geometry::Vec3;
 
 use crate::error::MeshFileError;
 use crate::file::Resources;
+use crate::mesh::direction;
+use crate::ply::excerpt;
 use crate::{Mesh, Unit};
 
 /// Reads a point list as a mesh without faces, in metres.
@@ -20,7 +22,7 @@ pub fn parse_xyz(
         file: file.to_owned(),
         field: format!("line {line}"),
         expected: expected.to_owned(),
-        found: found.chars().take(60).collect(),
+        found: excerpt(found),
     };
     let text = std::str::from_utf8(bytes).map_err(|_| field(1, "text", "bytes that are no UTF-8"))?;
     let (mut points, mut normals) = (Vec::new(), Vec::new());
@@ -39,7 +41,7 @@ pub fn parse_xyz(
             [x, y, z] => points.push(Vec3::new(x, y, z) * unit.to_metres()),
             [x, y, z, a, b, c] => {
                 points.push(Vec3::new(x, y, z) * unit.to_metres());
-                normals.push(Vec3::new(a, b, c).try_normalize(1e-9).unwrap_or_default());
+                normals.push(direction(&Vec3::new(a, b, c), 1e-9).unwrap_or_default());
             }
             _ => return Err(field(number + 1, "three or six numbers", content)),
         }

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use sixfold_mesh::{Mesh, Unit, read_mesh, simplify};
+use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh, simplify};
 
 fn data() -> Option<PathBuf> {
     let folder = std::env::var_os("SIXFOLD_DATA")
@@ -38,6 +38,7 @@ fn bop_models_have_the_published_diameters_and_boxes() {
         let folder = data.join(dataset).join("models");
         let text = std::fs::read(folder.join("models_info.json")).unwrap();
         let info: serde_json::Value = serde_json::from_slice(&text).unwrap();
+        let infos = ModelsInfo::parse(&text, dataset).unwrap();
         let paths = files(folder, "ply");
         assert!(paths.len() >= 8);
         for path in paths {
@@ -56,6 +57,8 @@ fn bop_models_have_the_published_diameters_and_boxes() {
                 start.elapsed()
             );
             assert!((diameter - number("diameter")).abs() < tolerance, "{dataset} {id}: {diameter}");
+            infos.check_mesh(id.parse().unwrap(), &mesh, dataset).unwrap();
+            infos.check_symmetries(id.parse().unwrap(), &mesh, dataset).unwrap();
             let (low, high) = mesh.bounding_box();
             for (axis, name) in ["x", "y", "z"].iter().enumerate() {
                 assert!((1e3 * low[axis] - number(&format!("min_{name}"))).abs() < tolerance);

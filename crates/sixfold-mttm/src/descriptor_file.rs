@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use sixfold_io::fnv1a;
+use sixfold_io::{fnv1a, limits, read_regular};
 
 use crate::error::StoreError;
 use crate::model::Descriptor;
@@ -29,7 +29,8 @@ pub(crate) fn write(path: &Path, made_from: [u64; 2], descriptors: &[Descriptor]
 
 /// Reads what [`write`] wrote, if it was made from this.
 pub(crate) fn read(path: &Path, made_from: [u64; 2]) -> Result<Vec<Descriptor>, StoreError> {
-    let bytes = std::fs::read(path).map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+    let bytes = read_regular(path, limits::DERIVED)
+        .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
     let damaged = |what| StoreError::Damaged { path: path.to_path_buf(), what };
     if bytes.len() < HEAD + 8 || &bytes[..8] != MAGIC {
         return Err(damaged("not a file of descriptors, or cut off"));
@@ -48,10 +49,13 @@ pub(crate) fn read(path: &Path, made_from: [u64; 2]) -> Result<Vec<Descriptor>, 
         return Err(StoreError::OtherInput { path: path.to_path_buf() });
     }
     let numbers = &body[HEAD..];
-    if numbers.len() != word(28) as usize * 4 * DESCRIPTOR {
+    if numbers.len() != (word(28) as usize).saturating_mul(4 * DESCRIPTOR) {
         return Err(damaged("its parts do not fit together"));
     }
     let number = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+    if !numbers.chunks_exact(4).all(|b| number(b).is_finite()) {
+        return Err(damaged("a number that is not finite"));
+    }
     let rows = numbers.chunks_exact(4 * DESCRIPTOR);
     Ok(rows.map(|row| std::array::from_fn(|k| number(&row[4 * k..]))).collect())
 }

@@ -58,6 +58,14 @@ pub enum TemplateError {
         /// Largest extent that is taken.
         high: f64,
     },
+    /// More views than templates that a file may hold.
+    #[error("found {found} views, expected up to {most}: leave out those that look alike")]
+    TooManyViews {
+        /// Views found.
+        found: usize,
+        /// Views taken.
+        most: usize,
+    },
     /// No view was given.
     #[error("no view of the object was given")]
     NoViews,
@@ -86,7 +94,7 @@ pub enum StoreError {
         source: io::Error,
     },
     /// Not a file of templates, or damaged.
-    #[error("{}: {what}; make the templates again", path.display())]
+    #[error("{}: {what}", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -95,7 +103,7 @@ pub enum StoreError {
     },
     /// Of another version.
     #[error(
-        "{}: written by another version of sixfold: found format {found}, expected {expected}; make the templates again",
+        "{}: written by another version of sixfold: found format {found}, expected {expected}",
         path.display()
     )]
     Version {
@@ -105,6 +113,16 @@ pub enum StoreError {
         found: u32,
         /// Format expected.
         expected: u32,
+    },
+    /// They cannot be used, and there is no mesh to make them again from.
+    #[error(
+        "the templates of an object without a mesh cannot be used; make them again with `sixfold object add {object} --depth FILE --mask FILE --camera FILE --replace`"
+    )]
+    OnlyTemplates {
+        /// The object.
+        object: String,
+        /// What is wrong with the file.
+        source: Box<StoreError>,
     },
     /// Whole and of this version, but made from something else.
     #[error("{}: made from other templates or by another network", path.display())]

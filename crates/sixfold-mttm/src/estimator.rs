@@ -10,6 +10,7 @@ use sixfold_estimator::{
 };
 use sixfold_mesh::Mesh;
 
+use crate::error::StoreError;
 use crate::estimate::{KnownObject, MttmEstimate, MttmOptions, Stages, search};
 use crate::regions::RegionCache;
 use crate::template::{ObjectTemplates, Source, TemplateOptions};
@@ -77,7 +78,9 @@ impl MttmEstimator {
                 method: METHOD,
                 advice: "add it with `sixfold object add`",
             })?;
-            return ObjectTemplates::read(&file).map_err(|e| wrap(Box::new(e)));
+            let only =
+                |source| StoreError::OnlyTemplates { object: object.name.clone(), source: Box::new(source) };
+            return ObjectTemplates::read(&file).map_err(|e| wrap(Box::new(only(e))));
         };
         let Some(file) = file else {
             return ObjectTemplates::from_mesh(mesh, &self.templates).map_err(|e| wrap(Box::new(e)));

@@ -4,6 +4,7 @@ use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec2, Vec3};
 
 use crate::error::TemplateError;
 use crate::roi::ray_rotation;
+use crate::store::MAX_TEMPLATES;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 
 /// Sizes of tabletop objects, metres: smaller and larger ones are a wrong depth scale or mask. Chosen by hand; not swept.
@@ -51,6 +52,9 @@ impl ObjectTemplates {
     ) -> Result<ObjectTemplates, TemplateError> {
         options.check()?;
         let first = views.first().ok_or(TemplateError::NoViews)?;
+        if views.len() > MAX_TEMPLATES {
+            return Err(TemplateError::TooManyViews { found: views.len(), most: MAX_TEMPLATES });
+        }
         let posed = first.camera_from_object.is_some();
         let mut extent = 0f64;
         let mut points = vec![];
@@ -82,7 +86,7 @@ type Seen = ([usize; 2], Vec3);
 /// The points under the mask, without those far off the others in depth: masks bleed over edges.
 fn masked_points(view: &DepthView<'_>) -> Result<Vec<Seen>, TemplateError> {
     let (depth, camera, mask) = (view.depth, view.camera, view.mask);
-    camera.check()?;
+    camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;
     if mask.size() != depth.size() {
         return Err(TemplateError::MaskSize {

@@ -18,6 +18,8 @@ const MAX_FACES: usize = 12_000;
 /// Times that a view is centred on the middle of what it shows: the perspective changes what is seen a little each time. Chosen by hand;
 /// not swept.
 const CENTRINGS: usize = 3;
+/// How far a length in a file may be off that of the mesh, as a fraction of the diameter: rounding.
+const SAME_LENGTH: f64 = 1e-9;
 
 impl ObjectTemplates {
     /// Draws `mesh` (metres) from all sides that the options ask for.
@@ -63,7 +65,10 @@ impl ObjectTemplates {
         let mut note = None;
         match ObjectTemplates::read(path) {
             Ok(templates) if templates.made_from == fingerprint(mesh, options) => {
-                return Ok((templates, None));
+                match templates.fits(mesh, options) {
+                    Ok(()) => return Ok((templates, None)),
+                    Err(what) => note = Some(StoreError::Damaged { path: path.into(), what }),
+                }
             }
             Ok(_) => note = Some(StoreError::Damaged { path: path.into(), what: "made from another mesh" }),
             Err(StoreError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
@@ -74,6 +79,28 @@ impl ObjectTemplates {
             note = Some(error);
         }
         Ok((templates, note))
+    }
+}
+
+impl ObjectTemplates {
+    /// Holds what a file says against the mesh that it says it was made from.
+    fn fits(&self, mesh: &Mesh, options: &TemplateOptions) -> Result<(), &'static str> {
+        let (low, high) = mesh.bounding_box();
+        // A view's reference point lies on the mesh, which is as far from its frame's origin as the furthest corner of its box.
+        let reach = low.abs().sup(&high.abs()).norm() + self.diameter;
+        if self.source != Source::Mesh || self.options != *options {
+            return Err("field source or options: not those of the mesh's templates");
+        }
+        if (self.diameter - mesh.diameter()).abs() > SAME_LENGTH * self.diameter {
+            return Err("field diameter: not that of the mesh");
+        }
+        if self.templates.len() > view_directions(options.coverage).len() {
+            return Err("field templates: more than there are views");
+        }
+        if self.templates.iter().any(|t| t.view_from_object.translation().norm() > reach) {
+            return Err("field view_from_object: a view that does not look at the mesh");
+        }
+        Ok(())
     }
 }
 
@@ -175,6 +202,40 @@ mod tests {
         let (other, note) = ObjectTemplates::cached(&path, &brick().scaled(1.1), &options).unwrap();
         assert!(note.unwrap().to_string().contains("another mesh"));
         assert!((other.diameter / first.diameter - 1.1).abs() < 1e-9);
+    }
+
+    /// Files that are whole, of this version and of this mesh, as they say.
+    #[test]
+    fn forged_templates_are_made_again_with_a_note_that_names_the_field() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("templates.bin");
+        let options = TemplateOptions::default();
+        let (honest, _) = ObjectTemplates::cached(&path, &brick(), &options).unwrap();
+        type Forge = fn(&mut ObjectTemplates);
+        let forgeries: [(&str, Forge); 11] = [
+            ("diameter", |t| t.diameter = 0.0),
+            ("diameter", |t| t.diameter = f64::NAN),
+            ("diameter", |t| (t.diameter, t.size) = (2.0 * t.diameter, 2.0 * t.size)),
+            ("size", |t| t.size *= 1e6),
+            ("options", |t| t.options.margin = 1e300),
+            ("source", |t| t.source = Source::Depth),
+            ("templates", |t| t.templates = vec![t.templates[0].clone(); 5000]),
+            ("templates", |t| t.templates.extend_from_within(..)),
+            ("distance", |t| t.templates[7].distance = 1e200),
+            ("view_from_object", |t| {
+                t.templates[3].view_from_object = Pose::from_translation(Vec3::x() * 50.0);
+            }),
+            ("depth", |t| t.templates[5].depth.fill(0)),
+        ];
+        for (field, forge) in forgeries {
+            let mut forged = honest.clone();
+            forge(&mut forged);
+            forged.write(&path).unwrap();
+            let (templates, note) = ObjectTemplates::cached(&path, &brick(), &options).unwrap();
+            let note = note.unwrap().to_string();
+            assert!(note.contains(field) && note.contains("templates.bin"), "{field}: {note}");
+            assert_eq!(templates, honest, "{field}");
+        }
     }
 
     #[test]

@@ -305,4 +305,23 @@ mod tests {
         let error = MttmModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
         assert!(error.contains("mttm.safetensors"), "{error}");
     }
+
+    #[test]
+    fn a_card_of_another_network_is_refused_and_nothing_else_of_it_is_believed() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("mttm.safetensors");
+        let whole = model();
+        let other = ModelCard { architecture: "mttm".to_owned(), ..whole.card.clone() };
+        save_weights(&whole.network, &other, &file).unwrap();
+        let error = MttmModel::load(&file).unwrap_err().to_string();
+        assert!(error.contains("mttm.safetensors") && error.contains("`architecture`"), "{error}");
+        let paper = ModelCard { architecture: "mttm-paper".to_owned(), ..whole.card.clone() };
+        save_weights(&whole.network, &paper, &file).unwrap();
+        let error = MttmModel::load(&file).unwrap_err().to_string();
+        assert!(error.contains("mttm.safetensors") && error.contains("differently configured"), "{error}");
+        // Sizes are the architecture's own: numbers beside it decide about nothing.
+        let extra = serde_json::json!({ "pool": { "anchors": { "side": u64::MAX } } });
+        save_weights(&whole.network, &ModelCard { extra, ..whole.card.clone() }, &file).unwrap();
+        assert_eq!(MttmModel::load(&file).unwrap().side(), whole.side());
+    }
 }

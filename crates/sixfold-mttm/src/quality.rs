@@ -13,7 +13,7 @@ use crate::samples::{Augmentation, Batch, PairBatchOptions, Pool};
 /// What a network achieves on regions with templates of about the right pose. Medians and fractions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
-    /// Regions looked at.
+    /// Regions that were searched.
     pub regions: usize,
     /// Fraction of them whose own template is nearer than 39 templates of other objects and poses.
     pub nearest: f64,

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
 use sixfold_nn::train_error::TrainError;
@@ -157,6 +158,17 @@ impl Recipe for MttmRecipe {
         let expected = "network paper; the compact network starts from random weights";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
         self.options().check()
+    }
+
+    fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        #[rustfmt::skip]
+        let MttmRecipe { network, encoder, objects, scenes, steps: _, anchors: _, learning_rate: _, seed: _, command: _ } = self;
+        Fingerprint::of(&self.options())?
+            .with("network", network.name())
+            .with("objects", *objects)
+            .with("scenes", *scenes)
+            .with_file("encoder", encoder.as_deref())
     }
 
     fn prepare(

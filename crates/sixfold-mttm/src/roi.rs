@@ -22,7 +22,7 @@ pub struct Roi {
 /// region's frame.
 pub type Cell = [f32; 4];
 
-/// A cell in which nothing was measured, or which is not looked at: like something far in front, it neither agrees nor
+/// A cell in which nothing was measured, or which is left out: like something far in front, it neither agrees nor
 /// contradicts. A thousand kilometres are in front of any scene.
 pub const UNKNOWN: Cell = [-1e6, 0.0, 0.0, 0.0];
 

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_io::{fnv1a, write_atomically_with};
+use sixfold_io::{fnv1a, limits, read_regular, write_atomically_with};
 
 use crate::error::StoreError;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
@@ -20,6 +20,15 @@ const MAGIC: &[u8; 8] = b"SIXFTPL\0";
 const VERSION: u32 = 1;
 const NUMBERS_PER_TEMPLATE: usize = 8;
 const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
+/// Most templates of an object: six times as many as a mesh is drawn from.
+pub(crate) const MAX_TEMPLATES: usize = 4096;
+/// Diameters, metres, and distances of views, metres, that a file may hold: wider than anything that makes one.
+const DIAMETERS: (f64, f64) = (1e-4, 1e3);
+const DISTANCES: (f64, f64) = (1e-3, 1e3);
+/// Furthest origin of an object's frame from a view's reference point, metres.
+const FURTHEST: f64 = 1e5;
+/// How far the patch may be off the margin times the diameter, as a fraction: rounding.
+const SAME_SIZE: f64 = 1e-9;
 const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 
 /// Puts a whole file in its place.
@@ -79,8 +88,8 @@ impl ObjectTemplates {
     /// # Errors
     /// [`StoreError`].
     pub fn read(path: &Path) -> Result<ObjectTemplates, StoreError> {
-        let bytes =
-            std::fs::read(path).map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+        let bytes = read_regular(path, limits::DERIVED)
+            .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
         ObjectTemplates::parse(&bytes, path)
     }
 
@@ -106,7 +115,38 @@ impl ObjectTemplates {
             return Err(damaged("the checksum does not match: damaged or cut off"));
         }
         reader = Reader(&body[12..]);
-        reader.templates().ok_or_else(|| damaged("its parts do not fit together"))
+        let templates = reader.templates().ok_or_else(|| damaged("its parts do not fit together"))?;
+        templates.check().map_err(damaged)?;
+        Ok(templates)
+    }
+
+    /// What holds of all templates, whatever they were made from: a checksum keeps accidents out, not forgery.
+    fn check(&self) -> Result<(), &'static str> {
+        let within = |value: f64, (low, high): (f64, f64)| (low..=high).contains(&value);
+        if !within(self.diameter, DIAMETERS) {
+            return Err("field diameter: not that of an object");
+        }
+        if self.options.check().is_err() {
+            return Err("field options: out of their range");
+        }
+        if !((self.size / (self.options.margin * self.diameter) - 1.0).abs() <= SAME_SIZE) {
+            return Err("field size: not the margin times the diameter");
+        }
+        if !(1..=MAX_TEMPLATES).contains(&self.templates.len()) {
+            return Err("field templates: none, or too many");
+        }
+        for t in &self.templates {
+            if !within(t.distance, DISTANCES) {
+                return Err("field distance: not that of a view");
+            }
+            if !(t.view_from_object.translation().norm() <= FURTHEST) {
+                return Err("field view_from_object: too far away");
+            }
+            if t.depth.iter().all(|z| *z == 0) {
+                return Err("field depth: a view that shows nothing");
+            }
+        }
+        Ok(())
     }
 }
 
@@ -124,7 +164,7 @@ impl Reader<'_> {
     }
 
     fn number(&mut self) -> Option<f64> {
-        self.take().map(f64::from_le_bytes).filter(|v| v.is_finite())
+        self.take().map(f64::from_le_bytes)
     }
 
     fn templates(&mut self) -> Option<ObjectTemplates> {
@@ -139,10 +179,7 @@ impl Reader<'_> {
         let options = TemplateOptions { coverage, margin: self.number()?, distance: self.number()? };
         let count = self.u32()? as usize;
         // Exactly what is left, before anything is allocated.
-        if !(diameter > 0.0 && size > 0.0)
-            || count == 0
-            || self.0.len() != count.checked_mul(TEMPLATE_BYTES)?
-        {
+        if self.0.len() != count.checked_mul(TEMPLATE_BYTES)? {
             return None;
         }
         let templates = (0..count).map(|_| self.template()).collect::<Option<Vec<_>>>()?;
@@ -150,9 +187,9 @@ impl Reader<'_> {
     }
 
     fn template(&mut self) -> Option<Template> {
-        let distance = self.number().filter(|d| *d > 0.0)?;
+        let distance = self.number()?;
         let q = Quaternion::new(self.number()?, self.number()?, self.number()?, self.number()?);
-        if (q.norm() - 1.0).abs() > 1e-6 {
+        if !((q.norm() - 1.0).abs() <= 1e-6) {
             return None;
         }
         let rotation = UnitQuaternion::new_unchecked(q);

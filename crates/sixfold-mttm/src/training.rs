@@ -65,7 +65,7 @@ impl MttmTrainingOptions {
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
-        OptionError::unless(self.batch.anchors >= 2, "anchors", self.batch.anchors, "2 or more")?;
+        OptionError::unless_samples("anchors", self.batch.anchors, 2, "2 or more")?;
         OptionError::unless_weight("cross", self.cross)?;
         OptionError::unless_weight("offset", self.offset)?;
         OptionError::unless_weight("matching", self.matching)

@@ -21,6 +21,7 @@ use serde::de::DeserializeOwned;
 use sixfold_io::write_atomically_with;
 
 use crate::files::explain;
+use crate::fingerprint::Fingerprint;
 
 const MAGIC: &[u8; 8] = b"sixfckp1";
 const ENDING: &str = ".checkpoint";
@@ -65,6 +66,13 @@ pub enum CheckpointError {
         /// What is wrong with each file.
         reasons: Vec<String>,
     },
+    /// The checkpoint was written before checkpoints named their inputs.
+    #[error("{}: does not say from which inputs it was trained (an earlier version of Sixfold wrote it), so whether they are these \
+        is not known; train again in another folder", file.display())]
+    NoFingerprint {
+        /// The file.
+        file: PathBuf,
+    },
     /// The checkpoint is whole, but a part that was asked for is not in it or does not fit.
     #[error("{}: {section}: expected {expected}, found {found}; continue with the same options as before, or start again in \
         another folder", file.display())]
@@ -79,6 +87,9 @@ pub enum CheckpointError {
         found: String,
     },
 }
+
+/// The state that says what a training depends on.
+const FINGERPRINT: &str = "fingerprint";
 
 /// A checkpoint that is put together to be written.
 pub struct CheckpointWriter {
@@ -125,6 +136,14 @@ impl CheckpointWriter {
         let bytes = serde_json::to_vec(state).map_err(|e| self.error(name, e))?;
         self.sections.insert(state_section(name), bytes);
         Ok(self)
+    }
+
+    /// Adds what the training depends on.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Record`].
+    pub fn fingerprint(self, fingerprint: &Fingerprint) -> Result<Self, CheckpointError> {
+        self.state(FINGERPRINT, fingerprint)
     }
 
     /// Writes the file into `folder`, which is made if need be, then removes what is older than the last two
@@ -281,6 +300,17 @@ impl Checkpoint {
         let section = state_section(name);
         let bytes = self.section(&section)?;
         serde_json::from_slice(bytes).map_err(|e| self.error(&section, "a state of the same form", e))
+    }
+
+    /// What the training depends on.
+    ///
+    /// # Errors
+    /// [`CheckpointError::NoFingerprint`] for a checkpoint of an earlier version.
+    pub fn fingerprint(&self) -> Result<Fingerprint, CheckpointError> {
+        if !self.sections.contains_key(&state_section(FINGERPRINT)) {
+            return Err(CheckpointError::NoFingerprint { file: self.file.clone() });
+        }
+        self.state(FINGERPRINT)
     }
 }
 

@@ -16,6 +16,7 @@ pub mod conv_transpose;
 pub mod dense;
 pub mod densenet;
 mod files;
+pub mod fingerprint;
 pub mod learner;
 pub mod options;
 pub mod pretrained;

@@ -45,6 +45,29 @@ impl OptionError {
         OptionError::unless((0.0..=1.0).contains(&value), field, value as f32, "0 to 1")
     }
 
+    /// This error unless `value` is a number of steps that a training can take.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless_steps(value: u64) -> Result<(), OptionError> {
+        OptionError::unless(value > 0, "steps", value, "1 or more")?;
+        OptionError::unless(value <= MOST_STEPS, "steps", value, "at most 100000000")
+    }
+
+    /// This error unless so many samples fit into a step: at least `least`, and not more than a memory holds.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless_samples(
+        field: &'static str,
+        value: usize,
+        least: usize,
+        expected: &'static str,
+    ) -> Result<(), OptionError> {
+        OptionError::unless(value >= least, field, value, expected)?;
+        OptionError::unless(value <= MOST_SAMPLES, field, value, "at most 1024")
+    }
+
     /// This error unless `value` is the weight of a loss: finite, 0 or more.
     ///
     /// # Errors
@@ -54,6 +77,11 @@ impl OptionError {
         OptionError::unless(fits, field, value, "a finite number, 0 or more")
     }
 }
+
+/// Most steps of a training.
+const MOST_STEPS: u64 = 100_000_000;
+/// Most samples in a step: they are in memory at once.
+const MOST_SAMPLES: usize = 1024;
 
 /// How long and how strongly a network is trained: AdamW (Loshchilov and Hutter 2019) on a cosine schedule. All of it
 /// decides about the result. Methods flatten it into options of their own.
@@ -80,7 +108,7 @@ impl TrainingOptions {
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
-        OptionError::unless(self.steps > 0, "steps", self.steps, "1 or more")?;
+        OptionError::unless_steps(self.steps)?;
         let positive = |value: f64| value.is_finite() && value > 0.0;
         let above = "a finite number above 0";
         OptionError::unless(positive(self.learning_rate), "learning_rate", self.learning_rate, above)?;
@@ -156,6 +184,10 @@ mod tests {
         options.schedule().check().unwrap();
         let wrong = [
             (TrainingOptions { steps: 0, ..options.clone() }, "steps: found 0, expected 1 or more"),
+            (
+                TrainingOptions { steps: u64::MAX, ..options.clone() },
+                "steps: found 18446744073709551615, expected at most",
+            ),
             (TrainingOptions { learning_rate: f64::NAN, ..options.clone() }, "learning_rate: found NaN"),
             (TrainingOptions { weight_decay: -1.0, ..options.clone() }, "weight_decay: found -1"),
             (TrainingOptions { max_grad_norm: Some(0.0), ..options.clone() }, "max_grad_norm: found 0"),
@@ -164,6 +196,9 @@ mod tests {
             let error = options.check().unwrap_err().to_string();
             assert!(error.starts_with(message), "{error}");
         }
+        assert!(OptionError::unless_samples("pairs", 1024, 1, "1 or more").is_ok());
+        let error = OptionError::unless_samples("pairs", 100_000, 1, "1 or more").unwrap_err().to_string();
+        assert_eq!(error, "pairs: found 100000, expected at most 1024");
         assert_eq!(Pace { log_every: 0, ..Pace::default() }.check().unwrap_err().field, "log_every");
     }
 

@@ -1,16 +1,19 @@
 //! Whole trainings, data in and a model file out: the one driver of all methods. It makes samples ready, resumes from the
-//! last checkpoint, trains, and has the method save its model and measure it.
+//! last checkpoint of a training on the same inputs, trains, and has the method save its model and measure it. One training
+//! runs in a folder at a time.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
+use sixfold_io::WriteLock;
 
 use crate::checkpoint::Checkpoint;
+use crate::fingerprint::Fingerprint;
 use crate::options::OptionError;
 use crate::train_error::TrainError;
-use crate::training::{Outcome, Training, fit, restore};
+use crate::training::{Outcome, Training, fit_on, restore};
 use crate::training_log::TrainingRecord;
 use crate::weights::{ModelCard, WeightsError, read_card};
 
@@ -102,6 +105,13 @@ pub trait Recipe: Default {
     /// [`OptionError`] with the first one that is out of its range.
     fn check(&self) -> Result<(), OptionError>;
 
+    /// What the result depends on: every option, and the contents of `data` and of each file that is read. Not what the result
+    /// is the same without, such as names and threads.
+    ///
+    /// # Errors
+    /// [`TrainError`] for a file that cannot be read.
+    fn inputs(&self, data: &Self::Data) -> Result<Fingerprint, TrainError>;
+
     /// The initial network with its optimisers, and the card as far as it is known. Tells of wrong weights and data before
     /// anything else begins.
     ///
@@ -163,24 +173,31 @@ pub struct Trained<R = ()> {
 /// Trains, or resumes the training in the session's folder, and writes the model there.
 ///
 /// # Errors
-/// [`TrainError`]; the last checkpoints stay.
+/// [`TrainError`]; the last checkpoints stay. Among them [`TrainError::OtherTraining`] where the folder holds a training on other
+/// inputs, and [`TrainError::Lock`] while another one runs there.
 pub fn train<R: Recipe>(
     recipe: &R,
     data: R::Data,
     session: &mut Session<'_>,
 ) -> Result<Outcome<Trained<R::Report>>, TrainError> {
     recipe.check()?;
-    let mut prepared = recipe.prepare(data, session)?;
-    let steps = recipe.steps();
+    let (folder, steps) = (session.folder(), recipe.steps());
+    let _lock = WriteLock::take(&folder)?;
     if steps == 0 {
+        let prepared = recipe.prepare(data, session)?;
         return finish(recipe, prepared, None, session);
     }
-    let folder = session.folder();
+    let inputs = recipe.inputs(&data)?;
+    // Before anything is made ready, which may take hours.
+    if let Some(checkpoint) = Checkpoint::latest(&folder)? {
+        check_inputs(&checkpoint, &inputs, &folder)?;
+    }
+    let mut prepared = recipe.prepare(data, session)?;
     let Some(samples) = recipe.samples(&mut prepared.context, session)? else {
         return Ok(Outcome::Interrupted { step: Checkpoint::latest(&folder)?.map_or(0, |c| c.step()) });
     };
     let mut last = TrainingRecord::default();
-    let outcome = fit(&mut prepared.training, &samples, &folder, session.stop, |record| {
+    let outcome = fit_on(&inputs, &mut prepared.training, &samples, &folder, session.stop, |record| {
         (session.events)(TrainingEvent::Steps(record, steps));
         last = record.clone();
     })?;
@@ -195,21 +212,31 @@ pub fn train<R: Recipe>(
 /// Writes the model of the last checkpoint in the session's folder, as [`train`] does at the end.
 ///
 /// # Errors
-/// [`TrainError`]; [`TrainError::NoCheckpoint`] where nothing was trained yet.
+/// As [`train`]; [`TrainError::NoCheckpoint`] where nothing was trained yet.
 pub fn export<R: Recipe>(
     recipe: &R,
     data: R::Data,
     session: &mut Session<'_>,
 ) -> Result<Outcome<Trained<R::Report>>, TrainError> {
     recipe.check()?;
-    let mut prepared = recipe.prepare(data, session)?;
     let folder = session.folder();
+    let _lock = WriteLock::take(&folder)?;
     let Some(checkpoint) = Checkpoint::latest(&folder)? else {
         return Err(TrainError::NoCheckpoint { folder });
     };
+    check_inputs(&checkpoint, &recipe.inputs(&data)?, &folder)?;
+    let mut prepared = recipe.prepare(data, session)?;
     restore(&mut prepared.training, &checkpoint)?;
     describe(recipe, &mut prepared.card, checkpoint.step());
     finish(recipe, prepared, None, session)
+}
+
+/// An error unless the training in `folder` was one on these inputs.
+fn check_inputs(checkpoint: &Checkpoint, inputs: &Fingerprint, folder: &Path) -> Result<(), TrainError> {
+    match checkpoint.fingerprint()?.difference_from_part(inputs) {
+        None => Ok(()),
+        Some(difference) => Err(TrainError::OtherTraining { folder: folder.to_owned(), difference }),
+    }
 }
 
 fn describe(recipe: &impl Recipe, card: &mut ModelCard, steps: u64) {
@@ -288,7 +315,7 @@ mod tests {
                 schedule: LearningRate::Constant { rate: 1.0 },
                 samples_per_step: 1,
                 pace: Pace { log_every: 1, ..Pace::default() },
-                settings: serde_json::json!({ "steps": self.steps }),
+                settings: Fingerprint::default().with("steps", self.steps),
             })
         }
 
@@ -332,6 +359,10 @@ mod tests {
 
         fn check(&self) -> Result<(), OptionError> {
             OptionError::unless(self.steps < 100, "steps", self.steps, "less than 100")
+        }
+
+        fn inputs(&self, data: &u64) -> Result<Fingerprint, TrainError> {
+            Ok(Fingerprint::default().with("offset", *data))
         }
 
         fn prepare(&self, data: u64, _: &mut Session<'_>) -> Result<Prepared<Sum, u64>, TrainError> {
@@ -398,5 +429,83 @@ mod tests {
         assert!(!session.folder().exists());
         let error = train(&SumRecipe { steps: 100 }, 3, &mut session).unwrap_err().to_string();
         assert_eq!(error, "steps: found 100, expected less than 100");
+    }
+
+    #[test]
+    fn a_training_on_other_inputs_is_neither_resumed_nor_exported_nor_taken_as_done() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let stop = AtomicBool::new(false);
+        let mut notes = 0;
+        let mut events = |event: TrainingEvent<'_>| {
+            notes += u32::from(matches!(event, TrainingEvent::Note(_)));
+            if let TrainingEvent::Steps(record, _) = event {
+                stop.store(record.step == 2, Ordering::Relaxed);
+            }
+        };
+        let mut session = Session::new(&out, &stop, &mut events);
+        let recipe = SumRecipe { steps: 4 };
+        let said = |error: TrainError| {
+            let text = error.to_string();
+            assert!(matches!(error, TrainError::OtherTraining { .. }), "{text}");
+            assert!(text.contains("training: holds a training") && text.contains("another folder"), "{text}");
+            text
+        };
+        assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Interrupted { step: 2 }));
+        stop.store(false, Ordering::Relaxed);
+        for error in [train(&recipe, 11, &mut session), export(&recipe, 11, &mut session)] {
+            assert!(said(error.unwrap_err()).contains("offset was 10, is 11"));
+        }
+        assert!(!session.model().exists());
+        assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Finished(_)));
+        let model = std::fs::read(session.model()).unwrap();
+        // Done already: not for other inputs, and for other steps only after samples are made.
+        assert!(said(train(&recipe, 11, &mut session).unwrap_err()).contains("offset was 10, is 11"));
+        assert!(
+            said(train(&SumRecipe { steps: 5 }, 10, &mut session).unwrap_err()).contains("steps was 4, is 5")
+        );
+        assert_eq!(std::fs::read(session.model()).unwrap(), model);
+        // Samples were made of the right inputs alone: begun, resumed, and of other steps.
+        assert_eq!(notes, 3);
+    }
+
+    #[test]
+    fn a_training_of_an_earlier_version_is_not_resumed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (stop, mut events) = (AtomicBool::new(false), |_: TrainingEvent<'_>| ());
+        let mut session = Session::new(folder.path(), &stop, &mut events);
+        let before = CheckpointWriter::new(3).state("options", &serde_json::json!({ "steps": 4 })).unwrap();
+        before.state("sum", &3).unwrap().write(&session.folder()).unwrap();
+        for ended in [
+            train(&SumRecipe { steps: 4 }, 1, &mut session),
+            export(&SumRecipe { steps: 4 }, 1, &mut session),
+        ] {
+            let error = ended.unwrap_err().to_string();
+            assert!(
+                error.contains("does not say from which inputs") && error.contains("another folder"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn two_trainings_in_one_folder_the_second_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let stop = AtomicBool::new(false);
+        let mut refused = vec![];
+        let mut events = |event: TrainingEvent<'_>| {
+            if let TrainingEvent::Steps(..) = event {
+                let mut quiet = |_: TrainingEvent<'_>| ();
+                let mut second = Session::new(&out, &stop, &mut quiet);
+                refused.push(train(&SumRecipe { steps: 4 }, 10, &mut second).unwrap_err().to_string());
+                refused.push(export(&SumRecipe { steps: 4 }, 10, &mut second).unwrap_err().to_string());
+            }
+        };
+        let mut session = Session::new(&out, &stop, &mut events);
+        assert!(matches!(train(&SumRecipe { steps: 4 }, 10, &mut session).unwrap(), Outcome::Finished(_)));
+        // And when it is done the next one may.
+        assert!(matches!(export(&SumRecipe { steps: 4 }, 10, &mut session).unwrap(), Outcome::Finished(_)));
+        assert!(refused.len() == 8 && refused.iter().all(|e| e.contains("another process")), "{refused:?}");
     }
 }

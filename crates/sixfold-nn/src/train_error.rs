@@ -3,7 +3,10 @@
 use std::error::Error;
 use std::path::PathBuf;
 
+use sixfold_io::LockError;
+
 use crate::checkpoint::CheckpointError;
+use crate::files::explain;
 use crate::options::OptionError;
 use crate::training_log::TrainingLogError;
 use crate::weights::WeightsError;
@@ -24,15 +27,29 @@ pub enum TrainError {
     /// Weights to begin with, or those that came out.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The folder holds a training with other options.
+    /// Another training runs in the folder, or the folder cannot be locked.
+    #[error(transparent)]
+    Lock(#[from] LockError),
+    /// An input cannot be read.
+    #[error("{name}: {}: cannot be read: {}", file.display(), explain(source))]
+    Input {
+        /// What it is for.
+        name: String,
+        /// The file.
+        file: PathBuf,
+        /// What the file system said.
+        source: std::io::Error,
+    },
+    /// The folder holds a training with other options, or on other inputs.
     #[error(
-        "{}: holds a training with other options ({difference}); continue with the same ones, or start again in another folder",
+        "{}: holds a training with other options or on other inputs ({difference}); continue with the same ones, or start again in \
+         another folder",
         folder.display()
     )]
     OtherTraining {
         /// The folder.
         folder: PathBuf,
-        /// Which option differs, and how.
+        /// Which option or input differs, and how.
         difference: String,
     },
     /// The loss is no number any more.

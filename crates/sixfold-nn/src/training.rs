@@ -2,6 +2,7 @@
 //! curves, checkpoints, and resuming after an interruption with the same bits as without one.
 
 use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
+use crate::fingerprint::Fingerprint;
 use crate::learner::Checkpointed;
 use crate::options::{Pace, TrainingOptions};
 use crate::schedule::LearningRate;
@@ -60,8 +61,8 @@ pub struct Plan {
     pub samples_per_step: usize,
     /// How often is logged and saved.
     pub pace: Pace,
-    /// All that the result depends on, an object: a training with other settings is not resumed.
-    pub settings: serde_json::Value,
+    /// All that the result depends on beside the inputs: a training with other settings is not resumed.
+    pub settings: Fingerprint,
 }
 
 impl Plan {
@@ -75,7 +76,7 @@ impl Plan {
         pace: Pace,
         settings: &impl Serialize,
     ) -> Result<Plan, TrainError> {
-        let settings = serde_json::to_value(settings).map_err(TrainError::method)?;
+        let settings = Fingerprint::of(settings)?;
         Ok(Plan { steps: options.steps, schedule: options.schedule(), samples_per_step, pace, settings })
     }
 }
@@ -104,20 +105,36 @@ pub fn restore<T: Training>(training: &mut T, checkpoint: &Checkpoint) -> Result
     Ok(())
 }
 
-/// Trains on `samples` in `folder`, which gets checkpoints, `log.jsonl` and `curves.png`; resumes where a training with the
-/// same settings left off there, and ends with the same bits as one that was not interrupted. `stop` ends it after the
-/// current step.
+/// [`fit_on`] samples that the caller made of nothing but the training's settings.
+///
+/// # Errors
+/// As [`fit_on`].
+pub fn fit<T: Training>(
+    training: &mut T,
+    samples: &T::Samples,
+    folder: &Path,
+    stop: &AtomicBool,
+    progress: impl FnMut(&TrainingRecord),
+) -> Result<Outcome<()>, TrainError> {
+    fit_on(&Fingerprint::default(), training, samples, folder, stop, progress)
+}
+
+/// Trains on `samples`, made of these `inputs`, in `folder`, which gets checkpoints, `log.jsonl` and `curves.png`; resumes where a
+/// training with the same settings and inputs left off there, and ends with the same bits as one that was not interrupted. `stop`
+/// ends it after the current step.
 ///
 /// # Errors
 /// [`TrainError`]; the last checkpoints stay.
-pub fn fit<T: Training>(
+pub fn fit_on<T: Training>(
+    inputs: &Fingerprint,
     training: &mut T,
     samples: &T::Samples,
     folder: &Path,
     stop: &AtomicBool,
     mut progress: impl FnMut(&TrainingRecord),
 ) -> Result<Outcome<()>, TrainError> {
-    let plan = training.plan(samples)?;
+    let mut plan = training.plan(samples)?;
+    plan.settings = plan.settings.merged(inputs);
     plan.pace.check()?;
     plan.schedule.check()?;
     let make_batch = training.batches(samples);
@@ -166,8 +183,7 @@ impl<'a> Run<'a> {
     fn start(training: &mut impl Training, plan: Plan, folder: &'a Path) -> Result<Self, TrainError> {
         let (mut step, mut before) = (0, 0.0);
         if let Some(checkpoint) = Checkpoint::latest(folder)? {
-            let found: serde_json::Value = checkpoint.state("options")?;
-            if let Some(difference) = difference(&found, &plan.settings) {
+            if let Some(difference) = checkpoint.fingerprint()?.difference(&plan.settings) {
                 return Err(TrainError::OtherTraining { folder: folder.to_owned(), difference });
             }
             restore(training, &checkpoint)?;
@@ -232,12 +248,12 @@ impl<'a> Run<'a> {
 /// Writes the checkpoint of a step, with the seconds until then.
 fn save(
     training: &mut impl Training,
-    settings: &serde_json::Value,
+    settings: &Fingerprint,
     folder: &Path,
     (step, seconds): (u64, f64),
 ) -> Result<(), TrainError> {
     training.before_checkpoint(folder);
-    let checkpoint = CheckpointWriter::new(step).state("options", settings)?.state("seconds", &seconds)?;
+    let checkpoint = CheckpointWriter::new(step).fingerprint(settings)?.state("seconds", &seconds)?;
     let learners = training.learners();
     let checkpoint = learners.iter().try_fold(checkpoint, |checkpoint, learner| learner.save(checkpoint))?;
     checkpoint.write(folder)?;
@@ -274,22 +290,6 @@ impl Sums {
             losses: self.losses.into_iter().map(|(n, sum)| (n, sum / f64::from(self.steps))).collect(),
         }
     }
-}
-
-/// The first field that differs, in words.
-fn difference(found: &serde_json::Value, asked: &serde_json::Value) -> Option<String> {
-    let empty = serde_json::Map::new();
-    let (found, asked) = (found.as_object().unwrap_or(&empty), asked.as_object().unwrap_or(&empty));
-    found
-        .iter()
-        .chain(asked)
-        .map(|(name, _)| (name, found.get(name), asked.get(name)))
-        .find(|(_, was, is)| was != is)
-        .map(|(name, was, is)| {
-            let show =
-                |value: Option<&serde_json::Value>| value.map_or("not there".into(), ToString::to_string);
-            format!("{name} was {}, is {}", show(was), show(is))
-        })
 }
 
 #[cfg(test)]
@@ -330,7 +330,7 @@ mod tests {
                     checkpoint_every: 4,
                     sample_threads: self.sample_threads,
                 },
-                settings: self.settings.clone(),
+                settings: Fingerprint::of(&self.settings)?,
             })
         }
 

@@ -258,7 +258,8 @@ pub fn load_weights<M: Module>(
 ) -> Result<(M, ModelCard), WeightsError> {
     // The card first: it is small, and says best what is wrong with a file of another kind.
     read_card(path)?;
-    let bytes = fs::read(path).map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
+    let bytes = sixfold_io::read_regular(path, sixfold_io::limits::WEIGHTS)
+        .map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
     load_weights_from_bytes(module, path, &bytes, expected_architecture)
 }
 
@@ -316,7 +317,7 @@ pub fn read_card(path: &Path) -> Result<ModelCard, WeightsError> {
     }
     let read_error = |source| WeightsError::Read { file: path.to_owned(), source };
     let broken = |reason: String| WeightsError::Broken { file: path.to_owned(), reason };
-    let mut file = fs::File::open(path).map_err(read_error)?;
+    let mut file = sixfold_io::open_regular(path, sixfold_io::limits::WEIGHTS).map_err(read_error)?;
     let size = file.metadata().map_err(read_error)?.len();
     if size < 8 {
         return Err(broken(format!("a file of {size} bytes")));

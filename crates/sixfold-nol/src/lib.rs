@@ -8,12 +8,14 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod agreement;
+pub mod coordinates;
 mod error;
 mod features;
 pub mod loss;
 mod maps;
 pub mod model;
 pub mod network;
+pub mod pose_file;
 mod preview;
 mod projection;
 pub mod quality;

@@ -157,3 +157,22 @@ fn a_model_survives_its_file_and_other_files_are_refused() {
     let error = NolModel::from_bytes(&file, &bytes[..bytes.len() / 2]).unwrap_err().to_string();
     assert!(error.contains("nol.safetensors"), "{error}");
 }
+
+#[test]
+fn a_card_of_other_parts_or_of_another_network_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("nol.safetensors");
+    let model = NolModel::shipped().unwrap();
+    let refused = |change: fn(&mut ModelCard), field: &str| {
+        let mut card = model.card.clone();
+        change(&mut card);
+        save_weights(&model.network, &card, &file).unwrap();
+        let error = NolModel::load(&file).unwrap_err().to_string();
+        assert!(error.contains("nol.safetensors") && error.contains(field), "{field}: {error}");
+    };
+    refused(|c| c.extra["parts"]["integrator"] = serde_json::json!(1e300), "`extra.parts`");
+    refused(|c| c.extra["parts"]["decoder"] = serde_json::json!(u64::MAX), "`extra.parts`");
+    refused(|c| c.extra = serde_json::Value::Null, "`extra.parts`");
+    refused(|c| c.extra["parts"]["decoder"] = serde_json::json!(false), "differently configured");
+    refused(|c| c.architecture = "nol".to_owned(), "`architecture`");
+}

@@ -4,7 +4,9 @@
 use std::path::PathBuf;
 
 use burn::tensor::Device;
+use sixfold_data::background_files;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
@@ -116,6 +118,19 @@ impl Recipe for NolRecipe {
         self.options().check()
     }
 
+    fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        #[rustfmt::skip]
+        let NolRecipe { network, encoder, parts, backgrounds, steps: _, learning_rate: _, seed: _, command: _ } = self;
+        let backgrounds =
+            background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
+        Fingerprint::of(&self.options())?
+            .merged(&Fingerprint::of(&serde_json::json!({ "parts": parts }))?)
+            .with("network", network.name())
+            .with_file("encoder", encoder.as_deref())?
+            .with_files("backgrounds", &backgrounds)
+    }
+
     fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<NolTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
         let parts = self.parts;
@@ -171,5 +186,41 @@ impl Recipe for NolRecipe {
         model.card_mut().scores = quality.scores();
         model.save(&path).map_err(TrainError::method)?;
         Ok(Some(quality))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::network::IntegratorKind;
+
+    #[test]
+    fn every_option_and_every_background_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str| folder.path().join(name);
+        std::fs::write(file("a.png"), b"one").unwrap();
+        let default = NolRecipe::default;
+        let of = |recipe: &NolRecipe| recipe.inputs(&()).unwrap();
+        let differs = |recipe: NolRecipe, name: &str| {
+            let difference = of(&default()).difference(&of(&recipe)).unwrap();
+            assert!(difference.contains(&format!("{name} was")), "{difference}");
+        };
+        differs(NolRecipe { network: NolKind::Paper, ..default() }, "batch.sides");
+        differs(NolRecipe { encoder: Some(file("a.png")), ..default() }, "encoder");
+        let parts = Parts { integrator: IntegratorKind::Average, ..Parts::default() };
+        differs(NolRecipe { parts, ..default() }, "parts.integrator");
+        differs(NolRecipe { steps: Some(3), ..default() }, "steps");
+        differs(NolRecipe { learning_rate: Some(0.5), ..default() }, "learning_rate");
+        differs(NolRecipe { seed: 3, ..default() }, "seed");
+        let photographs = NolRecipe { backgrounds: Some(folder.path().to_owned()), ..default() };
+        differs(photographs.clone(), "backgrounds");
+        let before = of(&photographs);
+        std::fs::write(file("notes.txt"), b"no photograph").unwrap();
+        assert_eq!(of(&photographs), before);
+        std::fs::write(file("a.png"), b"two").unwrap();
+        assert!(before.difference(&of(&photographs)).unwrap().starts_with("backgrounds was"));
+        // What is asked for in words changes nothing, and a default that is written down is the default.
+        let command = "another".to_owned();
+        assert_eq!(of(&NolRecipe { command, steps: Some(default().steps()), ..default() }), of(&default()));
     }
 }

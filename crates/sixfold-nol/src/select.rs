@@ -7,9 +7,54 @@
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
+use sixfold_data::RoughObject;
 use sixfold_geometry::{Pose, Vec3};
 
+use crate::error::NolError;
 use crate::source::SourceView;
+
+/// An image is left out where its mask covers less of the object's outline.
+const MIN_MASK: f64 = 0.1;
+/// A further image of an object must add so many of its [`POINTS`].
+const MIN_GAIN: f64 = 15.0;
+/// Points of the surface by which images are chosen.
+const POINTS: usize = 3000;
+/// Side of the crops in which they are looked up, pixels.
+const SIDE: usize = 96;
+
+/// Leaves the images that add most of the object's surface, at most `most` of them; a note for each that cannot be used.
+///
+/// # Errors
+/// [`NolError::Image`] for an image that does not show the object.
+pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String>, NolError> {
+    let surface = object.mesh.sample_surface(POINTS, 0);
+    let (mut shown, mut notes) = (vec![], vec![]);
+    for image in &object.images {
+        let view = SourceView::new(&image.posed, &object.mesh, SIDE)?;
+        let covered = view.visible_fraction();
+        if covered < MIN_MASK {
+            let name = image.posed.name().to_owned();
+            let wrong = NolError::Mask { name, share: 100.0 * covered, least: 100.0 * MIN_MASK };
+            notes.push(format!("{wrong}; left out"));
+            shown.push(vec![]);
+            continue;
+        }
+        shown.push(shown_points(&view, &surface.points, &surface.normals));
+    }
+    let points = surface.points.len();
+    shown.iter_mut().for_each(|s| s.resize(points, 0.0));
+    let least = if object.images.len() > most { 0.0 } else { MIN_GAIN * 0.01 };
+    let chosen = choose_by_surface(&shown, None, most, least);
+    let mut number = 0;
+    object.images.retain(|_| {
+        number += 1;
+        chosen.contains(&(number - 1))
+    });
+    if object.images.is_empty() {
+        notes.push(format!("object {}: its photographs and masks show nothing of its surface", object.id));
+    }
+    Ok(notes)
+}
 
 /// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times
 /// the fraction of its mask there; 0 where it does not.

@@ -14,6 +14,7 @@ use crate::samples::{Sample, SampleSource};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace};
 use sixfold_nn::schedule::LearningRate;
@@ -68,10 +69,9 @@ impl AdversarialOptions {
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
-        let counts = [("steps", self.steps), ("batch", self.batch as u64), ("decay_every", self.decay_every)];
-        for (field, value) in counts {
-            OptionError::unless(value > 0, field, value, "1 or more")?;
-        }
+        OptionError::unless_steps(self.steps)?;
+        OptionError::unless(self.decay_every > 0, "decay_every", self.decay_every, "1 or more")?;
+        OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
         let rate = self.learning_rate;
         let fits = rate.is_finite() && rate > 0.0;
         OptionError::unless(fits, "learning_rate", rate, "a finite number above 0")?;
@@ -176,7 +176,7 @@ impl<G: Generator> Training for AdversarialTraining<G> {
             schedule: options.schedule(),
             samples_per_step: options.batch,
             pace: self.pace,
-            settings: serde_json::to_value(options).map_err(TrainError::method)?,
+            settings: Fingerprint::of(options)?,
         })
     }
 

@@ -81,6 +81,11 @@ pub enum ModelError {
     },
 }
 
+/// Objects of a compact network, most.
+const MOST_OBJECTS: usize = 1000;
+/// Bytes of a decoder in a file, at least: 291,000 numbers of two bytes or more. A file cannot name more objects than it holds.
+const DECODER_BYTES: u64 = 500_000;
+
 /// Sizes of a network's images, part of the card.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImageSizes {
@@ -146,23 +151,7 @@ impl Pix2PoseModel {
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let device = Device::flex();
         let card = read_card(path)?;
-        let wrong = |field, expected, found: String| ModelError::Card {
-            file: path.to_path_buf(),
-            field,
-            expected,
-            found,
-        };
-        let objects = card
-            .objects
-            .iter()
-            .map(|value| {
-                serde_json::from_value(value.clone()).map_err(|error| {
-                    wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string())
-                })
-            })
-            .collect::<Result<Vec<ObjectEntry>, _>>()?;
-        let sizes: ImageSizes = serde_json::from_value(card.extra["image_sizes"].clone())
-            .map_err(|error| wrong("extra.image_sizes", "input and output in pixels", error.to_string()))?;
+        let (objects, sizes) = described(path, &card)?;
         let (network, card) = match card.architecture.as_str() {
             PAPER => {
                 let (network, card) =
@@ -180,13 +169,6 @@ impl Pix2PoseModel {
                 (Network::Compact(Box::new(network)), card)
             }
         };
-        if !matches!(network, Network::Compact(_)) && objects.len() != 1 {
-            return Err(wrong(
-                "objects",
-                "one object, which is all this network knows",
-                objects.len().to_string(),
-            ));
-        }
         Ok(Self { network, objects, sizes, card, device })
     }
 
@@ -309,6 +291,60 @@ impl Pix2PoseModel {
             })
             .collect()
     }
+}
+
+/// What a card says of objects and sizes, checked before a network of that size is made.
+fn described(path: &Path, card: &ModelCard) -> Result<(Vec<ObjectEntry>, ImageSizes), ModelError> {
+    let file = || path.to_path_buf();
+    let wrong = |field, expected, found: String| ModelError::Card { file: file(), field, expected, found };
+    let compact = match card.architecture.as_str() {
+        COMPACT => true,
+        PAPER | RESNET50 => false,
+        other => {
+            return Err(wrong(
+                "architecture",
+                "pix2pose-compact, pix2pose-paper or pix2pose-resnet50",
+                other.to_owned(),
+            ));
+        }
+    };
+    let count = card.objects.len();
+    if compact {
+        let expected = "1 to 1000 objects, and 500 kB of the file for each";
+        let bytes =
+            std::fs::metadata(path).map_err(|source| WeightsError::Read { file: file(), source })?.len();
+        if !(1..=MOST_OBJECTS).contains(&count) || bytes < count as u64 * DECODER_BYTES {
+            return Err(wrong("objects", expected, format!("{count} in a file of {bytes} bytes")));
+        }
+    } else if count != 1 {
+        return Err(wrong("objects", "one object, which is all this network knows", count.to_string()));
+    }
+    let mut objects: Vec<ObjectEntry> = Vec::with_capacity(count);
+    for value in &card.objects {
+        let entry: ObjectEntry = serde_json::from_value(value.clone()).map_err(|error| {
+            wrong("objects", "id, diameter, centre, half_size, thresholds", error.to_string())
+        })?;
+        entry.check().map_err(|(field, expected, found)| {
+            wrong(field, expected, format!("{found} (object {})", entry.id))
+        })?;
+        if objects.iter().any(|o| o.id == entry.id) {
+            return Err(wrong("objects", "every id once", format!("object {} twice", entry.id)));
+        }
+        objects.push(entry);
+    }
+    let sizes: ImageSizes = serde_json::from_value(card.extra["image_sizes"].clone())
+        .map_err(|error| wrong("extra.image_sizes", "input and output in pixels", error.to_string()))?;
+    let ImageSizes { input, output } = sizes;
+    let (fits, expected) = if compact {
+        let fits = input.is_multiple_of(32) && (32..=512).contains(&input) && output == input / 2;
+        (fits, "an input of 32 to 512 pixels, a multiple of 32, and an output of half of it")
+    } else {
+        (input == 128 && output == 128, "128 pixels for input and output")
+    };
+    if !fits {
+        return Err(wrong("extra.image_sizes", expected, format!("{input} and {output}")));
+    }
+    Ok((objects, sizes))
 }
 
 fn numbers(output: Tensor<4>) -> Vec<f32> {

@@ -23,6 +23,12 @@ pub struct ObjectEntry {
     pub correction: Correction,
 }
 
+/// Diameters and sides, smallest and largest, metres.
+const SMALLEST: f64 = 0.001;
+const LARGEST: f64 = 10.0;
+/// Outlier thresholds of an object, most: each of them is tried.
+const MOST_THRESHOLDS: usize = 16;
+
 /// Corners of mesh and model may differ by this fraction of the diameter: BOP's meshes for evaluation are simplified.
 const SAME_BOX: f64 = 0.05;
 
@@ -61,6 +67,40 @@ impl ObjectEntry {
             thresholds: BOP_THRESHOLDS.to_vec(),
             correction: Correction::default(),
         }
+    }
+
+    /// Whether its numbers can be an object's; otherwise which field cannot, what it should hold, and what it holds.
+    ///
+    /// # Errors
+    /// Field, expected, found.
+    pub fn check(&self) -> Result<(), (&'static str, &'static str, String)> {
+        let length = |v: &f64| *v > 0.0 && *v <= LARGEST;
+        if !(self.diameter >= SMALLEST && self.diameter <= LARGEST) {
+            return Err(("objects.diameter", "metres from 0.001 to 10", self.diameter.to_string()));
+        }
+        if !self.half_size.iter().all(length) {
+            return Err((
+                "objects.half_size",
+                "three lengths above 0 up to 10 m",
+                format!("{:?}", self.half_size),
+            ));
+        }
+        if !self.centre.iter().all(|c| c.abs() <= 1000.0) {
+            return Err(("objects.centre", "coordinates within 1000 m", format!("{:?}", self.centre)));
+        }
+        let count = self.thresholds.len();
+        if !(1..=MOST_THRESHOLDS).contains(&count) {
+            return Err(("objects.thresholds", "1 to 16 thresholds", format!("{count} thresholds")));
+        }
+        if !self.thresholds.iter().all(|t| *t > 0.0 && *t <= 1.0) {
+            return Err(("objects.thresholds", "numbers above 0 up to 1", format!("{:?}", self.thresholds)));
+        }
+        let Correction { shift, depth } = self.correction;
+        if !(shift.iter().all(|s| s.abs() <= 10_000.0) && depth.abs() < 1.0) {
+            let expected = "a shift within 10000 pixels, a depth above -1 and below 1";
+            return Err(("objects.correction", expected, format!("{shift:?} and {depth}")));
+        }
+        Ok(())
     }
 
     /// An error unless the mesh is the object's: of the same size and place in its frame.

@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use sixfold_align::outline::outline_mesh;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::choice::Choice;
+use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::learner::Checkpointed;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::{OptionError, TrainingOptions};
@@ -26,7 +27,9 @@ use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
 use crate::preset::Preset;
 use crate::samples::{SampleOptions, SampleSource};
 use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
-use sixfold_data::{FrameId, PosedImage, TrainingObject, TrainingSet, backgrounds_with_images};
+use sixfold_data::{
+    FrameId, PosedImage, TrainingObject, TrainingSet, background_files, backgrounds_with_images,
+};
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -324,7 +327,7 @@ impl Recipe for Pix2PoseRecipe {
         OptionError::unless(fits, "rotation", self.rotation, "radians from 0 to half a turn")?;
         OptionError::unless_fraction("render_share", self.render_share)?;
         OptionError::unless_fraction("near_photographs", self.near_photographs)?;
-        OptionError::unless(self.per_object != Some(0), "per_object", 0, "1 or more")?;
+        OptionError::unless_samples("per_object", self.per_object.unwrap_or(1), 1, "1 or more")?;
         let expected = "1 or more, or weights to begin with, whose alignment is then measured again";
         OptionError::unless(self.steps != Some(0) || self.init.is_some(), "steps", 0, expected)?;
         if self.network == NetworkKind::Compact {
@@ -335,6 +338,38 @@ impl Recipe for Pix2PoseRecipe {
             OptionError::unless(fits, "network", self.described(1), DISSERTATION)?;
             self.dissertation_options().check()
         }
+    }
+
+    fn inputs(&self, material: &TrainingSet) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place.
+        #[rustfmt::skip]
+        let Pix2PoseRecipe {
+            network, encoder, render_share, near_photographs, rotation, size, init, mesh_colors, convex_hull, view_limits, preset,
+            backgrounds,
+            // In the training's options.
+            steps: _, per_object: _, learning_rate: _, adversarial: _, frozen_stages: _, transformer_loss: _, seed: _,
+            // Changes nothing.
+            command: _,
+        } = self;
+        let training = match network {
+            NetworkKind::Compact => Fingerprint::of(&self.compact_options())?,
+            _ => Fingerprint::of(&self.dissertation_options())?,
+        };
+        let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::method)?;
+        training
+            .with("network", network.name())
+            .with("render_share", *render_share)
+            .with("near_photographs", *near_photographs)
+            .with("rotation", *rotation)
+            .with("size", *size)
+            .with("mesh_colors", *mesh_colors)
+            .with("convex_hull", *convex_hull)
+            .with("view_limits", *view_limits)
+            .with("preset", preset.map(Preset::name))
+            .with_contents(material.contents())
+            .with_file("encoder", encoder.as_deref())?
+            .with_file("init", init.as_deref())?
+            .with_files("backgrounds", &backgrounds)
     }
 
     fn prepare(

@@ -14,6 +14,9 @@ use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
+/// Stages of the encoder that the network uses: all of them may stay as they are.
+const ENCODER_STAGES: usize = 5;
+
 /// How to train.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pix2PoseTrainingOptions {
@@ -24,7 +27,7 @@ pub struct Pix2PoseTrainingOptions {
     pub per_object: usize,
     /// The encoder's fraction of the learning rate, 0 to 1: it is pretrained.
     pub encoder_share: f64,
-    /// Stages of the encoder that stay as they are.
+    /// Stages of the encoder that stay as they are, 0 to 5.
     pub frozen_stages: usize,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
@@ -66,7 +69,13 @@ impl Pix2PoseTrainingOptions {
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
-        OptionError::unless(self.per_object > 0, "per_object", self.per_object, "1 or more")?;
+        OptionError::unless_samples("per_object", self.per_object, 1, "1 or more")?;
+        OptionError::unless(
+            self.frozen_stages <= ENCODER_STAGES,
+            "frozen_stages",
+            self.frozen_stages,
+            "0 to 5",
+        )?;
         OptionError::unless_weight("adversarial", f64::from(self.adversarial))?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }

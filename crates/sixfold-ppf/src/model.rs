@@ -39,6 +39,16 @@ pub enum ModelError {
         /// Samples needed.
         needed: usize,
     },
+    /// Too many samples: their pairs would not fit into memory.
+    #[error(
+        "{found} surface samples are seen from outside, at most {most} are taken: raise the sampling step or check the mesh for faces that cross each other"
+    )]
+    TooManySamples {
+        /// Samples found.
+        found: usize,
+        /// Samples taken.
+        most: usize,
+    },
     /// An option is out of range.
     #[error(transparent)]
     Option(#[from] OptionError),
@@ -96,7 +106,9 @@ const SEEN_COSINE: f64 = -0.1;
 /// means over cells of that size.
 const SEEN_TOLERANCE: f64 = 0.5;
 /// Fewest samples that make a model; chosen by hand, not swept.
-const MIN_SAMPLES: usize = 20;
+pub(crate) const MIN_SAMPLES: usize = 20;
+/// Most samples: a sphere has 12,000 at the finest sampling step. The table grows with their square, to about 2 GB here.
+pub(crate) const MAX_SAMPLES: usize = 16_000;
 /// Points nearer than this have no direction between them, metres.
 const SAME_POINT: f32 = 1e-6;
 /// Logarithm (metres, radians) of a transformation below which it is the identity.
@@ -277,6 +289,9 @@ impl ObjectModel {
         }
         if kept.len() < MIN_SAMPLES {
             return Err(ModelError::TooFewSamples { found: kept.len(), needed: MIN_SAMPLES });
+        }
+        if kept.len() > MAX_SAMPLES {
+            return Err(ModelError::TooManySamples { found: kept.len(), most: MAX_SAMPLES });
         }
         Ok(ObjectModel::assemble(
             Description { mesh: flat, options: *options, diameter, centre, samples: kept, visible_from },

@@ -7,12 +7,18 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use sixfold_align::could_be_simplified;
 use sixfold_geometry::{PointCloud, Pose, Vec3};
-use sixfold_io::{Fnv1a, fnv1a, write_atomically};
+use sixfold_io::{Fnv1a, fnv1a, limits, read_regular, write_atomically};
 use sixfold_mesh::Mesh;
 use thiserror::Error;
 
-use crate::model::{Description, ModelError, ModelOptions, ObjectModel};
+use crate::model::{Description, MAX_SAMPLES, MIN_SAMPLES, ModelError, ModelOptions, ObjectModel};
+
+/// How far a length in the file may be off that of the mesh, as a fraction of the diameter: rounding.
+const SAME_LENGTH: f64 = 1e-9;
+/// How far a normal's length may be off 1.
+const SAME_NORMAL: f64 = 1e-6;
 
 const MAGIC: &[u8; 8] = b"SIXFPPF\0";
 const VERSION: u32 = 1;
@@ -64,7 +70,7 @@ impl ObjectModel {
         options.check()?;
         let key = fingerprint(mesh, options);
         let mut note = None;
-        match read(path, key, options) {
+        match read(path, key, mesh, options) {
             Ok(description) => return Ok((ObjectModel::assemble(description, symmetries), None)),
             Err(ModelFileError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
             Err(error) => note = Some(error),
@@ -120,9 +126,9 @@ fn write(path: &Path, key: u64, model: &ObjectModel) -> Result<(), ModelFileErro
     write_atomically(path, &out).map_err(|source| ModelFileError::Io { path: path.to_path_buf(), source })
 }
 
-fn read(path: &Path, key: u64, options: &ModelOptions) -> Result<Description, ModelFileError> {
-    let bytes =
-        std::fs::read(path).map_err(|source| ModelFileError::Io { path: path.to_path_buf(), source })?;
+fn read(path: &Path, key: u64, mesh: &Mesh, options: &ModelOptions) -> Result<Description, ModelFileError> {
+    let bytes = read_regular(path, limits::DERIVED)
+        .map_err(|source| ModelFileError::Io { path: path.to_path_buf(), source })?;
     let damaged = |what| ModelFileError::Damaged { path: path.to_path_buf(), what };
     if bytes.len() < 20 || &bytes[..8] != MAGIC {
         return Err(damaged("no description of an object"));
@@ -166,7 +172,41 @@ fn read(path: &Path, key: u64, options: &ModelOptions) -> Result<Description, Mo
             visible_from,
         })
     };
-    rest().ok_or_else(|| damaged("its parts do not fit together"))
+    let description = rest().ok_or_else(|| damaged("its parts do not fit together"))?;
+    check(&description, mesh).map_err(damaged)?;
+    Ok(description)
+}
+
+/// Holds every field against the mesh: a checksum keeps accidents out, not forgery, and what is wrong here would be a wrong pose, a
+/// panic or all memory later.
+fn check(found: &Description, mesh: &Mesh) -> Result<(), &'static str> {
+    let (low, high) = mesh.bounding_box();
+    let (diameter, centre) = (mesh.diameter(), (low + high) * 0.5);
+    let same = |a: f64, b: f64| (a - b).abs() <= SAME_LENGTH * diameter;
+    let samples = &found.samples;
+    let near = |p: &Vec3| (p - centre).norm() <= diameter;
+    if !same(found.diameter, diameter) {
+        return Err("field diameter: not that of the mesh");
+    }
+    if !(0..3).all(|k| same(found.centre[k], centre[k])) {
+        return Err("field centre: not that of the mesh");
+    }
+    if !could_be_simplified(&found.mesh, mesh) {
+        return Err("field mesh: not the simplified mesh");
+    }
+    if !(MIN_SAMPLES..=MAX_SAMPLES).contains(&samples.len()) {
+        return Err("field samples: too few or too many");
+    }
+    if !samples.points.iter().all(near) {
+        return Err("field samples: a point that is not on the object");
+    }
+    if !samples.normals.iter().all(|n| (n.norm() - 1.0).abs() <= SAME_NORMAL) {
+        return Err("field normals: one that is no direction");
+    }
+    if found.visible_from.contains(&0) {
+        return Err("field visible_from: a sample that no view sees");
+    }
+    Ok(())
 }
 
 struct Reader<'a> {
@@ -190,5 +230,62 @@ impl Reader<'_> {
     }
     fn vector(&mut self) -> Option<Vec3> {
         Some(Vec3::new(self.f64()?, self.f64()?, self.f64()?))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tetrahedron() -> Mesh {
+        let corners = vec![Vec3::zeros(), Vec3::x() * 0.05, Vec3::y() * 0.05, Vec3::z() * 0.05];
+        Mesh::new(corners, vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).unwrap()
+    }
+
+    /// Descriptions that are whole, of this version and of this mesh, as they say: they made an index panic, asked for 97 GB or
+    /// never ended.
+    #[test]
+    fn a_forged_description_is_made_again_with_a_note_that_names_the_field() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("ppf.bin");
+        let (mesh, options) = (tetrahedron(), ModelOptions { sampling_step: 0.2, ..ModelOptions::default() });
+        let key = fingerprint(&mesh, &options);
+        let honest = ObjectModel::new(&mesh, &[], &options).unwrap();
+        write(&path, key, &honest).unwrap();
+        let (read_back, note) = ObjectModel::cached(&path, &mesh, &[], &options).unwrap();
+        assert!(note.is_none() && read_back.table == honest.table);
+        type Forge = fn(&mut ObjectModel);
+        let forgeries: [(&str, Forge); 12] = [
+            ("diameter", |m| m.diameter = f64::NAN),
+            ("diameter", |m| m.diameter = 0.0),
+            ("diameter", |m| m.diameter *= 1000.0),
+            ("centre", |m| m.centre.x = f64::INFINITY),
+            ("mesh", |m| m.mesh = m.mesh.scaled(50.0)),
+            ("mesh", |m| m.mesh = Mesh::new(m.mesh.vertices().to_vec(), vec![]).unwrap()),
+            ("samples", |m| m.samples.points[3].y = f64::NAN),
+            ("samples", |m| m.samples.points[3].y = 1e30),
+            ("samples", |m| {
+                m.samples.points = vec![m.samples.points[0]; 20_000];
+                m.samples.normals = vec![m.samples.normals[0]; 20_000];
+                m.visible_from = vec![u64::MAX; 20_000];
+            }),
+            ("samples", |m| {
+                m.samples = PointCloud::default();
+                m.visible_from.clear();
+            }),
+            ("normals", |m| m.samples.normals[2] = Vec3::repeat(f64::NAN)),
+            ("visible_from", |m| m.visible_from[1] = 0),
+        ];
+        for (field, forge) in forgeries {
+            let mut forged = honest.clone();
+            forge(&mut forged);
+            write(&path, key, &forged).unwrap();
+            let (model, note) = ObjectModel::cached(&path, &mesh, &[], &options).unwrap();
+            let note = note.unwrap().to_string();
+            assert!(note.contains(field) && note.contains("ppf.bin"), "{field}: {note}");
+            assert!(model.table == honest.table && model.diameter == honest.diameter, "{field}");
+            // It is whole again.
+            assert!(ObjectModel::cached(&path, &mesh, &[], &options).unwrap().1.is_none(), "{field}");
+        }
     }
 }

@@ -89,6 +89,9 @@ const TURNS: usize = 32;
 
 /// The scene cloud at the model's sampling step, sorted into cells of the model's diameter so that all partners
 /// of a point lie in 27 cells.
+///
+/// Cells grow where there would be more than [`MAX_CELLS`], as with points that a camera of a wrong unit puts kilometres apart: the
+/// partners are the same.
 struct Grid {
     points: Vec<V3>,
     normals: Vec<V3>,
@@ -99,12 +102,27 @@ struct Grid {
     order: Vec<u32>,
 }
 
+/// Most cells of a [`Grid`]: 32 MB. A room seen with an object of 4 cm takes half of them.
+const MAX_CELLS: f64 = (1u64 << 22) as f64;
+
 impl Grid {
-    fn new(cloud: &PointCloud, cell: f32) -> Option<Grid> {
+    fn new(cloud: &PointCloud, mut cell: f32) -> Option<Grid> {
         let points: Vec<V3> = cloud.points.iter().map(|p| p.cast()).collect();
         let normals = cloud.normals.iter().map(|n| n.cast()).collect();
         let first = *points.first()?;
         let (low, high) = points.iter().fold((first, first), |(a, b), p| (a.inf(p), b.sup(p)));
+        if !(cell > 0.0) {
+            return None;
+        }
+        let cells =
+            |cell: f32| (0..3).map(|k| f64::from((high[k] - low[k]) / cell).floor() + 1.0).product::<f64>();
+        while cells(cell) > MAX_CELLS {
+            cell *= 2.0;
+        }
+        // Points that are not finite, or a cell without a size.
+        if !cells(cell).is_finite() {
+            return None;
+        }
         let size: [usize; 3] = std::array::from_fn(|k| ((high[k] - low[k]) / cell) as usize + 1);
         let index = |p: &V3| {
             let c: [usize; 3] = std::array::from_fn(|k| (((p[k] - low[k]) / cell) as usize).min(size[k] - 1));
@@ -342,6 +360,41 @@ mod tests {
             samples: PointCloud { points, normals },
         };
         ObjectModel::assemble(description, &[])
+    }
+
+    /// A focal length of half a pixel put the points 12 km apart, and the cells of 10 cm between them took 7.5 GB.
+    #[test]
+    fn points_kilometres_apart_take_a_bounded_grid_with_the_same_partners() {
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        let mut points: Vec<Vec3> =
+            (0..300).map(|_| Vec3::from_fn(|_, _| random.random_range(0.0..0.5))).collect();
+        let near = points.len();
+        points.extend([
+            Vec3::new(12_000.0, 9000.0, 5.0),
+            Vec3::new(-1e9, 0.0, 1.0),
+            Vec3::new(0.0, 1e12, 1.0),
+        ]);
+        let cloud =
+            |points: &[Vec3]| PointCloud { points: points.to_vec(), normals: vec![Vec3::z(); points.len()] };
+        let small = Grid::new(&cloud(&points[..near]), 0.1).unwrap();
+        assert_eq!((small.cell, small.size), (0.1, [5, 5, 5]));
+        for far in near + 1..=points.len() {
+            let grid = Grid::new(&cloud(&points[..far]), 0.1).unwrap();
+            assert!(grid.starts.len() <= MAX_CELLS as usize + 1, "{}", grid.starts.len());
+            let partners = |grid: &Grid, p: &V3| {
+                let mut found = vec![];
+                grid.for_neighbours(p, |i| {
+                    if (grid.points[i] - p).norm() <= 0.1 {
+                        found.push(i);
+                    }
+                });
+                found.sort_unstable();
+                found
+            };
+            assert!((0..near).all(|i| partners(&grid, &grid.points[i]) == partners(&small, &grid.points[i])));
+        }
+        assert!(Grid::new(&cloud(&[Vec3::zeros(), Vec3::x() * 1e300]), 0.1).is_none());
+        assert!(Grid::new(&cloud(&points), 0.0).is_none());
     }
 
     #[test]

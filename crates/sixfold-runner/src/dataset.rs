@@ -15,9 +15,11 @@ use sixfold_estimator::{
     check_min_confidence,
 };
 use sixfold_geometry::{Camera, RgbImage};
+use sixfold_io::{WriteLock, write_atomically};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
 
 use crate::error::{RunError, describe};
+use crate::inputs::Inputs;
 use crate::record::{RunOptions, RunRecord};
 use crate::regions::RegionSource;
 
@@ -99,9 +101,19 @@ struct Known {
     prepared: Box<dyn PreparedObject>,
 }
 
+/// What a run knows of its dataset.
+struct Work {
+    infos: Option<ModelsInfo>,
+    known: BTreeMap<u32, Known>,
+    scenes: BTreeMap<u32, Scene>,
+    /// Targets by scene and image.
+    images: BTreeMap<(u32, u32), Vec<Target>>,
+}
+
 impl DatasetRun<'_> {
     /// Estimates all targets and appends the rows of every image to `results` at once. Stops between images when `stop` is set;
-    /// a broken image is left out and reported.
+    /// a broken image is left out and reported. One run at a time writes a file; a later one resumes it with the same options and
+    /// the same contents of the dataset's files only.
     ///
     /// # Errors
     /// [`RunError`].
@@ -118,76 +130,110 @@ impl DatasetRun<'_> {
         if needs.region == Need::Required && matches!(self.regions, RegionSource::Anywhere) {
             return Err(RunError::NoRegions { method: self.estimator.name() });
         }
-        let mut record = RunRecord::open(results, self.estimator.name(), self.options)?;
-        let mut rows = open_results(results, &mut record, events)?;
-        let infos = self.dataset.models_info(Models::Rendering)?;
-        let mut known: BTreeMap<u32, Known> = BTreeMap::new();
-        let mut scenes: BTreeMap<u32, Scene> = BTreeMap::new();
-        let mut images: BTreeMap<(u32, u32), Vec<Target>> = BTreeMap::new();
-        for t in self.targets {
-            images.entry((t.scene_id, t.im_id)).or_default().push(*t);
+        // Before anything is read: what another run writes meanwhile would be taken for this one's.
+        let _lock = WriteLock::take(results)?;
+        if let Some(note) = self.regions.without_match(self.targets) {
+            events(DatasetEvent::Note(note))?;
         }
-        let mut poses = rows.existing().len();
-        let (mut seconds, mut skipped) = (vec![], vec![]);
-        for ((scene_id, im_id), targets) in &images {
-            if stop.load(Ordering::Relaxed) {
-                return Err(RunError::Interrupted);
+        let mut record = RunRecord::open(results, self.estimator.name(), self.options)?;
+        let infos = self.dataset.models_info(Models::Rendering)?;
+        let mut work =
+            Work { infos, known: BTreeMap::new(), scenes: BTreeMap::new(), images: BTreeMap::new() };
+        for t in self.targets {
+            work.images.entry((t.scene_id, t.im_id)).or_default().push(*t);
+            if let Entry::Vacant(place) = work.scenes.entry(t.scene_id) {
+                place.insert(self.dataset.scene(t.scene_id)?);
             }
+        }
+        let ids: BTreeSet<u32> = self.targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+        for id in ids {
+            record.object(id, &Inputs::of_object(self.dataset, id, work.infos.as_ref()))?;
+        }
+        record.check_images(stop, |scene_id, im_id| self.inputs_of(&work, scene_id, im_id))?;
+        let mut rows = open_results(results, &mut record, events)?;
+        let mut summary = DatasetSummary {
+            images: work.images.len(),
+            targets: self.targets.len(),
+            poses: rows.existing().len(),
+            skipped: vec![],
+            seconds_per_image: None,
+            results: results.display().to_string(),
+        };
+        let done = self.images(&mut work, &mut record, &mut rows, &mut summary, stop, events);
+        // What is done is done, whatever ended the loop.
+        record.save()?;
+        done.map(|()| summary)
+    }
+
+    /// What an image's poses are computed from; an image that is no target any more has other targets.
+    fn inputs_of(&self, work: &Work, scene_id: u32, im_id: u32) -> Inputs {
+        let targets = work.images.get(&(scene_id, im_id));
+        match (work.scenes.get(&scene_id), targets) {
+            (Some(scene), Some(targets)) => {
+                Inputs::of_image(scene, im_id, targets, &self.estimator.needs(), self.regions)
+            }
+            _ => Inputs::without_targets(self.dataset.root()),
+        }
+    }
+
+    /// Estimates all images that are not done.
+    fn images(
+        &self,
+        work: &mut Work,
+        record: &mut RunRecord,
+        rows: &mut ResultsAppender,
+        summary: &mut DatasetSummary,
+        stop: &AtomicBool,
+        events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
+    ) -> Result<(), RunError> {
+        let mut seconds = vec![];
+        let images: Vec<(u32, u32)> = work.images.keys().copied().collect();
+        for (scene_id, im_id) in images {
+            check(stop)?;
             let image = format!("{scene_id}/{im_id}");
-            if record.is_done(&image) {
+            if record.is_done(scene_id, im_id) {
                 events(DatasetEvent::Image { image, earlier: true })?;
                 continue;
             }
-            let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
-            for id in ids {
-                if let Entry::Vacant(place) = known.entry(id) {
-                    let made = self.known(id, infos.as_ref(), events)?;
-                    place.insert(made);
-                }
-            }
-            let scene = match scenes.entry(*scene_id) {
-                Entry::Occupied(known) => known.into_mut(),
-                Entry::Vacant(place) => place.insert(self.dataset.scene(*scene_id)?),
-            };
+            // Hashed before they are read: what changes in between makes the next run refuse, never believe.
+            let inputs = self.inputs_of(work, scene_id, im_id);
+            self.prepare(work, (scene_id, im_id), stop, events)?;
+            let (scene, targets) = (&work.scenes[&scene_id], &work.images[&(scene_id, im_id)]);
             let start = Instant::now();
-            match self.estimate_image(scene, *im_id, targets, &known, events) {
-                Err(error) => skipped.push(format!("image {image}: {}", describe(&error))),
+            match self.estimate_image(scene, im_id, targets, &work.known, events) {
+                Err(error) => summary.skipped.push(format!("image {image}: {}", describe(&error))),
                 Ok(found) => {
                     let time = start.elapsed().as_secs_f64();
                     seconds.push(time);
-                    let row = |p: &PosedObject<'_>| Estimate {
-                        time: Some(time),
-                        ..Estimate::new(
-                            *scene_id,
-                            *im_id,
-                            p.obj_id,
-                            p.estimate.confidence,
-                            p.estimate.camera_from_object,
-                        )
-                    };
-                    let new: Vec<Estimate> = found.iter().map(row).collect();
-                    rows.append(&new)?;
-                    poses += new.len();
-                    record.done(image.clone());
-                    if new.is_empty() {
-                        record.save()?;
-                    }
-                    let result = ImageResult { scene, scene_id: *scene_id, im_id: *im_id, found };
-                    events(DatasetEvent::Result(&result))?;
+                    rows.append(&rows_of(&found, (scene_id, im_id), time))?;
+                    record.finished((scene_id, im_id), found.len(), &inputs)?;
+                    summary.poses += found.len();
+                    summary.seconds_per_image = Some(seconds.iter().sum::<f64>() / seconds.len() as f64);
+                    events(DatasetEvent::Result(&ImageResult { scene, scene_id, im_id, found }))?;
                 }
             }
             events(DatasetEvent::Image { image, earlier: false })?;
         }
-        record.save()?;
-        Ok(DatasetSummary {
-            images: images.len(),
-            targets: self.targets.len(),
-            poses,
-            skipped,
-            seconds_per_image: (!seconds.is_empty())
-                .then(|| seconds.iter().sum::<f64>() / seconds.len() as f64),
-            results: results.display().to_string(),
-        })
+        Ok(())
+    }
+
+    /// Reads and prepares the models of an image's targets that are not yet.
+    fn prepare(
+        &self,
+        work: &mut Work,
+        image: (u32, u32),
+        stop: &AtomicBool,
+        events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
+    ) -> Result<(), RunError> {
+        let ids: BTreeSet<u32> =
+            work.images[&image].iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+        for id in ids {
+            check(stop)?;
+            if let Entry::Vacant(place) = work.known.entry(id) {
+                place.insert(self.known(id, work.infos.as_ref(), events)?);
+            }
+        }
+        Ok(())
     }
 
     /// Reads and prepares a model of the dataset.
@@ -304,8 +350,22 @@ impl Input {
     }
 }
 
-/// Opens a result file to append to. Rows are written image by image: only the last image can be there in part, and is done
-/// again unless it is known to be whole.
+/// An error once the caller has asked to stop.
+pub(crate) fn check(stop: &AtomicBool) -> Result<(), RunError> {
+    if stop.load(Ordering::Relaxed) { Err(RunError::Interrupted) } else { Ok(()) }
+}
+
+/// The rows of an image, all with the time that they took together.
+fn rows_of(found: &[PosedObject<'_>], (scene_id, im_id): (u32, u32), time: f64) -> Vec<Estimate> {
+    let row = |p: &PosedObject<'_>| Estimate {
+        time: Some(time),
+        ..Estimate::new(scene_id, im_id, p.obj_id, p.estimate.confidence, p.estimate.camera_from_object)
+    };
+    found.iter().map(row).collect()
+}
+
+/// Opens a result file to append to, without what a run that was cut off did not finish: half a row, and rows of images that the
+/// record does not have.
 fn open_results(
     path: &Path,
     record: &mut RunRecord,
@@ -316,28 +376,29 @@ fn open_results(
         let text = format!("{}: the last line was cut off and is dropped: {torn}", path.display());
         events(DatasetEvent::Note(text))?;
     }
-    if let Some(last) = results.existing().last()
-        && !record.is_done(&format!("{}/{}", last.scene_id, last.im_id))
-    {
-        let image = (last.scene_id, last.im_id);
+    record.forget_unless_whole(results.existing());
+    let unfinished = results.existing().iter().find(|e| !record.is_done(e.scene_id, e.im_id));
+    if let Some(Estimate { scene_id, im_id, .. }) = unfinished {
+        let text = format!(
+            "{}: the run was cut off before image {scene_id}/{im_id} was finished; it is computed again",
+            path.display()
+        );
+        events(DatasetEvent::Note(text))?;
         drop(results);
-        drop_last_image(path, image).map_err(|source| RunError::Io { path: path.into(), source })?;
+        keep_finished(path, record).map_err(|source| RunError::Io { path: path.into(), source })?;
         results = ResultsAppender::open(path)?;
-    }
-    for e in results.existing() {
-        record.done(format!("{}/{}", e.scene_id, e.im_id));
     }
     Ok(results)
 }
 
-/// Cuts the rows of this image off the end of a result file.
-fn drop_last_image(path: &Path, (scene_id, im_id): (u32, u32)) -> std::io::Result<()> {
+/// Leaves the rows of finished images in a result file, as they are, and the header.
+fn keep_finished(path: &Path, record: &RunRecord) -> std::io::Result<()> {
     let text = std::fs::read_to_string(path)?;
-    let of_image = |line: &&str| {
+    let finished = |line: &&str| {
         let mut columns = line.split(',').map(|c| c.trim().parse::<u32>().ok());
-        columns.next().flatten() == Some(scene_id) && columns.next().flatten() == Some(im_id)
+        let image = columns.next().flatten().zip(columns.next().flatten());
+        image.is_none_or(|(scene_id, im_id)| record.is_done(scene_id, im_id))
     };
-    let lines: Vec<&str> = text.split_inclusive('\n').collect();
-    let cut: usize = lines.iter().rev().take_while(|l| of_image(l)).map(|l| l.len()).sum();
-    std::fs::OpenOptions::new().write(true).open(path)?.set_len((text.len() - cut) as u64)
+    let kept: String = text.split_inclusive('\n').filter(finished).collect();
+    write_atomically(path, kept.as_bytes())
 }

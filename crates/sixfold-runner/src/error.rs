@@ -1,10 +1,11 @@
 //! Why a run cannot continue.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use sixfold_bop::{DatasetError, ResultsError};
+use sixfold_bop::{DatasetError, ResultsError, RleError};
 use sixfold_estimator::{CacheError, EstimatorError};
 use sixfold_geometry::CameraError;
+use sixfold_io::LockError;
 use thiserror::Error;
 
 /// Why a run cannot continue.
@@ -65,6 +66,15 @@ pub enum RunError {
     /// The result file was made with other options.
     #[error(transparent)]
     OtherOptions(Box<OtherOptions>),
+    /// The result file was made with other contents of an input.
+    #[error(transparent)]
+    OtherInput(Box<OtherInput>),
+    /// Another process writes the result file.
+    #[error(transparent)]
+    Locked(#[from] LockError),
+    /// A mask cannot be written as run lengths.
+    #[error(transparent)]
+    Mask(#[from] RleError),
     /// A file cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
@@ -104,6 +114,28 @@ pub struct OtherOptions {
     pub before: String,
     /// What it is.
     pub now: String,
+}
+
+/// A result file whose rows were computed from other contents of a file than it has now.
+#[derive(Debug, Error)]
+#[error(
+    "{} was made with another {input} ({}; see {}): remove both or choose another --out",
+    results.display(), changed(file), record.display()
+)]
+pub struct OtherInput {
+    /// The result file.
+    pub results: PathBuf,
+    /// The record beside it.
+    pub record: PathBuf,
+    /// What is another, and of which image or object.
+    pub input: String,
+    /// The file that it comes from; empty where it is gone.
+    pub file: PathBuf,
+}
+
+fn changed(file: &Path) -> String {
+    let gone = file.as_os_str().is_empty();
+    if gone { "the file is gone".into() } else { format!("{} has changed since", file.display()) }
 }
 
 /// The whole chain of causes in one line, without repeating a cause that its parent already prints.

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 use serde_json::{Map, Value};
-use sixfold_align::VerificationScore;
+use sixfold_align::{PreparedDepth, VerificationScore};
 use sixfold_estimator::{EstimatorError, Object, PoseEstimate, PoseEstimator, PreparedObject, Query};
 
 /// A method and the image that it is asked about.
@@ -47,6 +47,21 @@ impl ImageRun<'_> {
         let not_found = missing.map(|f| f.object.name().to_owned()).collect();
         ImageReport { poses, not_found, overlay: None, diagnostics: BTreeMap::new() }
     }
+}
+
+/// What makes a search of a depth image hopeless or slow, a sentence each.
+pub fn depth_notes(depth: &PreparedDepth, estimator: &dyn PoseEstimator) -> Vec<String> {
+    let mut notes = vec![];
+    let pixels = depth.depth().as_slice();
+    let measured = pixels.iter().filter(|&&z| z > 0.0).count();
+    if 10 * measured < pixels.len() {
+        let percent = (100.0 * measured as f64 / pixels.len() as f64).round();
+        notes.push(format!("only {percent} % of the depth image is measured"));
+    }
+    if estimator.depth_options().remove_plane && depth.plane().is_none() {
+        notes.push("no table plane was found; all of the image is searched".to_owned());
+    }
+    notes
 }
 
 /// A pose as JSON.

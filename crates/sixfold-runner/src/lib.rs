@@ -1,16 +1,20 @@
 //! Any [`PoseEstimator`](sixfold_estimator::PoseEstimator) on one image ([`ImageRun`]) or on all targets of a BOP dataset
-//! ([`DatasetRun`]), where regions come from the ground truth, a file of detections or a detector ([`RegionSource`]).
+//! ([`DatasetRun`]), where regions come from the ground truth, a file of detections or a detector
+//! ([`RegionSource`]); and a detector by itself on all images of a dataset ([`DetectionRun`]).
 
 mod dataset;
+mod detection;
 mod error;
 mod image;
+mod inputs;
 mod record;
 mod regions;
 mod table;
 
 pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject};
-pub use error::{OtherOptions, RunError, describe};
-pub use image::{FoundObject, FoundPose, ImageReport, ImageRun};
+pub use detection::{DetectionEvent, DetectionRun, DetectionSummary, FoundDetection, detections};
+pub use error::{OtherInput, OtherOptions, RunError, describe};
+pub use image::{FoundObject, FoundPose, ImageReport, ImageRun, depth_notes};
 pub use record::RunOptions;
 pub use regions::RegionSource;
 pub use table::pose_table;

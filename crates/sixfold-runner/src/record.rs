@@ -1,12 +1,26 @@
 //! What a result file was made with, kept beside it so that a later run resumes with the same.
+//!
+//! The record `FILE.csv.run.json` holds version, method and options, for every object a hash of its model and of its entry in
+//! `models_info.json`, and for every finished image hashes of what its poses were computed from: camera, targets, the images that
+//! the method reads, ground truth where the boxes are its. Contents count, not paths. Where any of them has changed the whole run
+//! is refused and names the input: poses of the former contents and of the present ones must not stand in one file as if they
+//! belonged together.
+//!
+//! Rows are written first and the record after them, once a second at most. Images that the record does not have, or with another
+//! number of rows, are those of a run that was cut off; they are computed again.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use sixfold_io::{fnv1a, write_atomically};
+use sixfold_bop::Estimate;
+use sixfold_io::{fnv1a_of_file, write_atomically};
 
-use crate::error::{OtherOptions, RunError};
+use crate::dataset::check;
+use crate::error::{OtherInput, OtherOptions, RunError};
+use crate::inputs::{Inputs, hex};
 
 /// The options that decide about a run's results, by name. An option that names a file counts by the file's contents too.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -18,9 +32,9 @@ impl RunOptions {
         self.0.insert(name.to_owned(), value.to_owned());
         let path = Path::new(value);
         if path.is_file()
-            && let Ok(bytes) = std::fs::read(path)
+            && let Ok(hash) = fnv1a_of_file(path)
         {
-            self.0.insert(format!("{name} (contents)"), format!("{:016x}", fnv1a(&bytes)));
+            self.0.insert(format!("{name} (contents)"), hex(hash));
         }
     }
 
@@ -38,15 +52,31 @@ struct Record {
     version: String,
     method: String,
     options: RunOptions,
-    /// Images that are done, `scene/image`.
-    done: BTreeSet<String>,
+    /// Of each object, by its number.
+    objects: BTreeMap<u32, BTreeMap<String, String>>,
+    done: Vec<DoneImage>,
+}
+
+/// An image whose rows are all in the result file.
+#[derive(Debug, Serialize, Deserialize)]
+struct DoneImage {
+    scene_id: u32,
+    im_id: u32,
+    rows: usize,
+    inputs: BTreeMap<String, String>,
 }
 
 /// The record of a result file on disk.
 pub(crate) struct RunRecord {
+    results: PathBuf,
     path: PathBuf,
     record: Record,
+    done: BTreeSet<(u32, u32)>,
+    saved: Instant,
 }
+
+/// A record that is less than this old is not written again: a run of a thousand images a minute would do little else.
+const SAVED_EVERY: Duration = Duration::from_secs(1);
 
 impl RunRecord {
     /// The record of `results`: a new one, or the one that is there if it was made with the same options.
@@ -56,10 +86,14 @@ impl RunRecord {
             version: env!("CARGO_PKG_VERSION").into(),
             method: method.into(),
             options: options.clone(),
-            done: BTreeSet::new(),
+            ..Record::default()
+        };
+        let opened = |record: Record, path| {
+            let done = record.done.iter().map(|d| (d.scene_id, d.im_id)).collect();
+            RunRecord { results: results.into(), path, record, done, saved: Instant::now() }
         };
         if !results.exists() {
-            let new = RunRecord { path, record };
+            let mut new = opened(record, path);
             new.save()?;
             return Ok(new);
         }
@@ -76,20 +110,70 @@ impl RunRecord {
             let other = OtherOptions { results, record: path, option, before, now };
             return Err(RunError::OtherOptions(Box::new(other)));
         }
-        Ok(RunRecord { path, record: Record { done: before.done, ..record } })
+        Ok(opened(before, path))
     }
 
-    pub fn is_done(&self, image: &str) -> bool {
-        self.record.done.contains(image)
+    /// Takes down what an object is known by; an error where the rows that are there were made with another.
+    pub fn object(&mut self, id: u32, inputs: &Inputs) -> Result<(), RunError> {
+        if let Some(before) = self.record.objects.get(&id) {
+            return self.same(before, inputs, &format!("object {id}"));
+        }
+        self.record.objects.insert(id, inputs.hashes());
+        Ok(())
     }
 
-    pub fn done(&mut self, image: String) {
-        self.record.done.insert(image);
+    /// An error where an image that is done was done with other inputs than `now` says.
+    pub fn check_images(&self, stop: &AtomicBool, now: impl Fn(u32, u32) -> Inputs) -> Result<(), RunError> {
+        let same = |done: &DoneImage| {
+            check(stop)?;
+            let image = format!("image {}/{}", done.scene_id, done.im_id);
+            self.same(&done.inputs, &now(done.scene_id, done.im_id), &image)
+        };
+        self.record.done.iter().try_for_each(same)
     }
 
-    pub fn save(&self) -> Result<(), RunError> {
+    fn same(&self, before: &BTreeMap<String, String>, now: &Inputs, of: &str) -> Result<(), RunError> {
+        let Some((name, file)) = now.difference(before) else { return Ok(()) };
+        Err(RunError::OtherInput(Box::new(OtherInput {
+            results: self.results.clone(),
+            record: self.path.clone(),
+            input: format!("{name} of {of}"),
+            file,
+        })))
+    }
+
+    /// Whether an image is done.
+    pub fn is_done(&self, scene_id: u32, im_id: u32) -> bool {
+        self.done.contains(&(scene_id, im_id))
+    }
+
+    /// Forgets the images that have not as many rows in the result file as they were written with.
+    pub fn forget_unless_whole(&mut self, rows: &[Estimate]) {
+        let mut counts: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+        for row in rows {
+            *counts.entry((row.scene_id, row.im_id)).or_default() += 1;
+        }
+        self.record.done.retain(|d| counts.get(&(d.scene_id, d.im_id)).copied().unwrap_or(0) == d.rows);
+        self.done = self.record.done.iter().map(|d| (d.scene_id, d.im_id)).collect();
+    }
+
+    /// Takes down an image with this many rows, which are on the disk.
+    pub fn finished(
+        &mut self,
+        (scene_id, im_id): (u32, u32),
+        rows: usize,
+        inputs: &Inputs,
+    ) -> Result<(), RunError> {
+        self.done.insert((scene_id, im_id));
+        self.record.done.push(DoneImage { scene_id, im_id, rows, inputs: inputs.hashes() });
+        if self.saved.elapsed() < SAVED_EVERY { Ok(()) } else { self.save() }
+    }
+
+    pub fn save(&mut self) -> Result<(), RunError> {
         let io = |source| RunError::Io { path: self.path.clone(), source };
         let text = serde_json::to_string_pretty(&self.record).map_err(|e| io(std::io::Error::other(e)))?;
-        write_atomically(&self.path, text.as_bytes()).map_err(io)
+        write_atomically(&self.path, text.as_bytes()).map_err(io)?;
+        self.saved = Instant::now();
+        Ok(())
     }
 }

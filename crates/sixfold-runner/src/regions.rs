@@ -5,8 +5,8 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use sixfold_bop::{
-    Adjustment, BopDataset, DatasetError, Detection, ReadDetections, Rle, Scene, Target, TargetObject,
-    VISIBILITY_DELTA, ground_truth_visibility, read_detections,
+    Adjustment, BopDataset, DatasetError, Detection, Rle, Scene, Target, TargetObject, VISIBILITY_DELTA,
+    ground_truth_visibility,
 };
 use sixfold_estimator::{DetectedObject, ObjectDetector, Region};
 use sixfold_geometry::{Camera, Rect};
@@ -51,16 +51,39 @@ impl RegionSource {
         dataset: &BopDataset,
         file: &Path,
     ) -> Result<(RegionSource, Vec<String>, Vec<String>), RunError> {
-        let options = ReadDetections { image_size: dataset.image_size(), ..ReadDetections::default() };
-        let read = read_detections(file, &options)?;
+        let read = dataset.detections(file, false)?;
         let (mut changed, mut left_out) = (vec![], vec![]);
         for adjusted in read.adjusted {
             match adjusted.adjustment {
-                Adjustment::Clipped => changed.push(adjusted.message),
+                Adjustment::Clipped | Adjustment::Scene => changed.push(adjusted.message),
                 _ => left_out.push(adjusted.message),
             }
         }
         Ok((RegionSource::Detections(read.detections), changed, left_out))
+    }
+
+    /// What to tell a user whose detections are of none of the targets: with other numbers of scenes, images or objects all of
+    /// them are passed over.
+    pub fn without_match(&self, targets: &[Target]) -> Option<String> {
+        let RegionSource::Detections(all) = self else { return None };
+        let is_for = |d: &Detection, t: &Target| {
+            (d.scene_id, d.image_id, Some(d.category_id)) == (t.scene_id, t.im_id, t.object.map(|o| o.obj_id))
+        };
+        if all.is_empty() || targets.is_empty() || all.iter().any(|d| targets.iter().any(|t| is_for(d, t))) {
+            return None;
+        }
+        let (d, t) = (&all[0], &targets[0]);
+        Some(format!(
+            "none of the {} detections is of a target, so nothing can be found: the first one is of scene_id {}, image_id {}, \
+             category_id {}, the first target of {}, {}, {}; the numbers of the file have to be those of the dataset",
+            all.len(),
+            d.scene_id,
+            d.image_id,
+            d.category_id,
+            t.scene_id,
+            t.im_id,
+            t.object.map_or(0, |o| o.obj_id)
+        ))
     }
 
     /// Regions of a target with their scores: detections best first, as many as there are instances, or the ground truth's.

@@ -1,14 +1,23 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
 //! arguments, stores and scenes that both take.
 
-#[cfg(feature = "networks")]
-pub mod detector;
+// First: its macros take the place of the standard ones in all that follows.
+#[macro_use]
+pub mod screen;
+
+pub mod folder;
+pub mod found;
 pub mod frames;
 pub mod grasp;
+pub mod meshes;
 pub mod objects;
 pub mod output;
 pub mod overlay;
+pub mod pictures;
 pub mod progress;
+pub mod ranges;
+#[cfg(feature = "physics")]
+pub mod scenes;
 #[cfg(feature = "networks")]
 pub mod training;
 
@@ -26,17 +35,20 @@ pub enum Outcome {
     Incomplete,
 }
 
-/// The exit status of a command; the reason of an error goes to standard error.
+/// The exit status of a command; the reason of an error goes to standard error, and as JSON to standard output where that was
+/// asked for.
 pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
-    match result {
-        Ok(Outcome::Found) => ExitCode::SUCCESS,
-        Ok(Outcome::NothingFound) => ExitCode::from(1),
-        Ok(Outcome::Incomplete) => ExitCode::from(2),
+    screen::finish(match result {
+        Ok(Outcome::Found) => 0,
+        Ok(Outcome::NothingFound) => 1,
+        Ok(Outcome::Incomplete) => 2,
         Err(error) => {
-            eprintln!("error: {}", describe(error));
-            ExitCode::from(2)
+            let stopped = progress::was_interrupted();
+            let failure = if stopped { screen::Failure::Interrupt } else { screen::Failure::Command };
+            screen::fail(&describe(error), failure);
+            2
         }
-    }
+    })
 }
 
 /// The whole chain of causes in one line, without repeating a cause that its parent already prints.
@@ -54,18 +66,21 @@ pub fn describe(error: &anyhow::Error) -> String {
     text
 }
 
-/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end one in C, rather
-/// than with a message of a panic. What a command has to keep it writes to files.
-pub fn end_with_the_reader() {
-    let usual = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        let message = panic.payload().downcast_ref::<String>();
-        if message.is_some_and(|m| m.starts_with("failed printing to") && m.contains("Broken pipe")) {
-            // 128 and the number of SIGPIPE.
-            std::process::exit(141);
+/// The largest image that either program reads.
+#[derive(Debug, clap::Args)]
+pub struct PixelLimit {
+    /// Read images of at most this many pixels (default: 100000000)
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pixels: Option<std::num::NonZeroU64>,
+}
+
+impl PixelLimit {
+    /// Sets it for this process.
+    pub fn set(&self) {
+        if let Some(pixels) = self.max_pixels {
+            sixfold_io::set_max_pixels(pixels.get());
         }
-        usual(panic);
-    }));
+    }
 }
 
 /// Uses so many threads for everything, or all cores.

@@ -2,10 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::Args;
 use serde::Serialize;
-use serde_json::Value;
 use sixfold_geometry::Pose;
 
 /// `--json`: to the screen, or to a file.
@@ -48,34 +47,10 @@ pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()
     Ok(())
 }
 
-/// Writes a file under another name first, so that no reader sees half of it.
+/// Writes a file so that no reader sees half of it ([`sixfold_io::write_atomically`]), with the file's name in the error.
+///
+/// # Errors
+/// What the system says.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
-    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
-        std::fs::create_dir_all(parent).with_context(|| format!("folder {}", parent.display()))?;
-    }
-    let mut name = path.as_os_str().to_owned();
-    name.push(format!(".{}.tmp", std::process::id()));
-    std::fs::write(&name, bytes)
-        .and_then(|()| std::fs::rename(&name, path))
-        .with_context(|| format!("cannot write {}", path.display()))
-}
-
-/// Keeps the options that decide about a folder's content in `file`, an object of them. Where the file is there already, a
-/// folder made with others is refused.
-pub fn go_on_with(file: &Path, options: &Value) -> Result<()> {
-    if !file.exists() {
-        return write_atomically(file, format!("{options:#}\n").as_bytes());
-    }
-    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
-    let before: Value = serde_json::from_str(&text).with_context(|| file.display().to_string())?;
-    let differs = |key: &&String| before.get(key.as_str()) != options.get(key.as_str());
-    if let Some(key) = options.as_object().into_iter().flat_map(|o| o.keys()).find(differs) {
-        bail!(
-            "{}: made with another {key} (there {}, now {}); give the same options to continue, or another --out",
-            file.display(),
-            before[key],
-            options[key]
-        );
-    }
-    Ok(())
+    sixfold_io::write_atomically(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }

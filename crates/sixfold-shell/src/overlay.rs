@@ -1,5 +1,6 @@
 //! Images of poses: the object's silhouette, tinted surface and axes over the image.
 
+use sixfold_bop::{Detection, Rle};
 use sixfold_geometry::{Camera, DepthImage, Image, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_plot::text_dots;
@@ -164,6 +165,33 @@ pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3])
     for (x, y) in text_dots(text) {
         set(left + 1 + x, top + 1 + y, [0; 3]);
     }
+}
+
+/// Detections over an image, boxes and tinted masks, the best on top.
+pub fn detections_over(image: &RgbImage, found: &[Detection]) -> RgbImage {
+    let mut out = image.clone();
+    for d in found.iter().rev() {
+        let color = color(d.category_id as usize);
+        if let Some(mask) = d.segmentation.as_ref().map(Rle::decode) {
+            for (pixel, inside) in out.as_mut_slice().iter_mut().zip(mask.as_slice()) {
+                if *inside {
+                    for (channel, tint) in pixel.iter_mut().zip(color) {
+                        *channel = ((u16::from(*channel) + u16::from(tint)) / 2) as u8;
+                    }
+                }
+            }
+        }
+        if let Some(b) = d.bbox {
+            rectangle(&mut out, [b.x, b.y, b.x + b.width, b.y + b.height], color);
+        }
+    }
+    for d in found.iter().rev() {
+        if let Some(b) = d.bbox {
+            let text = format!("{} {:.2}", d.category_id, d.score);
+            label(&mut out, [b.x, b.y], &text, color(d.category_id as usize));
+        }
+    }
+    out
 }
 
 /// Unit normals as the usual image: x, y, z from -1..1 to red, green, blue; black where unknown.

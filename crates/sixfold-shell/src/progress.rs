@@ -6,13 +6,21 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
-static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+use crate::screen::{self, Failure, plain};
 
-/// The first interrupt asks for a stop at the next whole step, the second ends the program.
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+/// Whether the command looks at [`INTERRUPTED`]: it has something to finish or to keep.
+static LOOKED_AT: AtomicBool = AtomicBool::new(false);
+
+/// The first interrupt asks a command that looks for it to stop at the next whole step, and ends any other at once: such a
+/// command writes nothing before its end, or whole files only. The second interrupt ends both.
 pub fn catch_interrupts() {
     // Without a handler an interrupt ends the program at once, which loses nothing that is on disk.
     let _ = ctrlc::set_handler(|| {
-        if INTERRUPTED.swap(true, Ordering::SeqCst) {
+        let again = INTERRUPTED.swap(true, Ordering::SeqCst);
+        if again || !LOOKED_AT.load(Ordering::SeqCst) {
+            let how = if again { "stopped at once" } else { "nothing was finished" };
+            screen::fail(&format!("interrupted; {how}"), Failure::Interrupt);
             std::process::exit(2);
         }
         eprintln!("stopping after this step (interrupt again to stop at once)");
@@ -21,12 +29,18 @@ pub fn catch_interrupts() {
 
 /// Set once the user has asked to stop, for jobs that look at it themselves.
 pub fn interrupted() -> &'static AtomicBool {
+    LOOKED_AT.store(true, Ordering::SeqCst);
     &INTERRUPTED
+}
+
+/// Whether the user has asked to stop, for who does not stop for it.
+pub(crate) fn was_interrupted() -> bool {
+    INTERRUPTED.load(Ordering::SeqCst)
 }
 
 /// An error once the user has asked to stop; `how` says how to continue.
 pub fn check_interrupt(how: &str) -> Result<()> {
-    if INTERRUPTED.load(Ordering::SeqCst) {
+    if interrupted().load(Ordering::SeqCst) {
         bail!("interrupted; {how}");
     }
     Ok(())
@@ -55,7 +69,7 @@ impl Progress {
     /// One step is done.
     pub fn step(&mut self, message: String) {
         self.set(self.bar.position() as usize + 1);
-        self.bar.set_message(message);
+        self.bar.set_message(plain(&message).into_owned());
     }
 
     /// What is shown behind the bar.
@@ -65,7 +79,7 @@ impl Progress {
         {
             eprintln!("  {message}");
         }
-        self.bar.set_message(message);
+        self.bar.set_message(plain(&message).into_owned());
     }
 
     /// `done` steps are done.

@@ -79,6 +79,7 @@ pub fn training_set(a: &MaterialArguments, min_visibility: f64) -> Result<Traini
 fn in_words(error: TrainingSetError) -> anyhow::Error {
     match &error {
         TrainingSetError::NoObjects { .. } => anyhow!("{error} with --ids"),
+        TrainingSetError::NamedTwice { .. } => anyhow!("--{error}"),
         TrainingSetError::NoImages { .. } => {
             anyhow!("{error}; give another --split, or train with --renders-only")
         }
@@ -96,8 +97,7 @@ fn in_words(error: TrainingSetError) -> anyhow::Error {
 pub fn was_trained_on(card: &ModelCard, file: &Path, frame: FrameId) -> Result<bool> {
     card.was_trained_on(frame).with_context(|| {
         format!(
-            "{}: its card has no training_frames, so whether it was trained on frame {frame} is not known; train it again, or \
-             write its last checkpoint again with --export",
+            "{}: its card has no training_frames, so whether it was trained on frame {frame} is not known; train it again",
             file.display()
         )
     })

@@ -89,6 +89,18 @@ pub enum Outcome {
     LostInShake,
 }
 
+impl std::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Outcome::Held => "held",
+            Outcome::Blocked => "the gripper cannot get there",
+            Outcome::Missed => "the fingers closed on nothing",
+            Outcome::LostInLift => "lost in the lift",
+            Outcome::LostInShake => "lost in the shake",
+        })
+    }
+}
+
 /// What happened in a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TrialReport {

@@ -13,7 +13,7 @@ pub struct ViewPoint {
     pub elevation: f64,
     /// Distance from the target, metres.
     pub distance: f64,
-    /// The point looked at, in the world's frame, metres.
+    /// The point that the camera looks at, in the world's frame, metres.
     pub target: Vec3,
 }
 

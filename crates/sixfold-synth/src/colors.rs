@@ -2,8 +2,8 @@
 
 use rand::RngExt;
 use sixfold_geometry::Vec3;
-use sixfold_geometry::random::{Random, uniform};
-use sixfold_mesh::Mesh;
+use sixfold_geometry::random::{Random, stream, uniform};
+use sixfold_mesh::{Mesh, MeshError};
 
 /// The mesh in random colours that change slowly over its surface, for shapes without colours.
 pub fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
@@ -34,4 +34,25 @@ pub fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
         .and_then(|shape| shape.with_normals(mesh.vertex_normals()))
         .and_then(|shape| shape.with_colors(colors))
         .unwrap_or_else(|_| mesh.clone())
+}
+
+/// A mesh without colours gets one of its own, which its number decides.
+///
+/// # Errors
+/// [`MeshError`]: never, one colour per vertex always fits.
+pub fn with_own_color(mesh: Mesh, number: u32) -> Result<Mesh, MeshError> {
+    if mesh.colors().is_some() || mesh.texture().is_some() {
+        return Ok(mesh);
+    }
+    let mut random = stream(u64::from(number), 2 << 40);
+    // Hues a golden section apart: neighbours in number differ most.
+    let hue = f64::from(number) * 0.618_033_988_749_895;
+    let (pale, bright) = (0.15 + 0.5 * random.random::<f64>(), 110.0 + 120.0 * random.random::<f64>());
+    let channel = |shift: f64| {
+        let wave = 0.5 + 0.5 * (std::f64::consts::TAU * (hue + shift)).cos();
+        (bright * (pale + (1.0 - pale) * wave)).round() as u8
+    };
+    let color = [channel(0.0), channel(1.0 / 3.0), channel(2.0 / 3.0)];
+    let count = mesh.vertices().len();
+    mesh.with_colors(vec![color; count])
 }

@@ -140,10 +140,10 @@ fn household(random: &mut Random) -> Mesh {
     let radius = between(random, 0.2, 0.55);
     let wall = 0.04;
     match random.random_range(0..5u32) {
-        0 => turned(&profiles::cylinder(radius, 1.0)),
+        0 => lathed(&profiles::cylinder(radius, 1.0)),
         1 => {
             let foot = radius * between(random, 0.6, 1.0);
-            let cup = turned(&profiles::cup(foot, radius, 1.0, wall, wall));
+            let cup = lathed(&profiles::cup(foot, radius, 1.0, wall, wall));
             if random.random::<bool>() { merged(&[cup, handle(0.5 * (foot + radius), random)]) } else { cup }
         }
         2 => {
@@ -156,12 +156,12 @@ fn household(random: &mut Random) -> Mesh {
             };
             let mut profile: Vec<(f64, f64)> = curve(0.0).collect();
             profile.extend(curve(wall).collect::<Vec<_>>().into_iter().rev());
-            turned(&profile)
+            lathed(&profile)
         }
         3 => {
             let (shoulder, neck) = (between(random, 0.45, 0.75), radius * between(random, 0.25, 0.6));
             let throat = shoulder + between(random, 0.05, 0.2);
-            turned(&[
+            lathed(&[
                 (0.0, 0.0),
                 (radius * 0.95, 0.0),
                 (radius, 0.03),
@@ -180,14 +180,14 @@ fn household(random: &mut Random) -> Mesh {
                     (radius * angle.sin() * (1.0 + bump), 0.5 - 0.5 * angle.cos())
                 })
                 .collect();
-            turned(&profile)
+            lathed(&profile)
         }
     }
 }
 
 /// A profile of (radius, height) from the axis back to the axis, rotated about z. Each band has normals of its own: edges of
 /// cans are sharp.
-fn turned(profile: &[(f64, f64)]) -> Mesh {
+fn lathed(profile: &[(f64, f64)]) -> Mesh {
     let (mut vertices, mut normals, mut texcoords, mut faces) = (vec![], vec![], vec![], vec![]);
     let lengths: Vec<f64> = profile.windows(2).map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1)).collect();
     let whole = lengths.iter().sum::<f64>().max(1e-9);

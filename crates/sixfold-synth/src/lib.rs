@@ -12,4 +12,4 @@ pub mod primitives;
 mod profiles;
 pub mod shapes;
 
-pub use colors::randomly_colored;
+pub use colors::{randomly_colored, with_own_color};

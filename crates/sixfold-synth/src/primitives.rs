@@ -1,4 +1,4 @@
-//! Simple closed shapes with known sizes, for tests and for trying out a gripper: boxes and turned (lathe) shapes.
+//! Simple closed shapes with known sizes, for tests and for trying out a gripper: boxes and lathed shapes (solids of revolution).
 //! All stand on `z = 0` except the cuboid, which is centred.
 
 use sixfold_geometry::Vec3;
@@ -7,7 +7,7 @@ use sixfold_mesh::{Mesh, MeshError};
 use crate::profiles;
 use crate::shapes::solids::{band, rings};
 
-/// Sides of a turned shape.
+/// Sides of a lathed shape.
 const SIDES: usize = 48;
 
 /// A box with these side lengths in metres, centred on the origin.
@@ -30,7 +30,7 @@ pub fn cuboid(size: Vec3) -> Result<Mesh, MeshError> {
 ///
 /// # Errors
 /// [`MeshError`] for numbers that are not finite or a profile without points.
-pub fn turned(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
+pub fn lathed(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
     let mut faces = vec![];
     for (row, pair) in profile.windows(2).enumerate() {
         for [lower, upper] in band(row * SIDES, (row + 1) * SIDES, SIDES) {
@@ -51,7 +51,7 @@ pub fn turned(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`].
 pub fn cylinder(radius: f64, height: f64) -> Result<Mesh, MeshError> {
-    turned(&profiles::cylinder(radius, height))
+    lathed(&profiles::cylinder(radius, height))
 }
 
 /// A cup without a handle: a cylinder with a wall and a floor of thickness `wall`.
@@ -59,7 +59,7 @@ pub fn cylinder(radius: f64, height: f64) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`].
 pub fn cup(radius: f64, height: f64, wall: f64) -> Result<Mesh, MeshError> {
-    turned(&profiles::cup(radius, radius, height, wall, wall))
+    lathed(&profiles::cup(radius, radius, height, wall, wall))
 }
 
 /// A bowl whose wall rises as a quarter of an ellipse, with a flat foot of a third of its radius.
@@ -77,7 +77,7 @@ pub fn bowl(radius: f64, height: f64, wall: f64) -> Result<Mesh, MeshError> {
     profile.extend(arc(radius, 0.0));
     profile.extend(arc(radius - wall, wall).rev());
     profile.push((0.0, wall));
-    turned(&profile)
+    lathed(&profile)
 }
 
 /// A bottle: a body, a shoulder and a neck of a third of its radius, solid.
@@ -85,7 +85,7 @@ pub fn bowl(radius: f64, height: f64, wall: f64) -> Result<Mesh, MeshError> {
 /// # Errors
 /// [`MeshError`].
 pub fn bottle(radius: f64, height: f64) -> Result<Mesh, MeshError> {
-    turned(&[
+    lathed(&[
         (0.0, 0.0),
         (radius, 0.0),
         (radius, 0.65 * height),

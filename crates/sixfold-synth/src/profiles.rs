@@ -1,4 +1,4 @@
-//! Outlines that shapes are turned (lathed) from: (radius, height) points from the axis at the bottom outwards, up, and back
+//! Outlines that shapes are lathed from: (radius, height) points from the axis at the bottom outwards, up, and back
 //! to the axis.
 
 /// A solid cylinder.

@@ -14,6 +14,7 @@ read_depth = _native.read_depth
 read_mask = _native.read_mask
 read_results = _native.read_results
 read_rgb = _native.read_rgb
+set_max_pixels = _native.set_max_pixels
 write_camera = _native.write_camera
 write_depth = _native.write_depth
 write_mask = _native.write_mask
@@ -33,6 +34,7 @@ __all__ = [
     "read_mask",
     "read_results",
     "read_rgb",
+    "set_max_pixels",
     "write_camera",
     "write_depth",
     "write_mask",

@@ -1,46 +1,27 @@
-//! `sixfold detect`: boxes and masks of a detector's objects, in images or in all of a dataset.
+//! `sixfold detect`: boxes and masks of a detector's objects, in images or in all of a dataset. Nothing is written before the end.
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Detection, Rle, write_detections};
+use sixfold_bop::{BopDataset, Detection, write_detections};
 use sixfold_detect::detect::DetectOptions;
+use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
-use sixfold_io::{read_rgb, write_rgb};
+use sixfold_io::read_rgb;
+use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, detections};
 
 use super::detect_arguments::DetectArguments;
 use sixfold_shell::Outcome;
-use sixfold_shell::detector::Detector;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{report, write_atomically};
-use sixfold_shell::overlay;
-use sixfold_shell::progress::{Progress, check_interrupt};
-
-#[derive(Serialize)]
-struct Found {
-    object_id: u32,
-    score: f64,
-    /// x, y, width, height in pixels.
-    bbox: [f64; 4],
-    mask_pixels: Option<u64>,
-}
-
-impl Found {
-    /// `None` for a detection without a box, which a detector does not give.
-    fn new(d: &Detection) -> Option<Found> {
-        let b = d.bbox?;
-        Some(Found {
-            object_id: d.category_id,
-            score: d.score,
-            bbox: [b.x, b.y, b.width, b.height],
-            mask_pixels: d.segmentation.as_ref().map(Rle::area),
-        })
-    }
-}
+use sixfold_shell::overlay::detections_over;
+use sixfold_shell::pictures::Pictures;
+use sixfold_shell::progress::Progress;
+use sixfold_shell::ranges::without_duplicates;
 
 #[derive(Serialize)]
 struct Many {
@@ -55,28 +36,20 @@ struct OneOfMany {
     /// Its place, from 1.
     image: u32,
     file: PathBuf,
-    detections: Vec<Found>,
+    detections: Vec<FoundDetection>,
     seconds: f64,
 }
 
 #[derive(Serialize)]
 struct Whole {
-    detections: Vec<Found>,
+    detections: Vec<FoundDetection>,
     seconds: f64,
     file: Option<PathBuf>,
     overlay: Option<PathBuf>,
 }
 
-#[derive(Serialize)]
-struct Summary {
-    images: usize,
-    detections: usize,
-    skipped: Vec<String>,
-    seconds_per_image: Option<f64>,
-    file: PathBuf,
-}
-
 pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
+    without_duplicates("--ids", &a.ids)?;
     let model = DetectorModel::load(&a.weights)?;
     for id in &a.ids {
         model.check_object(*id).with_context(|| "--ids".to_string())?;
@@ -93,7 +66,7 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
-    let detector = Detector::new(model, options);
+    let detector = TrainedDetector::new(model, options);
     match (&a.dataset, &a.rgb[..]) {
         (Some(root), _) => in_dataset(a, &detector, root),
         (None, [file]) => in_image(a, &detector, file),
@@ -102,30 +75,42 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     }
 }
 
-/// Whether an object was asked for.
-fn wanted(a: &DetectArguments, id: u32) -> bool {
-    a.ids.is_empty() || a.ids.contains(&id)
+/// The outcome of so many detections.
+fn outcome(detections: usize, skipped: &[String]) -> Outcome {
+    match (skipped.is_empty(), detections) {
+        (false, _) => Outcome::Incomplete,
+        (true, 0) => Outcome::NothingFound,
+        (true, _) => Outcome::Found,
+    }
 }
 
-fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Outcome> {
-    let image = read_rgb(file)?;
+/// An image, what is seen in it as number `image`, and in how many seconds.
+fn look(
+    a: &DetectArguments,
+    detector: &TrainedDetector,
+    file: &Path,
+    image: u32,
+) -> Result<(RgbImage, Vec<Detection>, f64)> {
+    let rgb = read_rgb(file)?;
     let start = Instant::now();
-    let mut found = detector.detections(&image, 0, 0).with_context(|| file.display().to_string())?;
-    let seconds = start.elapsed().as_secs_f64();
-    found.retain(|d| wanted(a, d.category_id));
-    let (mut overlay, mut json) = (None, None);
-    if let Some(folder) = &a.out {
-        let path = folder.join("overlay.png");
-        write_rgb(&path, &picture(&image, &found))?;
-        overlay = Some(path);
-        let path = folder.join("detections.json");
-        write_detections(&path, &found)?;
-        json = Some(path);
-    }
-    let detections = found.iter().filter_map(Found::new).collect();
-    let whole = Whole { detections, seconds, file: json, overlay };
-    if let Some(folder) = &a.out {
-        write_atomically(&folder.join("result.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    let found = detections(detector, &rgb, &a.ids, (0, image)).with_context(|| file.display().to_string())?;
+    Ok((rgb, found, start.elapsed().as_secs_f64()))
+}
+
+fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Result<Outcome> {
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let names = ["detections.json", "overlay.png", "result.json"];
+    let paths = folder.as_mut().map(|f| f.files(&names)).transpose()?;
+    let (image, found, seconds) = look(a, detector, file, 0)?;
+    let whole = Whole {
+        detections: found.iter().filter_map(FoundDetection::new).collect(),
+        seconds,
+        file: paths.as_ref().map(|p| p[0].clone()),
+        overlay: paths.as_ref().map(|p| p[1].clone()),
+    };
+    if let Some(paths) = &paths {
+        write_detections(&paths[0], &found)?;
+        write_atomically(&paths[2], serde_json::to_string_pretty(&whole)?.as_bytes())?;
     }
     report(&a.json, &whole, || {
         println!("{:>8} {:>8} {:>32} {:>10}", "object", "score", "box: x, y, width, height", "mask");
@@ -142,30 +127,29 @@ fn in_image(a: &DetectArguments, detector: &Detector, file: &Path) -> Result<Out
             println!("detections.json and overlay.png are in {}", folder.display());
         }
     })?;
-    Ok(if whole.detections.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    let mut pictures = Pictures::of(folder);
+    if whole.overlay.is_some() {
+        pictures.write("overlay.png", &detections_over(&image, &found));
+    }
+    Ok(pictures.outcome(outcome(whole.detections.len(), &[])))
 }
 
 /// Several images that belong to no dataset; in `detections.json` their ids are their places, from 1.
-fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Result<Outcome> {
+fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf]) -> Result<Outcome> {
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let file = folder.as_mut().map(|f| f.file("detections.json")).transpose()?;
+    let mut pictures = Pictures::of(folder);
     let mut progress = Progress::new("images", files.len());
     let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
     for (number, file) in (1..).zip(files) {
-        check_interrupt("nothing was written")?;
-        let found = read_rgb(file).map_err(anyhow::Error::from).and_then(|image| {
-            let start = Instant::now();
-            let mut found = detector.detections(&image, 0, number)?;
-            let seconds = start.elapsed().as_secs_f64();
-            found.retain(|d| wanted(a, d.category_id));
-            if let Some(folder) = &a.out {
-                let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-                let path = folder.join(format!("overlays/{number:06}_{stem}.png"));
-                write_rgb(&path, &picture(&image, &found))?;
-            }
-            Ok((found, seconds))
-        });
-        match found {
-            Ok((found, seconds)) => {
-                let detections = found.iter().filter_map(Found::new).collect();
+        match look(a, detector, file, number) {
+            Ok((image, found, seconds)) => {
+                if a.out.is_some() {
+                    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+                    let name = format!("overlays/{number:06}_{stem}.png");
+                    pictures.write(&name, &detections_over(&image, &found));
+                }
+                let detections = found.iter().filter_map(FoundDetection::new).collect();
                 images.push(OneOfMany { image: number, file: file.clone(), detections, seconds });
                 all.extend(found);
             }
@@ -174,11 +158,12 @@ fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Res
         progress.step(file.display().to_string());
     }
     progress.finish();
+    skipped.append(&mut pictures.take_failed());
     for s in &skipped {
         eprintln!("skipped {s}");
     }
-    if let Some(folder) = &a.out {
-        write_detections(&folder.join("detections.json"), &all)?;
+    if let Some(file) = &file {
+        write_detections(file, &all)?;
     }
     let per_image = (!images.is_empty()).then(|| all.len() as f64 / images.len() as f64);
     let many = Many { images, detections: all.len(), detections_per_image: per_image, skipped };
@@ -193,123 +178,46 @@ fn in_images(a: &DetectArguments, detector: &Detector, files: &[PathBuf]) -> Res
             println!("detections.json and overlays are in {}", folder.display());
         }
     })?;
-    Ok(if !many.skipped.is_empty() {
-        Outcome::Incomplete
-    } else if many.detections == 0 {
-        Outcome::NothingFound
-    } else {
-        Outcome::Found
-    })
+    Ok(outcome(many.detections, &many.skipped))
 }
 
-fn in_dataset(a: &DetectArguments, detector: &Detector, root: &Path) -> Result<Outcome> {
+fn in_dataset(a: &DetectArguments, detector: &TrainedDetector, root: &Path) -> Result<Outcome> {
     let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
     if out.extension().is_none_or(|e| e != "json") {
         bail!("--out: found {}, expected a file that ends in .json", out.display());
     }
     let dataset = BopDataset::open(root, &a.split)?;
-    let images = images(a, &dataset)?;
-    let mut progress = Progress::new("images", images.len());
-    let (mut all, mut skipped, mut seconds) = (vec![], vec![], vec![]);
-    let mut scene = None;
-    for (scene_id, im_id) in &images {
-        check_interrupt("nothing was written")?;
-        if scene.as_ref().is_none_or(|(id, _)| id != scene_id) {
-            scene = Some((*scene_id, dataset.scene(*scene_id)?));
-        }
-        let Some((_, scene)) = &scene else { continue };
-        let found = scene.rgb(*im_id).map_err(anyhow::Error::from).and_then(|image| {
-            let image = image.ok_or_else(|| anyhow!("there is no colour image"))?;
-            let start = Instant::now();
-            let mut found = detector.detections(&image, *scene_id, *im_id)?;
-            let time = start.elapsed().as_secs_f64();
-            found.retain(|d| wanted(a, d.category_id));
-            if let Some(folder) = &a.overlays {
-                let sure = detector.model().usage().threshold;
-                let shown: Vec<Detection> =
-                    found.iter().filter(|d| d.score >= f64::from(sure)).cloned().collect();
-                write_rgb(&folder.join(format!("{scene_id:06}_{im_id:06}.png")), &picture(&image, &shown))?;
-            }
-            Ok((found, time))
-        });
-        match found {
-            Ok((found, time)) => {
-                all.extend(found);
-                seconds.push(time);
-            }
-            Err(error) => {
-                skipped.push(format!("image {scene_id}/{im_id}: {}", sixfold_shell::describe(&error)))
-            }
-        }
-        progress.step(format!("{scene_id}/{im_id}"));
+    // The images of the targets, or all of a dataset without targets, but those of `--except`.
+    let mut images = dataset.images(a.targets.as_deref().or(dataset.targets_file().as_deref()))?;
+    for image in excepted(&dataset, a.except.as_deref())? {
+        images.remove(&image);
     }
+    let images: Vec<(u32, u32)> = images.into_iter().collect();
+    let mut progress = Progress::new("images", images.len());
+    let mut pictures = Pictures::of(a.overlays.as_deref().map(OutputFolder::take).transpose()?);
+    let sure = f64::from(detector.model().usage().threshold);
+    let run = DetectionRun { detector, dataset: &dataset, images: &images, ids: &a.ids };
+    let summary = run.run(out, &mut |event| match event {
+        DetectionEvent::Image(image) => progress.step(image),
+        DetectionEvent::Found { scene, im_id, image, detections } => {
+            if a.overlays.is_some() {
+                let shown: Vec<Detection> = detections.iter().filter(|d| d.score >= sure).cloned().collect();
+                let name = format!("{:06}_{im_id:06}.png", scene.scene_id);
+                pictures.write(&name, &detections_over(image, &shown));
+            }
+        }
+    });
     progress.finish();
-    for s in &skipped {
+    let mut summary = summary?;
+    summary.skipped.append(&mut pictures.take_failed());
+    for s in &summary.skipped {
         eprintln!("skipped {s}");
     }
-    write_detections(out, &all)?;
-    let summary = Summary {
-        images: images.len(),
-        detections: all.len(),
-        skipped,
-        seconds_per_image: (!seconds.is_empty()).then(|| seconds.iter().sum::<f64>() / seconds.len() as f64),
-        file: out.to_owned(),
-    };
     report(&a.json, &summary, || {
         println!("{} detections in {} images: {}", summary.detections, summary.images, out.display());
         if let Some(seconds) = summary.seconds_per_image {
             println!("{:.0} ms per image", 1000.0 * seconds);
         }
     })?;
-    Ok(if !summary.skipped.is_empty() {
-        Outcome::Incomplete
-    } else if summary.detections == 0 {
-        Outcome::NothingFound
-    } else {
-        Outcome::Found
-    })
-}
-
-/// The images of the targets, or all of a dataset without targets, but those of `--except`.
-fn images(a: &DetectArguments, dataset: &BopDataset) -> Result<Vec<(u32, u32)>> {
-    let mut images: BTreeSet<(u32, u32)> = BTreeSet::new();
-    if a.targets.is_some() || dataset.root().join("test_targets_bop19.json").is_file() {
-        let targets = dataset.targets(a.targets.as_deref())?;
-        images.extend(targets.iter().map(|t| (t.scene_id, t.im_id)));
-    } else {
-        for scene_id in dataset.scene_ids() {
-            images.extend(dataset.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
-        }
-    }
-    for image in excepted(dataset, a.except.as_deref())? {
-        images.remove(&image);
-    }
-    Ok(images.into_iter().collect())
-}
-
-/// Boxes and tinted masks over the image, the best on top.
-fn picture(image: &RgbImage, found: &[Detection]) -> RgbImage {
-    let mut out = image.clone();
-    for d in found.iter().rev() {
-        let color = overlay::color(d.category_id as usize);
-        if let Some(mask) = d.segmentation.as_ref().map(Rle::decode) {
-            for (pixel, inside) in out.as_mut_slice().iter_mut().zip(mask.as_slice()) {
-                if *inside {
-                    for (channel, tint) in pixel.iter_mut().zip(color) {
-                        *channel = ((u16::from(*channel) + u16::from(tint)) / 2) as u8;
-                    }
-                }
-            }
-        }
-        if let Some(b) = d.bbox {
-            overlay::rectangle(&mut out, [b.x, b.y, b.x + b.width, b.y + b.height], color);
-        }
-    }
-    for d in found.iter().rev() {
-        if let Some(b) = d.bbox {
-            let text = format!("{} {:.2}", d.category_id, d.score);
-            overlay::label(&mut out, [b.x, b.y], &text, overlay::color(d.category_id as usize));
-        }
-    }
-    out
+    Ok(outcome(summary.detections, &summary.skipped))
 }

@@ -1,21 +1,22 @@
 //! `sixfold eval`: scores on the screen, curves as a figure, JSON for scripts.
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use clap::Args;
 use serde::Serialize;
 use sixfold_bop::{
-    Adjustment, BopDataset, CocoGroundTruth, DetectionEvaluation, EvalOptions, Evaluation, IouType,
-    ReadDetections, VisibleTruth, evaluate, evaluate_coco, evaluate_detection, found_at_half,
-    read_detections, read_results, read_results_lenient, write_recall_curves,
+    Adjustment, BopDataset, DetectionEvaluation, EvalOptions, Evaluation, VisibleTruth,
+    detection_score_table, evaluate, evaluate_detection, read_results, read_results_lenient,
+    score_detections, score_table, write_recall_curves,
 };
 
 use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
+use sixfold_shell::ranges::in_range;
 
 #[derive(Debug, Args)]
 pub(crate) struct EvalArguments {
@@ -68,6 +69,7 @@ struct Whole {
 }
 
 pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
+    in_range("--min-score", a.min_score, 0.0..=1.0)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     if a.detections.is_some() {
         return coco(a, &dataset);
@@ -100,110 +102,50 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
     }
     let detection =
         a.detection_ap.then(|| evaluate_detection(&dataset, &estimates, &targets, &options)).transpose()?;
-    if let Some(picture) = &a.curves {
-        write_recall_curves(picture, &localisation)?;
-    }
-    let any = localisation.estimates > 0;
     let whole = Whole { localisation, detection };
-    report(&a.json, &whole, || print_table(&whole))?;
-    Ok(if !bad.is_empty() {
+    report(&a.json, &whole, || {
+        print!("{}", score_table(&whole.localisation));
+        if let Some(detection) = &whole.detection {
+            print!("{}", detection_score_table(detection));
+        }
+    })?;
+    let mut pictures = Pictures::default();
+    if let Some(picture) = &a.curves {
+        pictures.did(write_recall_curves(picture, &whole.localisation));
+    }
+    Ok(pictures.outcome(if !bad.is_empty() {
         Outcome::Incomplete
-    } else if any {
+    } else if whole.localisation.estimates > 0 {
         Outcome::Found
     } else {
         Outcome::NothingFound
-    })
-}
-
-/// A score with three digits, `-` where it cannot be computed.
-fn digits(score: Option<f64>) -> String {
-    score.map_or_else(|| "-".into(), |s| format!("{s:.3}"))
-}
-
-pub(super) fn print_evaluation(e: &Evaluation) {
-    println!(
-        "{:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
-        "object", "targets", "AR_VSD", "AR_MSSD", "AR_MSPD", "ADD(-S)<0.1d"
-    );
-    let mut objects: Vec<_> = e.objects.iter().collect();
-    objects.sort_by_key(|(id, _)| id.parse::<u32>().unwrap_or(u32::MAX));
-    for (id, o) in objects {
-        println!(
-            "{id:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
-            o.targets,
-            digits(o.ar_vsd),
-            digits(o.ar_mssd),
-            digits(o.ar_mspd),
-            digits(o.add_s_recall)
-        );
-    }
-    println!(
-        "{:>8} {:>8} {:>8} {:>8} {:>8} {:>12}",
-        "all",
-        e.targets,
-        digits(e.ar_vsd),
-        digits(e.ar_mssd),
-        digits(e.ar_mspd),
-        digits(e.add_s_recall.get("mean").copied().flatten())
-    );
-    println!(
-        "AR {}   AUC of ADD {}, of ADD-S {} (to 10 cm)",
-        digits(e.ar),
-        digits(e.add_auc),
-        digits(e.add_s_auc)
-    );
-    for (score, reason) in &e.reasons {
-        println!("{score} not computed: {reason}");
-    }
-    if let Some(t) = e.average_time_per_image {
-        println!("{t:.2} s per image");
-    }
-}
-
-fn print_table(whole: &Whole) {
-    print_evaluation(&whole.localisation);
-    if let Some(d) = &whole.detection {
-        println!(
-            "6D detection (BOP'24): AP {} AP_MSSD {} AP_MSPD {}",
-            digits(d.ap),
-            digits(d.ap_mssd),
-            digits(d.ap_mspd)
-        );
-        for (score, reason) in &d.reasons {
-            println!("{score} not computed: {reason}");
-        }
-    }
+    }))
 }
 
 /// Box and mask AP of detections, in COCO's terms.
 fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     let path = a.detections.as_deref().ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
-    let read =
-        read_detections(path, &ReadDetections { lenient: a.lenient, image_size: dataset.image_size() })?;
+    let read = dataset.detections(path, a.lenient)?;
     let mut incomplete = false;
     for changed in &read.adjusted {
-        let clipped = changed.adjustment == Adjustment::Clipped;
-        eprintln!("{} {}", if clipped { "note:" } else { "skipped" }, changed.message);
-        incomplete |= !clipped;
+        let kept = matches!(changed.adjustment, Adjustment::Clipped | Adjustment::Scene);
+        eprintln!("{} {}", if kept { "note:" } else { "skipped" }, changed.message);
+        incomplete |= !kept;
     }
-    let truth = coco_truth(a, dataset)?;
+    let mut images = dataset.images(a.targets.as_deref())?;
+    for image in excepted(dataset, a.except.as_deref())? {
+        images.remove(&image);
+    }
+    let truth = VisibleTruth::of_images(dataset, &images)?;
+    if !read.detections.is_empty()
+        && !read.detections.iter().any(|d| images.contains(&(d.scene_id, d.image_id)))
+    {
+        eprintln!("note: none of the {} detections is of a scored image", read.detections.len());
+    }
     if let Some(file) = &a.write_truth {
         truth.truth.write(file)?;
     }
-    let boxes = evaluate_coco(&truth.truth, &read.detections, IouType::Box);
-    let with_masks = read.detections.iter().any(|d| d.segmentation.is_some())
-        && truth.truth.annotations.iter().any(|a| a.segmentation.is_some());
-    let masks = with_masks.then(|| evaluate_coco(&truth.truth, &read.detections, IouType::Mask));
-    let known = truth.visible.len() == truth.truth.annotations.len();
-    let min_visibility: &[f64] = if known { &[0.1, 0.4] } else { &[] };
-    let found: Vec<_> =
-        min_visibility.iter().map(|v| found_at_half(&truth, &read.detections, a.min_score, *v)).collect();
-    let value = serde_json::json!({
-        "images": truth.truth.images.len(),
-        "box": boxes,
-        "mask": masks,
-        "found_at_half": found,
-    });
+    let value = serde_json::to_value(score_detections(&truth, &read.detections, a.min_score))?;
     report(&a.json, &value, || println!("{}", serde_json::to_string_pretty(&value).unwrap_or_default()))?;
     Ok(if incomplete {
         Outcome::Incomplete
@@ -212,38 +154,4 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     } else {
         Outcome::Found
     })
-}
-
-/// The ground truth of the dataset's images, or of those of the targets but `--except`: as its `scene_gt_coco.json` says,
-/// or from poses where a scene has none.
-fn coco_truth(a: &EvalArguments, dataset: &BopDataset) -> Result<VisibleTruth> {
-    let mut images: BTreeSet<(u32, u32)> = BTreeSet::new();
-    match &a.targets {
-        Some(file) => images.extend(dataset.targets(Some(file))?.iter().map(|t| (t.scene_id, t.im_id))),
-        None => {
-            for scene_id in dataset.scene_ids() {
-                images
-                    .extend(dataset.scene(scene_id)?.image_ids().into_iter().map(|im_id| (scene_id, im_id)));
-            }
-        }
-    }
-    for image in excepted(dataset, a.except.as_deref())? {
-        images.remove(&image);
-    }
-    let mut files = vec![];
-    for scene_id in dataset.scene_ids() {
-        files.push((scene_id, dataset.scene(scene_id)?.dir().join("scene_gt_coco.json")));
-    }
-    if !files.iter().all(|(_, file)| file.is_file()) {
-        let images: Vec<(u32, u32)> = images.into_iter().collect();
-        return Ok(VisibleTruth::of_poses(dataset, &images)?);
-    }
-    let mut truth = CocoGroundTruth::default();
-    for (scene_id, file) in files {
-        let text = std::fs::read(&file).with_context(|| file.display().to_string())?;
-        truth.add_scene(scene_id, &text, &file)?;
-    }
-    truth.images.retain(|image| images.contains(image));
-    truth.annotations.retain(|a| images.contains(&(a.scene_id, a.image_id)));
-    Ok(VisibleTruth { truth, visible: vec![] })
 }

@@ -14,6 +14,7 @@ use sixfold_render::{
 };
 
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::{JsonArguments, pose_rows, report};
 use sixfold_shell::{objects, overlay};
 
@@ -71,16 +72,16 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
     frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
     let (low, high) = object.mesh.bounding_box();
     let scale = BoundingBoxScale::of_corners(&low, &high);
-    let file = |name: &str| a.out.join(name);
-    write_depth(&file("depth.png"), &frame.depth(), 1e-4)?;
-    write_mask(&file("mask.png"), &frame.mask(0))?;
-    write_rgb(&file("normals.png"), &overlay::normal_picture(&frame.normals(&objects)))?;
+    let mut folder = OutputFolder::take(&a.out)?;
+    let files = folder.files(&["depth.png", "mask.png", "normals.png", "coordinates.png", "rgb.png"])?;
+    write_depth(&files[0], &frame.depth(), 1e-4)?;
+    write_mask(&files[1], &frame.mask(0))?;
+    write_rgb(&files[2], &overlay::normal_picture(&frame.normals(&objects)))?;
     let coordinates = frame.normalised_coordinates(&objects, &[scale]);
-    write_rgb(&file("coordinates.png"), &overlay::coordinate_picture(&coordinates))?;
+    write_rgb(&files[3], &overlay::coordinate_picture(&coordinates))?;
     let rgb = shade(&frame, &objects, &Light::default_set(), &Material::default(), None);
-    write_rgb(&file("rgb.png"), &rgb)?;
+    write_rgb(&files[4], &rgb)?;
     let pixels = frame.mask(0).as_slice().iter().filter(|m| **m).count();
-    let files = ["depth.png", "mask.png", "normals.png", "coordinates.png", "rgb.png"].map(file);
     let value = json!({
         "object": object.name,
         "camera_from_object": pose_rows(&pose),

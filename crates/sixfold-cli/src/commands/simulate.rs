@@ -10,16 +10,18 @@ use sixfold_bop::{
     BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
 };
 use sixfold_geometry::{Camera, DepthImage, Pose};
-use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_render::{
     DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, plane_mesh, simulate_depth, support_plane,
 };
 
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::{OutputFolder, take_empty};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
+use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::ranges::without_duplicates;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Sensor {
@@ -83,10 +85,13 @@ pub(crate) struct SimulateArguments {
 const TABLE: f64 = 3.0;
 
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
+    without_duplicates("--images", &a.images)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     if a.out.join(&a.split).exists() {
         bail!("{} exists already: remove it or choose another --out", a.out.join(&a.split).display());
     }
+    let _lock = take_empty(&a.out, &[&a.dataset])?;
+    let mut pictures = Pictures::of(a.pictures.as_deref().map(OutputFolder::take).transpose()?);
     let wanted = |im_id: u32| a.images.is_empty() || a.images.contains(&im_id);
     let mut meshes: BTreeMap<u32, Mesh> = BTreeMap::new();
     let mut images = 0;
@@ -113,9 +118,9 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             if !has_table && !a.no_table {
                 without_table.push(format!("{scene_id}/{im_id}"));
             }
-            if let Some(folder) = &a.pictures {
-                let path = folder.join(format!("{scene_id:06}_{im_id:06}.png"));
-                write_rgb(&path, &overlay::side_by_side(&ideal, &depth))?;
+            if a.pictures.is_some() {
+                let picture = overlay::side_by_side(&ideal, &depth);
+                pictures.write(&format!("{scene_id:06}_{im_id:06}.png"), &picture);
             }
             let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
@@ -147,7 +152,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     }
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
-    Ok(if images > 0 { Outcome::Found } else { Outcome::NothingFound })
+    Ok(pictures.outcome(if images > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
 /// The depth of posed objects on a table, if they may have one, as it is and as the camera measures it; whether there is a

@@ -185,6 +185,33 @@ fn intrinsics_of_another_resolution() {
     );
 }
 
+/// A focal length of half a pixel gave a pose 597 m behind the camera, one of 1e-5 pixels a panic.
+#[test]
+fn impossible_cameras() {
+    for (numbers, words) in [
+        (r#""fx": 0.5, "fy": 0.5, "cx": 159.5, "cy": 119.5"#, "millimetres"),
+        (r#""fx": 1e-5, "fy": 1e-5, "cx": 159.5, "cy": 119.5"#, "millimetres"),
+        (r#""fx": 0.94, "fy": 1.25, "cx": 0.5, "cy": 0.5"#, "normalised"),
+        (r#""fx": 300, "fy": 30, "cx": 159.5, "cy": 119.5"#, "factor of 2"),
+        (r#""fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5, "width": 320"#, "height"),
+        (r#""fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5, "focus": 3"#, "focus"),
+    ] {
+        let text = format!("{{{numbers}, \"depth_scale\": 0.1}}");
+        estimate_fails(
+            |dir| std::fs::write(dir.join("camera.json"), text).unwrap(),
+            "",
+            &["camera.json", "field", words],
+        );
+    }
+}
+
+#[test]
+fn images_above_the_limit() {
+    estimate_fails(|_| {}, "--max-pixels 76799", &["depth.png", "320x240", "--max-pixels"]);
+    let case = OneImage::new();
+    sixfold(case.path(), &format!("{} --max-pixels 76800", OneImage::ARGUMENTS)).expect(0);
+}
+
 #[test]
 fn boxes_and_masks_that_leave_nothing() {
     estimate_fails(|_| {}, "--box 400,10,50,50", &["--box", "320x240"]);

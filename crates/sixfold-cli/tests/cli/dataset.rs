@@ -184,6 +184,123 @@ fn images_without_depth_are_skipped_with_advice() {
 }
 
 #[test]
+fn stale_rows_of_changed_inputs_are_refused_by_name() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    let before = std::fs::read(&csv).unwrap();
+    let refused = |file: &str, change: &dyn Fn(&Path), words: [&str; 2]| {
+        let path = tiny.file(file);
+        let whole = std::fs::read(&path).unwrap();
+        change(&path);
+        fails(
+            tiny.path(),
+            ARGUMENTS,
+            &["results.csv was made with another", words[0], words[1], "choose another --out"],
+        );
+        assert!(std::fs::read(&csv).unwrap() == before, "{file}: rows were written");
+        std::fs::write(&path, whole).unwrap();
+    };
+    let copy = |from: &'static str| {
+        let from = tiny.file(from);
+        move |to: &Path| std::fs::write(to, std::fs::read(&from).unwrap()).unwrap()
+    };
+    let camera = "test/000007/scene_camera.json";
+    refused(camera, &|path| replace(path, "300", "303"), ["camera of image 7/0", "scene_camera.json"]);
+    let depth = "test/000007/depth/000004.png";
+    refused(depth, &copy("test/000007/depth/000011.png"), ["depth image of image 7/4", "000004.png"]);
+    let mesh = "models/obj_000002.ply";
+    refused(mesh, &copy("models/obj_000001.ply"), ["mesh of object 2", "obj_000002.ply"]);
+    let longer = |path: &Path| {
+        let mut infos: Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+        let diameter = infos["1"]["diameter"].as_f64().unwrap();
+        infos["1"]["diameter"] = (1.0001 * diameter).into();
+        std::fs::write(path, infos.to_string()).unwrap();
+    };
+    refused("models/models_info.json", &longer, ["models_info of object 1", "models_info.json"]);
+    let targets = "test_targets_bop19.json";
+    let fewer = |path: &Path| {
+        let mut targets: Vec<Value> = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+        targets.truncate(4);
+        std::fs::write(path, serde_json::json!(targets).to_string()).unwrap();
+    };
+    refused(targets, &fewer, ["list of targets of image 7/11", "tiny"]);
+
+    // As it was: nothing is left to do.
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert!(std::fs::read(&csv).unwrap() == before);
+
+    // Boxes of the ground truth are an input too, and so is the content of a file of boxes.
+    sixfold(tiny.path(), &format!("{} --boxes gt", ARGUMENTS.replace("results", "gt"))).expect(0);
+    let truth = tiny.file("test/000007/scene_gt.json");
+    let whole = std::fs::read(&truth).unwrap();
+    let mut poses: Value = serde_json::from_slice(&whole).unwrap();
+    poses["4"][0]["cam_t_m2c"][0] = 1.0.into();
+    std::fs::write(&truth, poses.to_string()).unwrap();
+    let gt = format!("{} --boxes gt", ARGUMENTS.replace("results", "gt"));
+    fails(tiny.path(), &gt, &["gt.csv", "ground truth of image 7/4", "scene_gt.json"]);
+}
+
+#[test]
+fn two_runs_on_one_result_file_do_not_mix_their_rows() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    let other = sixfold_io::WriteLock::take(&csv).unwrap();
+    fails(tiny.path(), ARGUMENTS, &["results.csv", "another process", "choose another place"]);
+    assert!(!csv.exists());
+    drop(other);
+
+    // Both at once: one is refused, or comes after the other.
+    let both = std::thread::scope(|scope| {
+        let run = || sixfold(tiny.path(), ARGUMENTS);
+        let other = scope.spawn(run);
+        [run(), other.join().unwrap()]
+    });
+    assert!(both.iter().any(|run| run.code == 0), "{both:?}");
+    assert!(both.iter().all(|run| run.code == 0 || run.stderr.contains("another process")), "{both:?}");
+    assert_all_found(&tiny, "results.csv");
+}
+
+#[test]
+fn detections_without_scene_id_are_of_the_only_scene_or_refused() {
+    let tiny = Tiny::new(true);
+    let middle = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
+    let mut detection = serde_json::json!({
+        "image_id": 4, "category_id": 2, "score": 0.8,
+        "bbox": [middle.x - 45.0, middle.y - 55.0, 90.0, 90.0],
+    });
+    let write = |detection: &Value| {
+        let text = serde_json::json!([detection]).to_string();
+        std::fs::write(tiny.path().join("boxes.json"), text).unwrap();
+    };
+    write(&detection);
+    let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --boxes boxes.json")).expect(0);
+    assert!(run.stderr.contains("name no scene_id and are taken for scene 7"), "{}", run.stderr);
+    assert_eq!(run.json()["poses"], 1);
+
+    // Of a scene that is not there: the reason is named.
+    detection["scene_id"] = 3.into();
+    write(&detection);
+    let other = ARGUMENTS.replace("results.csv", "other.csv");
+    let run = sixfold(tiny.path(), &format!("{other} --boxes boxes.json")).expect(1);
+    assert!(run.stderr.contains("none of the 1 detections is of a target"), "{}", run.stderr);
+    assert!(run.stderr.contains("scene_id 3, image_id 4, category_id 2"), "{}", run.stderr);
+
+    // With two scenes nobody can know which is meant.
+    detection.as_object_mut().unwrap().remove("scene_id");
+    write(&detection);
+    std::fs::create_dir_all(tiny.file("test/000008")).unwrap();
+    std::fs::copy(tiny.file("test/000007/scene_camera.json"), tiny.file("test/000008/scene_camera.json"))
+        .unwrap();
+    for command in [
+        format!("{} --boxes boxes.json", ARGUMENTS.replace("results", "two")),
+        "eval --dataset tiny --detections boxes.json".into(),
+    ] {
+        fails(tiny.path(), &command, &["boxes.json", "scene_id", "one of 7, 8"]);
+    }
+}
+
+#[test]
 fn the_demo_scores_and_draws_its_samples() {
     let tiny = Tiny::new(true);
     let run = sixfold(tiny.path(), "demo --data tiny --out out --json demo.json").expect(0);
@@ -198,4 +315,19 @@ fn the_demo_scores_and_draws_its_samples() {
     for picture in pictures {
         assert!(image::open(tiny.path().join(picture.as_str().unwrap())).is_ok(), "{picture}");
     }
+}
+
+#[test]
+fn rows_that_went_missing_are_computed_again() {
+    let tiny = Tiny::new(true);
+    let csv = tiny.path().join("results.csv");
+    sixfold(tiny.path(), ARGUMENTS).expect(0);
+    let whole = rows(&csv);
+    let text = std::fs::read_to_string(&csv).unwrap();
+    // One of the two rows of the second image, the last one of the third.
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    std::fs::write(&csv, [&lines[..3], &lines[4..6]].concat().concat()).unwrap();
+    let run = sixfold(tiny.path(), ARGUMENTS).expect(0);
+    assert!(run.stderr.contains("image 7/4"), "{}", run.stderr);
+    assert_eq!(rows(&csv), whole);
 }

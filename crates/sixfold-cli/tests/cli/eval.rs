@@ -110,3 +110,48 @@ fn detections_are_scored_as_coco_does() {
     assert_eq!(scores(100.0)["box"]["ap"], 0.0);
     assert!(scores(10.0)["mask"].is_null());
 }
+
+#[test]
+fn curves_that_cannot_be_plotted_cost_no_scores() {
+    let tiny = Tiny::new(false);
+    tiny.write_truth_as_results("results.csv");
+    std::fs::write(tiny.path().join("taken"), b"").unwrap();
+    let run = sixfold(tiny.path(), &format!("{ARGUMENTS} --json --curves taken/curves.png")).expect(2);
+    assert_eq!(run.json()["ar_mssd"], 1.0);
+    assert!(run.stderr.contains("skipped taken/curves.png"), "{}", run.stderr);
+}
+
+/// A result file that never ends stands for hours of scoring.
+#[cfg(unix)]
+#[test]
+fn an_interrupt_ends_it_at_once() {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+
+    let tiny = Tiny::new(false);
+    let made = Command::new("mkfifo").arg(tiny.path().join("results.csv")).status().unwrap();
+    assert!(made.success());
+    let arguments = format!("{ARGUMENTS} --json");
+    let mut run = Command::new(crate::PROGRAM)
+        .args(arguments.split_whitespace())
+        .current_dir(tiny.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_millis(700));
+    assert!(Command::new("kill").args(["-INT", &run.id().to_string()]).status().unwrap().success());
+    let start = Instant::now();
+    while run.try_wait().unwrap().is_none() {
+        if start.elapsed() > Duration::from_secs(10) {
+            run.kill().unwrap();
+            panic!("the interrupt was ignored");
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let output = run.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(json["error"]["kind"], "interrupt");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("error: interrupted"));
+}

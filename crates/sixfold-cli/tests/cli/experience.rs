@@ -104,6 +104,211 @@ fn a_hand_learns_and_goes_on() {
     fails(path, &learn.replace("--attempts 3", "--attempts 4"), &["attempts.jsonl", "other options"]);
 }
 
+const LEARN: &str = "grasp learn --experiences e.db --object part.ply --unit mm --attempts 3 --tries 3 --explore 2 --near 9 --weights w.safetensors --out learn --json";
+
+/// Rows of a learning folder, without the first line, which holds the journal's name.
+fn rows(folder: &Path) -> Vec<String> {
+    let text = fs::read_to_string(folder.join("attempts.jsonl")).unwrap_or_default();
+    text.lines().skip(1).map(str::to_owned).collect()
+}
+
+#[test]
+fn a_journal_without_its_store_is_refused() {
+    let case = folder();
+    let path = case.path();
+    let learn = LEARN.replace("--attempts 3 --tries 3 --explore 2", "--attempts 2");
+    let first = sixfold(path, &learn).json();
+    assert_eq!(first["attempts"], 2);
+    for name in ["e.db", "e.db-wal", "e.db-shm"] {
+        let _ = fs::rename(path.join(name), path.join(format!("kept-{name}")));
+    }
+    fails(path, &learn, &["attempts.jsonl", "holds 2 scenes", "e.db has 0", "another store", "--out"]);
+    assert!(!path.join("e.db").exists(), "what is refused makes no store");
+    // Another store in its place.
+    let another = learn.replace("--out learn", "--out other").replace("--attempts 2", "--attempts 1");
+    sixfold(path, &another);
+    fails(path, &learn, &["attempts.jsonl", "holds 2 scenes", "e.db has 0"]);
+    // Its own comes back.
+    for name in ["e.db", "e.db-wal", "e.db-shm"] {
+        let _ = fs::remove_file(path.join(name));
+        let _ = fs::rename(path.join(format!("kept-{name}")), path.join(name));
+    }
+    assert_eq!(sixfold(path, &learn).json(), first);
+}
+
+#[test]
+fn a_hand_that_is_killed_ends_as_if_nothing_had_happened() {
+    let case = folder();
+    let path = case.path();
+    let began = std::time::Instant::now();
+    let expected = sixfold(path, LEARN).expect(0).json();
+    let whole = began.elapsed();
+    let kills: u32 = std::env::var("SIXFOLD_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(4);
+    for kill in 0..kills {
+        let (store, out) = (format!("e{kill}.db"), format!("learn{kill}"));
+        let learn = LEARN.replace("e.db", &store).replace("--out learn", &format!("--out {out}"));
+        // Two kills each, all over the time that it takes.
+        for part in [f64::from(kill) + 0.4, f64::from(kills - kill) + 0.7] {
+            let mut hand = std::process::Command::new(crate::PROGRAM)
+                .args(learn.split_whitespace())
+                .current_dir(path)
+                .stdout(std::process::Stdio::null())
+                .stderr(std::process::Stdio::null())
+                .spawn()
+                .unwrap();
+            std::thread::sleep(whole.mul_f64(part / f64::from(kills + 1)));
+            hand.kill().unwrap();
+            hand.wait().unwrap();
+        }
+        let end = sixfold(path, &learn).expect(0).json();
+        assert_eq!(end, expected, "killed for the {kill}. time");
+        assert_eq!(rows(&path.join(out)), rows(&path.join("learn")));
+        let attempts = |file: &str| {
+            let listed =
+                sixfold(path, &format!("grasp store list {file} --attempts --json")).expect(0).json();
+            let mut listed = listed.as_array().unwrap().clone();
+            listed.iter_mut().for_each(|attempt| attempt["time"] = 0.into());
+            listed
+        };
+        assert_eq!(attempts(&store), attempts("e.db"));
+    }
+}
+
+#[test]
+fn two_hands_do_not_learn_into_one_folder() {
+    let case = folder();
+    let path = case.path();
+    let lock = sixfold_io::WriteLock::take(&path.join("learn/attempts.jsonl")).unwrap();
+    fails(path, LEARN, &["attempts.jsonl", "another process"]);
+    drop(lock);
+    assert!(!path.join("e.db").exists());
+}
+
+#[test]
+fn a_gripper_under_a_centimetre_is_no_panic() {
+    let case = folder();
+    let path = case.path();
+    sixfold(path, &format!("{VIEW} --out out")).expect(0);
+    add(path, "a.db", "").expect(0);
+    let small = |opening: f64, others: f64| {
+        serde_json::json!({
+            "kind": "parallel-jaws", "name": "small", "max_opening": opening, "finger_length": 5.0 * others,
+            "finger_width": others, "finger_thickness": others, "palm_width": 5.0 * others, "palm_depth": 5.0 * others,
+            "palm_height": 5.0 * others, "force": 1.0, "friction": 0.5,
+        })
+    };
+    for (opening, others) in [(0.001, 0.001), (0.0099, 0.001), (0.009, 0.05), (1.0, 0.001)] {
+        fs::write(path.join("small.json"), small(opening, others).to_string()).unwrap();
+        let run =
+            sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --gripper small.json"));
+        assert!(run.code == 0 || run.code == 1, "{}", run.stderr);
+    }
+    for (field, value) in [("max_opening", 0.0), ("palm_width", 1e300), ("finger_width", -1.0)] {
+        let mut gripper = small(0.05, 0.01);
+        gripper[field] = value.into();
+        fs::write(path.join("small.json"), gripper.to_string()).unwrap();
+        fails(path, &format!("{VIEW} --gripper small.json"), &["small.json", field, "expected"]);
+    }
+}
+
+/// Overwrites the first byte of some that are found in a file.
+fn overwrite(file: &Path, bytes: &[u8]) {
+    let mut content = fs::read(file).unwrap();
+    let place = content.windows(bytes.len()).position(|found| found == bytes).unwrap();
+    content[place] = b'[';
+    fs::write(file, content).unwrap();
+}
+
+#[test]
+fn one_broken_row_blocks_nothing_and_can_be_removed() {
+    let case = folder();
+    let path = case.path();
+    sixfold(path, &format!("{VIEW} --out out")).expect(0);
+    add(path, "e.db", "").expect(0);
+    overwrite(&path.join("e.db"), b"\x89PNG");
+    for number in 2..=3 {
+        add(path, "e.db", &format!("--number {number}")).expect(0);
+    }
+    sixfold(path, &LEARN.replace("--attempts 3", "--attempts 1"));
+    overwrite(&path.join("e.db"), b"{\"description\"");
+    let listed = sixfold(path, "grasp store list e.db --attempts").expect(0).stderr;
+    let broken = listed.split_once("note: attempt ").unwrap().1.split_once(':').unwrap().0;
+    let propose = format!("{VIEW} --experiences e.db --weights w.safetensors");
+    let learn = LEARN.replace("--out learn", "--out again");
+    for command in [&propose, &learn] {
+        let run = sixfold(path, command).expect(0);
+        for words in [
+            ["experience 1", "field depth", "grasp store forget e.db 1`"],
+            [
+                &format!("attempt {broken}"),
+                "left out",
+                &format!("grasp store forget e.db --attempt {broken}`"),
+            ],
+        ] {
+            let named = run.stderr.lines().any(|line| words.iter().all(|word| line.contains(word)));
+            assert!(named, "{command}: {words:?}: {}", run.stderr);
+        }
+    }
+    let merged = sixfold(path, "grasp store merge new.db e.db --json").expect(2);
+    assert_eq!(merged.json()["unreadable"], 2);
+    sixfold(path, &format!("grasp store forget e.db 1 --attempt {broken}")).expect(0);
+    let run = sixfold(path, &propose).expect(0);
+    assert!(!run.stderr.contains("left out"), "{}", run.stderr);
+    sixfold(path, &format!("grasp store forget e.db --attempt {broken}")).expect(1);
+    sixfold(path, "grasp store merge other.db e.db").expect(0);
+}
+
+#[test]
+fn a_damaged_store_is_saved_by_the_command_that_it_names() {
+    let case = folder();
+    let path = case.path();
+    sixfold(path, &format!("{VIEW} --out out --number 9")).expect(0);
+    for number in 1..=6 {
+        add(path, "a.db", &format!("--number {number}"));
+    }
+    let bytes = fs::read(path.join("a.db")).unwrap();
+    fs::write(path.join("a.db"), &bytes[..bytes.len() * 3 / 4]).unwrap();
+    for command in
+        ["grasp store list a.db".to_owned(), format!("{VIEW} --experiences a.db --weights w.safetensors")]
+    {
+        fails(path, &command, &["a.db", "damaged", "sixfold grasp store merge NEW.db a.db"]);
+    }
+    let saved = sixfold(path, "grasp store merge NEW.db a.db --json").expect(2).json();
+    let experiences = saved["experiences"].as_u64().unwrap();
+    assert!(experiences > 0 && saved["unreadable"].as_u64().unwrap() > 0, "{saved}");
+    let files = sixfold(path, "grasp store export a.db --out files --json").expect(2).json();
+    assert_eq!(files["experiences"].as_u64(), Some(experiences));
+}
+
+#[test]
+fn an_address_that_is_none_is_refused_without_its_password() {
+    let case = folder();
+    let path = case.path();
+    for address in [
+        "Postgres://robot:secret@127.0.0.1:1/fleet",
+        "postgresql+psycopg://robot:secret@127.0.0.1:1/fleet",
+        "password=secret",
+        "postgres://robot%3Asecret@127.0.0.1:1/fleet",
+        "robot:secret@127.0.0.1/fleet",
+    ] {
+        let learn = LEARN.replace("e.db", address).replace("--attempts 3", "--attempts 1");
+        for command in
+            [format!("grasp store list {address}"), format!("grasp store merge {address} {address}")]
+        {
+            let run = sixfold(path, &command).expect(2);
+            assert!(!run.stderr.contains("secret"), "{}", run.stderr);
+        }
+        // A server that is only away is learned without.
+        if !(cfg!(feature = "postgres") && address.starts_with("Postgres")) {
+            let run = sixfold(path, &learn).expect(2);
+            assert!(!run.stderr.contains("secret"), "{}", run.stderr);
+        }
+    }
+    let made = fs::read_dir(path).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let made: Vec<String> = made.filter(|name| name.contains("secret")).collect();
+    assert!(made.is_empty(), "{made:?}");
+}
+
 #[test]
 fn what_is_wrong_is_named() {
     let case = folder();

@@ -9,19 +9,24 @@ mod eval;
 mod experience;
 #[cfg(unix)]
 mod experiments;
+mod folders;
 mod grasp;
+mod hostile_meshes;
 mod image;
 #[cfg(feature = "networks")]
 mod mttm;
 mod objects;
 #[cfg(feature = "networks")]
 mod pix2pose;
+mod printing;
 mod simulate;
 #[cfg(feature = "physics")]
 mod simulate_scenes;
 mod support;
 #[cfg(feature = "networks")]
 mod synthesize;
+#[cfg(feature = "networks")]
+mod trainings;
 #[cfg(not(feature = "networks"))]
 mod without_networks;
 

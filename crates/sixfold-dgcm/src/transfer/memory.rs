@@ -1,6 +1,6 @@
 //! The experiences at hand: the index of all features and the experiences that were retrieved lately.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use sixfold_experience::{Attempt, ExperienceStore, FeatureIndex, Match, StoreError, Stored, Summary};
@@ -20,6 +20,10 @@ pub struct Memory {
     last_attempt: i64,
     /// What was learned from them, by gripper.
     outcomes: HashMap<String, OutcomeModel>,
+    /// What is wrong with rows that are left out, and was not asked for yet.
+    left_out: Vec<StoreError>,
+    /// Experiences that are left out.
+    broken: HashSet<i64>,
 }
 
 impl Memory {
@@ -36,6 +40,8 @@ impl Memory {
             attempts: vec![],
             last_attempt: 0,
             outcomes: HashMap::new(),
+            left_out: vec![],
+            broken: HashSet::new(),
         };
         memory.refresh()?;
         Ok(memory)
@@ -47,14 +53,37 @@ impl Memory {
     /// [`StoreError`].
     pub fn refresh(&mut self) -> Result<(), StoreError> {
         self.index.refresh(&*self.store)?;
+        for id in self.index.take_unusable() {
+            let found = "something else".to_owned();
+            self.leave_out(
+                id,
+                StoreError::Field { id, field: "feature", expected: "256 finite numbers", found },
+            );
+        }
         self.labels = self.store.list()?.into_iter().map(|s| (s.id, s)).collect();
         self.kept.retain(|id, _| self.labels.contains_key(id));
-        for (id, attempt) in self.store.attempts(self.last_attempt)? {
+        for (id, attempt) in self.store.attempt_rows(self.last_attempt)? {
             self.last_attempt = id;
-            self.attempts.push(attempt);
-            self.outcomes.clear();
+            match attempt {
+                Ok(attempt) => {
+                    self.attempts.push(attempt);
+                    self.outcomes.clear();
+                }
+                Err(error) => self.left_out.push(error),
+            }
         }
         Ok(())
+    }
+
+    /// What is wrong with experiences and attempts that were left out since the last call, for the user to hear of.
+    pub fn take_left_out(&mut self) -> Vec<StoreError> {
+        std::mem::take(&mut self.left_out)
+    }
+
+    fn leave_out(&mut self, id: i64, error: StoreError) {
+        if self.broken.insert(id) {
+            self.left_out.push(error);
+        }
     }
 
     /// What the attempts with a gripper say of the next one.
@@ -95,7 +124,7 @@ impl Memory {
         self.index.nearest(feature, count, |id| labels.get(&id).is_some_and(&wanted))
     }
 
-    /// An experience; `None` when it was forgotten meanwhile.
+    /// An experience; `None` when it was forgotten meanwhile, or cannot be read and is left out ([`Memory::take_left_out`]).
     ///
     /// # Errors
     /// [`StoreError`].
@@ -104,7 +133,14 @@ impl Memory {
         if let Some(stored) = self.kept.get(&id) {
             return Ok(Some(stored.clone()));
         }
-        let Some(stored) = self.store.get(id)? else { return Ok(None) };
+        let stored = match self.store.get(id) {
+            Err(error) if error.is_of_one_row() => {
+                self.leave_out(id, error);
+                return Ok(None);
+            }
+            stored => stored?,
+        };
+        let Some(stored) = stored else { return Ok(None) };
         let stored = Arc::new(stored);
         if self.kept.len() >= KEPT {
             self.kept.clear();

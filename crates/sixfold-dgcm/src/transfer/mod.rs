@@ -3,6 +3,7 @@
 mod align;
 mod combine;
 mod fit;
+mod grasps;
 mod memory;
 mod propose;
 mod shapes;
@@ -10,5 +11,6 @@ mod upright;
 
 pub use align::{AlignmentHypothesis, ExperienceAlignmentOptions, Transferred, transfer};
 pub use combine::{Kind, Ranked, rank, rank_as_published, rank_by_outcome, rank_on_part};
+pub use grasps::{GraspsError, RankedGrasps, grasps_from_experience};
 pub use memory::Memory;
 pub use propose::{Proposal, Proposals, ProposeError, ProposeOptions, propose};

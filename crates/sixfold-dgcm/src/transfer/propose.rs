@@ -127,7 +127,7 @@ impl Proposals {
 /// The centre between the pads may be this far from where it was in experience (standard deviation), metres.
 const MIDDLES: f64 = 0.02;
 
-/// A grasp that holds fewer pixels holds nothing that can be told.
+/// A grasp that holds fewer pixels holds too little to be rated.
 pub(super) const FEWEST_HELD: usize = 4;
 /// Pixels whose VD-NOC are nearer than this to those that were held are their counterparts. Less than the 0.3 by which a whole
 /// region is found again: a handle is thin.
@@ -281,7 +281,8 @@ pub(super) fn place(
         .iter()
         .map(|w| w + room)
         .chain([gripper.max_opening])
-        .map(|o| o.clamp(0.01, gripper.max_opening))
+        // Not `clamp`: a small gripper opens less than a centimetre.
+        .map(|o| o.max(0.01).min(gripper.max_opening))
         .collect();
     openings.dedup_by(|a, b| (*a - *b).abs() < 0.002);
     let start = t.camera_from_experience * *source.grasp;

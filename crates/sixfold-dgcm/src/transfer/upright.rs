@@ -15,7 +15,7 @@ const TURNS: usize = 20;
 const STRETCHES: [f64; 3] = [0.76, 1.0, 1.3];
 /// How far the first search moves an object, in steps of a centimetre.
 const MOVES: i64 = 3;
-/// How many of the first search are looked at more closely.
+/// How many of the first search are refined.
 const CLOSER: usize = 8;
 /// Alignments rotated by less than this are the same, radians.
 const SAME: f64 = 0.6;

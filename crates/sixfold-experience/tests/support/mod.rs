@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sixfold_experience::{
     Attempt, COPIES, Copy, Crop, CropOptions, Experience, ExperienceStore, FEATURE, FeatureIndex, Position,
-    SqliteStore, StoreError,
+    SqliteStore, StoreError, TaskRecord,
 };
 use sixfold_geometry::{Camera, Image, Mask, Plane, Pose, Vec3};
 use sixfold_grasp::{AntipodalQuality, GraspDescription, Gripper};
@@ -88,6 +88,7 @@ pub fn contract(mut make: impl FnMut() -> Box<dyn ExperienceStore + Send>) {
     a_wrong_experience_is_refused(&mut *make());
     changes_are_followed(&mut *make());
     attempts_are_kept(&mut *make());
+    records_are_kept(&mut *make());
     let folder = tempfile::tempdir().unwrap();
     let mut file = SqliteStore::create(&folder.path().join("other.db")).unwrap();
     stores_are_merged(&mut *make(), &mut file);
@@ -129,6 +130,25 @@ fn attempts_are_kept(store: &mut dyn ExperienceStore) {
     let error = store.add_attempt(&wrong).unwrap_err().to_string();
     assert!(error.contains("lever"), "{error}");
     assert_eq!(store.attempts(0).unwrap().len(), 2);
+}
+
+fn records_are_kept(store: &mut dyn ExperienceStore) {
+    let (attempts, mine) = ([attempt(1), attempt(2)], experience(1));
+    let record = TaskRecord { attempts: &attempts, experience: Some(&mine), journal: None };
+    let id = store.add_record(&record).unwrap();
+    assert!(id.is_some());
+    assert_eq!(store.add_record(&record).unwrap(), id, "once");
+    assert_eq!(store.add_record(&TaskRecord::default()).unwrap(), None);
+    assert_eq!((store.numbers().unwrap(), objects(store)), (vec![id.unwrap()], named([1])));
+    let rows = store.attempt_rows(0).unwrap();
+    assert_eq!(rows.iter().map(|row| row.1.as_ref().unwrap().clone()).collect::<Vec<_>>(), attempts);
+    assert!(store.forget_attempt(rows[0].0).unwrap() && !store.forget_attempt(rows[0].0).unwrap());
+    assert_eq!(store.attempts(0).unwrap(), [(rows[1].0, attempt(2))]);
+    // One thing in it is wrong.
+    let mut wrong = attempt(3);
+    wrong.share = f64::INFINITY;
+    assert!(store.add_record(&TaskRecord { attempts: &[attempt(4), wrong], ..record }).is_err());
+    assert_eq!(store.attempts(0).unwrap().len(), 1);
 }
 
 fn what_is_added_is_there(store: &mut dyn ExperienceStore) {

@@ -94,7 +94,8 @@ impl Server {
             .unwrap();
         assert!(answer.status.success(), "initdb: {}", String::from_utf8_lossy(&answer.stderr));
         let access =
-            "host guarded all 127.0.0.1/32 scram-sha-256\nhost all all 127.0.0.1/32 trust\n".to_owned();
+            "host guarded all 127.0.0.1/32 scram-sha-256\nhost in_clear all 127.0.0.1/32 password\nhost all all 127.0.0.1/32 trust\n"
+                .to_owned();
         fs::write(self.data().join("pg_hba.conf"), access).unwrap();
     }
 

@@ -31,6 +31,7 @@ use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness, outcome_
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::ranges::in_range;
 
 /// Images of this many scenes of each object are kept.
 const PICTURES: u64 = 2;
@@ -131,6 +132,8 @@ pub(crate) struct Class {
 }
 
 pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
+    in_range("--trials", a.trials, 1..=1_000_000)?;
+    in_range("--tries", a.tries, 1..=1000)?;
     let whole = compare(a)?;
     report(&a.json, &whole, || print_table(&whole))?;
     Ok(if whole.classes.iter().any(|c| c.rates.iter().any(|r| *r > 0.0)) {

@@ -2,22 +2,23 @@
 
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, Result};
 use clap::Args;
 use serde::Serialize;
+use sixfold_geometry::RgbImage;
 use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
-use sixfold_io::write_rgb;
 use sixfold_simulation::{
     Attempt, AttemptOptions, AttemptOutcome, ConvexParts, PartsOptions, TrialOptions, TrialReport, attempt,
     wilson_interval,
 };
 
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
 use sixfold_shell::grasp::trial::{PhysicsArguments, outcome_name, physics};
-use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
+use sixfold_shell::output::{JsonArguments, pose_rows, report};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
@@ -29,7 +30,7 @@ pub(crate) struct MeasureArguments {
     #[command(flatten)]
     pub objects: ObjectsArguments,
     /// Attempts on each object
-    #[arg(long, value_name = "N", default_value = "15")]
+    #[arg(long, value_name = "N", default_value = "15", value_parser = sixfold_shell::ranges::count::<100_000>)]
     pub trials: NonZeroUsize,
     /// Let the objects fall in any orientation; otherwise they stand with their own z axis up
     #[arg(long)]
@@ -59,6 +60,7 @@ pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
     let objects = named_objects(&a.objects)?;
     let trials = a.trials.get() as u64;
     let mut progress = Progress::new("attempts", objects.len() * a.trials.get());
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let mut measured: Vec<Measured> = vec![];
     for (class, name, mesh) in &objects {
         let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
@@ -71,8 +73,10 @@ pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
         for number in 0..trials {
             check_interrupt("nothing was written")?;
             let result = attempt(mesh, &parts, &gripper, &options, a.seed, number)?;
-            if let Some(folder) = a.out.as_ref().filter(|_| number < PICTURES) {
-                picture(&folder.join(format!("{}-{number}.png", file_name(name))), &gripper, &result)?;
+            if let Some(folder) = folder.as_mut().filter(|_| number < PICTURES)
+                && let Some(image) = picture(&gripper, &result)?
+            {
+                folder.write_rgb(&format!("{}-{number}.png", file_name(name)), &image)?;
             }
             done.trials.push(Tried::new(number, &result));
             progress.step(name.clone());
@@ -90,8 +94,8 @@ pub(super) fn run(a: &MeasureArguments) -> Result<Outcome> {
         trial,
         objects: measured,
     };
-    if let Some(folder) = &a.out {
-        write_atomically(&folder.join("trials.json"), serde_json::to_string(&whole)?.as_bytes())?;
+    if let Some(folder) = &mut folder {
+        folder.write_text("trials.json", &serde_json::to_string(&whole)?)?;
     }
     report(&a.json, &whole, || print_table(&whole))?;
     Ok(if whole.classes.iter().any(|c| c.successes > 0) { Outcome::Found } else { Outcome::NothingFound })
@@ -235,11 +239,10 @@ fn print_table(whole: &Whole) {
 }
 
 /// The view with the gripper that was tried: green when it held, red when not.
-fn picture(path: &Path, gripper: &Gripper, result: &Attempt) -> Result<()> {
-    let (Some(view), Some(best)) = (&result.view, result.proposals.first()) else { return Ok(()) };
+fn picture(gripper: &Gripper, result: &Attempt) -> Result<Option<RgbImage>> {
+    let (Some(view), Some(best)) = (&result.view, result.proposals.first()) else { return Ok(None) };
     let color = if result.ending.is_success() { [60, 220, 80] } else { [235, 70, 60] };
     let drawn = [DrawnGrasp { camera_from_gripper: best.camera_from_gripper, opening: best.opening, color }];
     let background = overlay::depth_picture(&view.depth);
-    let image = draw_grasps(&background, Some(&view.depth), &view.camera, gripper, &drawn)?;
-    Ok(write_rgb(path, &image)?)
+    Ok(Some(draw_grasps(&background, Some(&view.depth), &view.camera, gripper, &drawn)?))
 }

@@ -142,7 +142,7 @@ fn distortion_is_undone_at_the_edge() {
 }
 
 #[test]
-fn failures_are_told() {
+fn failures_are_reported() {
     let Case { points, pixels, .. } = case(1, 20, 0.0, 0.0, false);
     let options = PnpOptions::default();
     let solve = |points: &[Vec3], pixels: &[Vec2]| pnp_ransac(points, pixels, &camera(), &options);

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::Memory;
-use sixfold_experience::StorePlace;
+use sixfold_experience::{ExperienceStore, StoreError, StorePlace};
 
 /// Which network encodes objects.
 #[derive(Debug, Args)]
@@ -38,7 +38,8 @@ pub fn model(a: &NetworkArguments) -> Result<DgcmModel> {
 
 /// The experiences of a store that is there, for a network.
 pub fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
-    let memory = Memory::new(place.open()?, model)?;
+    let mut memory = Memory::new(place.open()?, model)?;
+    note_left_out(&memory.take_left_out(), &place.to_string());
     if memory.index().is_empty() && !memory.is_empty() {
         eprintln!(
             "note: the {} experiences in {place} were encoded by another network; `sixfold grasp store refresh` encodes them again",
@@ -48,26 +49,42 @@ pub fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
     Ok(memory)
 }
 
-/// The experiences of a store, made where there is none. When it lies on a server, a file in `out` is between, so that the
-/// server may go away.
-pub fn new_memory(
-    place: &StorePlace,
-    outbox: &OutboxArguments,
-    out: &Path,
-    model: &DgcmModel,
-) -> Result<Memory> {
-    let file = match (&outbox.outbox, place) {
-        (Some(file), StorePlace::File(_)) => {
-            bail!(
-                "--outbox: {} is for --experiences on a server, postgres://user@host/database",
-                file.display()
-            )
+/// Names what could not be read and was left out, and how it is removed.
+pub fn note_left_out(errors: &[StoreError], place: &str) {
+    for error in errors {
+        match error {
+            StoreError::Field { id, .. } => {
+                eprintln!(
+                    "note: {error}; it is left out, `sixfold grasp store forget {place} {id}` removes it"
+                );
+            }
+            StoreError::Attempt { id, .. } => {
+                eprintln!(
+                    "note: {error}; it is left out, `sixfold grasp store forget {place} --attempt {id}` removes it"
+                );
+            }
+            _ => eprintln!("note: {error}; it is left out"),
         }
-        (Some(file), _) => file.clone(),
-        (None, _) => out.join("outbox.db"),
-    };
-    let store = place.create_with_outbox(&file, |notice| eprintln!("note: {notice}"))?;
-    Ok(Memory::new(store, model)?)
+    }
+}
+
+/// The file in which a store that can be written is on this machine: its own, or that of the robot's copy, which is in `out`
+/// where nothing else is said.
+pub fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Path) -> Result<PathBuf> {
+    match (&outbox.outbox, place) {
+        (Some(file), StorePlace::File(_)) => bail!(
+            "--outbox: {} is for --experiences on a server, postgres://user@host/database",
+            file.display()
+        ),
+        (None, StorePlace::File(file)) => Ok(file.clone()),
+        (Some(file), _) => Ok(file.clone()),
+        (None, _) => Ok(out.join("outbox.db")),
+    }
+}
+
+/// A store, made where there is none. When it lies on a server, `file` is between, so that the server may go away.
+pub fn writable_store(place: &StorePlace, file: &Path) -> Result<Box<dyn ExperienceStore + Send>> {
+    Ok(place.create_with_outbox(file, |notice| eprintln!("note: {notice}"))?)
 }
 
 /// Seconds since 1970.

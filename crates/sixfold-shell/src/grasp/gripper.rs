@@ -1,4 +1,4 @@
-//! The gripper that a command is told.
+//! The gripper that a command is given.
 
 use std::path::Path;
 

@@ -8,20 +8,24 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::learner::{GraspTask, Learner, LearnerOptions, PartOf};
-use sixfold_experience::StorePlace;
+use sixfold_dgcm::learner::{GraspTask, JournalOf, Learned, Learner, LearnerOptions, PartOf};
+use sixfold_dgcm::transfer::Memory;
+use sixfold_experience::{ExperienceStore, JournalEntry, StorePlace, TaskRecord};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{AntipodalOptions, Grasp, GraspView, Gripper, centre_between_pads};
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOutcome, ConvexParts, PartsOptions, scene, try_grasp, wilson_interval};
 use sixfold_synth::shapes::{Family, Member, Rest, member};
 
-use super::experience::{NetworkArguments, OutboxArguments, model, new_memory, now};
-use super::journal::Journal;
+use super::experience::{
+    NetworkArguments, OutboxArguments, local_file, model, note_left_out, now, writable_store,
+};
+use super::journal::StoreJournal;
 use super::object_list::{ObjectsArguments, named_objects};
 use super::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use crate::output::JsonArguments;
 use crate::progress::{Progress, check_interrupt};
+use crate::ranges::in_range;
 
 /// Arguments of `sixfold grasp learn`.
 #[derive(Debug, Args)]
@@ -230,14 +234,19 @@ fn pupils(a: &LearnArguments) -> Result<Vec<TestObject>> {
 /// # Errors
 /// When the arguments, the store or the folder of an earlier run do not fit, and when the user asks to stop.
 pub fn learn(a: &LearnArguments) -> Result<Whole> {
+    learn_with(a, |store| store)
+}
+
+/// `wrap` gets the store before anything is done with it.
+fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -> Result<Whole> {
     if a.near.is_nan() || a.near < 0.0 {
         bail!("--near: found {}, expected 0 or more", a.near);
     }
-    if a.tries == 0 || a.attempts == 0 {
-        bail!("--tries and --attempts: expected at least 1");
-    }
+    in_range("--attempts", a.attempts, 1..=1_000_000)?;
+    in_range("--tries", a.tries, 1..=1000)?;
+    in_range("--explore", a.explore, 0..=1000)?;
+    in_range("--members", a.members, 1..=10_000)?;
     let setting = hardness(&a.physics, a.hard)?;
-    let gripper = &setting.gripper;
     let network = model(&a.network)?;
     let pupils = pupils(a)?;
     let recorded = Recorded {
@@ -253,9 +262,17 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
         network: network.fingerprint(),
         gripper: &setting.real,
     };
-    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("attempts.jsonl"), &recorded)?;
-    let mut memory = new_memory(&a.experiences, &a.outbox, &a.out, &network)?;
+    let file = local_file(&a.experiences, &a.outbox, &a.out)?;
+    let mut journal = StoreJournal::open(&a.out.join("attempts.jsonl"), &recorded)?;
+    let place = file.display().to_string();
+    if !journal.is_empty() && !file.exists() {
+        bail!(journal.of_another_store(0, &place));
+    }
+    let store = wrap(writable_store(&a.experiences, &file)?);
+    let mut rows: Vec<Row> = journal.complete(&*store, &place)?;
+    let mut memory = Memory::new(store, &network)?;
     let options = LearnerOptions { tries: a.tries, explore: a.explore, near: a.near, part: a.part.clone() };
+    let gripper = &setting.gripper;
     let mut learner = Learner { network: &network, memory: &mut memory, gripper, options: &options };
     let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
     for pupil in &pupils {
@@ -270,37 +287,48 @@ pub fn learn(a: &LearnArguments) -> Result<Whole> {
         for attempt in 0..a.attempts {
             if !done(&rows, attempt) {
                 check_interrupt("what was learned is kept; run the same command again to continue")?;
-                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt)?;
-                journal.row(&row)?;
+                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt, &journal.name)?;
+                journal.line(&line(&row))?;
                 rows.push(row);
+                note_left_out(&learner.memory.take_left_out(), &place);
             }
             progress.step(pupil.name.clone());
         }
     }
     progress.finish();
     memory.refresh()?;
+    note_left_out(&memory.take_left_out(), &place);
+    Ok(whole(&pupils, &rows, &mut memory, &gripper.name))
+}
+
+type BoxedStore = Box<dyn ExperienceStore + Send>;
+
+/// A row as store and journal keep it.
+fn line(row: &Row) -> String {
+    serde_json::to_string(row).unwrap_or_default()
+}
+
+fn whole(pupils: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str) -> Whole {
     let held = rows.iter().filter(|r| r.held).count();
-    Ok(Whole {
+    let curve = |p: &TestObject| {
+        let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
+        Curve {
+            object: p.name.clone(),
+            held: mine.iter().map(|r| r.held).collect(),
+            nearest: mine.iter().map(|r| r.nearest).collect(),
+            from_experience: mine.iter().map(|r| r.from_experience).collect(),
+        }
+    };
+    Whole {
         attempts: rows.len(),
         held,
         rate: held as f64 / rows.len().max(1) as f64,
         interval: wilson_interval(held, rows.len()),
         from_experience: rows.iter().filter(|r| r.from_experience).count(),
         experiences: memory.len(),
-        outcomes: memory.outcomes(&gripper.name).attempts,
-        objects: pupils
-            .iter()
-            .map(|p| {
-                let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
-                Curve {
-                    object: p.name.clone(),
-                    held: mine.iter().map(|r| r.held).collect(),
-                    nearest: mine.iter().map(|r| r.nearest).collect(),
-                    from_experience: mine.iter().map(|r| r.from_experience).collect(),
-                }
-            })
-            .collect(),
-    })
+        outcomes: memory.outcomes(gripper).attempts,
+        objects: pupils.iter().map(curve).collect(),
+    }
 }
 
 /// One letter an attempt: G geometry, E experience; capitals held.
@@ -314,7 +342,7 @@ pub fn marks(curve: &Curve) -> String {
     curve.held.iter().zip(&curve.from_experience).map(letter).collect()
 }
 
-/// One scene with an object, and what was learned of it.
+/// One scene with an object, and what was learned of it, which the store keeps with a row of the journal.
 fn attempt(
     a: &LearnArguments,
     setting: &Hardness,
@@ -322,9 +350,10 @@ fn attempt(
     pupil: &TestObject,
     parts: &ConvexParts,
     attempt: u64,
+    journal: &str,
 ) -> Result<Row> {
     let scene = scene(&pupil.mesh, parts, &setting.options, a.seed, attempt);
-    let mut row = Row {
+    let empty = Row {
         object: pupil.name.clone(),
         class: pupil.class.clone(),
         attempt,
@@ -335,7 +364,11 @@ fn attempt(
         rank: 0,
         stored: None,
     };
-    let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(row) };
+    let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else {
+        let journal = Some(JournalEntry { journal, row: &|_| line(&empty) });
+        learner.memory.store().add_record(&TaskRecord { journal, ..TaskRecord::default() })?;
+        return Ok(empty);
+    };
     let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
     let part_of = |grasp: &Grasp| pupil.part(&camera_from_object, grasp, view, &setting.gripper);
     let task = GraspTask {
@@ -346,7 +379,7 @@ fn attempt(
         part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
         now,
     };
-    let learned = learner.learn(&task, &mut |grasp| {
+    let mut try_one = |grasp: &Grasp| {
         let sent = seen.world_from_camera * grasp.camera_from_gripper;
         let tried = try_grasp(
             parts,
@@ -358,21 +391,32 @@ fn attempt(
         )?;
         let ending = AttemptOutcome::Tried(tried.outcome);
         Ok((ending.is_success(), ending))
-    })?;
-    row.nearest = learned.nearest;
-    row.from_experience = learned.from_experience;
-    row.held = learned.held;
-    row.stored = learned.stored;
-    if let Some((rank, ending)) = learned.last {
-        row.rank = rank;
-        row.ending = outcome_name(ending);
-    }
-    Ok(row)
+    };
+    let row = |learned: &Learned<AttemptOutcome>, stored: Option<i64>| {
+        let mut row = Row {
+            nearest: learned.nearest,
+            from_experience: learned.from_experience,
+            held: learned.held,
+            stored,
+            ..empty.clone()
+        };
+        if let Some((rank, ending)) = learned.last {
+            row.rank = rank;
+            row.ending = outcome_name(ending);
+        }
+        row
+    };
+    let of_task = JournalOf { journal, row: &|learned, stored| line(&row(learned, stored)) };
+    let learned = learner.learn(&task, &mut try_one, Some(&of_task))?;
+    Ok(row(&learned, learned.stored))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
+    use sixfold_experience::{Attempt, Changes, Experience, Position, StoreError, Stored, Summary};
     use sixfold_geometry::{Camera, DepthImage, Mask, PointCloud};
     use sixfold_grasp::{AntipodalQuality, gripper_pose};
 
@@ -423,5 +467,112 @@ mod tests {
         let front = body.iter().map(|p| p.x).fold(f64::MIN, f64::max);
         let height = body.iter().map(|p| p.z).sum::<f64>() / body.len() as f64;
         assert_eq!(part(Vec3::new(0.6 * front, 0.0, height - 0.01), -Vec3::z()), Some("body"));
+    }
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        learn: LearnArguments,
+    }
+
+    /// A store whose process is stopped before its n-th write.
+    struct Stopping {
+        store: BoxedStore,
+        left: usize,
+    }
+
+    impl Stopping {
+        fn write(&mut self) -> Result<&mut BoxedStore, StoreError> {
+            let file = PathBuf::from("stopped");
+            self.left = self.left.checked_sub(1).ok_or(StoreError::Full { file })?;
+            Ok(&mut self.store)
+        }
+    }
+
+    impl ExperienceStore for Stopping {
+        fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError> {
+            self.write()?.add(experience)
+        }
+
+        fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
+            self.write()?.add_attempt(attempt)
+        }
+
+        fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
+            self.write()?.add_record(record)
+        }
+
+        fn forget(&mut self, id: i64) -> Result<bool, StoreError> {
+            self.write()?.forget(id)
+        }
+
+        fn get(&self, id: i64) -> Result<Option<Stored>, StoreError> {
+            self.store.get(id)
+        }
+
+        fn list(&self) -> Result<Vec<Summary>, StoreError> {
+            self.store.list()
+        }
+
+        fn changes(&self, since: Position) -> Result<Changes, StoreError> {
+            self.store.changes(since)
+        }
+
+        fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError> {
+            self.store.attempts(after)
+        }
+
+        fn journal(&self, name: &str) -> Result<Vec<String>, StoreError> {
+            self.store.journal(name)
+        }
+    }
+
+    /// All that a run leaves behind, but for times and the journal's name.
+    fn left_behind(folder: &Path) -> (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>) {
+        let text = std::fs::read_to_string(folder.join("attempts.jsonl")).unwrap();
+        let store = StorePlace::File(folder.join("e.db")).open().unwrap();
+        let attempts =
+            store.attempts(0).unwrap().into_iter().map(|(_, a)| Attempt { time: 0, ..a }).collect();
+        let experiences = store.list().unwrap().into_iter().map(|summary| {
+            let stored = store.get(summary.id).unwrap().unwrap().experience;
+            (Summary { time: 0, ..summary }, stored.copies[0].feature.clone())
+        });
+        (text.lines().skip(1).map(str::to_owned).collect(), attempts, experiences.collect())
+    }
+
+    #[test]
+    fn a_run_that_is_stopped_at_any_write_ends_as_one_that_was_not() {
+        use clap::Parser;
+        let weights = concat!(env!("CARGO_MANIFEST_DIR"), "/../../weights/dgcm.safetensors");
+        let all = tempfile::tempdir().unwrap();
+        let arguments = |name: &str| {
+            let folder = all.path().join(name);
+            let store = folder.join("e.db");
+            let place = [store.to_str().unwrap(), folder.to_str().unwrap()].map(str::to_owned);
+            let [store, out] = place;
+            let text = ["learn", "--families", "can", "--members", "1", "--attempts", "3", "--tries", "2"];
+            let more = ["--explore", "2", "--weights", weights, "--experiences", &store, "--out", &out];
+            (Line::parse_from(text.into_iter().chain(more)).learn, folder)
+        };
+        let (undisturbed, folder) = arguments("undisturbed");
+        let whole = learn(&undisturbed).unwrap();
+        let expected = left_behind(&folder);
+        assert!(whole.held > 0 && expected.1.len() > 3 && !expected.2.is_empty());
+        for stop in 0..3 {
+            let (a, folder) = arguments(&format!("stopped {stop}"));
+            let stopped = learn_with(&a, |store| Box::new(Stopping { store, left: stop }));
+            assert!(stopped.is_err());
+            let before = left_behind(&folder);
+            assert_eq!(before.0, expected.0[..stop], "scenes are there whole, or not at all");
+            // Stopped after the store's write, and before or within the journal's.
+            let file = folder.join("attempts.jsonl");
+            let text = std::fs::read_to_string(&file).unwrap();
+            let last = text.trim_end().rfind('\n').map_or(text.len(), |end| end + 1);
+            let cut = [text.len(), last, text.len() - 4][if stop == 0 { 0 } else { stop }];
+            std::fs::write(&file, &text[..cut]).unwrap();
+            let resumed = learn(&a).unwrap();
+            assert_eq!(left_behind(&folder), expected, "stopped before write {stop}");
+            assert_eq!((resumed.held, resumed.outcomes), (whole.held, whole.outcomes));
+        }
     }
 }

@@ -4,11 +4,15 @@
 #[cfg(feature = "experience")]
 pub mod experience;
 pub mod gripper;
+pub mod input;
 #[cfg(all(feature = "physics", feature = "experience"))]
 pub mod journal;
 #[cfg(all(feature = "physics", feature = "experience"))]
 pub mod learn;
 #[cfg(feature = "physics")]
 pub mod object_list;
+pub mod proposals;
+#[cfg(feature = "experience")]
+pub mod store;
 #[cfg(feature = "physics")]
 pub mod trial;

@@ -1,12 +1,14 @@
 //! Where backgrounds come from: photographs of a folder, images in memory, or procedural textures.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use image::DynamicImage;
 use image::imageops::FilterType;
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
 use sixfold_geometry::{Image, Rect, RgbImage};
+use sixfold_io::read_rgb;
 
 use super::error::AugmentError;
 use super::patch::{AffineMap, Patch};
@@ -25,6 +27,19 @@ impl Default for PhotographOptions {
     fn default() -> Self {
         PhotographOptions { longest_side: 400, most: 2000 }
     }
+}
+
+/// The image with at most `side` pixels along its longer side.
+fn reduced(image: RgbImage, side: usize) -> Option<RgbImage> {
+    if image.width().max(image.height()) <= side {
+        return Some(image);
+    }
+    let data = image.as_slice().as_flattened().to_vec();
+    let pixels = image::RgbImage::from_raw(image.width() as u32, image.height() as u32, data)?;
+    let pixels =
+        DynamicImage::from(pixels).resize(side as u32, side as u32, FilterType::Triangle).into_rgb8();
+    let data = pixels.as_raw().as_chunks::<3>().0.to_vec();
+    Image::from_vec(pixels.width() as usize, pixels.height() as usize, data).ok()
 }
 
 /// An image and what its crops should keep away from.
@@ -53,6 +68,26 @@ impl Backgrounds {
     /// [`AugmentError`] when the folder cannot be listed or holds no readable photograph.
     pub fn from_folder(path: impl AsRef<Path>, options: &PhotographOptions) -> Result<Self, AugmentError> {
         let path = path.as_ref();
+        let mut images = Vec::new();
+        for file in Backgrounds::files(path, options)? {
+            let Ok(decoded) = read_rgb(&file) else { continue };
+            let side = options.longest_side.clamp(16, 1 << 14);
+            let Some(image) = reduced(decoded, side) else { continue };
+            if image.width().min(image.height()) >= 8 {
+                images.push(Arc::new(image));
+            }
+        }
+        if images.is_empty() {
+            return Err(AugmentError::NoPhotographs { path: path.to_owned(), found: 0 });
+        }
+        Backgrounds::from_images(images)
+    }
+
+    /// The files that [`Backgrounds::from_folder`] reads, in its order.
+    ///
+    /// # Errors
+    /// [`AugmentError::Folder`] when the folder cannot be listed.
+    pub fn files(path: &Path, options: &PhotographOptions) -> Result<Vec<PathBuf>, AugmentError> {
         let folder = |source| AugmentError::Folder { path: path.to_owned(), source };
         let mut files = Vec::new();
         for entry in std::fs::read_dir(path).map_err(folder)? {
@@ -64,28 +99,8 @@ impl Backgrounds {
         }
         // The order in which a system lists files is not the same everywhere.
         files.sort();
-        let mut images = Vec::new();
-        for file in files.into_iter().take(options.most) {
-            let Ok(decoded) = image::open(&file) else { continue };
-            let side = options.longest_side.clamp(16, 1 << 14) as u32;
-            let decoded = if decoded.width().max(decoded.height()) > side {
-                decoded.resize(side, side, FilterType::Triangle)
-            } else {
-                decoded
-            };
-            let pixels = decoded.into_rgb8();
-            let (width, height) = (pixels.width() as usize, pixels.height() as usize);
-            let data = pixels.as_raw().as_chunks::<3>().0.to_vec();
-            if let Ok(image) = Image::from_vec(width, height, data)
-                && width.min(height) >= 8
-            {
-                images.push(Arc::new(image));
-            }
-        }
-        if images.is_empty() {
-            return Err(AugmentError::NoPhotographs { path: path.to_owned(), found: 0 });
-        }
-        Backgrounds::from_images(images)
+        files.truncate(options.most);
+        Ok(files)
     }
 
     /// Images that are already in memory.

@@ -48,7 +48,7 @@ impl Cutout {
         (self.width, self.height)
     }
 
-    /// Draws the cut-out, turned and scaled about its centre, which comes to lie at `centre`: its colours and coverage
+    /// Draws the cut-out, rotated and scaled about its centre, which comes to lie at `centre`: its colours and coverage
     /// over a patch of the given size. `longest` is the length of its longer side in patch pixels.
     pub fn draw(
         &self,

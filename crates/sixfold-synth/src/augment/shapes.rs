@@ -13,16 +13,16 @@ use super::coverage::Coverage;
 /// A shape about a centre, without its size.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
-    /// A turned rectangle of the given side ratio.
+    /// A rotated rectangle of the given side ratio.
     Rectangle {
-        /// Cosine and sine of its turn.
+        /// Cosine and sine of its rotation.
         turn: [f32; 2],
         /// Half sides at size 1.
         half: [f32; 2],
     },
-    /// A turned ellipse.
+    /// A rotated ellipse.
     Ellipse {
-        /// Cosine and sine of its turn.
+        /// Cosine and sine of its rotation.
         turn: [f32; 2],
         /// Half axes at size 1.
         half: [f32; 2],

@@ -7,6 +7,7 @@
 
 pub(crate) mod solids;
 mod sweep;
+mod symmetry;
 mod toy;
 
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -164,7 +165,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
     match family {
         Family::Can => {
             let (r, h, rim) = (between(0.025, 0.036), between(0.05, 0.11), between(0.0, 0.003));
-            b.turned(
+            b.lathed(
                 &[(0.0, 0.0), (r, 0.0), (r, h), (r - 0.003, h), (r - 0.003, h - rim), (0.0, h - rim)],
                 SIDES,
                 5,
@@ -199,7 +200,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
             let (r, h, neck) = (between(0.02, 0.032), between(0.11, 0.17), between(0.3, 0.55));
             let shoulder = between(0.55, 0.75);
             let (top, foot) = (shoulder + between(0.06, 0.15), between(0.85, 1.0));
-            b.turned(
+            b.lathed(
                 &[
                     (0.0, 0.0),
                     (foot * r, 0.0),
@@ -227,7 +228,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
             profile.extend(arc(r, 0.0));
             profile.extend(arc(r - wall, wall).rev());
             profile.push((0.0, wall));
-            b.turned(&profile, SIDES, 2);
+            b.lathed(&profile, SIDES, 2);
             parts.push(("body", b.faces()));
         }
         Family::Box => {
@@ -294,7 +295,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
 /// A cup: foot narrower than the rim by `taper`.
 fn vessel(b: &mut Builder, r: f64, h: f64, taper: f64, wall: f64) {
     let floor = 1.5 * wall;
-    b.turned(&profiles::cup(taper * r, r, h, wall, floor), SIDES, 6);
+    b.lathed(&profiles::cup(taper * r, r, h, wall, floor), SIDES, 6);
 }
 
 #[cfg(test)]

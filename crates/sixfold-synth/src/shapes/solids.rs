@@ -47,7 +47,7 @@ impl Builder {
 
     /// The shape that a profile of (radius, height) points sweeps about z, the solid on the profile's left hand (radius to
     /// the right, height up). Every piece of the profile is cut into `rows`.
-    pub fn turned(&mut self, profile: &[(f64, f64)], sides: usize, rows: usize) {
+    pub fn lathed(&mut self, profile: &[(f64, f64)], sides: usize, rows: usize) {
         let mut fine = vec![];
         for pair in profile.windows(2) {
             for k in 0..rows {

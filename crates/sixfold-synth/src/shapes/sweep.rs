@@ -38,7 +38,7 @@ impl Sweep {
                 let s = k as f64 / rows as f64;
                 let radius = points.windows(2).find(|pair| s <= pair[1].0).map_or(0.05, |pair| {
                     let t = (s - pair[0].0) / (pair[1].0 - pair[0].0).max(1e-9);
-                    // Level at both ends of each piece: turned wood rather than sheet metal.
+                    // Level at both ends of each piece: lathed wood rather than sheet metal.
                     let t = t * t * (3.0 - 2.0 * t);
                     pair[0].1 + t * (pair[1].1 - pair[0].1)
                 });

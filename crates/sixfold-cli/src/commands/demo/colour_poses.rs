@@ -8,7 +8,6 @@ use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
 use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
-use sixfold_io::write_rgb;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
 
@@ -16,7 +15,8 @@ use super::arguments::DemoArguments;
 use super::colour::{Colour, Row};
 use super::samples::{Known, add_s, found_upwards};
 use sixfold_shell::overlay::{self, Drawn};
-use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::pictures::Pictures;
+use sixfold_shell::progress::Progress;
 use sixfold_shell::training::was_trained_on;
 
 /// Weights of the sample objects, relative to the repository.
@@ -28,6 +28,7 @@ const MIN_DETECTION: f32 = 0.1;
 
 pub(super) fn run(
     a: &DemoArguments,
+    out: &mut Pictures,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
@@ -40,7 +41,7 @@ pub(super) fn run(
     };
     let result = Pix2PoseEstimator::load(&weights)
         .map_err(anyhow::Error::from)
-        .and_then(|pix2pose| with_model(a, &pix2pose, &weights, dataset, targets, known));
+        .and_then(|pix2pose| with_model(a, out, &pix2pose, &weights, dataset, targets, known));
     match result {
         Ok(colour) => Ok(colour),
         // Those that were asked for have to be right.
@@ -62,6 +63,7 @@ fn objects(
 
 fn with_model(
     a: &DemoArguments,
+    out: &mut Pictures,
     pix2pose: &Pix2PoseEstimator,
     weights: &Path,
     dataset: &BopDataset,
@@ -86,7 +88,6 @@ fn with_model(
     for scene_id in dataset.scene_ids() {
         let scene = dataset.scene(scene_id)?;
         for im_id in scene.image_ids() {
-            check_interrupt("run it again")?;
             let Some(image) = scene.rgb(im_id)? else { continue };
             let detector = detector_card.as_ref().zip(colour.detector.as_deref());
             for (card, file) in [(pix2pose.model.card(), weights)].into_iter().chain(detector) {
@@ -125,9 +126,8 @@ fn with_model(
                     color: overlay::color(o.obj_id as usize),
                 });
             }
-            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}_colour.png"));
-            write_rgb(&picture, &overlay::draw(&image, &camera, &drawn))?;
-            colour.pictures.push(picture);
+            let picture = overlay::draw(&image, &camera, &drawn);
+            colour.pictures.extend(out.write(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture));
         }
     }
     progress.finish();

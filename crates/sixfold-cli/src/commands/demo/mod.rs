@@ -17,18 +17,19 @@ use std::time::Instant;
 use anyhow::Result;
 use serde::Serialize;
 use sixfold_align::{DepthOptions, DepthRegion};
-use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, write_recall_curves};
+use sixfold_bop::{BopDataset, EvalOptions, Evaluation, Models, evaluate, score_table, write_recall_curves};
 use sixfold_geometry::Pose;
-use sixfold_io::write_rgb;
 use sixfold_ppf::{PpfOptions, estimate};
 
 use self::arguments::DemoArguments;
 use self::colour::Colour;
 use self::samples::{Known, add_s, sample_folder};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::overlay::{self, Drawn};
-use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::pictures::Pictures;
+use sixfold_shell::progress::Progress;
 
 #[derive(Serialize)]
 struct Row {
@@ -57,6 +58,7 @@ struct Whole {
 
 pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let start = Instant::now();
+    let mut out = Pictures::of(Some(OutputFolder::take(&a.out)?));
     let folder = sample_folder(a.data.as_deref())?;
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
@@ -69,7 +71,6 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     for scene_id in dataset.scene_ids() {
         let scene = dataset.scene(scene_id)?;
         for im_id in scene.image_ids() {
-            check_interrupt("run it again")?;
             let camera = scene.camera(im_id)?;
             let Some(depth) = scene.depth(im_id)? else { continue };
             let prepared = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default())?;
@@ -109,17 +110,14 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                 }
             }
             let background = scene.rgb(im_id)?.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let picture = a.out.join(format!("{scene_id:06}_{im_id:06}.png"));
-            write_rgb(&picture, &overlay::draw(&background, &camera, &drawn(&found, &known)))?;
-            pictures.push(picture);
+            let picture = overlay::draw(&background, &camera, &drawn(&found, &known));
+            pictures.extend(out.write(&format!("{scene_id:06}_{im_id:06}.png"), &picture));
         }
     }
     progress.finish();
     let evaluation = evaluate(&dataset, &results, &dataset.targets(None)?, &EvalOptions::default(), &|_| {})?;
-    let curves = a.out.join("recall.png");
-    write_recall_curves(&curves, &evaluation)?;
-    pictures.push(curves);
-    let colour = colour_poses::run(a, &dataset, &targets, &known)?;
+    pictures.extend(out.with("recall.png", |curves| write_recall_curves(curves, &evaluation)));
+    let colour = colour_poses::run(a, &mut out, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
     let whole = Whole {
         poses: rows,
@@ -131,7 +129,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
         colour,
     };
     report(&a.json, &whole, || print_table(&whole))?;
-    Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    Ok(out.outcome(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
 }
 
 /// Poses by object, to be drawn.
@@ -169,7 +167,7 @@ fn print_table(whole: &Whole) {
         );
     }
     println!();
-    super::eval::print_evaluation(&whole.evaluation);
+    print!("{}", score_table(&whole.evaluation));
     println!("\n{} of {} poses within 10 % of the diameter", whole.correct, whole.targets);
     colour::print_table(&whole.colour, |image, object| {
         whole.poses.iter().find(|r| r.image == image && r.object == object).map(|r| r.add_s_of_diameter)

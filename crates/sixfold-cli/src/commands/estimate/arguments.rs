@@ -10,6 +10,7 @@ use sixfold_estimator::{Cache, ObjectStore, check_min_confidence};
 use sixfold_mesh::Unit;
 use sixfold_runner::RunOptions;
 use sixfold_shell::output::JsonArguments;
+use sixfold_shell::ranges::count;
 
 use super::methods::{METHODS, Method};
 
@@ -65,7 +66,7 @@ pub(crate) struct CommonArguments {
     /// Depth image: PNG, one channel of 16 bits
     #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
     pub depth: Option<PathBuf>,
-    /// Camera: a JSON file with fx fy cx cy or cam_K, and depth_scale (millimetres per unit of the depth image)
+    /// Camera: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale (millimetres per unit of the depth image)
     #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
@@ -93,7 +94,7 @@ pub(crate) struct CommonArguments {
     )]
     pub region: Option<Vec<f64>>,
     /// Most instances of each object (in a dataset: what its targets say)
-    #[arg(long, value_name = "N", default_value = "1")]
+    #[arg(long, value_name = "N", default_value = "1", value_parser = count::<1000>)]
     pub instances: NonZeroUsize,
     /// BOP dataset folder: estimate all its targets
     #[arg(long, value_name = "DIR", requires = "out")]

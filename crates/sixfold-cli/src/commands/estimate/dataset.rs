@@ -5,9 +5,9 @@ use std::path::Path;
 
 use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, Target};
-use sixfold_io::write_rgb;
 use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunError};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::report;
 use sixfold_shell::overlay::{self, Drawn};
@@ -22,6 +22,8 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     if out.extension().is_none_or(|e| e != "csv") {
         bail!("--out: found {}, expected a file that ends in .csv", out.display());
     }
+    // The files that they name are hashed before they are read: what changes in between is never taken for the same.
+    let options = a.run_options();
     let dataset = BopDataset::open(root, &common.split)?;
     let mut targets = dataset.targets(common.targets.as_deref())?;
     let left_out = excepted(&dataset, common.except.as_deref())?;
@@ -30,7 +32,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     let (regions, mut skipped) = regions(common, &dataset, &targets)?;
     let estimator = a.method.build(a.of_method(), common)?;
     let images: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
-    let (cache, options) = (common.cache.cache(), a.run_options());
+    let cache = common.cache.cache();
     let run = DatasetRun {
         estimator: estimator.as_ref(),
         dataset: &dataset,
@@ -40,6 +42,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
         cache: &cache,
         options: &options,
     };
+    let mut overlays = common.overlays.as_deref().map(OutputFolder::take).transpose()?;
     let mut progress = Progress::new("images", images.len());
     // An overlay that cannot be written costs no poses.
     let mut undrawn = vec![];
@@ -49,7 +52,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
             DatasetEvent::Image { image, earlier: false } => progress.step(image),
             DatasetEvent::Note(note) => eprintln!("note: {note}"),
             DatasetEvent::Result(result) => {
-                if let Some(folder) = &common.overlays
+                if let Some(folder) = &mut overlays
                     && let Err(error) = draw(folder, result)
                 {
                     let image = format!("{}/{}", result.scene_id, result.im_id);
@@ -106,7 +109,7 @@ fn regions(
 }
 
 /// Draws the poses of an image over it.
-fn draw(folder: &Path, result: &ImageResult<'_>) -> Result<()> {
+fn draw(folder: &mut OutputFolder, result: &ImageResult<'_>) -> Result<()> {
     let (scene, im_id) = (result.scene, result.im_id);
     let camera = scene.camera(im_id)?;
     let background = match (scene.rgb(im_id)?, scene.depth(im_id)?) {
@@ -123,7 +126,7 @@ fn draw(folder: &Path, result: &ImageResult<'_>) -> Result<()> {
             color: overlay::color(p.obj_id as usize),
         })
         .collect();
-    let path = folder.join(format!("{:06}_{im_id:06}.png", result.scene_id));
-    write_rgb(&path, &overlay::draw(&background, &camera, &drawn))?;
+    let name = format!("{:06}_{im_id:06}.png", result.scene_id);
+    folder.write_rgb(&name, &overlay::draw(&background, &camera, &drawn))?;
     Ok(())
 }

@@ -7,13 +7,12 @@ use anyhow::{Context, Result, anyhow, bail};
 use sixfold_align::PreparedDepth;
 use sixfold_estimator::{Need, Object, PoseEstimator, Query};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
-use sixfold_io::{CameraFile, read_depth, read_rgb, write_mask, write_rgb};
-use sixfold_mttm::mask::to_image;
-use sixfold_runner::{FoundObject, ImageReport, ImageRun, pose_table};
+use sixfold_io::{CameraFile, read_depth, read_rgb};
+use sixfold_runner::{FoundObject, ImageRun, depth_notes};
 use sixfold_shell::Outcome;
-use sixfold_shell::output::{report, write_atomically};
-use sixfold_shell::overlay::{self, Drawn};
-use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::folder::OutputFolder;
+use sixfold_shell::found::SearchedImage;
+use sixfold_shell::progress::Progress;
 
 use super::arguments::{CommonArguments, EstimateArguments};
 use super::region::{self, Where};
@@ -105,9 +104,12 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
         );
     }
     let input = Input::read(common, estimator)?;
+    // Before the poses take their time: what stands in the folder may be the input itself.
+    let mut folder = common.out.as_deref().map(OutputFolder::take).transpose()?;
+    folder.as_mut().map(|f| f.files(&["poses.json", "overlay.png"])).transpose()?;
     let depth = input.prepared(common, estimator)?;
     if let Some(depth) = &depth {
-        warn_about(depth, estimator);
+        depth_notes(depth, estimator).iter().for_each(|note| eprintln!("note: {note}"));
     }
     let place = region::find(common, &input.lens, input.rgb.as_ref())?;
     let region = match &place {
@@ -130,8 +132,13 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     };
     let image = ImageRun { estimator, query };
     let found = search(common, &image, matches!(place, Where::Nowhere))?;
-    let whole = image.report(&found);
-    finish(common, &input, &found, whole)
+    let searched = SearchedImage {
+        camera: &input.camera,
+        rgb: input.rgb.as_ref(),
+        depth: input.depth.as_ref(),
+        found: &found,
+    };
+    searched.finish(folder, &common.json, image.report(&found))
 }
 
 /// Searches every object.
@@ -142,7 +149,6 @@ fn search(a: &CommonArguments, image: &ImageRun<'_>, nowhere: bool) -> Result<Ve
     let names: Vec<Option<&String>> =
         if a.objects.is_empty() { vec![None] } else { a.objects.iter().map(Some).collect() };
     for name in names {
-        check_interrupt("nothing was written")?;
         let object = match name {
             None => Object::of_model(a.object_id),
             Some(name) => {
@@ -170,83 +176,6 @@ fn search(a: &CommonArguments, image: &ImageRun<'_>, nowhere: bool) -> Result<Ve
     Ok(found)
 }
 
-/// Writes the poses, then the images, and prints the poses.
-fn finish(
-    a: &CommonArguments,
-    input: &Input,
-    found: &[FoundObject],
-    mut whole: ImageReport,
-) -> Result<Outcome> {
-    let mut images = vec![];
-    if let Some(folder) = &a.out {
-        let path = folder.join("overlay.png");
-        images.push((path.clone(), overlaid(input, found)));
-        whole.overlay = Some(path);
-        for diagnostic in found.iter().flat_map(|f| &f.estimates).flat_map(|e| &e.diagnostics) {
-            let path = folder.join(format!("{}.png", diagnostic.name));
-            images.push((path.clone(), diagnostic.image.clone()));
-            whole.diagnostics.insert(diagnostic.name.to_owned(), path);
-        }
-        write_atomically(&folder.join("poses.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    }
-    let names: Vec<&str> = images.iter().filter_map(|(p, _)| p.file_name()?.to_str()).collect();
-    report(&a.json, &whole, || {
-        print!("{}", pose_table(&whole));
-        if let Some(folder) = &a.out {
-            println!("poses.json, {} are in {}", names.join(", "), folder.display());
-        }
-    })?;
-    // Results first: an image that cannot be written costs none of them.
-    for (path, image) in &images {
-        write_rgb(path, image)?;
-    }
-    if let Some(folder) = &a.out {
-        write_masks(folder, input, found)?;
-    }
-    Ok(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found })
-}
-
-/// The masks of all poses that have one.
-fn write_masks(folder: &Path, input: &Input, found: &[FoundObject]) -> Result<()> {
-    for (i, f) in found.iter().enumerate() {
-        for (k, estimate) in f.estimates.iter().enumerate() {
-            if let Some(mask) = &estimate.mask {
-                let name = format!("masks/{}-{}-{}.png", i + 1, file_name(f.object.name()), k + 1);
-                write_mask(&folder.join(name), &to_image(mask, input.camera.width, input.camera.height))?;
-            }
-        }
-    }
-    Ok(())
-}
-
-/// The poses over the image; where an object has no mesh, its mask.
-fn overlaid(input: &Input, found: &[FoundObject]) -> RgbImage {
-    let mut background = match (&input.rgb, &input.depth) {
-        (Some(rgb), _) => rgb.clone(),
-        (None, Some(depth)) => overlay::depth_picture(depth),
-        (None, None) => RgbImage::filled(input.camera.width, input.camera.height, [0; 3]),
-    };
-    let mut drawn = vec![];
-    for (i, f) in found.iter().enumerate() {
-        for estimate in &f.estimates {
-            match (f.object.mesh(), &estimate.mask) {
-                (Some(mesh), _) => drawn.push(Drawn {
-                    mesh,
-                    camera_from_object: estimate.camera_from_object,
-                    color: overlay::color(i),
-                }),
-                (None, Some(mask)) => overlay::tint(&mut background, mask, overlay::color(i)),
-                (None, None) => {}
-            }
-        }
-    }
-    overlay::draw(&background, &input.camera, &drawn)
-}
-
-fn file_name(name: &str) -> String {
-    name.chars().map(|c| if c.is_ascii_alphanumeric() || c == '-' || c == '_' { c } else { '_' }).collect()
-}
-
 /// Millimetres per unit of the depth image.
 fn depth_scale(a: &CommonArguments, file: &CameraFile, camera_path: &Path) -> Result<f64> {
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
@@ -259,17 +188,4 @@ fn depth_scale(a: &CommonArguments, file: &CameraFile, camera_path: &Path) -> Re
         bail!("--depth-scale: found {scale}, expected above 0");
     }
     Ok(scale)
-}
-
-/// Says what makes a search of a depth image hopeless or slow.
-fn warn_about(depth: &PreparedDepth, estimator: &dyn PoseEstimator) {
-    let pixels = depth.depth().as_slice();
-    let measured = pixels.iter().filter(|&&z| z > 0.0).count();
-    if 10 * measured < pixels.len() {
-        let percent = (100.0 * measured as f64 / pixels.len() as f64).round();
-        eprintln!("note: only {percent} % of the depth image is measured");
-    }
-    if estimator.depth_options().remove_plane && depth.plane().is_none() {
-        eprintln!("note: no table plane was found; all of the image is searched");
-    }
 }

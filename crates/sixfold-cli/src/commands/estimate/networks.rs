@@ -14,6 +14,7 @@ use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_pix2pose::estimator::Pix2PoseEstimator;
 use sixfold_runner::RegionSource;
+use sixfold_shell::ranges::count;
 
 use super::arguments::CommonArguments;
 use super::methods::{Method, MethodArguments};
@@ -41,7 +42,7 @@ struct Pix2PoseArguments {
     no_refine: bool,
     /// Most passes over an object: each but the first is into the box of the pose before, which helps where boxes are poor and
     /// takes as long again (default: 1)
-    #[arg(long, alias = "looks", value_name = "N")]
+    #[arg(long, alias = "looks", value_name = "N", value_parser = count::<100>)]
     passes: Option<NonZeroUsize>,
     /// Align poses with the depth image (ICP)
     #[arg(long)]

@@ -1,7 +1,6 @@
 //! `sixfold grasp`: grasps of a parallel-jaw gripper.
 
 pub(crate) mod arguments;
-mod input;
 #[cfg(all(feature = "physics", feature = "experience"))]
 mod learn;
 mod propose;

@@ -6,20 +6,23 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
-use sixfold_geometry::Pose;
-use sixfold_grasp::{
-    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
-    antipodal_grasps, cluster_grasps, draw_grasps,
-};
-use sixfold_io::write_rgb;
-
-use super::input::{self, Input, InputArguments};
+#[cfg(feature = "experience")]
+use sixfold_dgcm::transfer::grasps_from_experience;
+use sixfold_grasp::AntipodalOptions;
+#[cfg(feature = "experience")]
+use sixfold_grasp::{GraspView, Gripper};
 use sixfold_shell::Outcome;
+use sixfold_shell::folder::OutputFolder;
 #[cfg(feature = "experience")]
 use sixfold_shell::grasp::experience::{self, NetworkArguments};
 use sixfold_shell::grasp::gripper::gripper;
-use sixfold_shell::output::{JsonArguments, pose_rows, report, write_atomically};
-use sixfold_shell::overlay;
+use sixfold_shell::grasp::input::{self, Input, InputArguments};
+#[cfg(feature = "experience")]
+use sixfold_shell::grasp::proposals::of_both;
+use sixfold_shell::grasp::proposals::{Proposed, Table, by_geometry, picture, print_table};
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::pictures::Pictures;
+use sixfold_shell::ranges::count;
 
 #[derive(Debug, Args)]
 pub(crate) struct ProposeArguments {
@@ -29,7 +32,7 @@ pub(crate) struct ProposeArguments {
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
     /// Most grasps
-    #[arg(long, value_name = "N", default_value = "5")]
+    #[arg(long, value_name = "N", default_value = "5", value_parser = count::<10_000>)]
     pub number: NonZeroUsize,
     /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
     /// postgres://user@host/database
@@ -56,12 +59,10 @@ pub(crate) struct ProposeArguments {
     pub json: JsonArguments,
 }
 
-/// The best grasp's colour; the others are blue.
-const BEST: [u8; 3] = [60, 220, 80];
-const OTHER: [u8; 3] = [86, 150, 233];
-
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
+    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
+    let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.seed)?;
     let proposed: Vec<Proposed> = match &view {
         None => vec![],
@@ -80,44 +81,25 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         }
     };
     let seconds = began.elapsed().as_secs_f64();
-    let picture = match &a.out {
-        None => None,
-        Some(folder) => {
-            let background = rgb.unwrap_or_else(|| overlay::depth_picture(&depth));
-            let drawn: Vec<DrawnGrasp> = proposed
-                .iter()
-                .enumerate()
-                .rev()
-                .map(|(i, p)| DrawnGrasp {
-                    camera_from_gripper: p.pose,
-                    opening: p.opening,
-                    color: if i == 0 { BEST } else { OTHER },
-                })
-                .collect();
-            let path = folder.join("overlay.png");
-            write_rgb(&path, &draw_grasps(&background, Some(&depth), &camera, &gripper, &drawn)?)?;
-            Some(path)
-        }
-    };
     let whole = Whole {
         method: method(a),
         gripper: gripper.name.clone(),
         object_pixels: view.as_ref().map_or(0, |v| v.mask.as_slice().iter().filter(|m| **m).count()),
-        table: view
-            .as_ref()
-            .and_then(|v| v.table)
-            .map(|t| Table { normal: t.normal.into(), offset: t.offset }),
+        table: view.as_ref().and_then(|v| v.table).map(Table::from),
         cut_by_edge: view.as_ref().is_some_and(|v| v.cut_by_edge),
         grasps: proposed,
-        overlay: picture,
+        overlay: files.as_ref().map(|files| files[0].clone()),
         seconds,
     };
-    if let Some(folder) = &a.out {
-        let text = serde_json::to_string_pretty(&whole)?;
-        write_atomically(&folder.join("grasps.json"), text.as_bytes())?;
+    if let Some(files) = &files {
+        write_atomically(&files[1], serde_json::to_string_pretty(&whole)?.as_bytes())?;
     }
-    report(&a.json, &whole, || print_table(&whole, a.out.as_deref()))?;
-    Ok(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    report(&a.json, &whole, || report_grasps(&whole, a.out.as_deref()))?;
+    let mut pictures = Pictures::of(folder);
+    if whole.overlay.is_some() {
+        pictures.write("overlay.png", &picture(rgb, &depth, &camera, &gripper, &whole.grasps)?);
+    }
+    Ok(pictures.outcome(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
 }
 
 #[derive(Serialize)]
@@ -130,64 +112,6 @@ struct Whole {
     grasps: Vec<Proposed>,
     overlay: Option<PathBuf>,
     seconds: f64,
-}
-
-/// `normal . p = offset` in the camera's frame, metres.
-#[derive(Serialize)]
-struct Table {
-    normal: [f64; 3],
-    offset: f64,
-}
-
-#[derive(Serialize)]
-struct Proposed {
-    camera_from_gripper: [[f64; 4]; 4],
-    opening: f64,
-    width: f64,
-    quality: f64,
-    parts: AntipodalQuality,
-    cluster_score: f64,
-    cluster_members: usize,
-    /// The experience it was transferred from, or that agrees with it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    experience: Option<FromExperience>,
-    #[serde(skip)]
-    pose: Pose,
-}
-
-#[derive(Serialize)]
-struct FromExperience {
-    kind: &'static str,
-    /// Number of the experience in its store.
-    id: Option<i64>,
-    /// Distance of the features.
-    distance: Option<f64>,
-    /// Whether a difference in size was taken for a scale or for a turn.
-    hypothesis: Option<&'static str>,
-    /// The fraction of experience that agrees with the grasp.
-    share: f64,
-}
-
-impl Proposed {
-    fn new(grasp: &Grasp, score: f64, members: usize) -> Proposed {
-        Proposed {
-            camera_from_gripper: pose_rows(&grasp.camera_from_gripper),
-            opening: grasp.opening,
-            width: grasp.width,
-            quality: grasp.quality.total(),
-            parts: grasp.quality,
-            cluster_score: score,
-            cluster_members: members,
-            experience: None,
-            pose: grasp.camera_from_gripper,
-        }
-    }
-}
-
-fn by_geometry(view: &GraspView, gripper: &Gripper, planner: &AntipodalOptions) -> Result<Vec<Proposed>> {
-    let grasps = antipodal_grasps(view, gripper, planner)?;
-    let clusters = cluster_grasps(&grasps, &ClusterOptions::default());
-    Ok(clusters.iter().map(|c| Proposed::new(&c.best, c.score, c.members)).collect())
 }
 
 #[cfg(feature = "experience")]
@@ -212,67 +136,27 @@ fn with_experience(
     gripper: &Gripper,
     planner: &AntipodalOptions,
 ) -> Result<Vec<Proposed>> {
-    use sixfold_dgcm::transfer::{Kind, ProposeOptions, propose, rank_by_outcome, rank_on_part};
-    use sixfold_grasp::GraspFitter;
-    let Some(file) = &a.experiences else { return Ok(vec![]) };
-    let model = experience::model(&a.network)?;
-    let mut memory = experience::memory(file, &model)?;
-    let options = ProposeOptions { part: a.part.clone(), ..ProposeOptions::default() };
-    let fitter = GraspFitter::new(view, gripper, planner)?;
-    let found = propose(&fitter, &model, &mut memory, &options)?;
-    if found.nearest.is_empty() {
-        let wanted = a.part.as_ref().map_or(String::new(), |part| format!(" on a part named {part}"));
-        eprintln!("note: {} holds no experience{wanted} that this network can use", file.display());
+    let Some(place) = &a.experiences else { return Ok(vec![]) };
+    let network = experience::model(&a.network)?;
+    let mut memory = experience::memory(place, &network)?;
+    let part = a.part.as_deref();
+    let grasps = grasps_from_experience(view, gripper, planner, &network, &mut memory, part)?;
+    experience::note_left_out(&memory.take_left_out(), &place.to_string());
+    if grasps.found.nearest.is_empty() {
+        let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));
+        eprintln!("note: {place} holds no experience{wanted} that this network can use");
     }
-    let geometry = antipodal_grasps(view, gripper, planner)?;
-    let outcomes = memory.outcomes(&gripper.name);
-    let clusters = ClusterOptions::default();
-    let ranked = match &a.part {
-        None => rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes),
-        Some(_) => rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes),
-    };
-    Ok(ranked
-        .iter()
-        .map(|r| {
-            let proposal = r.proposal.map(|i| &found.proposals[i]);
-            let experience = FromExperience {
-                kind: match r.kind {
-                    Kind::Geometry => "geometry",
-                    Kind::Experience => "experience",
-                },
-                id: proposal.map(|p| p.from.experience),
-                distance: proposal.map(|p| p.from.distance),
-                hypothesis: proposal.map(|p| p.hypothesis.name()),
-                share: r.experience,
-            };
-            Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) }
-        })
-        .collect())
+    Ok(of_both(&grasps))
 }
 
-fn print_table(whole: &Whole, folder: Option<&std::path::Path>) {
+fn report_grasps(whole: &Whole, folder: Option<&std::path::Path>) {
     if whole.grasps.is_empty() {
         println!(
             "no grasp found for gripper {} ({} pixels of an object)",
             whole.gripper, whole.object_pixels
         );
     } else {
-        println!(
-            "{:>2} {:>8} {:>8} {:>10} {:>10} {:>26}",
-            "", "quality", "members", "width (m)", "open (m)", "tips' middle (m)"
-        );
-    }
-    for (i, g) in whole.grasps.iter().enumerate() {
-        let t: Vec<String> = g.camera_from_gripper[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
-        println!(
-            "{:>2} {:>8.3} {:>8} {:>10.4} {:>10.4} {:>26}",
-            i + 1,
-            g.quality,
-            g.cluster_members,
-            g.width,
-            g.opening,
-            t.join(" ")
-        );
+        print_table(&whole.grasps);
     }
     if let Some(folder) = folder {
         println!("grasps.json and overlay.png are in {}", folder.display());

@@ -4,19 +4,16 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
-use serde::{Deserialize, Serialize};
-use sixfold_experience::{Crop, Description, Experience, ExperienceStore, StorePlace, Stored};
-use sixfold_geometry::Pose;
-use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_grasp::{AntipodalQuality, Grasp};
+use serde::Serialize;
+use sixfold_experience::{Attempt, Crop, Description, Experience, ExperienceStore, StorePlace, Stored};
+use sixfold_grasp::read_grasp;
 use sixfold_io::write_rgb;
-
-use super::input::{self, InputArguments};
 use sixfold_shell::Outcome;
-use sixfold_shell::grasp::experience::{NetworkArguments, model, now};
+use sixfold_shell::grasp::experience::{NetworkArguments, model, note_left_out, now};
 use sixfold_shell::grasp::gripper::gripper;
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
-use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::grasp::input::{self, InputArguments};
+use sixfold_shell::grasp::store::{self, Moved};
+use sixfold_shell::output::{JsonArguments, report};
 
 #[derive(Debug, Args)]
 pub(crate) struct StoreArguments {
@@ -34,12 +31,15 @@ pub(crate) enum StoreCommand {
         --object mug --part handle"
     )]
     Add(Box<AddArguments>),
-    /// List all experiences
+    /// List all experiences, or all attempts
     #[command(after_help = "Example:\n  sixfold grasp store list experience.db")]
     List {
         /// The store
         #[arg(value_name = "FILE")]
         file: StorePlace,
+        /// List the grasps that were tried, whatever came of them
+        #[arg(long)]
+        attempts: bool,
     },
     /// Show one experience: what is known, and an image
     #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
@@ -54,15 +54,20 @@ pub(crate) enum StoreCommand {
         #[arg(long, value_name = "PNG")]
         picture: Option<PathBuf>,
     },
-    /// Forget experiences
-    #[command(after_help = "Example:\n  sixfold grasp store forget experience.db 3 4")]
+    /// Forget experiences and attempts
+    #[command(
+        after_help = "Examples:\n  sixfold grasp store forget experience.db 3 4\n  sixfold grasp store forget experience.db --attempt 17"
+    )]
     Forget {
         /// The store
         #[arg(value_name = "FILE")]
         file: StorePlace,
         /// Numbers of the experiences
-        #[arg(value_name = "ID", required = true)]
+        #[arg(value_name = "ID", required_unless_present = "attempt")]
         ids: Vec<i64>,
+        /// Number of an attempt (`list --attempts` shows them); may be given several times
+        #[arg(long, value_name = "ID")]
+        attempt: Vec<i64>,
     },
     /// Take over the experiences of other stores
     #[command(after_help = "Example:\n  sixfold grasp store merge all.db robot-a.db robot-b.db")]
@@ -132,52 +137,14 @@ pub(crate) struct AddArguments {
 pub(super) fn run(a: &StoreArguments) -> Result<Outcome> {
     match &a.command {
         StoreCommand::Add(add) => self::add(add, &a.json),
-        StoreCommand::List { file } => list(file, &a.json),
+        StoreCommand::List { file, attempts: true } => list_attempts(file, &a.json),
+        StoreCommand::List { file, attempts: false } => list(file, &a.json),
         StoreCommand::Show { file, id, picture } => show(file, *id, picture.as_deref(), &a.json),
-        StoreCommand::Forget { file, ids } => forget(file, ids, &a.json),
+        StoreCommand::Forget { file, ids, attempt } => forget(file, ids, attempt, &a.json),
         StoreCommand::Merge { file, others } => merge(file, others, &a.json),
         StoreCommand::Export { file, out } => export(file, out, &a.json),
         StoreCommand::Refresh { file, out, network } => refresh(file, out, network, &a.json),
     }
-}
-
-#[derive(Deserialize)]
-struct GraspFile {
-    camera_from_gripper: [[f64; 4]; 4],
-    opening: f64,
-    width: f64,
-}
-
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum GraspsFile {
-    List { grasps: Vec<GraspFile> },
-    One(GraspFile),
-}
-
-fn read_grasp(path: &Path, number: usize) -> Result<Grasp> {
-    let file = path.display();
-    let text = std::fs::read_to_string(path).with_context(|| file.to_string())?;
-    let read: GraspsFile = serde_json::from_str(&text).with_context(|| {
-        format!("{file}: expected camera_from_gripper (4x4, metres), opening and width (metres), or a list of them as `grasps`")
-    })?;
-    let grasps = match read {
-        GraspsFile::List { grasps } => grasps,
-        GraspsFile::One(grasp) => vec![grasp],
-    };
-    let count = grasps.len();
-    let Some(grasp) = number.checked_sub(1).and_then(|i| grasps.into_iter().nth(i)) else {
-        bail!("--number: found {number}, expected 1 to {count}: {file} holds {count} grasps");
-    };
-    for (field, value) in [("opening", grasp.opening), ("width", grasp.width)] {
-        if !(value > 0.0 && value < 1.0) {
-            bail!("{file}: field {field}: found {value}, expected above 0 and below 1 m");
-        }
-    }
-    let pose = Pose::from_matrix(&Matrix4::from_fn(|i, j| grasp.camera_from_gripper[i][j]))
-        .with_context(|| format!("{file}: field camera_from_gripper"))?;
-    let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.0, observed: 0.0 };
-    Ok(Grasp { camera_from_gripper: pose, opening: grasp.opening, width: grasp.width, quality })
 }
 
 #[derive(Serialize)]
@@ -259,86 +226,69 @@ fn show(file: &StorePlace, id: i64, picture: Option<&Path>, json: &JsonArguments
     Ok(Outcome::Found)
 }
 
-#[derive(Serialize)]
-struct Forgotten {
-    forgotten: Vec<i64>,
-    unknown: Vec<i64>,
-}
-
-fn forget(file: &StorePlace, ids: &[i64], json: &JsonArguments) -> Result<Outcome> {
-    let mut store = file.open()?;
-    let mut done = Forgotten { forgotten: vec![], unknown: vec![] };
-    for &id in ids {
-        if store.forget(id)? { done.forgotten.push(id) } else { done.unknown.push(id) }
+fn list_attempts(file: &StorePlace, json: &JsonArguments) -> Result<Outcome> {
+    #[derive(Serialize)]
+    struct Line {
+        id: i64,
+        #[serde(flatten)]
+        attempt: Attempt,
     }
-    report(json, &done, || {
-        println!("{} experiences forgotten", done.forgotten.len());
-        for id in &done.unknown {
-            println!("there was no experience {id}");
+    let (mut all, mut broken) = (vec![], vec![]);
+    for (id, attempt) in file.open()?.attempt_rows(0)? {
+        match attempt {
+            Ok(attempt) => all.push(Line { id, attempt }),
+            Err(error) => broken.push(error),
         }
+    }
+    note_left_out(&broken, &file.to_string());
+    report(json, &all, || {
+        println!("{:>6} {:>12} {:>10} {:>6} from", "id", "object", "gripper", "held");
+        for Line { id, attempt: a } in &all {
+            let held = if a.held { "yes" } else { "no" };
+            println!("{id:>6} {:>12} {:>10} {held:>6} {}", a.object, a.gripper, a.provenance);
+        }
+        println!("{} attempts", all.len());
     })?;
-    Ok(if done.forgotten.is_empty() { Outcome::NothingFound } else { Outcome::Found })
+    Ok(if all.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
 
-#[derive(Serialize)]
-struct Merged {
-    added: usize,
-    experiences: usize,
+fn forget(file: &StorePlace, ids: &[i64], attempts: &[i64], json: &JsonArguments) -> Result<Outcome> {
+    let done = store::forget(file, ids, attempts)?;
+    report(json, &done, || {
+        if !ids.is_empty() {
+            println!("{} experiences forgotten", done.forgotten.len());
+        }
+        if !attempts.is_empty() {
+            println!("{} attempts forgotten", done.attempts.len());
+        }
+        done.unknown.iter().for_each(|id| println!("there was no experience {id}"));
+        done.unknown_attempts.iter().for_each(|id| println!("there was no attempt {id}"));
+    })?;
+    let nothing = done.forgotten.is_empty() && done.attempts.is_empty();
+    Ok(if nothing { Outcome::NothingFound } else { Outcome::Found })
+}
+
+/// `found`: whether the command has done what it is for.
+fn outcome_of(moved: &Moved, found: bool) -> Outcome {
+    match (moved.unreadable, found) {
+        (1.., _) => Outcome::Incomplete,
+        (_, true) => Outcome::Found,
+        (_, false) => Outcome::NothingFound,
+    }
 }
 
 fn merge(file: &StorePlace, others: &[StorePlace], json: &JsonArguments) -> Result<Outcome> {
-    let sources: Vec<_> = others.iter().map(StorePlace::open).collect::<Result<_, _>>()?;
-    let mut store = file.create()?;
-    let mut added = 0;
-    for (source, name) in sources.iter().zip(others) {
-        check_interrupt("what was taken over is kept; the same command resumes")?;
-        added += store.merge(&**source).with_context(|| name.display().to_string())?;
-    }
-    let merged = Merged { added, experiences: store.list()?.len() };
+    let merged = store::merge(file, others)?;
     report(json, &merged, || {
         println!("{} experiences taken over, {} in {}", merged.added, merged.experiences, file.display());
     })?;
-    Ok(if added > 0 { Outcome::Found } else { Outcome::NothingFound })
-}
-
-#[derive(Serialize)]
-struct Exported {
-    experiences: usize,
-    unreadable: usize,
-    folder: PathBuf,
+    Ok(outcome_of(&merged, merged.added > 0))
 }
 
 fn export(file: &StorePlace, out: &Path, json: &JsonArguments) -> Result<Outcome> {
-    let store = file.open()?;
-    let all = store.list()?;
-    let mut progress = Progress::new("experiences", all.len());
-    let mut done = Exported { experiences: 0, unreadable: 0, folder: out.to_path_buf() };
-    for summary in &all {
-        check_interrupt("what was written is whole")?;
-        match store.get(summary.id) {
-            Ok(Some(stored)) => {
-                let name = format!("{:06}", stored.id);
-                write_rgb(&out.join(format!("{name}.png")), &stored.experience.picture()?)?;
-                let shown = Description::new(&stored, true);
-                let text = serde_json::to_string_pretty(&shown)?;
-                write_atomically(&out.join(format!("{name}.json")), text.as_bytes())?;
-                done.experiences += 1;
-            }
-            Ok(None) => {}
-            Err(error) => {
-                eprintln!("left out: {error}");
-                done.unreadable += 1;
-            }
-        }
-        progress.step(summary.object.clone());
-    }
-    progress.finish();
+    let done = store::export(file, out)?;
     report(json, &done, || println!("{} experiences are in {}", done.experiences, out.display()))?;
-    Ok(match (done.experiences, done.unreadable) {
-        (_, 1..) => Outcome::Incomplete,
-        (0, _) => Outcome::NothingFound,
-        _ => Outcome::Found,
-    })
+    Ok(done.outcome())
 }
 
 fn refresh(
@@ -347,25 +297,7 @@ fn refresh(
     network: &NetworkArguments,
     json: &JsonArguments,
 ) -> Result<Outcome> {
-    if file == out {
-        bail!("--out: expected another file than the store itself");
-    }
-    let network = model(network)?;
-    let source = file.open()?;
-    let mut target = out.create()?;
-    let all = source.list()?;
-    let mut progress = Progress::new("experiences", all.len());
-    let mut added = 0;
-    for summary in &all {
-        check_interrupt("what was encoded is kept; the same command resumes")?;
-        let Some(stored) = source.get(summary.id)? else { continue };
-        let encoded = stored.experience.encoded(&network);
-        let encoded = encoded.with_context(|| format!("experience {}", stored.id))?;
-        added += usize::from(target.add(&encoded)?.1);
-        progress.step(summary.object.clone());
-    }
-    progress.finish();
-    let merged = Merged { added, experiences: target.list()?.len() };
-    report(json, &merged, || println!("{} experiences are in {}", merged.experiences, out.display()))?;
-    Ok(if merged.experiences > 0 { Outcome::Found } else { Outcome::NothingFound })
+    let moved = store::refresh(file, out, &model(network)?)?;
+    report(json, &moved, || println!("{} experiences are in {}", moved.experiences, out.display()))?;
+    Ok(outcome_of(&moved, moved.experiences > 0))
 }

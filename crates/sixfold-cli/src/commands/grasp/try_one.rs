@@ -1,13 +1,12 @@
 //! `sixfold grasp try`: one grasp in the physics engine.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
-use serde::{Deserialize, Serialize};
-use sixfold_geometry::nalgebra::Matrix4;
+use serde::Serialize;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_grasp::gripper_pose;
+use sixfold_grasp::{gripper_pose, read_tried_grasp};
 use sixfold_mesh::Unit;
 use sixfold_simulation::{
     ConvexParts, Outcome as Trial, PartsOptions, TrialReport, settle_at_centre, try_grasp,
@@ -74,7 +73,10 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     let parts =
         ConvexParts::of_mesh(&object.mesh, &PartsOptions::default()).with_context(|| a.object.clone())?;
     let (world_from_object, world_from_gripper, opening) = match &a.grasp {
-        Some(path) => read_grasp(path)?,
+        Some(path) => {
+            let tried = read_tried_grasp(path)?;
+            (tried.world_from_object, tried.world_from_gripper, tried.opening)
+        }
         None => {
             let rest = settle_at_centre(&object.mesh, &parts, &Pose::identity())
                 .ok_or_else(|| anyhow!("{}: the object does not come to rest on the table", a.object))?;
@@ -104,7 +106,7 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
         report: result,
     };
     report(&a.json, &whole, || {
-        println!("{}: {}", whole.object, words(result.outcome));
+        println!("{}: {}", whole.object, result.outcome);
         println!(
             "gap {:.1} mm, raised {:.1} mm, slid {:.1} mm and turned {:.1} degrees in the hand, pushed {:.1} mm before the lift",
             1e3 * result.gap,
@@ -125,41 +127,6 @@ struct Whole {
     world_from_gripper: [[f64; 4]; 4],
     opening: f64,
     report: TrialReport,
-}
-
-/// An outcome as people say it.
-pub(super) fn words(outcome: Trial) -> &'static str {
-    match outcome {
-        Trial::Held => "held",
-        Trial::Blocked => "the gripper cannot get there",
-        Trial::Missed => "the fingers closed on nothing",
-        Trial::LostInLift => "lost in the lift",
-        Trial::LostInShake => "lost in the shake",
-    }
-}
-
-#[derive(Deserialize)]
-struct GraspFile {
-    world_from_object: [[f64; 4]; 4],
-    world_from_gripper: [[f64; 4]; 4],
-    opening: f64,
-}
-
-fn read_grasp(path: &Path) -> Result<(Pose, Pose, f64)> {
-    let file = path.display();
-    let text = std::fs::read_to_string(path).with_context(|| file.to_string())?;
-    let grasp: GraspFile = serde_json::from_str(&text).with_context(|| {
-        format!("{file}: expected world_from_object, world_from_gripper (4x4, metres) and opening (metres)")
-    })?;
-    let pose = |field: &str, rows: [[f64; 4]; 4]| {
-        Pose::from_matrix(&Matrix4::from_fn(|i, j| rows[i][j]))
-            .with_context(|| format!("{file}: field {field}"))
-    };
-    Ok((
-        pose("world_from_object", grasp.world_from_object)?,
-        pose("world_from_gripper", grasp.world_from_gripper)?,
-        grasp.opening,
-    ))
 }
 
 fn three(option: &str, numbers: &[f64]) -> Result<Vec3> {

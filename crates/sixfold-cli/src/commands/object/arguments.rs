@@ -110,7 +110,7 @@ pub(crate) struct DepthViewArguments {
     /// Where the object is in each of them (PNG, above zero inside), in the same order
     #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth")]
     pub masks: Vec<PathBuf>,
-    /// Camera of the depth images: a JSON file with fx fy cx cy or cam_K, and depth_scale
+    /// Camera of the depth images: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale
     #[arg(long, value_name = "FILE", requires = "depth")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth images, in place of the camera file's depth_scale

@@ -10,7 +10,7 @@ use serde::Serialize;
 use sixfold_estimator::{NewObject, ObjectRecord, ObjectStore, PoseEstimator};
 use sixfold_geometry::Vec3;
 use sixfold_io::write_rgb;
-use sixfold_mesh::{ContinuousSymmetry, ModelInfo, ModelsInfo, read_mesh};
+use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, ModelsInfo, read_mesh};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
 use sixfold_shell::Outcome;
@@ -64,7 +64,7 @@ fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Res
 fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArguments) -> Result<Outcome> {
     let unit = a.unit.as_ref().ok_or_else(|| anyhow!("--unit UNIT is missing"))?;
     let loaded = read_mesh(mesh, *unit)?;
-    let record = ObjectRecord::of_mesh(mesh, *unit, &loaded, &info(a, ModelInfo::of_mesh(&loaded))?);
+    let record = ObjectRecord::of_mesh(mesh, *unit, &loaded, &info(a, &loaded)?);
     let new = NewObject { mesh: Some(&loaded), record: &record, replace: a.replace };
     let mut views = None;
     store.add(&a.name, new, |object| {
@@ -105,10 +105,12 @@ fn keep(
 }
 
 /// Diameter and box of the mesh with the symmetries that the options name.
-fn info(a: &AddArguments, mut info: ModelInfo) -> Result<ModelInfo> {
+fn info(a: &AddArguments, mesh: &Mesh) -> Result<ModelInfo> {
+    let mut info = ModelInfo::of_mesh(mesh);
     if let (Some(file), Some(id)) = (&a.models_info, &a.model_id) {
         let all = ModelsInfo::read(file)?;
         let found = all.0.get(id).ok_or_else(|| anyhow!("{}: no object {id}", file.display()))?;
+        all.check_symmetries(*id, mesh, &file.display().to_string())?;
         info.symmetries_discrete = found.symmetries_discrete.clone();
         info.symmetries_continuous = found.symmetries_continuous.clone();
     }
@@ -126,11 +128,8 @@ fn info(a: &AddArguments, mut info: ModelInfo) -> Result<ModelInfo> {
 }
 
 fn list(store: &ObjectStore, folder: &Path, json: &JsonArguments) -> Result<Outcome> {
-    let listed = store
-        .names()?
-        .into_iter()
-        .map(|name| Ok(Listed { record: store.record(&name)?, name }))
-        .collect::<Result<Vec<_>>>()?;
+    let listed: Vec<Listed> =
+        store.records()?.into_iter().map(|(name, record)| Listed { name, record }).collect();
     report(json, &listed, || {
         if listed.is_empty() {
             println!("no objects in {}", folder.display());

@@ -63,7 +63,8 @@ pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<ObjectTemplates> {
 }
 
 fn read_poses(path: &Path) -> Result<Vec<Pose>> {
-    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let text = sixfold_io::read_regular_text(path, sixfold_io::limits::SMALL_TEXT)
+        .with_context(|| path.display().to_string())?;
     let rows: Vec<[[f64; 4]; 4]> = serde_json::from_str(&text)
         .with_context(|| format!("{}: expected a list of 4x4 matrices, row by row", path.display()))?;
     rows.iter()

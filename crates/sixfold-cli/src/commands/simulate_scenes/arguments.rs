@@ -12,7 +12,14 @@ use sixfold_simulation::{PileOptions, TabletopOptions};
 use sixfold_synth::shapes::Family;
 
 use crate::commands::simulate::Sensor;
+use sixfold_shell::folder::Contents;
+use sixfold_shell::objects::find;
 use sixfold_shell::output::JsonArguments;
+use sixfold_shell::ranges::{in_range, without_duplicates};
+use sixfold_shell::scenes::NamedModels;
+
+/// Most synthetic objects of a kind: each is kept in memory with its mesh.
+const MOST_OBJECTS: usize = 10_000;
 
 /// Shown under `sixfold simulate-scenes --help`.
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
@@ -118,13 +125,16 @@ impl SimulateScenesArguments {
                 bail!("{option}: found {found} numbers, expected two with a comma between them");
             }
         }
-        for (option, value) in
-            [("--scenes", self.scenes), ("--views", self.views), ("--members", self.members)]
-        {
-            if !(1..=1_000_000).contains(&value) {
-                bail!("{option}: found {value}, expected 1 to 1000000");
-            }
+        let counts = [
+            ("--scenes", self.scenes, 1..=1_000_000),
+            ("--views", self.views, 1..=10_000),
+            ("--members", self.members, 1..=MOST_OBJECTS),
+            ("--toys", self.toys, 0..=MOST_OBJECTS),
+        ];
+        for (option, value, range) in counts {
+            in_range(option, value, range)?;
         }
+        without_duplicates("--ids", &self.ids)?;
         let [low, high] = [self.objects_per_scene[0], self.objects_per_scene[1]];
         if low < 1 || low > high || high > 100 {
             bail!(
@@ -160,6 +170,33 @@ impl SimulateScenesArguments {
             upright: self.upright,
             stacked: self.stacked,
         }
+    }
+
+    /// All objects.
+    pub fn models(&self) -> Result<NamedModels> {
+        let mut models = match &self.dataset {
+            Some(dataset) => NamedModels::of_dataset(dataset, &self.ids)?,
+            None => NamedModels::default(),
+        };
+        for name in &self.objects {
+            let object = find(name, self.unit, &self.store)?;
+            models.add(object.name, object.mesh, object.info);
+        }
+        models.add_synthetic(&self.chosen_families()?, self.members, self.toys, self.seed)?;
+        Ok(models)
+    }
+
+    /// What the inputs hold. Synthetic objects follow from the options.
+    pub fn contents(&self, models: &NamedModels) -> Result<Contents> {
+        let mut contents = Contents::default();
+        if let Some(camera) = &self.camera {
+            contents.add_path("camera", camera)?;
+        }
+        let synthetic = self.chosen_families()?.len() * self.members + self.toys;
+        for model in &models.0[..models.0.len() - synthetic] {
+            contents.add_object(&format!("object {}", model.id), &model.mesh, &model.info);
+        }
+        Ok(contents)
     }
 
     /// What scenes are like.

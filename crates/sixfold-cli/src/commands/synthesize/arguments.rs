@@ -2,9 +2,13 @@
 
 use std::path::PathBuf;
 
+use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
-
+use serde_json::{Value, json};
+use sixfold_nol::refine::{PoseRefinementOptions, SceneKind};
+use sixfold_nol::view_grid::ViewGrid;
 use sixfold_shell::output::JsonArguments;
+use sixfold_shell::ranges::{in_range, without_duplicates};
 
 /// How colours of several photographs become one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -116,3 +120,88 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     {\"mesh\": \"mug.ply\", \"unit\": \"mm\", \"photographs\": [{\"image\": \"1.png\", \"camera\": \"camera.json\",\n    \
     \"cam_R_m2c\": [1,0,0, 0,1,0, 0,0,1], \"cam_t_m2c\": [0, 0, 600], \"mask\": \"1-mask.png\"}]}\n\n\
     Stopped, the same command resumes.";
+
+impl SynthesizeArguments {
+    /// Tests every option that is a number.
+    pub fn check(&self) -> Result<()> {
+        for (option, values) in
+            [("--elevation", &self.elevation), ("--rough", &self.rough), ("--disturb", &self.disturb)]
+        {
+            if values.len() != 2 && !(values.is_empty() && option == "--disturb") {
+                bail!("{option}: found {}, expected two numbers with a comma between them", values.len());
+            }
+        }
+        if !(1.0..=90.0).contains(&self.step) {
+            bail!("--step: found {}, expected degrees from 1 to 90", self.step);
+        }
+        let [low, high] = [self.elevation[0], self.elevation[1]];
+        if !(-90.0 <= low && low <= high && high <= 90.0) {
+            bail!(
+                "--elevation: found {low},{high}, expected two angles from -90 to 90 degrees, the lower one first"
+            );
+        }
+        if !(1..=72).contains(&self.turns) {
+            bail!("--turns: found {}, expected 1 to 72", self.turns);
+        }
+        in_range("views of an object by --step, --elevation and --turns", self.grid().count(), 1..=200_000)?;
+        if !(32..=1024).contains(&self.size) {
+            bail!("--size: found {}, expected 32 to 1024 pixels", self.size);
+        }
+        in_range("--sources", self.sources, 1..=1000)?;
+        in_range("--per-view", self.per_view, 1..=1000)?;
+        in_range("--least-visible", self.least_visible, 0.0..=1.0)?;
+        without_duplicates("--ids", &self.ids)?;
+        if self.weights.is_some() && self.weighting != WeightingKind::Network {
+            bail!("--weights belongs to --weighting network");
+        }
+        if !self.rough.iter().all(|v| *v > 0.0 && *v <= 1000.0) {
+            bail!("--rough: found {:?}, expected millimetres and degrees above 0, at most 1000", self.rough);
+        }
+        self.disturb_reach()?;
+        Ok(())
+    }
+
+    /// By how much poses are disturbed, metres and radians.
+    pub fn disturb_reach(&self) -> Result<Option<[f64; 2]>> {
+        match self.disturb.as_slice() {
+            [] => Ok(None),
+            [mm, degrees] if [mm, degrees].iter().all(|v| (0.0..=1000.0).contains(*v)) => {
+                Ok(Some([mm * 1e-3, degrees.to_radians()]))
+            }
+            other => bail!("--disturb: found {other:?}, expected millimetres and degrees, 0 to 1000"),
+        }
+    }
+
+    /// Where the views are taken from.
+    pub fn grid(&self) -> ViewGrid {
+        let (step, elevation) = (self.step, [self.elevation[0], self.elevation[1]]);
+        ViewGrid { step, elevation, turns: self.turns, size: self.size, seed: self.seed }
+    }
+
+    /// How poses are made better; none where they are taken as they are.
+    pub fn refinement(&self) -> Option<PoseRefinementOptions> {
+        let scene = match self.scene {
+            SceneArgument::Judge => SceneKind::Judge,
+            SceneArgument::Still => SceneKind::Still,
+            SceneArgument::Moving => SceneKind::Moving,
+        };
+        let rough = [self.rough[0] * 1e-3, self.rough[1].to_radians()];
+        let options = PoseRefinementOptions { scene, rough, seed: self.seed, ..Default::default() };
+        (!self.no_refine).then_some(options)
+    }
+
+    /// Options that decide about the result; a folder made with others is not gone on with.
+    pub fn deciding(&self) -> Value {
+        json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "dataset": self.dataset, "split": self.split, "frames": self.frames, "ids": self.ids,
+            "photographs": self.photographs, "new_split": self.new_split, "sources": self.sources,
+            "per_view": self.per_view, "least_visible": self.least_visible,
+            "weighting": format!("{:?}", self.weighting), "weights": self.weights,
+            "detector": self.detector, "no_refine": self.no_refine, "scene": format!("{:?}", self.scene),
+            "rough": self.rough, "disturb": self.disturb, "step": self.step, "elevation": self.elevation,
+            "turns": self.turns, "size": self.size, "backgrounds": self.backgrounds,
+            "with_photographs": self.with_photographs, "seed": self.seed,
+        })
+    }
+}

@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
-use anyhow::Result;
-use sixfold_data::PosedImage;
+use anyhow::{Result, anyhow};
+use sixfold_data::RoughImages;
 use sixfold_geometry::{Camera, Pose, RgbImage};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nol::SourceView;
+use sixfold_nol::pose_file::PoseFile;
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use sixfold_shell::overlay;
@@ -35,18 +36,20 @@ fn outline(image: &mut RgbImage, mesh: &Mesh, camera: &Camera, pose: &Pose, colo
 }
 
 /// One row per object, one column per photograph: above the outline at the given pose, below at the refined one.
-pub(super) fn refinement(path: &Path, rows: &[(&Mesh, Vec<(PosedImage, Pose)>)]) -> Result<()> {
-    let columns = rows.iter().map(|(_, list)| list.len()).max().unwrap_or(0);
+pub(super) fn refinement(path: &Path, images: &RoughImages, poses: &PoseFile) -> Result<()> {
+    let columns = images.objects.iter().map(|o| o.images.len()).max().unwrap_or(0);
     if columns == 0 {
         return Ok(());
     }
-    let mut sheet = RgbImage::filled(columns * SIDE, rows.len() * 2 * SIDE, [24; 3]);
-    for (row, (mesh, list)) in rows.iter().enumerate() {
-        for (column, (given, refined)) in list.iter().enumerate() {
-            let view = SourceView::new(given, mesh, SIDE)?;
-            for (below, pose, color) in [(0, given.camera_from_object(), BEFORE), (1, refined, AFTER)] {
+    let mut sheet = RgbImage::filled(columns * SIDE, images.objects.len() * 2 * SIDE, [24; 3]);
+    let mut records = poses.photographs.iter();
+    for (row, object) in images.objects.iter().enumerate() {
+        for (column, (image, record)) in object.images.iter().zip(records.by_ref()).enumerate() {
+            let (given, refined) = (&image.posed, record.pose().map_err(|reason| anyhow!(reason))?);
+            let view = SourceView::new(given, &object.mesh, SIDE)?;
+            for (below, pose, color) in [(0, given.camera_from_object(), BEFORE), (1, &refined, AFTER)] {
                 let mut picture = view.patch.to_rgb();
-                outline(&mut picture, mesh, &view.camera, pose, color);
+                outline(&mut picture, &object.mesh, &view.camera, pose, color);
                 paste(&mut sheet, &picture, column * SIDE, (2 * row + below) * SIDE);
             }
         }

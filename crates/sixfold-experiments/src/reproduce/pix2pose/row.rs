@@ -126,6 +126,15 @@ impl Setting {
         }
         pix2pose.varied(options, self.refine)
     }
+
+    /// Where the boxes come from, in words.
+    fn name_of_boxes(&self, detections: Option<&str>) -> String {
+        match (detections, self.noise) {
+            (Some(name), _) => name.to_owned(),
+            (None, None) => "ground truth".to_string(),
+            (None, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
+        }
+    }
 }
 
 impl Bench {
@@ -202,11 +211,7 @@ impl Bench {
         let csv = folder.join("rows").join(format!("{}.csv", setting.key));
         std::fs::create_dir_all(folder.join("rows")).with_context(|| folder.display().to_string())?;
         write_results(&csv, &estimates)?;
-        let name = match (detections, setting.noise) {
-            (Some(d), _) => d.name.clone(),
-            (None, None) => "ground truth".to_string(),
-            (None, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
-        };
+        let name = setting.name_of_boxes(detections.map(|d| d.name.as_str()));
         let mut row = self.scored(&setting.key, &setting.title, &name, &estimates, times, regions)?;
         row.detection = detections.map(|d| self.right_boxes(&d.regions, &estimates)).transpose()?;
         Ok(row)

@@ -10,11 +10,11 @@ use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 
 /// A depth image and what belongs to it.
 #[derive(Debug, Args)]
-pub(crate) struct InputArguments {
+pub struct InputArguments {
     /// Depth image: PNG, one channel of 16 bits
     #[arg(long, value_name = "FILE")]
     pub depth: PathBuf,
-    /// Camera: a JSON file with fx fy cx cy or cam_K, and depth_scale (millimetres per unit of the depth image)
+    /// Camera: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale (millimetres per unit of the depth image)
     #[arg(long, value_name = "FILE")]
     pub camera: PathBuf,
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
@@ -29,17 +29,24 @@ pub(crate) struct InputArguments {
 }
 
 /// What was read, without distortion.
-pub(super) struct Input {
+pub struct Input {
+    /// Metres.
     pub depth: DepthImage,
+    /// Of all images.
     pub camera: Camera,
+    /// Where there is one.
     pub rgb: Option<RgbImage>,
     /// The object; `None` when nothing stands on the table.
     pub view: Option<GraspView>,
+    /// When the files were read, and work began.
     pub began: std::time::Instant,
 }
 
 /// Reads and prepares the view of the masked object, or of the largest thing on the table.
-pub(super) fn read(a: &InputArguments, seed: u64) -> Result<Input> {
+///
+/// # Errors
+/// For files that cannot be read or do not go together.
+pub fn read(a: &InputArguments, seed: u64) -> Result<Input> {
     let file = CameraFile::read(&a.camera)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
         anyhow!(

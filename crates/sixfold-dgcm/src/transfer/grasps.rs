@@ -1,0 +1,58 @@
+//! All grasps on what is seen now, those of experience and those of geometry, in one order.
+
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps,
+};
+use thiserror::Error;
+
+use super::{
+    Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
+};
+use crate::model::DgcmModel;
+
+/// Why there are no grasps.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum GraspsError {
+    /// The planner's options.
+    #[error(transparent)]
+    Options(#[from] OptionsError),
+    /// Experience cannot be asked.
+    #[error(transparent)]
+    Propose(#[from] ProposeError),
+}
+
+/// Grasps of both kinds.
+#[derive(Debug, Clone)]
+pub struct RankedGrasps {
+    /// What experience says.
+    pub found: Proposals,
+    /// The grasps, the best first.
+    pub ranked: Vec<Ranked>,
+}
+
+/// Grasps from experience and from geometry, by the success probability that the attempts with this gripper predict. With the
+/// name of a part: only experiences on such parts, and only grasps that hold what they held.
+///
+/// # Errors
+/// [`GraspsError`].
+pub fn grasps_from_experience(
+    view: &GraspView,
+    gripper: &Gripper,
+    planner: &AntipodalOptions,
+    network: &DgcmModel,
+    memory: &mut Memory,
+    part: Option<&str>,
+) -> Result<RankedGrasps, GraspsError> {
+    let options = ProposeOptions { part: part.map(str::to_owned), ..ProposeOptions::default() };
+    let fitter = GraspFitter::new(view, gripper, planner)?;
+    let found = propose(&fitter, network, memory, &options)?;
+    let geometry = antipodal_grasps(view, gripper, planner)?;
+    let outcomes = memory.outcomes(&gripper.name);
+    let clusters = ClusterOptions::default();
+    let ranked = match part {
+        None => rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes),
+        Some(_) => rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes),
+    };
+    Ok(RankedGrasps { found, ranked })
+}

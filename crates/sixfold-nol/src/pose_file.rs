@@ -1,0 +1,247 @@
+//! The poses of roughly posed images, made better once and kept in a file: what a run that continues starts from.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sixfold_data::{RoughImage, RoughImages, TrainingSetError};
+use sixfold_geometry::Pose;
+use sixfold_geometry::nalgebra::Matrix4;
+use sixfold_mesh::Mesh;
+
+use crate::error::NolError;
+use crate::refine::{PoseRefinementOptions, PosedSource, refine_scene};
+
+/// A pose as four rows, translation in metres.
+type Rows = [[f64; 4]; 4];
+
+/// Why there are no better poses.
+#[derive(Debug, thiserror::Error)]
+pub enum PoseFileError {
+    /// The images cannot be used.
+    #[error(transparent)]
+    Nol(#[from] NolError),
+    /// A mask or pose does not fit its image.
+    #[error(transparent)]
+    Images(#[from] TrainingSetError),
+    /// The file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file holds something else.
+    #[error("{}: not the poses of these images: {reason}; remove it to have them made again", path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// One image's poses of one object, as they are written.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PoseRecord {
+    /// The object.
+    pub object: u32,
+    /// The image.
+    pub name: String,
+    /// Its number.
+    pub image: usize,
+    /// Scene and image of a dataset.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub frame: Option<(u32, u32)>,
+    /// As given (disturbed, where that was asked for): four rows, translation in metres.
+    pub given: Rows,
+    /// Before it was disturbed.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub undisturbed: Option<Rows>,
+    /// Used.
+    pub camera_from_object: Rows,
+    /// How far the object's centre moved, millimetres.
+    pub moved_mm: f64,
+    /// How far it was rotated, degrees.
+    pub turned_degrees: f64,
+    /// Mean difference in colour to the other images of the object, 0 to 1, before and after.
+    pub difference: [Option<f64>; 2],
+    /// Why the image is not used.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub dropped: Option<String>,
+}
+
+impl PoseRecord {
+    /// The pose that is used.
+    ///
+    /// # Errors
+    /// When it is no pose.
+    pub fn pose(&self) -> Result<Pose, String> {
+        let matrix = Matrix4::from_fn(|i, j| self.camera_from_object[i][j]);
+        Pose::from_matrix(&matrix).map_err(|error| format!("{}: {error}", self.name))
+    }
+}
+
+/// All poses, and whether the objects stood still.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PoseFile {
+    /// Whether they were made better.
+    pub refined: bool,
+    /// Whether the objects stood still in all images.
+    pub still: bool,
+    /// At how many places the objects stood; as many as objects if nothing moved, or nothing is known of it.
+    #[serde(default)]
+    pub places: usize,
+    /// Disagreement of the given poses with one arrangement, in units of what their roughness explains.
+    pub disagreement: Option<f64>,
+    /// By object, then in the order of the images.
+    pub photographs: Vec<PoseRecord>,
+}
+
+fn rows(pose: &Pose) -> Rows {
+    let m = pose.to_matrix();
+    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+}
+
+/// The images of all objects, in one list with the number of their object.
+fn all(images: &RoughImages) -> Vec<(usize, &RoughImage)> {
+    let numbered = images.objects.iter().enumerate();
+    numbered.flat_map(|(object, o)| o.images.iter().map(move |i| (object, i))).collect()
+}
+
+impl PoseFile {
+    /// The poses as given; `disturbed` says whether they are not those of the input.
+    fn given(images: &RoughImages, refined: bool, disturbed: bool) -> PoseFile {
+        let record = |(object, image): &(usize, &RoughImage)| PoseRecord {
+            object: images.objects[*object].id,
+            name: image.posed.name().to_owned(),
+            image: image.number,
+            frame: image.posed.frame().map(|frame| (frame.scene_id, frame.im_id)),
+            given: rows(image.posed.camera_from_object()),
+            undisturbed: disturbed.then(|| rows(&image.given)),
+            camera_from_object: rows(image.posed.camera_from_object()),
+            moved_mm: 0.0,
+            turned_degrees: 0.0,
+            difference: [None, None],
+            dropped: None,
+        };
+        PoseFile {
+            refined,
+            still: false,
+            places: images.objects.len(),
+            disagreement: None,
+            photographs: all(images).iter().map(record).collect(),
+        }
+    }
+
+    /// Makes the poses better unless `file` has them already or `options` are none, and keeps them there. `progress` gets what
+    /// is done, 0 to 1, and returns whether to go on; `None` where it did not.
+    ///
+    /// # Errors
+    /// [`PoseFileError`].
+    pub fn refined(
+        images: &RoughImages,
+        options: Option<&PoseRefinementOptions>,
+        disturbed: bool,
+        file: &Path,
+        mut progress: impl FnMut(f64) -> bool,
+    ) -> Result<Option<PoseFile>, PoseFileError> {
+        let mut poses = PoseFile::given(images, options.is_some(), disturbed);
+        if let Some(options) = options {
+            if file.exists() {
+                return PoseFile::read(file).map(Some);
+            }
+            let mut stopped = false;
+            poses.refine(images, options, |done| {
+                stopped |= !progress(done);
+                !stopped
+            })?;
+            // The last step may have been the one that was not wanted any more.
+            if stopped || !progress(1.0) {
+                return Ok(None);
+            }
+        }
+        poses.write(file)?;
+        // Numbers in text may lose their last digit, and a run that continues must not differ from one that was never stopped.
+        PoseFile::read(file).map(Some)
+    }
+
+    fn refine(
+        &mut self,
+        images: &RoughImages,
+        options: &PoseRefinementOptions,
+        progress: impl FnMut(f64) -> bool,
+    ) -> Result<(), PoseFileError> {
+        let sources = all(images);
+        let meshes: Vec<Mesh> = images.objects.iter().map(|o| o.mesh.clone()).collect();
+        // Images are numbered without gaps.
+        let mut numbers = BTreeMap::new();
+        for (_, source) in &sources {
+            let next = numbers.len();
+            numbers.entry(source.number).or_insert(next);
+        }
+        let listed: Vec<PosedSource<'_>> = sources
+            .iter()
+            .map(|(object, source)| PosedSource {
+                object: *object,
+                image: numbers[&source.number],
+                photograph: &source.posed,
+            })
+            .collect();
+        let refined = refine_scene(&listed, &meshes, options, progress)?;
+        self.still = refined.still;
+        self.places = refined.places;
+        self.disagreement = refined.disagreement;
+        for (record, report) in self.photographs.iter_mut().zip(&refined.sources) {
+            record.camera_from_object = rows(&report.camera_from_object);
+            record.moved_mm = report.moved * 1e3;
+            record.turned_degrees = report.turned.to_degrees();
+            record.difference = report.difference.map(|d| d.is_finite().then_some(d));
+            record.dropped.clone_from(&report.dropped);
+        }
+        Ok(())
+    }
+
+    fn read(file: &Path) -> Result<PoseFile, PoseFileError> {
+        let text = std::fs::read_to_string(file)
+            .map_err(|source| PoseFileError::Io { path: file.to_owned(), source })?;
+        serde_json::from_str(&text).map_err(|error| content(file, error.to_string()))
+    }
+
+    fn write(&self, file: &Path) -> Result<(), PoseFileError> {
+        let text = serde_json::to_string_pretty(self).map_err(|error| content(file, error.to_string()))?;
+        sixfold_io::write_atomically(file, text.as_bytes())
+            .map_err(|source| PoseFileError::Io { path: file.to_owned(), source })
+    }
+
+    /// Puts these poses in place of the given ones and leaves out the images that were dropped; a note for each of those.
+    ///
+    /// # Errors
+    /// When they are those of other images; `file` is where they were read.
+    pub fn apply(&self, images: &mut RoughImages, file: &Path) -> Result<Vec<String>, PoseFileError> {
+        let mut records = self.photographs.iter();
+        let (mut refined, mut notes) = (vec![], vec![]);
+        for object in &mut images.objects {
+            let mut kept = vec![];
+            for mut image in object.images.drain(..) {
+                let record = records.next().ok_or_else(|| content(file, "there are fewer".into()))?;
+                if let Some(reason) = &record.dropped {
+                    notes.push(format!("photograph {} is left out: {reason}", record.name));
+                    continue;
+                }
+                let pose = record.pose().map_err(|reason| content(file, reason))?;
+                image.posed = image.posed.with_pose(pose).map_err(TrainingSetError::from)?;
+                refined.push((image.number, object.id, pose));
+                kept.push(image);
+            }
+            object.images = kept;
+        }
+        images.render_masks_again(&refined)?;
+        Ok(notes)
+    }
+}
+
+fn content(file: &Path, reason: String) -> PoseFileError {
+    PoseFileError::Content { path: file.to_owned(), reason }
+}

@@ -1,0 +1,377 @@
+//! Folders that commands write: one writer at a time, nothing of anybody else replaced. A dataset is resumed with the options
+//! and the inputs that it was begun with; a folder of images knows which files are its own.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use serde_json::{Value, json};
+use sixfold_geometry::RgbImage;
+use sixfold_io::{Fnv1a, WriteLock, fnv1a_of_file};
+use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, ply_files};
+
+use crate::output::write_atomically;
+
+/// Holds the options that decide about a dataset, and what its inputs held.
+const OPTIONS: &str = "options.json";
+/// Lists the files of a folder that commands wrote.
+const OWN_FILES: &str = ".sixfold-files";
+
+/// What the inputs of a command hold: hashes by name. Paths alone say nothing: files change.
+#[derive(Debug, Default)]
+pub struct Contents(BTreeMap<String, Fnv1a>);
+
+impl Contents {
+    /// The hash of one input, to be filled.
+    pub fn of(&mut self, name: impl Into<String>) -> &mut Fnv1a {
+        self.0.entry(name.into()).or_default()
+    }
+
+    /// Takes in a file, or the files of a folder with their names.
+    ///
+    /// # Errors
+    /// When one cannot be read.
+    pub fn add_path(&mut self, name: &str, path: &Path) -> Result<()> {
+        let mut files = vec![path.to_path_buf()];
+        if path.is_dir() {
+            let read = std::fs::read_dir(path).with_context(|| path.display().to_string())?;
+            files = read.map(|entry| Ok(entry?.path())).collect::<Result<_>>()?;
+            files.retain(|file| file.is_file());
+            files.sort();
+        }
+        for file in files {
+            let hash = fnv1a_of_file(&file).with_context(|| file.display().to_string())?;
+            self.of(name).write(file.file_name().unwrap_or_default().as_encoded_bytes());
+            self.of(name).write(&hash.to_le_bytes());
+        }
+        Ok(())
+    }
+
+    /// Takes in an object: everything of its mesh, and what is known of it.
+    pub fn add_object(&mut self, name: &str, mesh: &Mesh, info: &ModelInfo) {
+        let hash = self.of(name);
+        let vectors = mesh.vertices().iter().chain(mesh.normals().into_iter().flatten());
+        vectors.flat_map(|v| [v.x, v.y, v.z]).for_each(|x| hash.write(&x.to_le_bytes()));
+        mesh.faces().iter().flatten().for_each(|i| hash.write(&i.to_le_bytes()));
+        hash.write(mesh.colors().unwrap_or_default().as_flattened());
+        let texcoords = mesh.texcoords().unwrap_or_default().as_flattened();
+        texcoords.iter().for_each(|x| hash.write(&x.to_le_bytes()));
+        if let Some(texture) = mesh.texture() {
+            hash.write(texture.as_slice().as_flattened());
+        }
+        // Numbers print with all their digits.
+        hash.write(format!("{info:?}").as_bytes());
+    }
+
+    fn to_json(&self) -> Value {
+        self.0.iter().map(|(name, hash)| (name.clone(), json!(format!("{:016x}", hash.value())))).collect()
+    }
+}
+
+/// The folder of a new dataset.
+pub struct DatasetFolder {
+    path: PathBuf,
+    options: Value,
+    _lock: WriteLock,
+}
+
+impl DatasetFolder {
+    /// Takes the folder for `command` with these options, an object of them. `inputs` are what the command reads.
+    ///
+    /// # Errors
+    /// When the folder is an input, another process writes it, it was begun with other options, or holds anything else.
+    pub fn take(path: &Path, command: &str, mut options: Value, inputs: &[&Path]) -> Result<DatasetFolder> {
+        let lock = lock(path)?;
+        // With the lock the folders on the way are there: only now a path with `..` says where it leads.
+        refuse_inputs(path, inputs)?;
+        options["command"] = json!(command);
+        let folder = DatasetFolder { path: path.to_path_buf(), options, _lock: lock };
+        match folder.kept()? {
+            Some(kept) => folder.compare(&kept, &folder.options, "made with another")?,
+            None => refuse_contents(path)?,
+        }
+        Ok(folder)
+    }
+
+    /// Keeps what the inputs hold, or compares it with what they held when the folder was begun. Before that nothing is
+    /// written.
+    ///
+    /// # Errors
+    /// When they held something else: what is in the folder would belong to other objects than what is added.
+    pub fn begin(&self, contents: &Contents) -> Result<()> {
+        let contents = contents.to_json();
+        match self.kept()? {
+            Some(kept) => self.compare(&kept["contents"], &contents, "made from other contents of"),
+            None => {
+                let mut options = self.options.clone();
+                options["contents"] = contents;
+                write_atomically(&self.path.join(OPTIONS), format!("{options:#}\n").as_bytes())
+            }
+        }
+    }
+
+    fn kept(&self) -> Result<Option<Value>> {
+        let file = self.path.join(OPTIONS);
+        if !file.exists() {
+            return Ok(None);
+        }
+        let text = std::fs::read_to_string(&file).with_context(|| file.display().to_string())?;
+        let kept: Value = serde_json::from_str(&text).with_context(|| {
+            format!("{}: not the options of a dataset; choose another --out", file.display())
+        })?;
+        Ok(Some(kept))
+    }
+
+    fn compare(&self, before: &Value, now: &Value, what: &str) -> Result<()> {
+        let keys = [before, now].into_iter().filter_map(Value::as_object).flat_map(|o| o.keys());
+        let differs =
+            |key: &&String| key.as_str() != "contents" && before.get(key.as_str()) != now.get(key.as_str());
+        if let Some(key) = keys.into_iter().find(differs) {
+            bail!(
+                "{}: {what} {key} (there {}, now {}); give the same to continue, or another --out",
+                self.path.join(OPTIONS).display(),
+                before.get(key.as_str()).unwrap_or(&Value::Null),
+                now.get(key.as_str()).unwrap_or(&Value::Null)
+            );
+        }
+        Ok(())
+    }
+
+    /// Writes the models with their `models_info.json`.
+    ///
+    /// # Errors
+    /// As [`DatasetFolder::write_once`].
+    pub fn write_models<'a>(
+        &self,
+        models: impl Iterator<Item = (u32, &'a Mesh, &'a ModelInfo)>,
+    ) -> Result<()> {
+        let mut infos = ModelsInfo::default();
+        for (id, mesh, info) in models {
+            let path = self.path.join("models").join(format!("obj_{id:06}.ply"));
+            for (file, bytes) in ply_files(&path, mesh, Unit::Millimetre, PlyFormat::BinaryLittleEndian)? {
+                self.write_once(&file, &bytes)?;
+            }
+            infos.0.insert(id, info.clone());
+        }
+        self.write_once(&self.path.join("models/models_info.json"), infos.to_text().as_bytes())
+    }
+
+    /// Writes a file of the folder unless it is there and equal.
+    ///
+    /// # Errors
+    /// When it is there and holds something else: images that are there already belong to it.
+    pub fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
+        match std::fs::read(file) {
+            Ok(there) if there == bytes => Ok(()),
+            Ok(_) => bail!(
+                "{}: it is not what this command wrote there: somebody changed it; remove the folder and start again, or choose \
+                 another --out",
+                file.display()
+            ),
+            Err(_) => write_atomically(file, bytes),
+        }
+    }
+}
+
+/// Takes the folder of a dataset that is made in one go: there is nothing in it yet.
+///
+/// # Errors
+/// When it is an input, another process writes it, or it holds anything.
+pub fn take_empty(path: &Path, inputs: &[&Path]) -> Result<WriteLock> {
+    let lock = lock(path)?;
+    refuse_inputs(path, inputs)?;
+    refuse_contents(path)?;
+    Ok(lock)
+}
+
+/// The lock of a folder, the same by whatever path it is named.
+fn lock(path: &Path) -> Result<WriteLock> {
+    Ok(WriteLock::take(&path.canonicalize().unwrap_or_else(|_| path.to_path_buf()))?)
+}
+
+/// An error where `out` is one of the inputs, by whatever path.
+fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
+    let Ok(place) = out.canonicalize() else { return Ok(()) };
+    if let Some(input) = inputs.iter().find(|input| input.canonicalize().is_ok_and(|i| i == place)) {
+        bail!(
+            "--out {}: holds another dataset or file: it is the input {}, which would be written over; choose another --out",
+            out.display(),
+            input.display()
+        );
+    }
+    Ok(())
+}
+
+/// An error where a folder holds anything but hidden files.
+fn refuse_contents(out: &Path) -> Result<()> {
+    let hidden = |name: &std::ffi::OsStr| name.as_encoded_bytes().starts_with(b".");
+    match std::fs::read_dir(out) {
+        Ok(entries) => {
+            let mut names: Vec<_> = entries.flatten().map(|e| e.file_name()).filter(|n| !hidden(n)).collect();
+            names.sort();
+            let Some(first) = names.first() else { return Ok(()) };
+            bail!(
+                "--out {}: holds another dataset or other files ({}), which would be written over; choose another --out",
+                out.display(),
+                first.to_string_lossy()
+            );
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(error).with_context(|| format!("--out {}", out.display())),
+    }
+}
+
+/// A folder for a command's images and files beside whatever is there.
+pub struct OutputFolder {
+    path: PathBuf,
+    own: BTreeSet<String>,
+    _lock: WriteLock,
+}
+
+impl OutputFolder {
+    /// Takes the folder.
+    ///
+    /// # Errors
+    /// When another process writes it.
+    pub fn take(path: &Path) -> Result<OutputFolder> {
+        let lock = lock(path)?;
+        let own = std::fs::read_to_string(path.join(OWN_FILES)).unwrap_or_default();
+        let own = own.lines().map(str::to_owned).collect();
+        Ok(OutputFolder { path: path.to_path_buf(), own, _lock: lock })
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The path of a file that is to be written, which is then one of the folder's own.
+    ///
+    /// # Errors
+    /// When it is there and no command wrote it.
+    pub fn file(&mut self, name: &str) -> Result<PathBuf> {
+        Ok(self.files(&[name])?.remove(0))
+    }
+
+    /// The paths of all files that are to be written: either all of them can be, or none is touched.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::file`].
+    pub fn files(&mut self, names: &[&str]) -> Result<Vec<PathBuf>> {
+        let foreign =
+            |name: &&&str| !self.own.contains(**name) && self.path.join(name).symlink_metadata().is_ok();
+        if let Some(name) = names.iter().find(foreign) {
+            bail!(
+                "{}: is there already and was not written by this program; move it, or choose another folder for the output",
+                self.path.join(name).display()
+            );
+        }
+        let new: Vec<String> = names
+            .iter()
+            .map(|name| (*name).to_owned())
+            .filter(|name| self.own.insert(name.clone()))
+            .collect();
+        if !new.is_empty() {
+            let list = self.path.join(OWN_FILES);
+            note_files(&list, &new).with_context(|| list.display().to_string())?;
+        }
+        Ok(names.iter().map(|name| self.path.join(name)).collect())
+    }
+
+    /// Writes an image.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::file`], and when it cannot be written.
+    pub fn write_rgb(&mut self, name: &str, image: &RgbImage) -> Result<PathBuf> {
+        let path = self.file(name)?;
+        sixfold_io::write_rgb(&path, image)?;
+        Ok(path)
+    }
+
+    /// Writes a text.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::file`], and when it cannot be written.
+    pub fn write_text(&mut self, name: &str, text: &str) -> Result<PathBuf> {
+        let path = self.file(name)?;
+        write_atomically(&path, text.as_bytes())?;
+        Ok(path)
+    }
+}
+
+/// Adds names to the list of a folder's own files, before the files are written.
+fn note_files(list: &Path, names: &[String]) -> std::io::Result<()> {
+    if let Some(folder) = list.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    let mut file = std::fs::File::options().append(true).read(true).create(true).open(list)?;
+    let mut before = vec![];
+    file.read_to_end(&mut before)?;
+    // A process that was killed may have left half a line.
+    let gap = if before.last().is_some_and(|byte| *byte != b'\n') { "\n" } else { "" };
+    file.write_all(format!("{gap}{}\n", names.join("\n")).as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn error<T>(result: Result<T>) -> String {
+        result.map(|_| ()).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_dataset_folder_is_for_one_command_its_options_and_contents() {
+        let root = tempfile::tempdir().unwrap();
+        let out = root.path().join("new");
+        let (dataset, input) = (root.path().join("dataset"), root.path().join("input"));
+        std::fs::create_dir_all(&dataset).unwrap();
+        std::fs::write(dataset.join("camera.json"), "{}").unwrap();
+        std::fs::write(&input, "one").unwrap();
+        let take =
+            |out: &Path, seed: u32| DatasetFolder::take(out, "make", json!({ "seed": seed }), &[&dataset]);
+        let contents = || {
+            let mut contents = Contents::default();
+            contents.add_path("mesh", &input).unwrap();
+            contents
+        };
+        // Its input, by any path, and what is not its own.
+        for path in ["dataset", "new/../dataset", "./dataset/"] {
+            assert!(error(take(&root.path().join(path), 1)).contains("is the input"), "{path}");
+        }
+        std::fs::create_dir_all(&out).unwrap();
+        std::fs::write(out.join("notes.txt"), "mine").unwrap();
+        assert!(error(take(&out, 1)).contains("notes.txt"));
+        std::fs::remove_file(out.join("notes.txt")).unwrap();
+
+        let folder = take(&out, 1).unwrap();
+        assert!(error(take(&out, 1)).contains("another process"));
+        folder.begin(&contents()).unwrap();
+        folder.write_once(&out.join("a"), b"x").unwrap();
+        folder.write_once(&out.join("a"), b"x").unwrap();
+        assert!(error(folder.write_once(&out.join("a"), b"y")).contains("changed"));
+        drop(folder);
+        take(&out, 1).unwrap().begin(&contents()).unwrap();
+        assert!(error(take(&out, 2)).contains("another seed (there 1, now 2)"));
+        assert!(
+            error(DatasetFolder::take(&out, "paint", json!({ "seed": 1 }), &[])).contains("another command")
+        );
+        std::fs::write(&input, "two").unwrap();
+        assert!(error(take(&out, 1).unwrap().begin(&contents())).contains("other contents of mesh"));
+    }
+
+    #[test]
+    fn an_output_folder_replaces_its_own_files_only() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::write(root.path().join("depth.png"), "taken with a camera").unwrap();
+        let mut folder = OutputFolder::take(root.path()).unwrap();
+        assert!(error(folder.files(&["mask.png", "depth.png"])).contains("depth.png"));
+        assert!(!root.path().join(OWN_FILES).exists());
+        folder.write_text("result.json", "1").unwrap();
+        drop(folder);
+        OutputFolder::take(root.path()).unwrap().write_text("result.json", "2").unwrap();
+        assert_eq!(std::fs::read_to_string(root.path().join("result.json")).unwrap(), "2");
+        assert_eq!(std::fs::read_to_string(root.path().join("depth.png")).unwrap(), "taken with a camera");
+    }
+}

@@ -1,0 +1,156 @@
+//! Proposed grasps as a command reports them: numbers for JSON and tables, and an image.
+
+use anyhow::Result;
+use serde::Serialize;
+use sixfold_geometry::{Camera, DepthImage, Plane, Pose, RgbImage};
+use sixfold_grasp::{
+    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
+    antipodal_grasps, cluster_grasps, draw_grasps,
+};
+
+use crate::output::pose_rows;
+use crate::overlay::depth_picture;
+
+/// The best grasp's colour; the others are blue.
+const BEST: [u8; 3] = [60, 220, 80];
+const OTHER: [u8; 3] = [86, 150, 233];
+
+/// `normal . p = offset` in the camera's frame, metres.
+#[derive(Serialize)]
+pub struct Table {
+    normal: [f64; 3],
+    offset: f64,
+}
+
+impl From<Plane> for Table {
+    fn from(plane: Plane) -> Table {
+        Table { normal: plane.normal.into(), offset: plane.offset }
+    }
+}
+
+/// A grasp.
+#[derive(Serialize)]
+pub struct Proposed {
+    /// The gripper when it closes.
+    pub camera_from_gripper: [[f64; 4]; 4],
+    /// Distance of the pads before closing, metres.
+    pub opening: f64,
+    /// Distance of the contacts, metres.
+    pub width: f64,
+    /// 0 to 1.
+    pub quality: f64,
+    parts: AntipodalQuality,
+    cluster_score: f64,
+    /// Grasps that it stands for.
+    pub cluster_members: usize,
+    /// The experience it was transferred from, or that agrees with it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    experience: Option<FromExperience>,
+    #[serde(skip)]
+    pose: Pose,
+}
+
+#[derive(Serialize)]
+struct FromExperience {
+    kind: &'static str,
+    /// Number of the experience in its store.
+    id: Option<i64>,
+    /// Distance of the features.
+    distance: Option<f64>,
+    /// Whether a difference in size was taken for a scale or for a rotation.
+    hypothesis: Option<&'static str>,
+    /// The fraction of experience that agrees with the grasp.
+    share: f64,
+}
+
+impl Proposed {
+    fn new(grasp: &Grasp, score: f64, members: usize) -> Proposed {
+        Proposed {
+            camera_from_gripper: pose_rows(&grasp.camera_from_gripper),
+            opening: grasp.opening,
+            width: grasp.width,
+            quality: grasp.quality.total(),
+            parts: grasp.quality,
+            cluster_score: score,
+            cluster_members: members,
+            experience: None,
+            pose: grasp.camera_from_gripper,
+        }
+    }
+}
+
+/// Grasps of the planner alone, the best first.
+///
+/// # Errors
+/// For options out of range.
+pub fn by_geometry(view: &GraspView, gripper: &Gripper, planner: &AntipodalOptions) -> Result<Vec<Proposed>> {
+    let grasps = antipodal_grasps(view, gripper, planner)?;
+    let clusters = cluster_grasps(&grasps, &ClusterOptions::default());
+    Ok(clusters.iter().map(|c| Proposed::new(&c.best, c.score, c.members)).collect())
+}
+
+/// Grasps of experience and of geometry, the best first.
+#[cfg(feature = "experience")]
+pub fn of_both(grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
+    use sixfold_dgcm::transfer::Kind;
+    let proposed = |r: &sixfold_dgcm::transfer::Ranked| {
+        let proposal = r.proposal.map(|i| &grasps.found.proposals[i]);
+        let experience = FromExperience {
+            kind: match r.kind {
+                Kind::Geometry => "geometry",
+                Kind::Experience => "experience",
+            },
+            id: proposal.map(|p| p.from.experience),
+            distance: proposal.map(|p| p.from.distance),
+            hypothesis: proposal.map(|p| p.hypothesis.name()),
+            share: r.experience,
+        };
+        Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) }
+    };
+    grasps.ranked.iter().map(proposed).collect()
+}
+
+/// The grippers over the colour image or, without one, the depth image.
+///
+/// # Errors
+/// For a gripper that has no mesh.
+pub fn picture(
+    rgb: Option<RgbImage>,
+    depth: &DepthImage,
+    camera: &Camera,
+    gripper: &Gripper,
+    proposed: &[Proposed],
+) -> Result<RgbImage> {
+    let background = rgb.unwrap_or_else(|| depth_picture(depth));
+    let drawn: Vec<DrawnGrasp> = proposed
+        .iter()
+        .enumerate()
+        .rev()
+        .map(|(i, p)| DrawnGrasp {
+            camera_from_gripper: p.pose,
+            opening: p.opening,
+            color: if i == 0 { BEST } else { OTHER },
+        })
+        .collect();
+    Ok(draw_grasps(&background, Some(depth), camera, gripper, &drawn)?)
+}
+
+/// Prints the grasps, one a line.
+pub fn print_table(grasps: &[Proposed]) {
+    println!(
+        "{:>2} {:>8} {:>8} {:>10} {:>10} {:>26}",
+        "", "quality", "members", "width (m)", "open (m)", "tips' middle (m)"
+    );
+    for (i, g) in grasps.iter().enumerate() {
+        let t: Vec<String> = g.camera_from_gripper[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
+        println!(
+            "{:>2} {:>8.3} {:>8} {:>10.4} {:>10.4} {:>26}",
+            i + 1,
+            g.quality,
+            g.cluster_members,
+            g.width,
+            g.opening,
+            t.join(" ")
+        );
+    }
+}

@@ -1,0 +1,21 @@
+//! The options by which every command reads meshes.
+
+use clap::Args;
+use sixfold_mesh::MeshOptions;
+
+/// How mesh files are read, by whatever command and from datasets and stores alike.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct MeshArguments {
+    /// Let mesh files name textures, materials and buffers outside their own folder: any file of this machine
+    #[arg(long, global = true)]
+    pub allow_outside: bool,
+}
+
+impl MeshArguments {
+    /// Makes them the rule for the rest of the program.
+    pub fn apply(self) {
+        if self.allow_outside {
+            MeshOptions::allow_outside_everywhere();
+        }
+    }
+}

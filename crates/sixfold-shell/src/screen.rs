@@ -1,0 +1,187 @@
+//! What the programs print, all of it at this one place. Control characters of names and messages that were read from files never
+//! reach a terminal, and a result that could not be printed never passes for printed.
+//!
+//! The macros have the names of the standard ones and take their place: no line of the programs can go around them.
+
+use std::borrow::Cow;
+use std::ffi::OsString;
+use std::fmt;
+use std::io::{self, Write};
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use clap::Parser;
+use serde_json::json;
+
+/// Prints a line to standard output as [`std::println`] does, without control characters and without a panic.
+#[macro_export]
+macro_rules! println {
+    () => { $crate::screen::out(::std::format_args!("\n")) };
+    ($($text:tt)*) => { $crate::screen::out(::std::format_args!("{}\n", ::std::format_args!($($text)*))) };
+}
+
+/// Prints to standard output as [`std::print`] does, without control characters and without a panic.
+#[macro_export]
+macro_rules! print {
+    ($($text:tt)*) => { $crate::screen::out(::std::format_args!($($text)*)) };
+}
+
+/// Prints a line to standard error as [`std::eprintln`] does, without control characters and without a panic.
+#[macro_export]
+macro_rules! eprintln {
+    () => { $crate::screen::err(::std::format_args!("\n")) };
+    ($($text:tt)*) => { $crate::screen::err(::std::format_args!("{}\n", ::std::format_args!($($text)*))) };
+}
+
+/// Whether anything went to standard output.
+static PRINTED: AtomicBool = AtomicBool::new(false);
+/// The first thing that could not be written there.
+static FAILED: Mutex<Option<io::Error>> = Mutex::new(None);
+
+/// What the macros call for standard output. A failure is kept for [`finish`].
+pub fn out(text: fmt::Arguments<'_>) {
+    PRINTED.store(true, Ordering::Relaxed);
+    kept(io::stdout().write_all(plain(&text.to_string()).as_bytes()));
+}
+
+/// What the macros call for standard error. There is nowhere to report that it cannot be written.
+pub fn err(text: fmt::Arguments<'_>) {
+    if let Err(error) = io::stderr().write_all(plain(&text.to_string()).as_bytes()) {
+        end_with_the_reader(&error);
+    }
+}
+
+/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end one in C. What a
+/// command has to keep it writes to files.
+fn end_with_the_reader(error: &io::Error) {
+    if error.kind() == io::ErrorKind::BrokenPipe {
+        // 128 and the number of SIGPIPE.
+        std::process::exit(141);
+    }
+}
+
+/// Keeps the first failure.
+fn kept(result: io::Result<()>) {
+    if let Err(error) = result {
+        end_with_the_reader(&error);
+        FAILED.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    }
+}
+
+/// The text with control characters and those that reverse the direction of writing as JSON escapes (`\u001b`), so that texts of
+/// files cannot move the cursor, clear the screen or pass for another name. Line ends and tabs stay. JSON remains the same JSON.
+pub fn plain(text: &str) -> Cow<'_, str> {
+    let harmful = |c: char| {
+        (c.is_control() && !matches!(c, '\n' | '\t'))
+            || matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    };
+    if !text.contains(harmful) {
+        return Cow::Borrowed(text);
+    }
+    let mut safe = String::with_capacity(text.len() + 16);
+    for c in text.chars() {
+        if harmful(c) {
+            safe.push_str(&format!("\\u{:04x}", u32::from(c)));
+        } else {
+            safe.push(c);
+        }
+    }
+    Cow::Owned(safe)
+}
+
+/// What the caller of a program wanted and did not get.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Failure {
+    /// The command line is wrong.
+    Usage,
+    /// The command could not be done.
+    Command,
+    /// The user stopped it.
+    Interrupt,
+}
+
+/// Reports an error on standard error and, where JSON was asked for and nothing was printed yet, as JSON on standard output.
+pub(crate) fn fail(message: &str, failure: Failure) {
+    eprintln!("error: {message}");
+    fail_as_json(message, failure);
+}
+
+fn fail_as_json(message: &str, failure: Failure) {
+    if !json_wanted(std::env::args_os().skip(1)) || PRINTED.load(Ordering::Relaxed) {
+        return;
+    }
+    let kind = match failure {
+        Failure::Usage => "usage",
+        Failure::Command => "command",
+        Failure::Interrupt => "interrupt",
+    };
+    println!("{:#}", json!({ "error": { "kind": kind, "message": message, "exit_status": 2 } }));
+}
+
+/// Whether `--json` asks for JSON on the screen: it has no file behind it. For when arguments could not be parsed.
+fn json_wanted(arguments: impl Iterator<Item = OsString>) -> bool {
+    let arguments: Vec<OsString> = arguments.take_while(|a| a != "--").collect();
+    let is_option = |a: &OsString| a.len() > 1 && a.as_encoded_bytes().starts_with(b"-");
+    let place = arguments.iter().position(|a| a == "--json");
+    place.is_some_and(|i| arguments.get(i + 1).is_none_or(is_option))
+}
+
+/// The command line of a program; where it is wrong, or asks for help, all has been printed and the exit status is the error.
+pub fn parse<A: Parser>() -> Result<A, ExitCode> {
+    A::try_parse().map_err(|error| {
+        let printed = error.print();
+        if error.use_stderr() {
+            let text = error.render().to_string();
+            let end = ["\n\nUsage:", "\n\nFor more information"].iter().filter_map(|e| text.find(e)).min();
+            let message = text[..end.unwrap_or(text.len())].trim();
+            fail_as_json(message.strip_prefix("error: ").unwrap_or(message), Failure::Usage);
+        } else {
+            kept(printed);
+        }
+        finish(u8::try_from(error.exit_code()).unwrap_or(2))
+    })
+}
+
+/// The exit status of a program that would end with `code`: 2 where its output could not be printed.
+pub(crate) fn finish(code: u8) -> ExitCode {
+    kept(io::stdout().flush());
+    match FAILED.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        None => ExitCode::from(code),
+        Some(error) => {
+            eprintln!(
+                "error: standard output: cannot be written: {error}; give --json FILE or --out for a file"
+            );
+            ExitCode::from(2)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn terminals_see_no_control_characters() {
+        assert!(matches!(plain("Tasse, 12 µm\n\tΩ"), Cow::Borrowed(_)));
+        let hostile = "mug\u{1b}[2J\u{1b}]0;title\u{7}\r\u{9b}1m\u{202e}gnp.\u{7f}";
+        assert_eq!(plain(hostile), "mug\\u001b[2J\\u001b]0;title\\u0007\\u000d\\u009b1m\\u202egnp.\\u007f");
+        // JSON means the same as before.
+        let text = json!({ "name": hostile }).to_string();
+        let back: serde_json::Value = serde_json::from_str(&plain(&text)).unwrap();
+        assert_eq!(back["name"], hostile);
+    }
+
+    #[test]
+    fn json_is_wanted_on_the_screen_or_in_a_file() {
+        let wanted = |text: &str| json_wanted(text.split_whitespace().map(OsString::from));
+        for text in ["eval --json", "eval --json --dataset lmo", "object list --json -v"] {
+            assert!(wanted(text), "{text}");
+        }
+        for text in
+            ["eval", "eval --json out.json", "eval --json=out.json", "eval -- --json", "eval --json -"]
+        {
+            assert!(!wanted(text), "{text}");
+        }
+    }
+}
