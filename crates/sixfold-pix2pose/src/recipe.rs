@@ -330,6 +330,9 @@ impl Recipe for Pix2PoseRecipe {
         OptionError::unless_samples("per_object", self.per_object.unwrap_or(1), 1, "1 or more")?;
         let expected = "1 or more, or weights to begin with, whose alignment is then measured again";
         OptionError::unless(self.steps != Some(0) || self.init.is_some(), "steps", 0, expected)?;
+        let wrong = self.encoder.is_some() && self.network != NetworkKind::ResNet50;
+        let found = format!("one for the {} network", self.network.name());
+        OptionError::unless(!wrong, "encoder", found, "network resnet50; the others bring theirs along")?;
         if self.network == NetworkKind::Compact {
             let common = TrainingOptions { steps: self.steps().max(1), ..self.compact_options().common };
             Pix2PoseTrainingOptions { common, ..self.compact_options() }.check()

@@ -28,13 +28,13 @@ pub struct MaterialArguments {
     #[arg(long, default_value = "test")]
     pub split: String,
     /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "objects")]
     pub frames: Option<PathBuf>,
     /// Open no photograph, learn from renders of the dataset's models alone
-    #[arg(long, requires = "dataset", conflicts_with = "frames")]
+    #[arg(long, requires = "dataset", conflicts_with_all = ["frames", "objects"])]
     pub renders_only: bool,
     /// Object ids of the dataset (default: all)
-    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
+    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset", conflicts_with = "objects")]
     pub ids: Vec<u32>,
     /// Objects to learn from renders: mesh files, or names given with `sixfold object add`; they get the ids 1, 2, ...
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]

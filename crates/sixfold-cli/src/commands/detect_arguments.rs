@@ -20,16 +20,16 @@ pub(crate) struct DetectArguments {
     #[arg(long, default_value = "test")]
     pub split: String,
     /// Targets file that says which images (default: its test_targets_bop19.json, or all images)
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "rgb")]
     pub targets: Option<PathBuf>,
     /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "rgb")]
     pub except: Option<PathBuf>,
     /// Result: a JSON file of COCO detections for a dataset, a folder for images
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Folder for overlays of a dataset's images
-    #[arg(long, value_name = "DIR", requires = "dataset")]
+    #[arg(long, value_name = "DIR", requires = "dataset", conflicts_with = "rgb")]
     pub overlays: Option<PathBuf>,
     /// Only these of the detector's objects (default: all)
     #[arg(long, value_name = "ID", value_delimiter = ',')]

@@ -42,7 +42,7 @@ pub(crate) struct EvalArguments {
     #[arg(long, value_name = "SCORE", default_value = "0.4")]
     pub min_score: f64,
     /// With --detections: write the ground truth that they were scored with as a COCO file
-    #[arg(long, value_name = "FILE.json", requires = "detections")]
+    #[arg(long, value_name = "FILE.json", requires = "detections", conflicts_with = "results")]
     pub write_truth: Option<PathBuf>,
     /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)
     #[arg(long)]

@@ -38,6 +38,12 @@ fn dataset(folder: &Path) {
     copy(&CASE, folder);
 }
 
+/// The dataset, of which one target is looked for.
+fn one_target(folder: &Path) {
+    dataset(folder);
+    fs::copy(folder.join("targets.json"), folder.join("tiny/test_targets_bop19.json")).unwrap();
+}
+
 /// What another row's command wrote.
 fn of(row: &Row, file: &str) -> PathBuf {
     reference(row).folder().join(file)
@@ -84,20 +90,20 @@ fn object(folder: &Path) {
 }
 
 rows! {
-    estimate_image: image, ["out/", "poses.json"], None,
+    estimate_image: image, ["out", "poses.json"], None,
         "estimate --depth depth.png --rgb rgb.png --camera camera.json --object part.ply --unit mm --out out --json poses.json";
-    estimate_image_by_templates: image, ["out/"], None,
+    estimate_image_by_templates: image, ["out"], None,
         "estimate --method mttm --matcher points --depth depth.png --camera camera.json --object part.ply --unit mm --out out";
-    estimate_image_by_colour: dataset_and_networks, ["out/"], None,
+    estimate_image_by_colour: dataset_and_networks, ["out"], None,
         "estimate --method pix2pose --weights pix2pose.safetensors --rgb tiny/test/000007/rgb/000004.png --camera tiny/camera.json \
          --object tiny/models/obj_000001.ply --unit mm --box 60,60,120,120 --out out";
     estimate_dataset: dataset, ["results.csv", "pictures", "run.json"], None,
-        "estimate --dataset tiny --out results.csv --overlays pictures";
+        "estimate --dataset tiny --targets targets.json --out results.csv --overlays pictures";
     estimate_dataset_by_templates: dataset, ["results.csv"], None,
         "estimate --method mttm --matcher points --dataset tiny --targets targets.json --out results.csv";
     estimate_dataset_by_colour: dataset_and_networks, ["results.csv"], None,
         "estimate --method pix2pose --weights pix2pose.safetensors --dataset tiny --targets targets.json --boxes gt --out results.csv";
-    detect_image: dataset_and_networks, ["out/"], None,
+    detect_image: dataset_and_networks, ["out"], None,
         "detect --weights detector.safetensors --rgb tiny/test/000007/rgb/000004.png --threshold 0 --per-object 2 --out out";
     detect_dataset: dataset_and_networks, ["found.json", "pictures"], None,
         "detect --weights detector.safetensors --dataset tiny --threshold 0 --per-object 2 --out found.json --overlays pictures";
@@ -106,7 +112,7 @@ rows! {
     train_detector: dataset, ["out"], None,
         "train detector --dataset tiny --ids 1 --size 96 --batch 2 --steps 3 --out out";
     train_nol: dataset, ["out"], None, "train nol --steps 2 --out out";
-    train_mttm: dataset, ["out"], None, "train mttm --steps 2 --objects 4 --scenes 2 --anchors 4 --out out";
+    train_mttm: dataset, ["out"], None, "train mttm --steps 2 --objects 16 --scenes 4 --anchors 4 --out out";
     train_dgcm: dataset, ["out"], None, "train dgcm --views 64 --steps 3 --pairs 2 --out out";
     simulate_depth: dataset, ["out"], Some((2, "exists already")),
         "simulate-depth --dataset tiny --rgb --pictures out/pictures --out out";
@@ -123,7 +129,7 @@ rows! {
         "object add part part.ply --unit mm --turns-about z --templates --replace";
     object_remove: object, ["sixfold-objects", "part"], Some((2, "none yet")), "object remove part";
     object_show: object, ["part.png"], None, "object show part --picture part.png";
-    grasp_propose: image, ["out/"], None,
+    grasp_propose: image, ["out"], None,
         "grasp propose --depth depth.png --camera camera.json --mask mask.png --out out";
     grasp_learn: grasp, ["learn", "e.db"], None,
         "grasp learn --experiences e.db --object part.ply --unit mm --attempts 2 --tries 2 --explore 1 --near 9 --weights w.safetensors --out learn";
@@ -140,5 +146,5 @@ rows! {
     eval_detections: detections, ["scores.json", "coco.json"], None,
         "eval --dataset tiny --detections found.json --write-truth coco.json --json scores.json";
     render: image, ["out"], None, "render --object part.ply --unit mm --camera camera.json --out out";
-    demo: dataset, ["out", "demo.json"], None, "demo --data tiny --out out --json demo.json";
+    demo: one_target, ["out", "demo.json"], None, "demo --data tiny --out out --json demo.json";
 }

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 use crate::commands;
-use crate::driver::{Row, environment, start, thorough};
+use crate::driver::{Row, environment, program, start, thorough};
 
 /// A run may take so long.
 const SECONDS: u64 = 10;
@@ -64,7 +64,8 @@ fn kind(name: &str, value: &str) -> Kind {
 
 /// The options of a command that take a value, from its help.
 fn options(command: &str) -> Vec<Opt> {
-    let output = Command::new(crate::PROGRAM).args(command.split(' ')).arg("--help").output().unwrap();
+    let words = command.split(' ').take_while(|word| !word.starts_with("--"));
+    let output = Command::new(program()).args(words).arg("--help").output().unwrap();
     let help = String::from_utf8(output.stdout).unwrap();
     let mut found = vec![];
     for line in help.lines() {
@@ -96,7 +97,6 @@ fn good() -> BTreeMap<&'static str, Row> {
         ("simulate-scenes", of("simulate_scenes")),
         ("synthesize", of("synthesize")),
         ("object add", of("object_add_views")),
-        ("grasp propose", of("grasp_propose")),
         ("grasp learn", of("grasp_learn")),
         ("grasp store add", of("grasp_store_add")),
         ("grasp store refresh", of("grasp_store_refresh")),
@@ -107,6 +107,13 @@ fn good() -> BTreeMap<&'static str, Row> {
     let mut good = BTreeMap::from(rows);
     let arguments = "grasp try --object part.ply --unit mm --tip 0.0,0.0,0.01 --closing 0,1,0";
     good.insert("grasp try", Row { name: "grasp_try", arguments, ..of("render") });
+    let arguments = "grasp propose --depth depth.png --camera camera.json --mask mask.png --experiences a.db --weights w.safetensors --out out";
+    good.insert("grasp propose", Row { arguments, ..of("grasp_store_merge") });
+    let arguments = "estimate --dataset tiny --targets targets.json --out results.csv";
+    good.insert("estimate --dataset", Row { arguments, ..of("estimate_dataset") });
+    let arguments =
+        "detect --weights detector.safetensors --dataset tiny --targets targets.json --out found.json";
+    good.insert("detect --dataset", Row { arguments, ..of("detect_dataset") });
     good
 }
 
@@ -132,11 +139,17 @@ fn hostile_files() -> &'static [&'static str] {
 const ACCEPTED: &[(&str, &str, &[&str])] = &[
     // Any whole number is a seed.
     ("*", "seed", &["0", "18446744073709551615"]),
+    // Above every confidence: nothing is found.
+    ("estimate", "min-score", &["0", "1e308"]),
+    // However far an experience is, it proposes.
+    ("grasp learn", "near", &["0", "1e308"]),
 ];
 
 fn is_accepted(option: &Opt, value: &str) -> bool {
     ACCEPTED.iter().any(|(command, name, values)| {
-        (*command == "*" || *command == option.command) && *name == option.name && values.contains(&value)
+        (*command == "*" || option.command.starts_with(command))
+            && *name == option.name
+            && values.contains(&value)
     })
 }
 
@@ -172,15 +185,10 @@ fn with_value(arguments: &str, option: &str, value: &str) -> Vec<String> {
 
 /// Runs the program in a folder within the limits. `words`: one of them has to be in the message.
 fn refused(folder: &Path, parts: &[String], words: &[&str]) -> Option<Finding> {
-    let mut program = Command::new("sh");
-    program
-        .arg("-c")
-        .arg(format!("ulimit -v {KILOBYTES}; exec \"$@\""))
-        .arg("sh")
-        .arg(crate::PROGRAM)
-        .args(parts);
-    environment(&mut program, folder);
-    let mut run = start(program);
+    let mut command = Command::new("sh");
+    command.arg("-c").arg(format!("ulimit -v {KILOBYTES}; exec \"$@\"")).arg("sh").arg(program()).args(parts);
+    environment(&mut command, folder);
+    let mut run = start(command);
     let began = Instant::now();
     while !run.is_done() {
         if began.elapsed() > Duration::from_secs(SECONDS) {
@@ -198,12 +206,17 @@ fn refused(folder: &Path, parts: &[String], words: &[&str]) -> Option<Finding> {
         "memory"
     } else if code != Some(2) {
         "accepted"
-    } else if !words.iter().any(|word| message.contains(word)) {
+    } else if !words.iter().any(|word| plain(&message).contains(&plain(word))) {
         "not named"
     } else {
         return None;
     };
     Some(Finding { what, line: parts.join(" "), message: error.to_owned() })
+}
+
+/// An option as people and as fields write it: without hyphens, underscores and capitals.
+fn plain(text: &str) -> String {
+    text.replace(['-', '_'], " ").to_lowercase().trim().to_owned()
 }
 
 /// The folder that a row works in, with a folder and a pipe.
@@ -302,7 +315,7 @@ const TABLE: &[(&str, &str, &[&str])] = &[
     ),
     (
         "synthesize",
-        "synthesize --dataset tiny --ids 1,1 --weighting best --step 90 --out out",
+        "synthesize --dataset tiny --ids 1,1 --weighting best --step 90 --size 48 --out out",
         &["--ids", "1"],
     ),
     (

@@ -65,6 +65,16 @@ pub fn tree(folder: &Path) -> Tree {
             "json" | "jsonl" | "csv" => {
                 tree.insert(name, without_times(&end, bytes));
             }
+            // Holds parameters under random names and the time; the model that comes of it is compared.
+            "checkpoint" => {
+                tree.insert(name, vec![]);
+            }
+            // Shows how many samples a second were learnt from.
+            _ if name.ends_with("training/curves.png") => {
+                let size =
+                    image::image_dimensions(&path).map_or_else(|e| e.to_string(), |s| format!("{s:?}"));
+                tree.insert(name, size.into_bytes());
+            }
             _ => {
                 tree.insert(name, bytes);
             }

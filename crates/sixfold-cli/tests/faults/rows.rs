@@ -16,27 +16,37 @@ macro_rules! rows {
 
             #[test]
             fn is_killed_and_restarted() {
-                crate::kill::killed_and_restarted(&ROW);
+                if !crate::driver::is_left_out(&ROW) {
+                    crate::kill::killed_and_restarted(&ROW);
+                }
             }
 
             #[test]
             fn runs_twice_at_once() {
-                crate::two::two_at_once(&ROW);
+                if !crate::driver::is_left_out(&ROW) {
+                    crate::two::two_at_once(&ROW);
+                }
             }
 
             #[test]
             fn fills_a_disk() {
-                crate::space::small_disk(&ROW);
+                if !crate::driver::is_left_out(&ROW) {
+                    crate::space::small_disk(&ROW);
+                }
             }
 
             #[test]
             fn may_only_read() {
-                crate::unwritable::read_only(&ROW);
+                if !crate::driver::is_left_out(&ROW) {
+                    crate::unwritable::read_only(&ROW);
+                }
             }
 
             #[test]
             fn has_no_standard_output() {
-                crate::unwritable::no_standard_output(&ROW);
+                if !crate::driver::is_left_out(&ROW) {
+                    crate::unwritable::no_standard_output(&ROW);
+                }
             }
         })*
 

@@ -15,27 +15,19 @@ pub fn no_standard_output(row: &Row) {
     }
     let reference = reference(row);
     let mut wrong = vec![];
-    for json in ["", "--json"] {
-        if !json.is_empty() && row.arguments.contains("--json") {
-            continue;
-        }
-        let folder = prepared(row);
-        let mut program = command(row, folder.path());
-        if !json.is_empty() {
-            program.arg(json);
-        }
-        let output = program.stdout(File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
-        let message = String::from_utf8_lossy(&output.stderr);
-        if output.status.code() != Some(2)
-            || message.contains("panicked")
-            || !message.contains("No space left")
-        {
-            wrong.push(format!("{json}: {}: {}", output.status, message.trim()));
-        }
-        wrong.extend(
-            differences(&reference.tree, &tree(folder.path())).iter().map(|d| format!("{json}: {d}")),
-        );
+    // The card of a network holds its command, so that its training is given as it is.
+    let as_it_is = row.arguments.contains("--json") || row.arguments.starts_with("train");
+    let folder = prepared(row);
+    let mut program = command(row, folder.path());
+    if !as_it_is {
+        program.arg("--json");
     }
+    let output = program.stdout(File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
+    let message = String::from_utf8_lossy(&output.stderr);
+    if output.status.code() != Some(2) || message.contains("panicked") || !message.contains("No space left") {
+        wrong.push(format!("{}: {}", output.status, message.trim()));
+    }
+    wrong.extend(differences(&reference.tree, &tree(folder.path())));
     assert!(wrong.is_empty(), "sixfold {} > /dev/full\n{}", row.arguments, wrong.join("\n"));
 }
 
@@ -57,16 +49,10 @@ pub fn read_only(row: &Row) {
     program.arg(inside.get_program()).args(inside.get_args());
     crate::driver::environment(&mut program, folder.path());
     let run = start(program).wait();
+    let why = ["Read-only file system", "read-only", "readonly", "unable to open database file"];
     let named = run.stderr.lines().any(|line| {
-        line.contains("Read-only file system") && row.writes.iter().any(|name| line.contains(name))
+        why.iter().any(|words| line.contains(words)) && row.writes.iter().any(|name| line.contains(name))
     });
-    let refused = run.stderr.contains("read-only") || run.stderr.contains("readonly");
-    assert!(
-        run.code == 2 && (named || refused),
-        "sixfold {}\nexit status {}: {}",
-        row.arguments,
-        run.code,
-        run.stderr
-    );
+    assert!(run.code == 2 && named, "sixfold {}\nexit status {}: {}", row.arguments, run.code, run.stderr);
     assert_eq!(differences(&before, &tree(folder.path())), Vec::<String>::new());
 }

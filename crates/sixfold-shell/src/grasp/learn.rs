@@ -37,10 +37,10 @@ pub struct LearnArguments {
     #[command(flatten)]
     pub outbox: OutboxArguments,
     /// Synthetic objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
-    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list"])]
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list", "meshes"])]
     pub families: Vec<String>,
     /// Synthetic objects of each family
-    #[arg(long, value_name = "N", default_value = "4", requires = "families")]
+    #[arg(long, value_name = "N", default_value = "4", requires = "families", conflicts_with_all = ["objects", "list"])]
     pub members: u64,
     /// The objects to learn on, where they are not synthetic.
     #[command(flatten)]

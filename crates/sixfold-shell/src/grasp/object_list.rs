@@ -75,7 +75,7 @@ pub struct ObjectsArguments {
     #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
     pub list: Option<PathBuf>,
     /// Folder that the list's meshes are in (default: the list's own)
-    #[arg(long, value_name = "DIR", requires = "list")]
+    #[arg(long, value_name = "DIR", requires = "list", conflicts_with = "objects")]
     pub meshes: Option<PathBuf>,
     /// Folder of stored objects
     #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]

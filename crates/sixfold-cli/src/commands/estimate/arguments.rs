@@ -57,6 +57,10 @@ impl CacheArguments {
     }
 }
 
+/// What stands for one image in place of a dataset. Options of a dataset name it: what they require is not asked for by `clap`
+/// where something stands that it conflicts with, and they would be ignored.
+const OF_ONE_IMAGE: [&str; 6] = ["depth", "camera", "objects", "object_id", "mask", "region"];
+
 /// Options that belong to no method.
 #[derive(Debug, Args)]
 pub(crate) struct CommonArguments {
@@ -103,14 +107,14 @@ pub(crate) struct CommonArguments {
     #[arg(long, default_value = "test")]
     pub split: String,
     /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub targets: Option<PathBuf>,
     /// Leave out these frames of the dataset, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub except: Option<PathBuf>,
     /// Where the objects are: gt for the ground truth's boxes, detect for those of --detector, or a file of COCO
     /// detections (default: detect with --detector, else anywhere)
-    #[arg(long, value_name = "gt|detect|FILE", requires = "dataset")]
+    #[arg(long, value_name = "gt|detect|FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub boxes: Option<String>,
     /// Trained detector that says where the objects are: a file that `sixfold train detector` wrote
     #[arg(long, value_name = "FILE.safetensors")]
@@ -119,7 +123,7 @@ pub(crate) struct CommonArguments {
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Folder for overlays of a dataset's images
-    #[arg(long, value_name = "DIR", requires = "dataset")]
+    #[arg(long, value_name = "DIR", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub overlays: Option<PathBuf>,
     /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image and 0.05 for a dataset with --method ppf, 0.45
     /// and 0.05 with mttm, 0 with pix2pose)

@@ -108,16 +108,16 @@ pub(crate) struct DepthViewArguments {
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
     pub depth: Vec<PathBuf>,
     /// Where the object is in each of them (PNG, above zero inside), in the same order
-    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth")]
+    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth", conflicts_with = "mesh")]
     pub masks: Vec<PathBuf>,
     /// Camera of the depth images: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale
-    #[arg(long, value_name = "FILE", requires = "depth")]
+    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
-    #[arg(long, value_name = "MM", requires = "depth")]
+    #[arg(long, value_name = "MM", requires = "depth", conflicts_with = "mesh")]
     pub depth_scale: Option<f64>,
     /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
     /// metres (default: every view has a frame of its own)
-    #[arg(long, value_name = "FILE", requires = "depth")]
+    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
     pub poses: Option<PathBuf>,
 }

@@ -41,10 +41,16 @@ pub(crate) struct SynthesizeArguments {
     #[arg(long, default_value = "test")]
     pub split: String,
     /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "photographs")]
     pub frames: Option<PathBuf>,
     /// Object ids of the dataset (default: all)
-    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset")]
+    #[arg(
+        long,
+        value_name = "ID",
+        value_delimiter = ',',
+        requires = "dataset",
+        conflicts_with = "photographs"
+    )]
     pub ids: Vec<u32>,
     /// In place of a dataset: a JSON file that names a mesh and its photographs (see below)
     #[arg(long, value_name = "FILE.json", conflicts_with = "dataset")]
