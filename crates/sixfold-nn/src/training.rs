@@ -200,6 +200,15 @@ impl<'a> Run<'a> {
         self.before + self.started.elapsed().as_secs_f64()
     }
 
+    /// Draws the curves of what the log holds.
+    fn draw(&self) -> Result<(), TrainError> {
+        let records = read_training_log(&self.folder.join("log.jsonl"))?;
+        if !records.is_empty() {
+            draw_curves(&records, &self.folder.join("curves.png"))?;
+        }
+        Ok(())
+    }
+
     /// The steps that are left.
     fn steps<T: Training>(
         &mut self,
@@ -209,6 +218,10 @@ impl<'a> Run<'a> {
         progress: &mut impl FnMut(&TrainingRecord),
     ) -> Result<Outcome<()>, TrainError> {
         let pace = self.plan.pace;
+        if self.step == self.plan.steps {
+            // The run before may have been killed between its last checkpoint and the figure.
+            self.draw()?;
+        }
         let mut sums = Sums::new();
         while self.step < self.plan.steps {
             let Some(batch) = batch(self.step) else {
@@ -232,10 +245,7 @@ impl<'a> Run<'a> {
             let stopped = stop.load(Ordering::Relaxed);
             if self.step.is_multiple_of(pace.checkpoint_every) || last || stopped {
                 save(training, &self.plan.settings, self.folder, (self.step, self.seconds()))?;
-                let records = read_training_log(&self.folder.join("log.jsonl"))?;
-                if !records.is_empty() {
-                    draw_curves(&records, &self.folder.join("curves.png"))?;
-                }
+                self.draw()?;
             }
             if stopped && !last {
                 return Ok(Outcome::Interrupted { step: self.step });

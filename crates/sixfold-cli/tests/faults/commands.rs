@@ -148,3 +148,14 @@ rows! {
     render: image, ["out"], None, "render --object part.ply --unit mm --camera camera.json --out out";
     demo: one_target, ["out", "demo.json"], None, "demo --data tiny --out out --json demo.json";
 }
+
+/// Killed between its last checkpoint and the figure of its curves, a training has nothing left to do but the figure.
+#[test]
+fn a_training_without_its_curves_gets_them() {
+    let folder = tempfile::tempdir().unwrap();
+    copy(reference(&train_dgcm::ROW).folder(), folder.path());
+    let curves = folder.path().join("out/training/curves.png");
+    fs::remove_file(&curves).unwrap();
+    run(&train_dgcm::ROW, folder.path()).expect(0);
+    assert!(image::open(curves).is_ok());
+}
