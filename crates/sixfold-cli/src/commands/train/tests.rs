@@ -114,16 +114,26 @@ fn stub(function: &str) -> BTreeMap<String, String> {
         .collect()
 }
 
+/// A truth value as Python writes it.
+fn word(flag: bool) -> String {
+    if flag { "True" } else { "False" }.to_owned()
+}
+
+/// A name as Python writes it.
+fn name(name: &str) -> String {
+    format!("{name:?}")
+}
+
+/// Holds the defaults in the stub of a Python function against those of the recipe.
+fn check(function: &str, expected: Vec<(&str, String)>) {
+    let expected = expected.into_iter().map(|(name, default)| (name.to_owned(), default)).collect();
+    assert_eq!(stub(function), expected, "{function}");
+}
+
 #[test]
-fn the_stub_of_python_shows_the_defaults() {
-    let word = |flag: bool| if flag { "True" } else { "False" }.to_owned();
-    let name = |name: &str| format!("{name:?}");
+fn the_stub_of_python_shows_the_defaults_of_what_learns_from_images() {
     // Not of the recipe: which of a dataset's frames are read.
     let renders_only = || ("renders_only", word(false));
-    let check = |function: &str, expected: Vec<(&str, String)>| {
-        let expected = expected.into_iter().map(|(name, default)| (name.to_owned(), default)).collect();
-        assert_eq!(stub(function), expected, "{function}");
-    };
     let d = sixfold_pix2pose::recipe::Pix2PoseRecipe::default();
     check(
         "train_pix2pose",
@@ -161,6 +171,10 @@ fn the_stub_of_python_shows_the_defaults() {
             ("seed", d.seed.to_string()),
         ],
     );
+}
+
+#[test]
+fn the_stub_of_python_shows_the_defaults_of_the_others() {
     #[cfg(feature = "physics")]
     {
         let d = sixfold_mttm::recipe::MttmRecipe::default();
