@@ -133,15 +133,15 @@ impl Hash {
         mesh.vertices().iter().for_each(|v| self.point(v));
         self.count(mesh.faces().len());
         mesh.faces().iter().flatten().for_each(|i| self.0.write(&i.to_le_bytes()));
-        for normals in mesh.normals().into_iter() {
+        if let Some(normals) = mesh.normals() {
             self.count(1);
             normals.iter().for_each(|n| self.point(n));
         }
-        for colors in mesh.colors().into_iter() {
+        if let Some(colors) = mesh.colors() {
             self.count(2);
             self.0.write(colors.as_flattened());
         }
-        for texcoords in mesh.texcoords().into_iter() {
+        if let Some(texcoords) = mesh.texcoords() {
             self.count(3);
             texcoords.iter().flatten().for_each(|t| self.0.write(&t.to_le_bytes()));
         }
