@@ -241,7 +241,10 @@ pub(super) fn shown(text: &str) -> String {
         plain(host, ":[]%") && port.chars().all(|c| c.is_ascii_digit())
     };
     let lower = rest.to_ascii_lowercase();
-    let clear = !["password", "%3a", "%40", "@"].iter().any(|word| lower.contains(word))
+    // Where another kind of address has its passwords is not known.
+    let of_postgres = ["postgres", "postgresql"].iter().any(|known| scheme.eq_ignore_ascii_case(known));
+    let clear = of_postgres
+        && !["password", "%3a", "%40", "@"].iter().any(|word| lower.contains(word))
         && hosts.split(',').all(of_a_host)
         && plain(database, "")
         && plain(user.unwrap_or_default(), "");

@@ -66,7 +66,7 @@ fn two_processes_write_one_store_and_lose_no_row() {
     let file = folder.path().join("experience.db");
     // Nobody made the file before them.
     let writers = ["0", "1000", "2000"].map(|first| process(first, &file).spawn().unwrap());
-    writers.map(ends_well);
+    writers.into_iter().for_each(ends_well);
     let store = SqliteStore::open(&file).unwrap();
     store.check_integrity().unwrap();
     let mut there = objects(&store);
@@ -143,7 +143,7 @@ fn one_broken_row_is_named_costs_itself_alone_and_can_be_removed() {
         "camera_from_gripper = zeroblob(128)",
         "extent = ''",
         "region = 'none'",
-        "part = 5",
+        "part = x'05'",
         "network = x'00'",
     ] {
         let folder = tempfile::tempdir().unwrap();

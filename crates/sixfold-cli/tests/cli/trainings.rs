@@ -157,7 +157,6 @@ fn options_that_no_training_can_have() {
         (format!("{d} --threshold nan"), "--threshold: found NaN"),
         (format!("{d} --encoder-share nan"), "--encoder-share: found NaN"),
         (format!("{d} --photograph-share nan"), "--photograph-share: found NaN"),
-        (format!("{d} --render-share -0.5"), ""),
         (without(&d, "--size") + " --size 50", "--size: found 50, expected a multiple of 32"),
         (without(&d, "--steps") + " --steps 0", "--steps: found 0, expected 1 or more"),
         ("train nol --out trained --steps 0".to_owned(), "--steps: found 0, expected 1 or more"),
