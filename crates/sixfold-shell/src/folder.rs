@@ -174,23 +174,8 @@ impl DatasetFolder {
     }
 }
 
-<<<<<<< HEAD
-/// The lock of a folder, the same by whatever path it is named.
-=======
-/// Takes the folder of a dataset that is made in one go: there is nothing in it yet.
-///
-/// # Errors
-/// When it is an input, another process writes it, or it holds anything.
-pub fn take_empty(path: &Path, inputs: &[&Path]) -> Result<WriteLock> {
-    let lock = lock(path)?;
-    refuse_inputs(path, inputs)?;
-    refuse_contents(path)?;
-    Ok(lock)
-}
-
 /// The lock of a folder, the same by whatever path it is named. It lies beside the folder, which need not exist, or in it where
 /// beside it nothing can be written, as beside a mounted folder.
->>>>>>> 59baaebaf022e02b99c4bb9de4a70925f686ded1
 fn lock(path: &Path) -> Result<WriteLock> {
     let place = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     match WriteLock::take(&place) {
