@@ -174,17 +174,6 @@ impl DatasetFolder {
     }
 }
 
-/// Takes the folder of a dataset that is made in one go: there is nothing in it yet.
-///
-/// # Errors
-/// When it is an input, another process writes it, or it holds anything.
-pub fn take_empty(path: &Path, inputs: &[&Path]) -> Result<WriteLock> {
-    let lock = lock(path)?;
-    refuse_inputs(path, inputs)?;
-    refuse_contents(path)?;
-    Ok(lock)
-}
-
 /// The lock of a folder, the same by whatever path it is named. It lies beside the folder, which need not exist, or in it where
 /// beside it nothing can be written, as beside a mounted folder.
 fn lock(path: &Path) -> Result<WriteLock> {

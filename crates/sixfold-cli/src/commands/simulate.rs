@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use serde_json::json;
+use serde_json::{Value, json};
 use sixfold_bop::{
     BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
 };
@@ -16,7 +16,7 @@ use sixfold_render::{
 };
 
 use sixfold_shell::Outcome;
-use sixfold_shell::folder::{OutputFolder, take_empty};
+use sixfold_shell::folder::{Contents, DatasetFolder, OutputFolder};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
 use sixfold_shell::pictures::Pictures;
@@ -81,16 +81,29 @@ pub(crate) struct SimulateArguments {
     pub json: JsonArguments,
 }
 
+impl SimulateArguments {
+    /// The options that decide about the result.
+    fn deciding(&self) -> Value {
+        json!({
+            "dataset": self.dataset, "split": self.split, "sensor": format!("{:?}", self.sensor), "rgb": self.rgb,
+            "images": self.images, "no-table": self.no_table, "seed": self.seed,
+        })
+    }
+}
+
 /// Width of the simulated table in metres.
 const TABLE: f64 = 3.0;
 
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
-    if a.out.join(&a.split).exists() {
+    // Written last: without it a run was stopped, and this one makes all of it again.
+    let targets_file = a.out.join("test_targets_bop19.json");
+    if targets_file.exists() {
         bail!("{} exists already: remove it or choose another --out", a.out.join(&a.split).display());
     }
-    let _lock = take_empty(&a.out, &[&a.dataset])?;
+    let folder = DatasetFolder::take(&a.out, "simulate-depth", a.deciding(), &[&a.dataset])?;
+    folder.begin(&Contents::default())?;
     let mut pictures = Pictures::of(a.pictures.as_deref().map(OutputFolder::take).transpose()?);
     let wanted = |im_id: u32| a.images.is_empty() || a.images.contains(&im_id);
     let mut meshes: BTreeMap<u32, Mesh> = BTreeMap::new();
@@ -103,7 +116,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
         let mut writer = SceneWriter::new(&a.out, &a.split, scene_id);
         let mut progress = Progress::new("images", ids.len());
         for im_id in ids {
-            check_interrupt(&format!("remove {} and start again", a.out.display()))?;
+            check_interrupt("run the same command again to make all of it")?;
             let image = scene.image(im_id)?;
             for g in &image.ground_truth {
                 if let std::collections::btree_map::Entry::Vacant(place) = meshes.entry(g.obj_id) {
@@ -142,11 +155,11 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     if let Some(camera) = first_camera {
         write_camera(&a.out, &camera, 1e-3)?;
     }
-    let targets: Vec<Target> = dataset.targets(None)?.into_iter().filter(|t| wanted(t.im_id)).collect();
-    write_targets(&a.out.join("test_targets_bop19.json"), &targets)?;
     if let Some(models) = dataset.models_dir(Models::Rendering) {
         copy_files(&models, &a.out.join("models"))?;
     }
+    let targets: Vec<Target> = dataset.targets(None)?.into_iter().filter(|t| wanted(t.im_id)).collect();
+    write_targets(&targets_file, &targets)?;
     for image in &without_table {
         eprintln!("note: image {image}: no plane lies under its objects, simulated without a table");
     }

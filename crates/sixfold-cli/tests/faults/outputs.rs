@@ -31,7 +31,8 @@ fn paths(folder: &Path) -> Vec<PathBuf> {
 /// A name of a file that only a running command may have.
 fn is_temporary(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    name.starts_with('.')
+    // A folder of images keeps a list of its own files.
+    (name.starts_with('.') && name != ".sixfold-files")
         || [".tmp", ".lock", "-journal", "-wal", "-shm"].iter().any(|end| name.ends_with(end))
 }
 
