@@ -214,6 +214,8 @@ pub(crate) fn png_of_depth(depth: &DepthImage, metres_per_unit: f64) -> Option<D
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+
     use super::*;
     use proptest::prelude::*;
 
