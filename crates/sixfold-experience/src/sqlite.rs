@@ -64,6 +64,17 @@ const COLUMNS: [&str; 17] = [
     "table_plane",
 ];
 
+/// Bytes of the index of a write-ahead log, the smallest there is.
+const LOG_INDEX: usize = 32 << 10;
+
+/// Whether the folder of `file` has no room for the index of a write-ahead log, found by writing one.
+fn is_full_beside(file: &Path) -> bool {
+    let probe = file.with_file_name(format!(".sixfold-{}.tmp", std::process::id()));
+    let written = std::fs::write(&probe, [0; LOG_INDEX]);
+    let _ = std::fs::remove_file(&probe);
+    written.is_err_and(|error| error.kind() == std::io::ErrorKind::StorageFull)
+}
+
 /// A store in a file.
 #[derive(Debug)]
 pub struct SqliteStore {
@@ -115,7 +126,7 @@ impl SqliteStore {
         // A reader of a write-ahead log takes part in it, so it opens for writing where it may.
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         match Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE).and_then(checked) {
-            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. }) => {
+            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. } | StoreError::Full { .. }) => {
                 checked(Self::connect_to_unchanging(path, "")?)
             }
             opened => opened,
@@ -266,6 +277,8 @@ impl SqliteStore {
                 }
                 Some(ErrorCode::DatabaseCorrupt) => StoreError::Broken { file, reason },
                 Some(ErrorCode::DiskFull) => StoreError::Full { file },
+                // What SQLite says of a full disk where it cannot make the log's index.
+                Some(ErrorCode::SystemIoFailure) if is_full_beside(&file) => StoreError::Full { file },
                 Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => StoreError::Busy { file },
                 Some(ErrorCode::ReadOnly) => StoreError::ReadOnly { file },
                 Some(ErrorCode::CannotOpen) => StoreError::Open { file, reason },
