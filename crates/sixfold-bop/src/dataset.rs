@@ -31,6 +31,9 @@ pub enum Models {
 /// Width and height of a split's images, and the file that states them.
 type StatedSize = ((usize, usize), PathBuf);
 
+/// A `models_info.json` and the name of its file, where there is one.
+type NamedInfos = Option<(String, ModelsInfo)>;
+
 /// A dataset folder with one of its splits.
 #[derive(Debug, Clone)]
 pub struct BopDataset {
@@ -39,11 +42,8 @@ pub struct BopDataset {
     size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
     /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
-    infos: Arc<[OnceLock<ReadInfos>; 2]>,
+    infos: Arc<[OnceLock<NamedInfos>; 2]>,
 }
-
-/// The file `models_info.json` of a folder of models and what it says, if it is there.
-type ReadInfos = Option<(String, ModelsInfo)>;
 
 impl BopDataset {
     /// Opens `dir/split` (such as `test`), or `dir` itself where it is a scene folder (`scene_camera.json` in it);
@@ -136,10 +136,7 @@ impl BopDataset {
     }
 
     /// The same with the name of its file, read once.
-    pub(crate) fn named_models_info(
-        &self,
-        models: Models,
-    ) -> Result<&Option<(String, ModelsInfo)>, DatasetError> {
+    pub(crate) fn named_models_info(&self, models: Models) -> Result<&NamedInfos, DatasetError> {
         let place = match models {
             Models::Evaluation => &self.infos[0],
             Models::Rendering => &self.infos[1],
@@ -151,7 +148,7 @@ impl BopDataset {
         Ok(place.get_or_init(|| read))
     }
 
-    fn read_models_info(&self, models: Models) -> Result<Option<(String, ModelsInfo)>, DatasetError> {
+    fn read_models_info(&self, models: Models) -> Result<NamedInfos, DatasetError> {
         let first = self.models_dir(models);
         let other = self.models_dir(Models::Rendering);
         for dir in [first, other].into_iter().flatten() {

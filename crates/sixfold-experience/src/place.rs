@@ -205,9 +205,6 @@ pub(super) fn address(text: &str) -> Result<String, String> {
     if scheme != "postgres" && scheme != "postgresql" {
         return Err(format!("this kind of address is not known, only postgres:// is; {FILE}"));
     }
-    if rest.matches('@').count() > 1 {
-        return Err("there is more than one @; within a password it is written %40".to_owned());
-    }
     if let Some((credentials, _)) = rest.split_once('@') {
         let user = credentials.split(':').next().unwrap_or_default().to_ascii_lowercase();
         if user.contains("%3a") {

@@ -96,6 +96,9 @@ impl PostgresStore {
     pub fn at(url: &str) -> Result<PostgresStore, StoreError> {
         let server = shown(url);
         let wrong = |reason: &str| StoreError::Address { server: server.clone(), reason: reason.to_owned() };
+        if url.matches('@').count() > 1 {
+            return Err(wrong("there is more than one @; within a password it is written %40"));
+        }
         let url = address(url).map_err(|reason| wrong(&reason))?;
         let mut config: Config = url.parse().map_err(|e: Error| {
             // Its cause names a parameter, never a value.

@@ -41,6 +41,8 @@ const ATTEMPTS: &str = "
 const JOURNAL: &str = "
     CREATE TABLE IF NOT EXISTS journal (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, row TEXT NOT NULL);
 ";
+/// SQLite refuses a file that is shorter than its header says, but not to who may repair it.
+const REPAIRS: &str = "PRAGMA writable_schema=ON";
 /// What an experience is read from.
 const COLUMNS: [&str; 17] = [
     "time",
@@ -61,6 +63,17 @@ const COLUMNS: [&str; 17] = [
     "provenance",
     "table_plane",
 ];
+
+/// Bytes of the index of a write-ahead log, the smallest there is.
+const LOG_INDEX: usize = 32 << 10;
+
+/// Whether the folder of `file` has no room for the index of a write-ahead log, found by writing one.
+fn is_full_beside(file: &Path) -> bool {
+    let probe = file.with_file_name(format!(".sixfold-{}.tmp", std::process::id()));
+    let written = std::fs::write(&probe, [0; LOG_INDEX]);
+    let _ = std::fs::remove_file(&probe);
+    written.is_err_and(|error| error.kind() == std::io::ErrorKind::StorageFull)
+}
 
 /// A store in a file.
 #[derive(Debug)]
@@ -113,8 +126,8 @@ impl SqliteStore {
         // A reader of a write-ahead log takes part in it, so it opens for writing where it may.
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         match Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE).and_then(checked) {
-            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. }) => {
-                checked(Self::connect_to_unchanging(path)?)
+            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. } | StoreError::Full { .. }) => {
+                checked(Self::connect_to_unchanging(path, "")?)
             }
             opened => opened,
         }
@@ -126,18 +139,14 @@ impl SqliteStore {
     /// # Errors
     /// [`StoreError`] where nothing can be read.
     pub fn open_damaged(path: &Path) -> Result<SqliteStore, StoreError> {
-        // SQLite refuses a file that is shorter than its header says, but not to who may repair it.
-        let lenient = |store: SqliteStore| {
-            store.run("PRAGMA writable_schema=ON")?;
-            store.check_version().map(|()| store)
-        };
-        Self::connect(path, OpenFlags::SQLITE_OPEN_READ_ONLY)
-            .and_then(lenient)
-            .or_else(|_| Self::connect_to_unchanging(path).and_then(lenient))
+        let checked = |store: SqliteStore| store.check_version().map(|()| store);
+        Self::connect_as(path, path, OpenFlags::SQLITE_OPEN_READ_ONLY, REPAIRS)
+            .and_then(checked)
+            .or_else(|_| checked(Self::connect_to_unchanging(path, REPAIRS)?))
     }
 
     /// Opens a file where no files may be made beside it, as a write-ahead log needs.
-    fn connect_to_unchanging(path: &Path) -> Result<SqliteStore, StoreError> {
+    fn connect_to_unchanging(path: &Path, first: &str) -> Result<SqliteStore, StoreError> {
         let mut log = path.as_os_str().to_owned();
         log.push("-wal");
         if std::fs::metadata(&log).is_ok_and(|log| log.len() > 0) {
@@ -158,20 +167,26 @@ impl SqliteStore {
         }
         uri.push_str("?immutable=1");
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI;
-        Self::connect_as(Path::new(&uri), path, flags)
+        Self::connect_as(Path::new(&uri), path, flags, first)
     }
 
     fn connect(path: &Path, flags: OpenFlags) -> Result<SqliteStore, StoreError> {
-        Self::connect_as(path, path, flags)
+        Self::connect_as(path, path, flags, "")
     }
 
-    /// `file` is for the errors.
-    fn connect_as(place: &Path, file: &Path, flags: OpenFlags) -> Result<SqliteStore, StoreError> {
+    /// `file` is for the errors, `first` is done before anything is read.
+    fn connect_as(
+        place: &Path,
+        file: &Path,
+        flags: OpenFlags,
+        first: &str,
+    ) -> Result<SqliteStore, StoreError> {
         let file = file.to_path_buf();
         let connection = Connection::open_with_flags(place, flags | OpenFlags::SQLITE_OPEN_NO_MUTEX)
             .map_err(|e| StoreError::Open { file: file.clone(), reason: e.to_string() })?;
         let store = SqliteStore { connection, file };
         store.checked(store.connection.busy_timeout(Duration::from_secs(20)))?;
+        store.run(first)?;
         store.run("PRAGMA foreign_keys=ON; PRAGMA synchronous=FULL")?;
         Ok(store)
     }
@@ -262,6 +277,8 @@ impl SqliteStore {
                 }
                 Some(ErrorCode::DatabaseCorrupt) => StoreError::Broken { file, reason },
                 Some(ErrorCode::DiskFull) => StoreError::Full { file },
+                // What SQLite says of a full disk where it cannot make the log's index.
+                Some(ErrorCode::SystemIoFailure) if is_full_beside(&file) => StoreError::Full { file },
                 Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => StoreError::Busy { file },
                 Some(ErrorCode::ReadOnly) => StoreError::ReadOnly { file },
                 Some(ErrorCode::CannotOpen) => StoreError::Open { file, reason },

@@ -71,11 +71,9 @@ impl WriteLock {
             if !still_there(&file, &lock) {
                 continue;
             }
+            // Only to name this process to others: where the disk is full, the lock holds all the same.
             let id = format!("{}\n", std::process::id());
-            file.set_len(0)
-                .and_then(|()| file.rewind())
-                .and_then(|()| file.write_all(id.as_bytes()))
-                .map_err(io)?;
+            let _ = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes()));
             return Ok(WriteLock { path: lock, _file: file });
         }
     }

@@ -207,7 +207,15 @@ fn impossible_cameras() {
 
 #[test]
 fn images_above_the_limit() {
-    estimate_fails(|_| {}, "--max-pixels 76799", &["depth.png", "320x240", "--max-pixels"]);
+    estimate_fails(|_| {}, "--max-pixels 76799", &["camera.json", "320x240", "--max-pixels"]);
+    let without_size = |dir: &Path| {
+        let camera = dir.join("camera.json");
+        let text = std::fs::read_to_string(&camera).unwrap();
+        let mut value: serde_json::Value = serde_json::from_str(&text).unwrap();
+        value.as_object_mut().unwrap().retain(|key, _| key != "width" && key != "height");
+        std::fs::write(&camera, value.to_string()).unwrap();
+    };
+    estimate_fails(without_size, "--max-pixels 76799", &["depth.png", "320x240", "--max-pixels"]);
     let case = OneImage::new();
     sixfold(case.path(), &format!("{} --max-pixels 76800", OneImage::ARGUMENTS)).expect(0);
 }

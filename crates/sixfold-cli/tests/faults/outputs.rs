@@ -131,12 +131,13 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
     }
 }
 
-/// A value without the fields that a clock measured.
+/// A value without the fields that a clock measured, and without the name that a journal draws for itself.
 fn timeless(value: Value) -> Value {
     match value {
         Value::Object(fields) => {
-            let of_a_clock =
-                |name: &str| name.contains("second") || name.contains("time") || name == "created";
+            let of_a_clock = |name: &str| {
+                name.contains("second") || name.contains("time") || name == "created" || name == "journal"
+            };
             let kept = fields.into_iter().filter(|(name, _)| !of_a_clock(name));
             Value::Object(kept.map(|(name, value)| (name, timeless(value))).collect())
         }

@@ -49,7 +49,13 @@ pub fn read_only(row: &Row) {
     program.arg(inside.get_program()).args(inside.get_args());
     crate::driver::environment(&mut program, folder.path());
     let run = start(program).wait();
-    let why = ["Read-only file system", "read-only", "readonly", "unable to open database file"];
+    let why = [
+        "Read-only file system",
+        "read-only",
+        "readonly",
+        "unable to open database file",
+        "may only be read",
+    ];
     let named = run.stderr.lines().any(|line| {
         why.iter().any(|words| line.contains(words)) && row.writes.iter().any(|name| line.contains(name))
     });

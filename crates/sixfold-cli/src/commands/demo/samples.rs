@@ -45,7 +45,9 @@ impl Known {
 pub(super) fn found_upwards(name: &Path) -> Option<PathBuf> {
     let here = std::env::current_dir().unwrap_or_default();
     let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists())
+    let found =
+        here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists());
+    found.map(|path| path.canonicalize().unwrap_or(path))
 }
 
 /// The samples: given, or found.
