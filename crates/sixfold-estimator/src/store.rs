@@ -535,12 +535,16 @@ impl ObjectStore {
     /// [`StoreError`] where there is none, another process changes it, or it cannot be removed.
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
         let place = self.writable_place(name)?;
-        if !is_object(&place) {
+        if !self.folder.exists() {
             // The error says what there is.
             self.record(name)?;
         }
         let _lock = WriteLock::take(&place)?;
+        // Of a removal that was killed halfway too, which has left no object.
         self.tidy(name);
+        if !is_object(&place) {
+            self.record(name)?;
+        }
         let gone = self.own(name, GONE);
         // Away as a whole first: killed halfway, it is not half an object.
         std::fs::rename(&place, &gone).map_err(|source| StoreError::Io { path: place, source })?;
@@ -656,6 +660,18 @@ mod tests {
             std::fs::write(object.file("kept.bin").unwrap(), b"kept")?;
             derived.map_err(Into::into)
         })
+    }
+
+    #[test]
+    fn a_removal_that_was_killed_halfway_is_finished_by_the_next() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(dir.path());
+        let gone = dir.path().join(".part.1.gone");
+        std::fs::create_dir(&gone).unwrap();
+        std::fs::write(gone.join("mesh.ply"), b"half an object").unwrap();
+        std::fs::write(dir.path().join(".part.lock"), b"1").unwrap();
+        assert!(matches!(store.remove("part"), Err(StoreError::Unknown { .. })));
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
     }
 
     #[test]

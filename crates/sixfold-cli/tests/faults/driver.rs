@@ -85,7 +85,7 @@ fn cache() -> PathBuf {
 
 /// Whether a row takes too long for a run that was not asked to be thorough: it shares all that writes with quicker ones.
 pub fn is_left_out(row: &Row) -> bool {
-    let left_out = !thorough() && row.name == "train_nol";
+    let left_out = !thorough() && ["train_nol", "train_mttm"].contains(&row.name);
     if left_out {
         println!("skipped: {} takes minutes; SIXFOLD_FAULTS=all runs it", row.name);
     }
