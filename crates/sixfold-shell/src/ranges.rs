@@ -37,6 +37,18 @@ pub fn count<const MOST: usize>(text: &str) -> Result<NonZeroUsize, String> {
     number.ok_or_else(|| format!("found {text}, expected a whole number from 1 to {MOST}"))
 }
 
+/// An error for a name that could lead out of the folder in which something of that name is made.
+///
+/// # Errors
+/// As it says.
+pub fn folder_name(option: &str, name: &str) -> Result<()> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if name.is_empty() || !name.chars().all(plain) {
+        bail!("{option}: found {name:?}, expected letters, digits, _ and -");
+    }
+    Ok(())
+}
+
 /// An error for an id that is named twice.
 ///
 /// # Errors

@@ -21,7 +21,7 @@ use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, check_interrupt};
-use sixfold_shell::ranges::without_duplicates;
+use sixfold_shell::ranges::{folder_name, without_duplicates};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Sensor {
@@ -96,6 +96,7 @@ const TABLE: f64 = 3.0;
 
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
+    folder_name("--split", &a.split)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     // Written last: without it a run was stopped, and this one makes all of it again.
     let targets_file = a.out.join("test_targets_bop19.json");

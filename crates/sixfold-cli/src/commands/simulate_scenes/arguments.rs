@@ -15,7 +15,7 @@ use crate::commands::simulate::Sensor;
 use sixfold_shell::folder::Contents;
 use sixfold_shell::objects::find;
 use sixfold_shell::output::JsonArguments;
-use sixfold_shell::ranges::{in_range, without_duplicates};
+use sixfold_shell::ranges::{folder_name, in_range, without_duplicates};
 use sixfold_shell::scenes::NamedModels;
 
 /// Most synthetic objects of a kind: each is kept in memory with its mesh.
@@ -154,10 +154,7 @@ impl SimulateScenesArguments {
             );
         }
         self.pile().check()?;
-        let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-        if self.split.is_empty() || !self.split.chars().all(plain) {
-            bail!("--split: found {:?}, expected letters, digits, _ and -", self.split);
-        }
+        folder_name("--split", &self.split)?;
         self.chosen_families()?;
         Ok(())
     }
