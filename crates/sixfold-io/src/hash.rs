@@ -1,9 +1,10 @@
 //! FNV-1a with 64 bits (Fowler, Noll, Vo): tells files and settings apart, the same on every machine. No protection against
 //! anybody who wants two to be equal.
 
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
+
+use crate::regular::open_regular;
 
 /// A hash that grows with the bytes it is given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,9 +40,9 @@ pub fn fnv1a(bytes: &[u8]) -> u64 {
 /// The hash of a file's bytes, read piece by piece.
 ///
 /// # Errors
-/// What the system says.
+/// What the system says; a folder, a pipe or a device is refused, as by [`open_regular`].
 pub fn fnv1a_of_file(path: &Path) -> io::Result<u64> {
-    let mut file = File::open(path)?;
+    let mut file = open_regular(path, u64::MAX)?;
     let (mut hash, mut buffer) = (Fnv1a::default(), vec![0; 1 << 16]);
     loop {
         match file.read(&mut buffer)? {

@@ -73,11 +73,13 @@ impl OptionError {
     /// # Errors
     /// [`OptionError`].
     pub fn unless_weight(field: &'static str, value: f64) -> Result<(), OptionError> {
-        let fits = value >= 0.0 && value.is_finite();
-        OptionError::unless(fits, field, value, "a finite number, 0 or more")
+        let fits = (0.0..=MOST_WEIGHT).contains(&value);
+        OptionError::unless(fits, field, value, "a number from 0 to 1000000")
     }
 }
 
+/// Most that a part of a loss weighs.
+const MOST_WEIGHT: f64 = 1e6;
 /// Most steps of a training.
 const MOST_STEPS: u64 = 100_000_000;
 /// Most samples in a step: they are in memory at once.

@@ -37,16 +37,25 @@ pub fn count<const MOST: usize>(text: &str) -> Result<NonZeroUsize, String> {
     number.ok_or_else(|| format!("found {text}, expected a whole number from 1 to {MOST}"))
 }
 
-/// An error for a name that could lead out of the folder in which something of that name is made.
+/// Parses millimetres per unit of a depth image.
 ///
 /// # Errors
-/// As it says.
-pub fn folder_name(option: &str, name: &str) -> Result<()> {
-    let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if name.is_empty() || !name.chars().all(plain) {
-        bail!("{option}: found {name:?}, expected letters, digits, _ and -");
+/// What is wrong with it.
+pub fn depth_scale(text: &str) -> Result<f64, String> {
+    let scale = text.parse().ok().filter(|scale: &f64| *scale > 0.0 && *scale <= 1000.0);
+    scale.ok_or_else(|| format!("found {text}, expected millimetres above 0, at most 1000"))
+}
+
+/// Parses the name of a folder within another, such as a split of a dataset.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn folder_name(text: &str) -> Result<String, String> {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+    if text.is_empty() || !text.chars().all(is_plain) {
+        return Err(format!("found {text:?}, expected letters, digits, _ and -"));
     }
-    Ok(())
+    Ok(text.to_owned())
 }
 
 /// An error for an id that is named twice.

@@ -54,7 +54,7 @@ pub(crate) struct SimulateArguments {
     #[arg(long, value_name = "DIR")]
     pub dataset: PathBuf,
     /// Split of the dataset
-    #[arg(long, default_value = "test")]
+    #[arg(long, default_value = "test", value_parser = folder_name)]
     pub split: String,
     /// New dataset folder
     #[arg(long, value_name = "DIR")]
@@ -96,7 +96,6 @@ const TABLE: f64 = 3.0;
 
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
-    folder_name("--split", &a.split)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     // Written last: without it a run was stopped, and this one makes all of it again.
     let targets_file = a.out.join("test_targets_bop19.json");

@@ -127,6 +127,16 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
             Ok(value) => timeless(value).to_string().into_bytes(),
             Err(_) => bytes,
         },
+        // The cells of a table that hold seconds: one number of two digits, or a sum of two.
+        "md" => {
+            let of_a_clock = |cell: &str| {
+                cell.contains('.')
+                    && cell.chars().all(|c| c.is_ascii_digit() || matches!(c, '.' | '+' | ' '))
+                    && cell.contains(" + ")
+            };
+            let cells = text.split('|').map(|cell| if of_a_clock(cell) { " seconds " } else { cell });
+            cells.collect::<Vec<_>>().join("|").into_bytes()
+        }
         _ => bytes,
     }
 }

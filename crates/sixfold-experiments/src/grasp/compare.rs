@@ -24,7 +24,7 @@ use sixfold_simulation::{
 };
 
 use sixfold_shell::Outcome;
-use sixfold_shell::grasp::experience::{NetworkArguments, memory, model};
+use sixfold_shell::grasp::experience::{NetworkArguments, memory, model, store_place};
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
@@ -41,7 +41,7 @@ pub(crate) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "out
 #[derive(Debug, Args)]
 pub(crate) struct CompareArguments {
     /// The store of experiences, a file or postgres://user@host/database
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = store_place())]
     pub experiences: StorePlace,
     #[command(flatten)]
     pub objects: ObjectsArguments,

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use clap::builder::{OsStringValueParser, TypedValueParser};
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::Memory;
 use sixfold_experience::{ExperienceStore, StoreError, StorePlace};
@@ -34,6 +35,14 @@ pub fn model(a: &NetworkArguments) -> Result<DgcmModel> {
         );
     }
     DgcmModel::load(&a.weights).context("--weights")
+}
+
+/// Parses a store's place on the command line.
+pub fn store_place() -> impl TypedValueParser<Value = StorePlace> {
+    OsStringValueParser::new().try_map(|text| match text.is_empty() {
+        true => Err("found nothing, expected a file or the address of a server"),
+        false => Ok(StorePlace::from(text)),
+    })
 }
 
 /// The experiences of a store that is there, for a network.

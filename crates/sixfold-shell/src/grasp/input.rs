@@ -8,6 +8,8 @@ use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_
 use sixfold_grasp::{GraspView, ViewOptions, find_objects};
 use sixfold_io::{CameraFile, read_depth, read_mask, read_rgb};
 
+use crate::ranges;
+
 /// A depth image and what belongs to it.
 #[derive(Debug, Args)]
 pub struct InputArguments {
@@ -18,7 +20,7 @@ pub struct InputArguments {
     #[arg(long, value_name = "FILE")]
     pub camera: PathBuf,
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
-    #[arg(long, value_name = "MM")]
+    #[arg(long, value_name = "MM", value_parser = ranges::depth_scale)]
     pub depth_scale: Option<f64>,
     /// The object's mask: PNG, above zero inside (default: the largest thing on the table)
     #[arg(long, value_name = "FILE")]

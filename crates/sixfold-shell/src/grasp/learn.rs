@@ -18,7 +18,7 @@ use sixfold_simulation::{AttemptOutcome, ConvexParts, PartsOptions, scene, try_g
 use sixfold_synth::shapes::{Family, Member, Rest, member};
 
 use super::experience::{
-    NetworkArguments, OutboxArguments, local_file, model, note_left_out, now, writable_store,
+    NetworkArguments, OutboxArguments, local_file, model, note_left_out, now, store_place, writable_store,
 };
 use super::journal::StoreJournal;
 use super::object_list::{ObjectsArguments, named_objects};
@@ -31,7 +31,7 @@ use crate::ranges::in_range;
 #[derive(Debug, Args)]
 pub struct LearnArguments {
     /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = store_place())]
     pub experiences: StorePlace,
     /// Where experiences wait for a server.
     #[command(flatten)]

@@ -1,7 +1,7 @@
 //! Poses from colour in the samples. A detector says where the objects are; without its weights the ground truth does.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Result, bail};
@@ -39,12 +39,20 @@ pub(super) fn run(
             format!("no {WEIGHTS}; `sixfold train pix2pose` makes weights, --weights FILE takes them"),
         ));
     };
+    // What was asked for has to be right.
+    let detector = match a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR))) {
+        None => None,
+        Some(file) => match TrainedDetector::load(&file) {
+            Ok(detector) => Some((detector, file)),
+            Err(error) if a.detector.is_some() => return Err(error.into()),
+            Err(error) => return Ok(Colour::none(Some(weights), sixfold_shell::describe(&error.into()))),
+        },
+    };
     let result = Pix2PoseEstimator::load(&weights)
         .map_err(anyhow::Error::from)
-        .and_then(|pix2pose| with_model(a, out, &pix2pose, &weights, dataset, targets, known));
+        .and_then(|pix2pose| with_model(out, &pix2pose, &weights, detector, dataset, targets, known));
     match result {
         Ok(colour) => Ok(colour),
-        // Those that were asked for have to be right.
         Err(error) if a.weights.is_some() => Err(error),
         Err(error) => Ok(Colour::none(Some(weights), sixfold_shell::describe(&error))),
     }
@@ -62,25 +70,25 @@ fn objects(
 }
 
 fn with_model(
-    a: &DemoArguments,
     out: &mut Pictures,
     pix2pose: &Pix2PoseEstimator,
     weights: &Path,
+    detector: Option<(TrainedDetector, PathBuf)>,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
     let objects = objects(pix2pose, targets, known)?;
-    let detector = a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR)));
-    let (mut regions, mut detector_card) = (RegionSource::GroundTruth, None);
-    if let Some(file) = &detector {
-        let trained = TrainedDetector::load(file)?.with_threshold(MIN_DETECTION);
+    let (mut regions, mut detector_card, mut detector_file) = (RegionSource::GroundTruth, None, None);
+    if let Some((trained, file)) = detector {
         detector_card = Some(trained.model().card().clone());
+        detector_file = Some(file);
+        let trained = trained.with_threshold(MIN_DETECTION);
         regions = RegionSource::of_detector(Box::new(trained), known.keys().copied())?;
     }
     let mut colour = Colour {
         weights: Some(weights.to_owned()),
-        detector,
+        detector: detector_file,
         reason: None,
         ..Colour::none(None, String::new())
     };

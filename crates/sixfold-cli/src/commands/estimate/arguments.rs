@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
+use clap::builder::NonEmptyStringValueParser;
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, Command, FromArgMatches};
@@ -10,7 +11,7 @@ use sixfold_estimator::{Cache, ObjectStore, check_min_confidence};
 use sixfold_mesh::Unit;
 use sixfold_runner::RunOptions;
 use sixfold_shell::output::JsonArguments;
-use sixfold_shell::ranges::count;
+use sixfold_shell::ranges::{self, count};
 
 use super::methods::{METHODS, Method};
 
@@ -65,7 +66,7 @@ const OF_ONE_IMAGE: [&str; 6] = ["depth", "camera", "objects", "object_id", "mas
 #[derive(Debug, Args)]
 pub(crate) struct CommonArguments {
     /// Colour image: what a method works on, or for the overlay
-    #[arg(long, value_name = "FILE", requires = "camera")]
+    #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
     pub rgb: Option<PathBuf>,
     /// Depth image: PNG, one channel of 16 bits
     #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
@@ -74,7 +75,7 @@ pub(crate) struct CommonArguments {
     #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
-    #[arg(long, value_name = "MM")]
+    #[arg(long, value_name = "MM", value_parser = ranges::depth_scale, conflicts_with = "dataset")]
     pub depth_scale: Option<f64>,
     /// Objects to look for: mesh files, or names given with `sixfold object add`
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
@@ -114,7 +115,7 @@ pub(crate) struct CommonArguments {
     pub except: Option<PathBuf>,
     /// Where the objects are: gt for the ground truth's boxes, detect for those of --detector, or a file of COCO
     /// detections (default: detect with --detector, else anywhere)
-    #[arg(long, value_name = "gt|detect|FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
+    #[arg(long, value_name = "gt|detect|FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE, value_parser = NonEmptyStringValueParser::new())]
     pub boxes: Option<String>,
     /// Trained detector that says where the objects are: a file that `sixfold train detector` wrote
     #[arg(long, value_name = "FILE.safetensors")]

@@ -14,7 +14,7 @@ use sixfold_grasp::{GraspView, Gripper};
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
 #[cfg(feature = "experience")]
-use sixfold_shell::grasp::experience::{self, NetworkArguments};
+use sixfold_shell::grasp::experience::{self, NetworkArguments, store_place};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::grasp::input::{self, Input, InputArguments};
 #[cfg(feature = "experience")]
@@ -37,7 +37,7 @@ pub(crate) struct ProposeArguments {
     /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
     /// postgres://user@host/database
     #[cfg(feature = "experience")]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = store_place())]
     pub experiences: Option<sixfold_experience::StorePlace>,
     #[cfg(feature = "experience")]
     #[command(flatten)]

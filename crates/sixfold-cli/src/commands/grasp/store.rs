@@ -9,7 +9,7 @@ use sixfold_experience::{Attempt, Crop, Description, Experience, ExperienceStore
 use sixfold_grasp::read_grasp;
 use sixfold_io::write_rgb;
 use sixfold_shell::Outcome;
-use sixfold_shell::grasp::experience::{NetworkArguments, model, note_left_out, now};
+use sixfold_shell::grasp::experience::{NetworkArguments, model, note_left_out, now, store_place};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::grasp::input::{self, InputArguments};
 use sixfold_shell::grasp::store::{self, Moved};
@@ -35,7 +35,7 @@ pub(crate) enum StoreCommand {
     #[command(after_help = "Example:\n  sixfold grasp store list experience.db")]
     List {
         /// The store
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// List the grasps that were tried, whatever came of them
         #[arg(long)]
@@ -45,7 +45,7 @@ pub(crate) enum StoreCommand {
     #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
     Show {
         /// The store
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// Number of the experience
         #[arg(value_name = "ID")]
@@ -60,7 +60,7 @@ pub(crate) enum StoreCommand {
     )]
     Forget {
         /// The store
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// Numbers of the experiences
         #[arg(value_name = "ID", required_unless_present = "attempt")]
@@ -73,17 +73,17 @@ pub(crate) enum StoreCommand {
     #[command(after_help = "Example:\n  sixfold grasp store merge all.db robot-a.db robot-b.db")]
     Merge {
         /// The store that gets them; it is made where there is none
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// The other stores
-        #[arg(value_name = "OTHER", required = true)]
+        #[arg(value_name = "OTHER", required = true, value_parser = store_place())]
         others: Vec<StorePlace>,
     },
     /// Write all experiences as files: images, and JSON with everything else
     #[command(after_help = "Example:\n  sixfold grasp store export experience.db --out out/experiences")]
     Export {
         /// The store
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// Folder for the files
         #[arg(long, value_name = "DIR")]
@@ -95,10 +95,10 @@ pub(crate) enum StoreCommand {
     )]
     Refresh {
         /// The store
-        #[arg(value_name = "FILE")]
+        #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// The new store
-        #[arg(long, value_name = "FILE")]
+        #[arg(long, value_name = "FILE", value_parser = store_place())]
         out: StorePlace,
         #[command(flatten)]
         network: NetworkArguments,
@@ -108,7 +108,7 @@ pub(crate) enum StoreCommand {
 #[derive(Debug, Args)]
 pub(crate) struct AddArguments {
     /// The store; it is made where there is none
-    #[arg(value_name = "FILE")]
+    #[arg(value_name = "FILE", value_parser = store_place())]
     pub file: StorePlace,
     #[command(flatten)]
     pub input: InputArguments,

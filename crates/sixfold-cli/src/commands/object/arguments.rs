@@ -6,6 +6,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
 use sixfold_mttm::ViewCoverage;
 use sixfold_shell::output::JsonArguments;
+use sixfold_shell::ranges;
 
 #[derive(Debug, Args)]
 pub(crate) struct ObjectArguments {
@@ -114,7 +115,7 @@ pub(crate) struct DepthViewArguments {
     #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
     pub camera: Option<PathBuf>,
     /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
-    #[arg(long, value_name = "MM", requires = "depth", conflicts_with = "mesh")]
+    #[arg(long, value_name = "MM", requires = "depth", conflicts_with = "mesh", value_parser = ranges::depth_scale)]
     pub depth_scale: Option<f64>,
     /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
     /// metres (default: every view has a frame of its own)

@@ -98,7 +98,7 @@ pub(crate) struct SimulateScenesArguments {
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Name of the new dataset's split
-    #[arg(long, value_name = "NAME", default_value = "test")]
+    #[arg(long, value_name = "NAME", default_value = "test", value_parser = folder_name)]
     pub split: String,
     /// Seed of objects, poses, cameras and noise
     #[arg(long, default_value = "0")]
@@ -154,7 +154,6 @@ impl SimulateScenesArguments {
             );
         }
         self.pile().check()?;
-        folder_name("--split", &self.split)?;
         self.chosen_families()?;
         Ok(())
     }

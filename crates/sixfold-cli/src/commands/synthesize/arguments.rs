@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use sixfold_nol::refine::{PoseRefinementOptions, SceneKind};
 use sixfold_nol::view_grid::ViewGrid;
 use sixfold_shell::output::JsonArguments;
-use sixfold_shell::ranges::{folder_name, in_range, without_duplicates};
+use sixfold_shell::ranges::{self, in_range, without_duplicates};
 
 /// How colours of several photographs become one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -59,7 +59,7 @@ pub(crate) struct SynthesizeArguments {
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Name of the new dataset's split
-    #[arg(long, value_name = "NAME", default_value = "train_nol")]
+    #[arg(long, value_name = "NAME", default_value = "train_nol", value_parser = ranges::folder_name)]
     pub new_split: String,
     /// Most photographs of an object; those that add most of its surface are taken
     #[arg(long, value_name = "N", default_value = "16")]
@@ -130,7 +130,6 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
 impl SynthesizeArguments {
     /// Tests every option that is a number.
     pub fn check(&self) -> Result<()> {
-        folder_name("--new-split", &self.new_split)?;
         for (option, values) in
             [("--elevation", &self.elevation), ("--rough", &self.rough), ("--disturb", &self.disturb)]
         {
