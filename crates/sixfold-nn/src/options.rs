@@ -78,6 +78,8 @@ impl OptionError {
     }
 }
 
+/// Highest learning rate: with more, the first step ends in no numbers, after all samples were made.
+const MOST_RATE: f64 = 1000.0;
 /// Most that a part of a loss weighs.
 const MOST_WEIGHT: f64 = 1e6;
 /// Most steps of a training.
@@ -113,7 +115,9 @@ impl TrainingOptions {
         OptionError::unless_steps(self.steps)?;
         let positive = |value: f64| value.is_finite() && value > 0.0;
         let above = "a finite number above 0";
-        OptionError::unless(positive(self.learning_rate), "learning_rate", self.learning_rate, above)?;
+        let fits = positive(self.learning_rate) && self.learning_rate <= MOST_RATE;
+        let expected = "a number above 0, at most 1000";
+        OptionError::unless(fits, "learning_rate", self.learning_rate, expected)?;
         OptionError::unless_weight("weight_decay", f64::from(self.weight_decay))?;
         let norm = self.max_grad_norm.unwrap_or(1.0);
         OptionError::unless(positive(f64::from(norm)), "max_grad_norm", norm, above)
@@ -191,6 +195,7 @@ mod tests {
                 "steps: found 18446744073709551615, expected at most",
             ),
             (TrainingOptions { learning_rate: f64::NAN, ..options.clone() }, "learning_rate: found NaN"),
+            (TrainingOptions { learning_rate: 1e308, ..options.clone() }, "learning_rate: found 1000"),
             (TrainingOptions { weight_decay: -1.0, ..options.clone() }, "weight_decay: found -1"),
             (TrainingOptions { max_grad_norm: Some(0.0), ..options.clone() }, "max_grad_norm: found 0"),
         ];
