@@ -19,7 +19,8 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     write_atomically_with(path, |file| file.write_all(bytes))
 }
 
-/// As [`write_atomically`], with what `write` puts into the file, into a folder that is there already.
+/// As [`write_atomically`], with what `write` puts into the file, into a folder that is there already. A link stays, and what it
+/// leads to is written; a device or a pipe (`/dev/null`, `/dev/stdout`) is written as it is, not replaced.
 ///
 /// # Errors
 /// What the system or `write` says; the temporary file is then removed and what stood at `path` before is unchanged.
@@ -27,6 +28,13 @@ pub fn write_atomically_with(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> io::Result<()> {
+    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        let mut file = BufWriter::new(File::options().write(true).open(path)?);
+        return write(&mut file).and_then(|()| file.flush());
+    }
+    let linked = fs::symlink_metadata(path).is_ok_and(|found| found.is_symlink());
+    let linked = if linked { fs::canonicalize(path).ok() } else { None };
+    let path = linked.as_deref().unwrap_or(path);
     let (temporary, file) = temporary_beside(path)?;
     let mut file = BufWriter::new(file);
     // The file stays open, and so locked, until it has its name: until then nobody takes it for left behind.
@@ -98,6 +106,26 @@ fn remove_left_behind(path: &Path) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn links_stay_and_pipes_are_not_replaced() {
+        use std::os::unix::fs::FileTypeExt;
+        let dir = tempfile::tempdir().unwrap();
+        let (file, link) = (dir.path().join("result.json"), dir.path().join("newest.json"));
+        write_atomically(&file, b"old").unwrap();
+        std::os::unix::fs::symlink("result.json", &link).unwrap();
+        write_atomically(&link, b"new").unwrap();
+        assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+        assert_eq!(fs::read(&file).unwrap(), b"new");
+        let pipe = dir.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let from = pipe.clone();
+        let reader = std::thread::spawn(move || fs::read(from).unwrap());
+        write_atomically(&pipe, b"through").unwrap();
+        assert_eq!(reader.join().unwrap(), b"through");
+        assert!(fs::symlink_metadata(&pipe).unwrap().file_type().is_fifo());
+    }
 
     #[test]
     fn a_file_is_replaced_and_nothing_is_left_beside_it() {
