@@ -24,11 +24,14 @@ WRITERS = {
     """,
     "store": """
         network = sixfold.DgcmNet.load(ROOT / "weights/dgcm.safetensors")
-        box = sixfold.Mesh([[0, 0, 0], [0.1, 0, 0], [0, 0.06, 0], [0, 0, 0.04]]).convex_hull()
+        sys.path.insert(0, str(ROOT / "python/tests"))
+        from scenes import box_mesh, posed
         camera = sixfold.Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
-        pose = sixfold.pose_exp([0, 0, 0.6, 0, 0, 0])
-        drawn = sixfold.render_scene([(box, pose)], camera)
-        seen = (drawn.depth, camera, drawn.masks[0])
+        view = posed((0.0, 0.05, 0.75), (2.5, 0.0, 0.0))
+        scene = [(box_mesh((1.2, 1.2, 0.02)), view @ posed((0, 0, -0.01), (0, 0, 0)))]
+        scene.append((box_mesh((0.05, 0.16, 0.06)), view @ posed((0.02, -0.01, 0.03), (0, 0, 0.4))))
+        drawn = sixfold.render_scene(scene, camera)
+        seen = (drawn.depth, camera, drawn.masks[1])
         store = sixfold.ExperienceStore(out / "experience.db", network)
         for number, grasp in enumerate(sixfold.propose_grasps(*seen, gripper="jaws-85")[:3]):
             store.add(*seen, grasp, object=f"box {number}", gripper="jaws-85")
@@ -45,6 +48,7 @@ CLOCK = ("second", "time", "created")
 def start(name, out, **options):
     head = f"""
         import pathlib
+        import sys
         import sixfold
         ROOT, DEMO, out = (pathlib.Path(p) for p in ({str(ROOT)!r}, {str(ROOT / "data/demo")!r}, {str(out)!r}))
     """

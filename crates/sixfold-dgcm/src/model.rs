@@ -95,11 +95,11 @@ impl DgcmModel {
     ) -> Result<(Network, CropOptions), ModelError> {
         let wrong =
             |field, expected, found| ModelError::Card { file: path.to_path_buf(), field, expected, found };
+        let network = Network::of_architecture(&card.architecture, device)
+            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
         let crop: CropOptions = serde_json::from_value(card.extra["crop"].clone())
             .map_err(|e| wrong("extra.crop", "how objects are cut out", e.to_string()))?;
         check_crop(&crop).map_err(|(field, expected, found)| wrong(field, expected, found))?;
-        let network = Network::of_architecture(&card.architecture, device)
-            .ok_or_else(|| wrong("architecture", "dgcm-compact or dgcm-paper", card.architecture.clone()))?;
         if crop.side != network.side() {
             return Err(wrong(
                 "extra.crop.side",

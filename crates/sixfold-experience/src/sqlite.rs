@@ -80,6 +80,8 @@ fn is_full_beside(file: &Path) -> bool {
 pub struct SqliteStore {
     pub(super) connection: Connection,
     pub(super) file: PathBuf,
+    /// It was opened for reading alone because the disk is full.
+    no_room: bool,
 }
 
 impl SqliteStore {
@@ -126,7 +128,11 @@ impl SqliteStore {
         // A reader of a write-ahead log takes part in it, so it opens for writing where it may.
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         match Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE).and_then(checked) {
-            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. } | StoreError::Full { .. }) => {
+            Err(StoreError::Full { .. }) => {
+                let store = checked(Self::connect_to_unchanging(path, "")?)?;
+                Ok(SqliteStore { no_room: true, ..store })
+            }
+            Err(StoreError::ReadOnly { .. } | StoreError::Open { .. }) => {
                 checked(Self::connect_to_unchanging(path, "")?)
             }
             opened => opened,
@@ -184,7 +190,7 @@ impl SqliteStore {
         let file = file.to_path_buf();
         let connection = Connection::open_with_flags(place, flags | OpenFlags::SQLITE_OPEN_NO_MUTEX)
             .map_err(|e| StoreError::Open { file: file.clone(), reason: e.to_string() })?;
-        let store = SqliteStore { connection, file };
+        let store = SqliteStore { connection, file, no_room: false };
         store.checked(store.connection.busy_timeout(Duration::from_secs(20)))?;
         store.run(first)?;
         store.run("PRAGMA foreign_keys=ON; PRAGMA synchronous=FULL")?;
@@ -280,6 +286,7 @@ impl SqliteStore {
                 // What SQLite says of a full disk where it cannot make the log's index.
                 Some(ErrorCode::SystemIoFailure) if is_full_beside(&file) => StoreError::Full { file },
                 Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => StoreError::Busy { file },
+                Some(ErrorCode::ReadOnly) if self.no_room => StoreError::Full { file },
                 Some(ErrorCode::ReadOnly) => StoreError::ReadOnly { file },
                 Some(ErrorCode::CannotOpen) => StoreError::Open { file, reason },
                 _ => StoreError::Other { file, reason },

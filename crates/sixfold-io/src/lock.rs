@@ -35,6 +35,8 @@ pub enum LockError {
 #[derive(Debug)]
 pub struct WriteLock {
     path: PathBuf,
+    /// Folders that were made for the lock file, the deepest first: they go with it unless something is in them.
+    made: Vec<PathBuf>,
     /// Holds the system's lock, which ends with the process in any case.
     _file: File,
 }
@@ -47,17 +49,20 @@ impl WriteLock {
     pub fn take(path: &Path) -> Result<WriteLock, LockError> {
         let lock = lock_file(path).map_err(|source| LockError::Io { path: path.into(), source })?;
         let io = |source| LockError::Io { path: lock.clone(), source };
-        if let Some(parent) = lock.parent().filter(|p| !p.as_os_str().is_empty()) {
-            std::fs::create_dir_all(parent).map_err(io)?;
-        }
+        let parent = lock.parent().filter(|p| !p.as_os_str().is_empty());
+        let missing = |parent: &&Path| !parent.as_os_str().is_empty() && !parent.exists();
+        let made = parent.into_iter().flat_map(Path::ancestors).take_while(missing);
+        let made: Vec<PathBuf> = made.map(Path::to_path_buf).collect();
         loop {
-            let mut file = File::options()
-                .read(true)
-                .write(true)
-                .create(true)
-                .truncate(false)
-                .open(&lock)
-                .map_err(io)?;
+            if let Some(parent) = parent {
+                std::fs::create_dir_all(parent).map_err(io)?;
+            }
+            let opened = File::options().read(true).write(true).create(true).truncate(false).open(&lock);
+            let mut file = match opened {
+                // Another lock that made the folder took it away again.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                opened => opened.map_err(io)?,
+            };
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => {
@@ -74,7 +79,7 @@ impl WriteLock {
             // Only to name this process to others: where the disk is full, the lock holds all the same.
             let id = format!("{}\n", std::process::id());
             let _ = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes()));
-            return Ok(WriteLock { path: lock, _file: file });
+            return Ok(WriteLock { path: lock, made, _file: file });
         }
     }
 }
@@ -83,6 +88,9 @@ impl Drop for WriteLock {
     fn drop(&mut self) {
         // Removed while it is still locked; where the system does not allow that, an empty lock file stays.
         let _ = std::fs::remove_file(&self.path);
+        for folder in &self.made {
+            let _ = std::fs::remove_dir(folder);
+        }
     }
 }
 
@@ -125,7 +133,7 @@ mod tests {
         let id = std::process::id().to_string();
         assert!(error.contains("results.csv") && error.contains(&id), "{error}");
         drop(first);
-        assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 0);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         drop(WriteLock::take(&path).unwrap());
     }
 

@@ -63,7 +63,7 @@ pub fn tree(folder: &Path) -> Tree {
         let end = name.extension().unwrap_or_default().to_string_lossy().into_owned();
         match end.as_str() {
             "db" => tree.extend(store(&path).into_iter().map(|(inside, bytes)| (name.join(inside), bytes))),
-            "json" | "jsonl" | "csv" => {
+            "json" | "jsonl" | "csv" | "md" => {
                 tree.insert(name, without_times(&end, bytes));
             }
             // Holds parameters under random names and the time; the model that comes of it is compared.
