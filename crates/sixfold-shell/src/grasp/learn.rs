@@ -550,7 +550,7 @@ mod tests {
             let store = folder.join("e.db");
             let place = [store.to_str().unwrap(), folder.to_str().unwrap()].map(str::to_owned);
             let [store, out] = place;
-            let text = ["learn", "--families", "can", "--members", "1", "--attempts", "3", "--tries", "2"];
+            let text = ["learn", "--families", "box", "--members", "1", "--attempts", "3", "--tries", "2"];
             let more = ["--explore", "2", "--weights", weights, "--experiences", &store, "--out", &out];
             (Line::parse_from(text.into_iter().chain(more)).learn, folder)
         };
