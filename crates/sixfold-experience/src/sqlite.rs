@@ -5,7 +5,7 @@
 //! numbers, so that readers hear of them.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rusqlite::types::ValueRef;
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Row, Transaction, params};
@@ -64,6 +64,8 @@ const COLUMNS: [&str; 17] = [
     "table_plane",
 ];
 
+/// How long to wait for another process that writes.
+const PATIENCE: Duration = Duration::from_secs(20);
 /// Bytes of the index of a write-ahead log, the smallest there is.
 const LOG_INDEX: usize = 32 << 10;
 
@@ -101,8 +103,7 @@ impl SqliteStore {
         let made = store.make_tables();
         store.run(if made.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
         made?;
-        let mode: String =
-            store.checked(store.connection.query_row("PRAGMA journal_mode=WAL", [], |r| r.get(0)))?;
+        let mode = store.use_log()?;
         if mode != "wal" {
             return Err(StoreError::Other {
                 file: path.to_path_buf(),
@@ -112,6 +113,20 @@ impl SqliteStore {
             });
         }
         Ok(store)
+    }
+
+    /// Turns the write-ahead log on; the mode that came of it. SQLite waits for no other process here, which may be about the same.
+    fn use_log(&self) -> Result<String, StoreError> {
+        let start = Instant::now();
+        loop {
+            let mode = self.connection.query_row("PRAGMA journal_mode=WAL", [], |r| r.get(0));
+            match self.checked(mode) {
+                Err(StoreError::Busy { .. }) if start.elapsed() < PATIENCE => {
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                done => return done,
+            }
+        }
     }
 
     /// Opens a store that is there.
@@ -191,7 +206,7 @@ impl SqliteStore {
         let connection = Connection::open_with_flags(place, flags | OpenFlags::SQLITE_OPEN_NO_MUTEX)
             .map_err(|e| StoreError::Open { file: file.clone(), reason: e.to_string() })?;
         let store = SqliteStore { connection, file, no_room: false };
-        store.checked(store.connection.busy_timeout(Duration::from_secs(20)))?;
+        store.checked(store.connection.busy_timeout(PATIENCE))?;
         store.run(first)?;
         store.run("PRAGMA foreign_keys=ON; PRAGMA synchronous=FULL")?;
         Ok(store)
