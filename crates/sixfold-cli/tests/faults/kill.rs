@@ -22,7 +22,7 @@ fn moments(duration: Duration) -> Vec<Moment> {
         let changes = [1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22, 30].map(Moment::Change);
         return times.chain(changes).collect();
     }
-    let few = vec![Moment::Change(1), Moment::Change(4), Moment::Time(0.6)];
+    let few = [Moment::Change(1), Moment::Change(4), Moment::Time(0.6)];
     // A run of many seconds is killed once.
     let count = if duration > Duration::from_secs(6) { 1 } else { few.len() };
     few[few.len() - count..].to_vec()
