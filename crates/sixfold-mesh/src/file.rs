@@ -409,7 +409,7 @@ mod tests {
             said.map_err(|e| e.to_string())
         };
         assert!(explain(vec![Vec3::x(); 400_000], vec![]).unwrap_err().contains("the same point"));
-        let two = |k: u32| if k % 2 == 0 { Vec3::zeros() } else { Vec3::x() };
+        let two = |k: u32| if k.is_multiple_of(2) { Vec3::zeros() } else { Vec3::x() };
         explain((0..400_000).map(two).collect(), vec![]).unwrap();
         // Nearly equal ones at two places: all of their pairs are nearly as long.
         let nearly = |k: u32| two(k) + Vec3::new(0.0, f64::from(k / 2) * 1e-13, 0.0);

@@ -527,8 +527,11 @@ mod tests {
         }
     }
 
+    /// The journal's lines, the attempts, and the experiences with their features.
+    type LeftBehind = (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>);
+
     /// All that a run leaves behind, but for times and the journal's name.
-    fn left_behind(folder: &Path) -> (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>) {
+    fn left_behind(folder: &Path) -> LeftBehind {
         let text = std::fs::read_to_string(folder.join("attempts.jsonl")).unwrap();
         let store = StorePlace::File(folder.join("e.db")).open().unwrap();
         let attempts =
