@@ -190,11 +190,17 @@ fn present<'v>(map: &'v Map<String, Value>, field: &str) -> Option<&'v Value> {
     map.get(field).filter(|v| !v.is_null() && v.as_array().is_none_or(|a| !a.is_empty()))
 }
 
+/// Largest number of a box, pixels: beyond it numbers of a box cannot be added without loss.
+const FURTHEST: f64 = 1e6;
+
 fn parse_bbox(at: &At<'_>, value: &Value) -> Result<Rect, DatasetError> {
     let [x, y, width, height] = at.numbers("bbox", value)?;
     if width < 0.0 || height < 0.0 {
         let found = format!("width {width}, height {height}");
         return Err(at.error("bbox", found, "[x, y, width, height] with width and height from 0"));
+    }
+    if let Some(far) = [x, y, width, height].into_iter().find(|v| v.abs() > FURTHEST) {
+        return Err(at.error("bbox", far.to_string(), "pixels, at most a million"));
     }
     Ok(Rect { x, y, width, height })
 }
@@ -404,6 +410,7 @@ mod tests {
         let cases = [
             (TEXT.replace("[10, 20, 30.5, 40]", "[10, 20, 30.5]"), "entry 0, field bbox: found a list of 3"),
             (TEXT.replace("30.5", "-30.5"), "width -30.5"),
+            (TEXT.replace("30.5", "3e307"), "at most a million"),
             (TEXT.replace("\"score\": 0.9", "\"score\": \"high\""), "score: found \"high\""),
             (TEXT.replace("[1, 3, 2]", "[1, 3, 9]"), "entry 1, field segmentation"),
             (TEXT.replace("{\"size\": [2, 3], \"counts\": \"132\"}", "[[1, 2, 3, 4, 5, 6]]"), "no polygons"),
