@@ -39,7 +39,7 @@ static PRINTED: AtomicBool = AtomicBool::new(false);
 /// The first thing that could not be written there.
 static FAILED: Mutex<Option<io::Error>> = Mutex::new(None);
 
-/// What the macros call for standard output. A failure is kept for [`finish`].
+/// What the macros call for standard output. A failure is kept for the end of the program.
 pub fn out(text: fmt::Arguments<'_>) {
     PRINTED.store(true, Ordering::Relaxed);
     kept(io::stdout().write_all(plain(&text.to_string()).as_bytes()));
