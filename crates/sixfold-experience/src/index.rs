@@ -1,6 +1,6 @@
 //! The nearest experiences to a feature, exactly, over a copy of all features in memory.
 //!
-//! In 256 dimensions a tree finds nothing faster than looking at everything. Everything is looked at in whole numbers of 16
+//! In 256 dimensions a tree finds nothing faster than comparing with everything. Everything is compared in whole numbers of 16
 //! bits first, whose distances are off by a known bound; most rows are given up after a quarter of their numbers. The few
 //! that may be among the nearest are then compared in full. The result is the same as of a plain search.
 

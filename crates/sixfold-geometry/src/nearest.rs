@@ -161,7 +161,7 @@ impl KdTree {
             return;
         };
         let difference = p[inner.axis] - inner.cut;
-        // Of two cells equally far away that with the lowest index first: of many equal points only a few are then looked at.
+        // Of two cells equally far away that with the lowest index first: of many equal points only a few are then visited.
         let near = if difference.abs() == off[inner.axis].abs() {
             usize::from(inner.lowest[1] < inner.lowest[0])
         } else {

@@ -17,7 +17,7 @@ use crate::measure::position_key;
 const BORDER_WEIGHT: f64 = 100.0;
 /// A vertex with more faces than this is left alone once the work is used up.
 const HUB: usize = 64;
-/// Faces looked at, for each face of the mesh and at all, until then: several times what the finest scans take. Where thousands of
+/// Faces visited, for each face of the mesh and at all, until then: several times what the finest scans take. Where thousands of
 /// faces meet in one vertex again and again, the time would grow with their square.
 const WORK: (u64, u64) = (200, 20_000_000);
 /// Where so many times the faces asked for are left, those that are there several times are left out.
@@ -90,7 +90,7 @@ struct Collapser {
     quadrics: Vec<Quadric>,
     stamps: Vec<u32>,
     heap: BinaryHeap<Candidate>,
-    /// How many more faces may be looked at before hubs are left alone.
+    /// How many more faces may be visited before hubs are left alone.
     work: u64,
 }
 

@@ -98,7 +98,7 @@ pub enum DetectionEvent<'e> {
 /// What a run did.
 #[derive(Debug, Serialize)]
 pub struct DetectionSummary {
-    /// Images that were looked at.
+    /// Images that were searched.
     pub images: usize,
     /// Detections in them.
     pub detections: usize,

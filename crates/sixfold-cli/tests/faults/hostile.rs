@@ -15,7 +15,7 @@ use tempfile::TempDir;
 use crate::commands;
 use crate::driver::{Row, environment, program, start, thorough};
 
-/// A run may compute for so long, as `ulimit -t` has it: other tests take their share of the processors.
+/// A run may compute for so long, as `ulimit -t` has it: other tests use the processors too.
 const SECONDS: u64 = 10;
 /// And a run that computes nothing may wait for so long.
 const WAITING: Duration = Duration::from_secs(60);

@@ -18,7 +18,7 @@ fn mesh(folder: &Path) {
     copy(&CASE, folder);
 }
 
-/// A dataset `tiny` of which one image is looked at.
+/// A dataset `tiny` of which one image is scored.
 fn dataset(folder: &Path) {
     static CASE: LazyLock<PathBuf> = LazyLock::new(|| {
         let tiny = Tiny::coloured();

@@ -1,4 +1,4 @@
-//! `sixfold grasp store`: the experiences, looked at and looked after.
+//! `sixfold grasp store`: lists, shows, removes, merges and exports experiences.
 
 use std::path::{Path, PathBuf};
 
