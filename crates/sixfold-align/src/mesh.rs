@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::Vec3;
-use sixfold_io::{limits, read_regular, write_atomically};
+use sixfold_io::{fnv1a, limits, read_regular, write_atomically};
 use sixfold_mesh::{Mesh, MeshError, simplify};
 use thiserror::Error;
 
@@ -80,7 +80,7 @@ impl VerificationMesh {
         let Some(path) = file.filter(|_| mesh.faces().len() > RENDERED_FACES) else {
             return Ok(VerificationMesh { mesh: verification_mesh(mesh)?, note: None });
         };
-        let key = fingerprint(mesh);
+        let key = mesh.shape_hash();
         let mut note = None;
         match read_regular(path, limits::DERIVED) {
             Ok(bytes) => match decode(&bytes, key).filter(|kept| could_be_simplified(kept, mesh)) {
@@ -98,17 +98,6 @@ impl VerificationMesh {
     }
 }
 
-/// FNV-1a (Fowler, Noll, Vo).
-fn hash(bytes: impl IntoIterator<Item = u8>) -> u64 {
-    let step = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
-    bytes.into_iter().fold(0xcbf2_9ce4_8422_2325, step)
-}
-
-fn fingerprint(mesh: &Mesh) -> u64 {
-    let vertices = mesh.vertices().iter().flat_map(|v| [v.x, v.y, v.z]).flat_map(f64::to_le_bytes);
-    hash(vertices.chain(mesh.faces().iter().flatten().flat_map(|i| i.to_le_bytes())))
-}
-
 fn encode(mesh: &Mesh, key: u64) -> Vec<u8> {
     let mut out = Vec::new();
     out.extend_from_slice(MAGIC);
@@ -118,14 +107,14 @@ fn encode(mesh: &Mesh, key: u64) -> Vec<u8> {
     out.extend_from_slice(&(mesh.faces().len() as u32).to_le_bytes());
     out.extend(mesh.vertices().iter().flat_map(|v| [v.x, v.y, v.z]).flat_map(f64::to_le_bytes));
     out.extend(mesh.faces().iter().flatten().flat_map(|i| i.to_le_bytes()));
-    let sum = hash(out.iter().copied());
+    let sum = fnv1a(&out);
     out.extend_from_slice(&sum.to_le_bytes());
     out
 }
 
 fn decode(bytes: &[u8], key: u64) -> Option<Mesh> {
     let (body, sum) = bytes.split_last_chunk::<8>()?;
-    if hash(body.iter().copied()).to_le_bytes() != *sum || body.get(..8)? != MAGIC {
+    if fnv1a(body).to_le_bytes() != *sum || body.get(..8)? != MAGIC {
         return None;
     }
     let word = |at: usize| body.get(at..at + 4)?.try_into().ok().map(u32::from_le_bytes);
@@ -177,7 +166,7 @@ mod tests {
         let first = VerificationMesh::cached(Some(&file), &mesh).unwrap();
         assert!(same(&first) && first.note.is_none());
         let kept = std::fs::read(&file).unwrap();
-        assert!(decode(&kept, fingerprint(&mesh)).is_some());
+        assert!(decode(&kept, mesh.shape_hash()).is_some());
         assert!(same(&VerificationMesh::cached(Some(&file), &mesh).unwrap()));
         for broken in
             [&kept[..kept.len() / 2], &kept[..5], b"something else, longer than a head of such a file"]
@@ -192,7 +181,7 @@ mod tests {
             let mut vertices = expected.vertices().to_vec();
             vertices[0].x += shift;
             let forged = Mesh::new(vertices, faces.to_vec()).unwrap();
-            std::fs::write(&file, encode(&forged, fingerprint(&mesh))).unwrap();
+            std::fs::write(&file, encode(&forged, mesh.shape_hash())).unwrap();
             let again = VerificationMesh::cached(Some(&file), &mesh).unwrap();
             assert!(same(&again) && again.note.is_some());
         }

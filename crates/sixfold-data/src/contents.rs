@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use sixfold_geometry::{Camera, FrameId, Pose, RgbImage, Vec3};
 use sixfold_io::Fnv1a;
-use sixfold_mesh::Mesh;
 
 use crate::posed_image::PosedImage;
 use crate::training_set::{TrainingObject, TrainingSet};
@@ -47,14 +46,7 @@ fn hash_of_object(object: &TrainingObject) -> u64 {
     let TrainingObject { id, mesh, info, scale } = object;
     let mut hash = Hash::default();
     hash.count(*id as usize);
-    hash.mesh(mesh);
-    hash.number(info.diameter);
-    hash.count(info.symmetries_discrete.len());
-    info.symmetries_discrete.iter().for_each(|pose| hash.pose(pose));
-    for symmetry in &info.symmetries_continuous {
-        hash.point(&symmetry.axis);
-        hash.point(&symmetry.offset);
-    }
+    [mesh.contents_hash(), info.contents_hash()].iter().for_each(|h| hash.0.write(&h.to_le_bytes()));
     hash.point(&scale.centre);
     hash.point(&scale.half_size);
     hash.0.value()
@@ -127,29 +119,6 @@ impl Hash {
         self.count(image.height());
         self.0.write(image.as_slice().as_flattened());
     }
-
-    fn mesh(&mut self, mesh: &Mesh) {
-        self.count(mesh.vertices().len());
-        mesh.vertices().iter().for_each(|v| self.point(v));
-        self.count(mesh.faces().len());
-        mesh.faces().iter().flatten().for_each(|i| self.0.write(&i.to_le_bytes()));
-        if let Some(normals) = mesh.normals() {
-            self.count(1);
-            normals.iter().for_each(|n| self.point(n));
-        }
-        if let Some(colors) = mesh.colors() {
-            self.count(2);
-            self.0.write(colors.as_flattened());
-        }
-        if let Some(texcoords) = mesh.texcoords() {
-            self.count(3);
-            texcoords.iter().flatten().for_each(|t| self.0.write(&t.to_le_bytes()));
-        }
-        if let Some(texture) = mesh.texture() {
-            self.count(4);
-            self.image(texture);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -157,7 +126,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use sixfold_geometry::Mask;
-    use sixfold_mesh::ModelInfo;
+    use sixfold_mesh::{Mesh, ModelInfo};
 
     use super::*;
 

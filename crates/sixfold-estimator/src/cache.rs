@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use sixfold_geometry::Pose;
+use sixfold_io::Fnv1a;
 use sixfold_mesh::{Mesh, ModelInfo};
 use thiserror::Error;
 
@@ -115,18 +116,16 @@ fn size(folder: &Path) -> u64 {
     entries.filter_map(|e| e.metadata().ok()).map(|m| m.len()).sum()
 }
 
-/// FNV-1a (Fowler, Noll, Vo) over vertices, faces and symmetries.
+/// The hash of vertices, faces and symmetries.
 fn fingerprint(mesh: &Mesh, info: &ModelInfo) -> u64 {
     let symmetries = info.symmetries_discrete.iter().map(Pose::to_matrix);
     let symmetries = symmetries.flat_map(|m| m.iter().copied().collect::<Vec<f64>>());
     let axes =
         info.symmetries_continuous.iter().flat_map(|s| [s.axis, s.offset]).flat_map(|v| [v.x, v.y, v.z]);
-    let vertices = mesh.vertices().iter().flat_map(|v| [v.x, v.y, v.z]);
-    let numbers = vertices.chain(symmetries).chain(axes).flat_map(f64::to_le_bytes);
-    let faces = mesh.faces().iter().flatten().flat_map(|i| i.to_le_bytes());
-    numbers.chain(faces).fold(0xcbf2_9ce4_8422_2325, |hash: u64, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    let mut hash = Fnv1a::default();
+    hash.write(&mesh.shape_hash().to_le_bytes());
+    symmetries.chain(axes).for_each(|number| hash.write(&number.to_le_bytes()));
+    hash.value()
 }
 
 #[cfg(test)]

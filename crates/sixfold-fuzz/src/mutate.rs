@@ -54,9 +54,7 @@ pub fn mutated(seeds: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
 /// checksum reaches the reader behind it.
 pub fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
     let Some(end) = bytes.len().checked_sub(8) else { return bytes };
-    let sum = bytes[..end]
-        .iter()
-        .fold(0xcbf2_9ce4_8422_2325u64, |sum, b| (sum ^ u64::from(*b)).wrapping_mul(0x0000_0100_0000_01b3));
+    let sum = sixfold_io::fnv1a(&bytes[..end]);
     bytes[end..].copy_from_slice(&sum.to_le_bytes());
     bytes
 }

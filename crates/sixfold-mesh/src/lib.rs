@@ -14,6 +14,7 @@
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
+mod contents;
 mod convex_hull;
 mod diameter;
 mod error;

@@ -51,17 +51,8 @@ impl Contents {
     /// Takes in an object: everything of its mesh, and what is known of it.
     pub fn add_object(&mut self, name: &str, mesh: &Mesh, info: &ModelInfo) {
         let hash = self.of(name);
-        let vectors = mesh.vertices().iter().chain(mesh.normals().into_iter().flatten());
-        vectors.flat_map(|v| [v.x, v.y, v.z]).for_each(|x| hash.write(&x.to_le_bytes()));
-        mesh.faces().iter().flatten().for_each(|i| hash.write(&i.to_le_bytes()));
-        hash.write(mesh.colors().unwrap_or_default().as_flattened());
-        let texcoords = mesh.texcoords().unwrap_or_default().as_flattened();
-        texcoords.iter().for_each(|x| hash.write(&x.to_le_bytes()));
-        if let Some(texture) = mesh.texture() {
-            hash.write(texture.as_slice().as_flattened());
-        }
-        // Numbers print with all their digits.
-        hash.write(format!("{info:?}").as_bytes());
+        hash.write(&mesh.contents_hash().to_le_bytes());
+        hash.write(&info.contents_hash().to_le_bytes());
     }
 
     fn to_json(&self) -> Value {

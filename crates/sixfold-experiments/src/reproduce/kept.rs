@@ -46,21 +46,3 @@ pub(super) fn same_inputs(folder: &Path, inputs: &impl Serialize) -> Result<()> 
     }
     write_atomically(&path, serde_json::to_string_pretty(&now)?.as_bytes())
 }
-
-/// 64-bit FNV-1a: tells files apart, nothing more.
-pub(super) fn fnv(bytes: &[u8]) -> u64 {
-    bytes
-        .iter()
-        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_hash_is_fnv_1a() {
-        assert_eq!(fnv(b""), 0xcbf2_9ce4_8422_2325);
-        assert_eq!(fnv(b"foobar"), 0x8594_4171_f739_67e8);
-    }
-}

@@ -26,7 +26,7 @@ use self::picture::Strips;
 use self::poses::{PosesRow, PosesSummary};
 use self::speed::Speed;
 use self::views::{Networks, Target, ViewRow, ViewsSummary, Way};
-use super::kept::{fnv, kept_or_made, same_inputs};
+use super::kept::{kept_or_made, same_inputs};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -100,7 +100,7 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         }
         networks.push((name.clone(), NolModel::load(file)?));
         let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
-        hashes.push((name, format!("{:016x}", fnv(&bytes))));
+        hashes.push((name, format!("{:016x}", sixfold_io::fnv1a(&bytes))));
     }
     let material = Material::read(a)?;
     let inputs = Inputs {

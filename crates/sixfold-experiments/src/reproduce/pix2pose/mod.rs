@@ -23,7 +23,7 @@ use sixfold_pix2pose::estimate::Quirks;
 
 use self::model::Pix2Pose;
 use self::row::{Row, Setting};
-use super::kept::{fnv, kept_or_made, same_inputs};
+use super::kept::{kept_or_made, same_inputs};
 use sixfold_runner::RegionSource;
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
@@ -160,7 +160,7 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
         weights: a.weights.display().to_string(),
         weights_hash: format!(
             "{:016x}",
-            fnv(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
+            sixfold_io::fnv1a(&std::fs::read(&a.weights).with_context(|| a.weights.display().to_string())?)
         ),
         trained_on: trained_on.iter().map(|(scene, image)| format!("{scene}/{image}")).collect(),
         published: a.published.as_ref().map(|f| f.display().to_string()),
@@ -354,7 +354,7 @@ impl Bench {
             for s in skipped {
                 eprintln!("skipped {s}");
             }
-            let hash = fnv(&std::fs::read(file).with_context(|| file.display().to_string())?);
+            let hash = sixfold_io::fnv1a(&std::fs::read(file).with_context(|| file.display().to_string())?);
             let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
             detections.push(Detections {
                 name,
