@@ -176,7 +176,7 @@ impl Part {
 impl DetectionRun<'_> {
     /// Searches all images and writes what was found to `out`, whole at the end. An image that cannot be read is left out and
     /// reported. Stops between images when `stop` is set; a later run with the same options resumes, where the images that are
-    /// done have the same contents. After a run that left images out, the next one looks at these only. One run at a time writes a
+    /// done have the same contents. After a run that left images out, the next one searches these only. One run at a time writes a
     /// file.
     ///
     /// # Errors
