@@ -8,8 +8,8 @@ use std::path::Path;
 
 use serde_json::{Map, Value, json};
 use sixfold_geometry::Rect;
-use sixfold_io::write_atomically;
 
+use crate::coco_rows::DetectionRows;
 use crate::dataset::{BopDataset, list_ids};
 use crate::dataset_error::DatasetError;
 use crate::json::{At, describe, parse};
@@ -264,24 +264,26 @@ fn rle_json(rle: &Rle) -> Value {
 /// # Errors
 /// [`DatasetError::Write`].
 pub fn write_detections(path: &Path, detections: &[Detection]) -> Result<(), DatasetError> {
-    let entry = |d: &Detection| {
-        let mut map = Map::new();
-        map.insert("scene_id".into(), json!(d.scene_id));
-        map.insert("image_id".into(), json!(d.image_id));
-        map.insert("category_id".into(), json!(d.category_id));
-        map.insert("score".into(), json!(d.score));
-        if let Some(b) = &d.bbox {
-            map.insert("bbox".into(), json!([b.x, b.y, b.width, b.height]));
-        }
-        if let Some(rle) = &d.segmentation {
-            map.insert("segmentation".into(), rle_json(rle));
-        }
-        map.insert("time".into(), json!(d.time.unwrap_or(-1.0)));
-        Value::Object(map).to_string()
-    };
-    let lines: Vec<String> = detections.iter().map(entry).collect();
-    write_atomically(path, format!("[\n{}\n]\n", lines.join(",\n")).as_bytes())
-        .map_err(|source| DatasetError::Write { path: path.to_owned(), source })
+    let mut rows = DetectionRows::default();
+    rows.add(detections);
+    rows.write(path)
+}
+
+/// A detection as its file has it.
+pub(crate) fn detection_row(d: &Detection) -> String {
+    let mut map = Map::new();
+    map.insert("scene_id".into(), json!(d.scene_id));
+    map.insert("image_id".into(), json!(d.image_id));
+    map.insert("category_id".into(), json!(d.category_id));
+    map.insert("score".into(), json!(d.score));
+    if let Some(b) = &d.bbox {
+        map.insert("bbox".into(), json!([b.x, b.y, b.width, b.height]));
+    }
+    if let Some(rle) = &d.segmentation {
+        map.insert("segmentation".into(), rle_json(rle));
+    }
+    map.insert("time".into(), json!(d.time.unwrap_or(-1.0)));
+    Value::Object(map).to_string()
 }
 
 /// One annotated object of the ground truth.

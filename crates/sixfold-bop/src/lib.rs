@@ -6,6 +6,7 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod coco;
+mod coco_rows;
 mod coco_score;
 mod coco_truth;
 mod dataset;
@@ -27,6 +28,7 @@ pub use coco::{
     AdjustedDetection, Adjustment, Annotation, CocoGroundTruth, Detection, Detections, ReadDetections,
     parse_detections, read_detections, write_detections,
 };
+pub use coco_rows::DetectionRows;
 pub use coco_score::{CocoScores, IouType, evaluate_coco};
 pub use coco_truth::{DetectionScores, FoundAtHalf, VisibleTruth, found_at_half, score_detections};
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};

@@ -6,7 +6,7 @@ use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use sixfold_geometry::{Mat3, Pose, Vec3};
-use sixfold_io::write_atomically;
+use sixfold_io::{make_folder_of, sync_folder_of, write_atomically};
 use thiserror::Error;
 
 use crate::errors::Placement;
@@ -246,9 +246,7 @@ impl ResultsAppender {
     /// [`ResultsError`]; a bad row that is not the torn last one is an error, as in [`read_results`].
     pub fn open(path: &Path) -> Result<Self, ResultsError> {
         let write_error = |source| ResultsError::Write { path: path.to_owned(), source };
-        if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
-            std::fs::create_dir_all(parent).map_err(write_error)?;
-        }
+        make_folder_of(path).map_err(write_error)?;
         let mut file = OpenOptions::new()
             .read(true)
             .write(true)
@@ -273,6 +271,7 @@ impl ResultsAppender {
         file.seek(SeekFrom::End(0)).map_err(write_error)?;
         if whole == 0 {
             file.write_all(format!("{HEADER}\n").as_bytes()).map_err(write_error)?;
+            sync_folder_of(path).map_err(write_error)?;
         }
         Ok(ResultsAppender { path: path.to_owned(), file, existing, torn })
     }

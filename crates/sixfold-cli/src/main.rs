@@ -8,6 +8,7 @@ extern crate sixfold_shell;
 
 mod arguments;
 mod commands;
+mod idle;
 
 use std::process::ExitCode;
 
@@ -18,7 +19,7 @@ use sixfold_shell::{exit_code, progress, use_threads};
 use crate::arguments::{Arguments, Command};
 
 fn main() -> ExitCode {
-    let arguments = match parse::<Arguments>() {
+    let arguments = match parse::<Arguments>(idle::IDLE) {
         Ok(arguments) => arguments,
         Err(code) => return code,
     };

@@ -14,9 +14,6 @@ use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
-/// Stages of the encoder that the network uses: all of them may stay as they are.
-const ENCODER_STAGES: usize = 5;
-
 /// How to train. All of it decides about the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DetectorTrainingOptions {
@@ -57,12 +54,7 @@ impl DetectorTrainingOptions {
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
         OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
-        OptionError::unless(
-            self.frozen_stages <= ENCODER_STAGES,
-            "frozen_stages",
-            self.frozen_stages,
-            "0 to 5",
-        )?;
+        OptionError::unless_frozen_stages(self.frozen_stages)?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }
 }

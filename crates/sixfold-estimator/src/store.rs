@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3};
-use sixfold_io::{LockError, WriteLock, limits, read_regular_text, write_atomically};
+use sixfold_io::{LockError, WriteLock, limits, read_regular_text, sync_folder_of, write_atomically};
 use sixfold_mesh::{
     ContinuousSymmetry, Mesh, MeshError, MeshFileError, ModelInfo, PlyFormat, Unit, read_mesh, write_ply,
 };
@@ -518,7 +518,8 @@ impl ObjectStore {
                 serde_json::to_string_pretty(new.record)?.as_bytes(),
             )?;
             let away = if replaced { Some(self.own(name, OLD)) } else { None };
-            Ok(swap(&fresh, &place, away.as_deref(), |from, to| std::fs::rename(from, to))?)
+            swap(&fresh, &place, away.as_deref(), |from, to| std::fs::rename(from, to))?;
+            Ok(sync_folder_of(&place)?)
         })();
         if place.exists() {
             self.tidy(name);
@@ -547,7 +548,9 @@ impl ObjectStore {
         }
         let gone = self.own(name, GONE);
         // Away as a whole first: killed halfway, it is not half an object.
-        std::fs::rename(&place, &gone).map_err(|source| StoreError::Io { path: place, source })?;
+        std::fs::rename(&place, &gone)
+            .and_then(|()| sync_folder_of(&place))
+            .map_err(|source| StoreError::Io { path: place, source })?;
         std::fs::remove_dir_all(&gone).map_err(|source| StoreError::Io { path: gone, source })
     }
 

@@ -3,35 +3,20 @@
 
 mod support;
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::Stdio;
 
 use sixfold_experience::{
     Attempt, ExperienceStore, FeatureIndex, JournalEntry, SqliteStore, StoreError, StorePlace, TaskRecord,
 };
-use support::{attempt, experience, named, objects};
-
-/// This test binary again, as a process of its own that does one thing.
-fn process(what: &str, file: &Path) -> Command {
-    let mut command = Command::new(std::env::current_exe().unwrap());
-    command
-        .args(["--exact", "helper_process", "--nocapture", "--ignored"])
-        .env("SIXFOLD_HELPER", what)
-        .env("SIXFOLD_HELPER_FILE", file)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped());
-    command
-}
+use support::{attempt, experience, helped, helper, named, objects};
 
 const EACH: i64 = 40;
 
 #[test]
 #[ignore = "started by the other tests"]
 fn helper_process() {
-    let (Ok(what), Ok(file)) = (std::env::var("SIXFOLD_HELPER"), std::env::var("SIXFOLD_HELPER_FILE")) else {
-        return;
-    };
-    let file = PathBuf::from(file);
+    let Some((file, what)) = helped() else { return };
     if what == "read" {
         let mut store = StorePlace::File(file).open().unwrap();
         assert_eq!(objects(&*store), named(0..3));
@@ -65,7 +50,8 @@ fn two_processes_write_one_store_and_lose_no_row() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("experience.db");
     // Nobody made the file before them.
-    let writers = ["0", "1000", "2000"].map(|first| process(first, &file).spawn().unwrap());
+    let writers =
+        ["0", "1000", "2000"].map(|first| helper(&file, first).stderr(Stdio::piped()).spawn().unwrap());
     writers.into_iter().for_each(ends_well);
     let store = SqliteStore::open(&file).unwrap();
     store.check_integrity().unwrap();
@@ -228,7 +214,8 @@ fn a_store_that_may_only_be_read_is_read() {
         drop(three(&file));
         allow(&file, 0o444);
         allow(folder.path(), of_folder);
-        let mut reader = process("read", &file);
+        let mut reader = helper(&file, "read");
+        reader.stderr(Stdio::piped());
         if root {
             if name == "file" {
                 chown(folder.path(), Some(NOBODY), None).unwrap();

@@ -6,34 +6,18 @@
 mod support;
 
 use std::io::{BufRead, BufReader, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sixfold_experience::{COPIES, ExperienceStore, FeatureIndex, Position, SqliteStore, StoreError};
-use support::{experience, feature, kills, said};
-
-/// This test binary again, as a process of its own that does one thing.
-fn process(what: &str, file: &Path) -> Child {
-    Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "helper_process", "--nocapture", "--ignored"])
-        .env("SIXFOLD_HELPER", what)
-        .env("SIXFOLD_HELPER_FILE", file)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap()
-}
+use support::{experience, feature, helped, helper, kills, said};
 
 #[test]
 #[ignore = "started by the other tests"]
 fn helper_process() {
-    let (Ok(what), Ok(file)) = (std::env::var("SIXFOLD_HELPER"), std::env::var("SIXFOLD_HELPER_FILE")) else {
-        return;
-    };
-    let file = PathBuf::from(file);
+    let Some((file, what)) = helped() else { return };
     let mut out = std::io::stdout();
     if what == "write" {
         let mut store = SqliteStore::create(&file).unwrap();
@@ -77,7 +61,7 @@ fn nothing_acknowledged_is_lost_when_the_writer_is_killed() {
             file = folder.path().join(format!("experience-{kill}.db"));
             acknowledged = 0;
         }
-        let mut writer = process("write", &file);
+        let mut writer = helper(&file, "write").spawn().unwrap();
         // The last one gets as far as storing something, on a slow computer too.
         let after = if kill + 1 == kills { 1_000_000 } else { random.random_range(0..120_000) };
         std::thread::sleep(Duration::from_micros(after));
@@ -116,8 +100,8 @@ fn two_processes_read_while_one_writes() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("experience.db");
     SqliteStore::create(&file).unwrap();
-    let mut writer = process("write", &file);
-    let mut readers = [process("read", &file), process("read", &file)];
+    let mut writer = helper(&file, "write").spawn().unwrap();
+    let mut readers = [helper(&file, "read").spawn().unwrap(), helper(&file, "read").spawn().unwrap()];
     // Both readers hear of new experiences while the writer continues.
     for reader in &mut readers {
         let lines = BufReader::new(reader.stdout.take().unwrap()).lines();

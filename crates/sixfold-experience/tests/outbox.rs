@@ -7,8 +7,7 @@
 mod support;
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -19,7 +18,7 @@ use sixfold_experience::{
     Attempt, Changes, Experience, ExperienceStore, FeatureIndex, Notice, OutboxOptions, OutboxStore,
     Position, SqliteStore, StoreError, StorePlace, Stored, Summary,
 };
-use support::{attempt, contract, experience, feature, heard, kills, named, objects, said};
+use support::{attempt, contract, experience, feature, heard, helped, helper, kills, named, objects, said};
 
 const FINE: u32 = 0;
 /// No answer at all.
@@ -317,8 +316,7 @@ fn a_place_never_shows_a_password() {
 #[test]
 #[ignore = "started by the other tests"]
 fn helper_process() {
-    let Ok(folder) = std::env::var("SIXFOLD_HELPER") else { return };
-    let folder = PathBuf::from(folder);
+    let Some((folder, _)) = helped() else { return };
     let remote = Remote::new(&folder.join("fleet.db"), &Arc::new(SHAKY.into()));
     let (mut store, _) = robot(&folder.join("outbox.db"), remote);
     let mut out = std::io::stdout();
@@ -341,13 +339,7 @@ fn what_a_killed_robot_acknowledged_is_delivered_exactly_once() {
             (acknowledged, unsaid) = (0, 0);
             folder = tempfile::tempdir().unwrap();
         }
-        let mut robot_process = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "helper_process", "--nocapture", "--ignored"])
-            .env("SIXFOLD_HELPER", folder.path())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
+        let mut robot_process = helper(folder.path(), "").spawn().unwrap();
         // The last one gets as far as storing something, on a slow computer too.
         let after = if kill + 1 == kills { 1_000_000 } else { random.random_range(0..200_000) };
         std::thread::sleep(Duration::from_micros(after));

@@ -8,8 +8,8 @@ mod support;
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::Write;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
+use std::process::Child;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ use sixfold_experience::{
     PostgresStore, StoreError, StorePlace,
 };
 use support::server::Server;
-use support::{contract, experience, feature, heard, kills, named, objects, said};
+use support::{contract, experience, feature, heard, helped, helper, kills, named, objects, said};
 
 const SOON: OutboxOptions = OutboxOptions { retry: Duration::from_millis(50) };
 
@@ -379,10 +379,8 @@ fn nothing_acknowledged_is_lost_when_the_server_is_killed() {
 #[test]
 #[ignore = "started by the other tests"]
 fn helper_process() {
-    let (Ok(file), Ok(url)) = (std::env::var("SIXFOLD_HELPER"), std::env::var("SIXFOLD_HELPER_URL")) else {
-        return;
-    };
-    let mut store = outbox(&PathBuf::from(file), &url);
+    let Some((file, url)) = helped() else { return };
+    let mut store = outbox(&file, &url);
     let mut out = std::io::stdout();
     for number in store.list().unwrap().len() as i64.. {
         store.add(&experience(number)).unwrap();
@@ -391,17 +389,6 @@ fn helper_process() {
         // Else it would store far more while the server is away than it can deliver before the next kill.
         std::thread::sleep(Duration::from_millis(10));
     }
-}
-
-fn robot(file: &Path, url: &str) -> Child {
-    Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "helper_process", "--nocapture", "--ignored"])
-        .env("SIXFOLD_HELPER", file)
-        .env("SIXFOLD_HELPER_URL", url)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap()
 }
 
 #[test]
@@ -420,14 +407,14 @@ fn what_waits_is_delivered_exactly_once_whoever_is_killed() {
         let rows = said(&String::from_utf8_lossy(&output.stdout), "stored ");
         (acknowledged, unsaid) = heard(&rows, acknowledged, unsaid);
     };
-    let mut process = robot(&file, &url);
+    let mut process = helper(&file, &url).spawn().unwrap();
     let mut up = true;
     for _ in 0..kills {
         std::thread::sleep(Duration::from_millis(random.random_range(20..300)));
         match random.random_range(0..3) {
             0 => {
                 hear(process);
-                process = robot(&file, &url);
+                process = helper(&file, &url).spawn().unwrap();
                 robots += 1;
             }
             _ if up => {

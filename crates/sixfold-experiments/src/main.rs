@@ -14,10 +14,17 @@ use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use sixfold_shell::idle::{Idle, When};
 use sixfold_shell::meshes::MeshArguments;
 use sixfold_shell::ranges::threads;
 use sixfold_shell::screen::parse;
 use sixfold_shell::{PixelLimit, exit_code, progress, use_threads};
+
+/// The options that would be ignored beside others, and are refused.
+const IDLE: &[Idle] = &[
+    Idle { command: "grasp measure", options: &["unit", "store"], when: &[When::Without("objects")] },
+    Idle { command: "grasp compare", options: &["unit", "store"], when: &[When::Without("objects")] },
+];
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.
 #[derive(Debug, Parser)]
@@ -51,7 +58,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let arguments = match parse::<Arguments>() {
+    let arguments = match parse::<Arguments>(IDLE) {
         Ok(arguments) => arguments,
         Err(code) => return code,
     };

@@ -1,6 +1,8 @@
-//! Writing whole files: nothing is ever seen half-written, and what a killed writer leaves behind goes with the next write.
+//! Writing whole files: nothing is ever seen half-written, what a killed writer leaves behind goes with the next write, and what
+//! was written is there after a power failure, contents and name (`fsync` of the file before it is renamed, of its folder after).
 
 use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind::{InvalidInput, PermissionDenied, Unsupported};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,19 +13,53 @@ use crate::lock::still_there;
 /// are made.
 ///
 /// # Errors
-/// What the system says; the temporary file is then removed and what stood at `path` before is unchanged.
+/// What the system says; the temporary file is then removed and what stood at `path` before is unchanged, unless it was the folder
+/// that could not be handed to the disk.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
-        fs::create_dir_all(parent)?;
-    }
+    make_folder_of(path)?;
     write_atomically_with(path, |file| file.write_all(bytes))
+}
+
+/// Makes the folder that `path` lies in, with those on the way, and hands their names to the disk.
+///
+/// # Errors
+/// What the system says.
+pub fn make_folder_of(path: &Path) -> io::Result<()> {
+    let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) else { return Ok(()) };
+    let missing: Vec<&Path> =
+        parent.ancestors().take_while(|a| !a.as_os_str().is_empty() && !a.exists()).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    fs::create_dir_all(parent)?;
+    missing.into_iter().rev().try_for_each(sync_folder_of)
+}
+
+/// Hands the name of a file or folder that was made or renamed to the disk, which is kept in the folder that it lies in: after a
+/// power failure it is there under that name. Where folders cannot be handed over (Windows, some network file systems) that is up
+/// to the system.
+///
+/// # Errors
+/// What the system says, such as that the disk is broken.
+pub fn sync_folder_of(path: &Path) -> io::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    #[cfg(test)]
+    tests::SYNCED.with_borrow_mut(|synced| synced.push(folder.to_owned()));
+    if !cfg!(unix) {
+        return Ok(());
+    }
+    match File::open(folder).and_then(|folder| folder.sync_all()) {
+        // A folder that may be written and not be read; a file system that knows no such request.
+        Err(error) if matches!(error.kind(), InvalidInput | PermissionDenied | Unsupported) => Ok(()),
+        result => result,
+    }
 }
 
 /// As [`write_atomically`], with what `write` puts into the file, into a folder that is there already. A link stays, and what it
 /// leads to is written; a device or a pipe (`/dev/null`, `/dev/stdout`) is written as it is, not replaced.
 ///
 /// # Errors
-/// What the system or `write` says; the temporary file is then removed and what stood at `path` before is unchanged.
+/// What the system or `write` says; as [`write_atomically`].
 pub fn write_atomically_with(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
@@ -43,11 +79,16 @@ pub fn write_atomically_with(
         .and_then(|()| file.get_ref().sync_all())
         .and_then(|()| fs::rename(&temporary, path));
     match result {
-        Ok(()) => remove_left_behind(path),
-        // The first error is the one to report; a temporary file left behind changes nothing.
-        Err(_) => drop(fs::remove_file(&temporary)),
+        Ok(()) => {
+            remove_left_behind(path);
+            sync_folder_of(path)
+        }
+        Err(error) => {
+            // The first error is the one to report; a temporary file left behind changes nothing.
+            drop(fs::remove_file(&temporary));
+            Err(error)
+        }
     }
-    result
 }
 
 /// The `number`th temporary file of a target, `.NAME.NUMBER.tmp`.
@@ -105,7 +146,34 @@ fn remove_left_behind(path: &Path) {
 
 #[cfg(test)]
 mod tests {
+    use std::cell::RefCell;
+
     use super::*;
+
+    thread_local! {
+        /// The folders that this thread handed to the disk.
+        pub(super) static SYNCED: RefCell<Vec<PathBuf>> = const { RefCell::new(vec![]) };
+    }
+
+    #[test]
+    fn names_of_files_and_of_new_folders_are_handed_to_the_disk() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path();
+        let synced = || SYNCED.with_borrow_mut(std::mem::take);
+        synced();
+        write_atomically(&root.join("a/b/record.json"), b"new").unwrap();
+        assert_eq!(synced(), [root.to_owned(), root.join("a"), root.join("a/b")]);
+        write_atomically(&root.join("a/b/record.json"), b"newer").unwrap();
+        assert_eq!(synced(), [root.join("a/b")]);
+        // Nothing has a new name where nothing could be written.
+        assert!(write_atomically_with(&root.join("other"), |_| Err(io::Error::other("no"))).is_err());
+        assert!(synced().is_empty());
+        sync_folder_of(Path::new("Cargo.toml")).unwrap();
+        assert_eq!(synced(), [Path::new(".")]);
+        if cfg!(unix) {
+            assert_eq!(sync_folder_of(&root.join("none/file")).unwrap_err().kind(), io::ErrorKind::NotFound);
+        }
+    }
 
     #[cfg(unix)]
     #[test]

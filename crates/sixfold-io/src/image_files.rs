@@ -15,8 +15,9 @@ use crate::files::write_atomically;
 use crate::limit::{check_pixels, max_pixels};
 use crate::mask_pixels;
 
-/// Neither PNG nor JPEG packs more than about this many bytes of pixels into one byte of file.
-const LARGEST_EXPANSION: u64 = 2048;
+/// Neither PNG nor JPEG packs more bytes of pixels than this into one byte of file. PNG's deflate packs 1032 bytes of equal values into
+/// one (zlib, "Maximum Compression Factor"), and a bit of a palette becomes up to four bytes.
+const LARGEST_EXPANSION: u64 = 1032 * 32;
 const LARGEST_SIDE: u32 = 1 << 15;
 /// Most bytes of what is no pixel: colour profiles take up to 4 MB.
 const BESIDE_PIXELS: u64 = 32 << 20;
@@ -392,6 +393,31 @@ mod tests {
             }
             encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
             assert_eq!(file(&path).mask().unwrap().as_slice(), [false, true, true, false], "{name}");
+        }
+    }
+
+    /// One object in a large image takes next to no bytes: it was taken for a file that was cut off.
+    #[test]
+    fn masks_of_single_bits_that_compress_well() {
+        let dir = tempfile::tempdir().unwrap();
+        for (name, color) in
+            [("bits.png", png::ColorType::Grayscale), ("palette.png", png::ColorType::Indexed)]
+        {
+            let path = dir.path().join(name);
+            let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 1920, 1200);
+            encoder.set_color(color);
+            encoder.set_depth(png::BitDepth::One);
+            encoder.set_compression(png::Compression::High);
+            encoder.set_filter(png::Filter::NoFilter);
+            if color == png::ColorType::Indexed {
+                encoder.set_palette(vec![0, 0, 0, 1, 0, 0]);
+            }
+            let mut bytes = vec![0u8; 1920 / 8 * 1200];
+            (100..140).for_each(|y| bytes[y * 240 + 20..y * 240 + 25].fill(255));
+            encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
+            assert!(std::fs::metadata(&path).unwrap().len() < 1000);
+            let mask = file(&path).mask().unwrap();
+            assert_eq!(mask.as_slice().iter().filter(|m| **m).count(), 40 * 40, "{name}");
         }
     }
 

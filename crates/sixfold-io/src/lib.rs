@@ -15,7 +15,7 @@ mod regular;
 
 pub use camera_file::{CameraFile, CameraFileError};
 pub use error::ImageFileError;
-pub use files::{write_atomically, write_atomically_with};
+pub use files::{make_folder_of, sync_folder_of, write_atomically, write_atomically_with};
 pub use hash::{Fnv1a, fnv1a, fnv1a_of_file};
 pub use image_files::ImageFile;
 pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};

@@ -5,6 +5,8 @@
 //! the program too: the faces that a point sees are one connected patch and its horizon is one closed loop, however
 //! small and flat the faces are. With rounding errors instead, smooth dense shapes come out torn and folded.
 
+use std::collections::HashSet;
+
 use sixfold_geometry::{Vec3, sphere_directions};
 
 use crate::mesh::{Mesh, MeshError};
@@ -18,6 +20,9 @@ const STEPS: f64 = (1u64 << 40) as f64;
 
 /// [`TOLERANCE`] in steps. It has to be well above the rounding errors of [`Face::height`], a few thousandths of a step.
 const FLAT: f64 = TOLERANCE * STEPS;
+
+/// The hull is computed again at most so many times to get rid of corners in the middle of edges; once is nearly always enough.
+const REPETITIONS: usize = 8;
 
 /// So many directions' furthest points go first. They hold the corners of boxes and the like, so that few points in the
 /// middle of a flat side ever become corners, and most points inside are dropped at once.
@@ -39,12 +44,12 @@ impl Mesh {
             .filter_map(|d| furthest(&points, &all, |p| p.dot(d)))
             .map(|(i, _)| i)
             .collect();
-        let Some(first) = tetrahedron(&points, &corners).or_else(|| tetrahedron(&points, &all)) else {
-            return Err(MeshError::Empty);
-        };
-        let mut hull = Hull::new(&points, first);
-        hull.add(&corners);
-        hull.add(&all);
+        let mut hull = Hull::of(&points, &corners, &all).ok_or(MeshError::Empty)?;
+        for _ in 0..REPETITIONS {
+            let Some(corners) = hull.corners_without_those_on_edges() else { break };
+            let Some(again) = Hull::of(&points, &corners, &all) else { break };
+            hull = again;
+        }
         let mut numbers = vec![u32::MAX; points.len()];
         let mut vertices = vec![];
         let faces = hull.faces.iter().filter(|f| f.alive).map(|f| {
@@ -139,6 +144,16 @@ impl Face {
         Face { corners, neighbours, at, normal, length: normal.norm(), outside: vec![], alive: true }
     }
 
+    /// The corner that lies on the longest edge, up to the tolerance.
+    fn corner_on_edge(&self, points: &[Point]) -> Option<u32> {
+        let [a, b, c] = self.corners;
+        let opposite = [(a, b, c), (b, c, a), (c, a, b)];
+        let length = |from: u32, to: u32| points[to as usize].offset_from(points[from as usize]).norm();
+        let edges = opposite.map(|(corner, from, to)| (corner, length(from, to)));
+        let (corner, longest) = edges.into_iter().reduce(|most, e| if e.1 > most.1 { e } else { most })?;
+        (self.length <= FLAT * longest).then_some(corner)
+    }
+
     /// How far a point lies outside, times [`Face::length`].
     fn height(&self, point: Point) -> f64 {
         self.normal.dot(&point.offset_from(self.at))
@@ -179,6 +194,34 @@ struct Hull<'a> {
 }
 
 impl<'a> Hull<'a> {
+    /// The hull of `all`; those of `first` go first. `None` where all lie in a plane.
+    fn of(points: &'a [Point], first: &[u32], all: &[u32]) -> Option<Hull<'a>> {
+        let corners = tetrahedron(points, first).or_else(|| tetrahedron(points, all))?;
+        let mut hull = Hull::new(points, corners);
+        hull.add(first);
+        hull.add(all);
+        Some(hull)
+    }
+
+    /// The corners without those that lie on an edge between two others, up to the tolerance; `None` where there are no such.
+    ///
+    /// Of points on one line of a side, which the grid moves off it by half a step, the middle one may come first: it is as far
+    /// outside as the others. Then one of the two faces beside the line sees the next point and the other does not, and between
+    /// them comes a face of three points on a line: a proper one on the grid, but its normal says nothing of the mesh. Where the
+    /// ends of the line come first, no face is far from the middle one.
+    fn corners_without_those_on_edges(&self) -> Option<Vec<u32>> {
+        let alive = || self.faces.iter().filter(|f| f.alive);
+        let on_edges: HashSet<u32> = alive().filter_map(|f| f.corner_on_edge(self.points)).collect();
+        if on_edges.is_empty() {
+            return None;
+        }
+        let mut corners: Vec<u32> =
+            alive().flat_map(|f| f.corners).filter(|i| !on_edges.contains(i)).collect();
+        corners.sort_unstable();
+        corners.dedup();
+        Some(corners)
+    }
+
     /// The tetrahedron whose fourth point lies behind the face of the first three.
     fn new(points: &'a [Point], [a, b, c, d]: [u32; 4]) -> Hull<'a> {
         let faces =
@@ -257,8 +300,6 @@ impl<'a> Hull<'a> {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::HashSet;
-
     use proptest::prelude::*;
     use sixfold_geometry::Pose;
 
@@ -425,6 +466,19 @@ mod tests {
         }
         let largest = Mesh::new(sphere.iter().map(|p| p * f64::MAX).collect(), vec![]).unwrap();
         assert_eq!(largest.convex_hull().unwrap().faces().len(), 396);
+    }
+
+    #[test]
+    fn three_points_on_a_line_of_a_side() {
+        let points = [[3, 3, 0], [1, 1, 3], [2, 1, 3], [1, 2, 2], [3, 3, 2], [3, 1, 3]];
+        let corners = [[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]];
+        let twist = [0.0, 0.0, 0.0, -1.4599672017995113, -2.697340946748811, 1.6183936080282013];
+        let pose = Pose::exp(&twist.into());
+        let straight: Vec<Vec3> =
+            points.iter().chain(&corners).map(|p| Vec3::from(p.map(f64::from))).collect();
+        let turned: Vec<Vec3> = straight.iter().map(|p| pose.transform_point(p)).collect();
+        let volumes = [straight, turned].map(|points| volume(&hull_of(&points)));
+        assert!((volumes[0] - volumes[1]).abs() < 1e-6, "{volumes:?}");
     }
 
     proptest! {

@@ -4,7 +4,6 @@
 //! A file is written beside its place, flushed to the disk and then moved there: a reader, a crash or a power cut never leaves
 //! half a file, and the old one stays until the new one is whole.
 
-use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
@@ -34,12 +33,7 @@ const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 /// Puts a whole file in its place.
 pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
     write_atomically_with(path, |file| file.write_all(bytes))
-        .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
-    // The new name must be on the disk as well. Not every system lets a folder be opened.
-    if let Some(Ok(folder)) = path.parent().map(File::open) {
-        let _ = folder.sync_all();
-    }
-    Ok(())
+        .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
 }
 
 impl ObjectTemplates {

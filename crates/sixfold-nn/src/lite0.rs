@@ -17,6 +17,9 @@ use std::path::{Path, PathBuf};
 /// Name of the five-stage encoder in weight files.
 pub const ENCODER_ARCHITECTURE: &str = "efficientnet-lite0-5-stages";
 
+/// Its stages, all of which may stay as they are in a training.
+pub const ENCODER_STAGES: usize = 5;
+
 /// The ImageNet encoder that this crate carries (1.4 MB, Apache-2.0; its card lies beside it).
 const ENCODER: &[u8] = include_bytes!("../weights/efficientnet-lite0-encoder.safetensors");
 
@@ -88,7 +91,7 @@ pub struct Lite0Config {
 
 impl Default for Lite0Config {
     fn default() -> Self {
-        Self { stages: 5 }
+        Self { stages: ENCODER_STAGES }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::lite0::ENCODER_STAGES;
 use crate::schedule::LearningRate;
 
 /// An option is out of its range.
@@ -66,6 +67,14 @@ impl OptionError {
     ) -> Result<(), OptionError> {
         OptionError::unless(value >= least, field, value, expected)?;
         OptionError::unless(value <= MOST_SAMPLES, field, value, "at most 1024")
+    }
+
+    /// This error unless `value` is a number of stages of the five-stage ImageNet encoder that stay as they are.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn unless_frozen_stages(value: usize) -> Result<(), OptionError> {
+        OptionError::unless(value <= ENCODER_STAGES, "frozen_stages", value, "0 to 5")
     }
 
     /// This error unless `value` is the weight of a loss: finite, 0 or more.
@@ -206,6 +215,9 @@ mod tests {
         assert!(OptionError::unless_samples("pairs", 1024, 1, "1 or more").is_ok());
         let error = OptionError::unless_samples("pairs", 100_000, 1, "1 or more").unwrap_err().to_string();
         assert_eq!(error, "pairs: found 100000, expected at most 1024");
+        assert!(OptionError::unless_frozen_stages(5).is_ok());
+        let error = OptionError::unless_frozen_stages(6).unwrap_err().to_string();
+        assert_eq!(error, "frozen_stages: found 6, expected 0 to 5");
         assert_eq!(Pace { log_every: 0, ..Pace::default() }.check().unwrap_err().field, "log_every");
     }
 

@@ -14,9 +14,6 @@ use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
-/// Stages of the encoder that the network uses: all of them may stay as they are.
-const ENCODER_STAGES: usize = 5;
-
 /// How to train.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pix2PoseTrainingOptions {
@@ -70,12 +67,7 @@ impl Pix2PoseTrainingOptions {
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
         OptionError::unless_samples("per_object", self.per_object, 1, "1 or more")?;
-        OptionError::unless(
-            self.frozen_stages <= ENCODER_STAGES,
-            "frozen_stages",
-            self.frozen_stages,
-            "0 to 5",
-        )?;
+        OptionError::unless_frozen_stages(self.frozen_stages)?;
         OptionError::unless_weight("adversarial", f64::from(self.adversarial))?;
         OptionError::unless_fraction("encoder_share", self.encoder_share)
     }

@@ -206,10 +206,12 @@ impl DatasetRun<'_> {
                     let time = start.elapsed().as_secs_f64();
                     seconds.push(time);
                     rows.append(&rows_of(&found, (scene_id, im_id), time))?;
-                    record.finished((scene_id, im_id), found.len(), &inputs)?;
-                    summary.poses += found.len();
+                    let count = found.len();
+                    summary.poses += count;
                     summary.seconds_per_image = Some(seconds.iter().sum::<f64>() / seconds.len() as f64);
+                    // Before the record has the image: an overlay that was not drawn when the run was killed is drawn by the next.
                     events(DatasetEvent::Result(&ImageResult { scene, scene_id, im_id, found }))?;
+                    record.finished((scene_id, im_id), count, &inputs)?;
                 }
             }
             events(DatasetEvent::Image { image, earlier: false })?;
@@ -376,7 +378,7 @@ fn open_results(
         let text = format!("{}: the last line was cut off and is dropped: {torn}", path.display());
         events(DatasetEvent::Note(text))?;
     }
-    record.forget_unless_whole(results.existing());
+    record.forget_unless_whole(results.existing().iter().map(|e| (e.scene_id, e.im_id)));
     let unfinished = results.existing().iter().find(|e| !record.is_done(e.scene_id, e.im_id));
     if let Some(Estimate { scene_id, im_id, .. }) = unfinished {
         let text = format!(

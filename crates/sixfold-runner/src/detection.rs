@@ -1,15 +1,22 @@
-//! A detector on all images of a dataset, into one file of COCO detections.
+//! A detector on all images of a dataset, into one file of COCO detections. A stopped run resumes.
+//!
+//! The file is written whole at the end. Until then the rows are in `FILE.part`, with a record beside it as result files have it
+//! ([`RunOptions`]), both once a second at most; they go when nothing is left to do.
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
-use sixfold_bop::{BopDataset, Detection, Rle, Scene, write_detections};
+use sixfold_bop::{BopDataset, Detection, DetectionRows, Rle, Scene};
 use sixfold_estimator::ObjectDetector;
 use sixfold_geometry::RgbImage;
 use sixfold_io::WriteLock;
 
+use crate::dataset::check;
 use crate::error::{RunError, describe};
+use crate::inputs::Inputs;
+use crate::record::{RunOptions, RunRecord};
 
 /// What a detector sees in an image, as COCO has it. Of `ids` only, where there are any.
 ///
@@ -76,6 +83,8 @@ pub struct DetectionRun<'a> {
     pub images: &'a [(u32, u32)],
     /// Detections of these objects are kept; of all where there are none.
     pub ids: &'a [u32],
+    /// What decides about the detections of an image: a run resumes with the same only.
+    pub options: &'a RunOptions,
 }
 
 /// What a run says of its progress.
@@ -91,8 +100,13 @@ pub enum DetectionEvent<'e> {
         /// What was found in it.
         detections: &'e [Detection],
     },
-    /// An image, `scene/image`, is done.
-    Image(String),
+    /// An image, `scene/image`, is done, now or in an earlier run.
+    Image {
+        /// Which.
+        image: String,
+        /// Whether it was done in an earlier run.
+        earlier: bool,
+    },
 }
 
 /// What a run did.
@@ -104,44 +118,97 @@ pub struct DetectionSummary {
     pub detections: usize,
     /// What was left out, and why.
     pub skipped: Vec<String>,
-    /// Seconds an image took on average.
+    /// Seconds an image took on average, of those done now.
     pub seconds_per_image: Option<f64>,
     /// The file of detections.
     pub file: PathBuf,
 }
 
+/// The rows of a run that is not done, on disk with their record.
+struct Part {
+    path: PathBuf,
+    rows: DetectionRows,
+    record: RunRecord,
+    saved: Instant,
+    /// How long saving took.
+    cost: Duration,
+}
+
+/// Saving takes no more than one part in so many of the time: all rows are written again.
+const SAVING: u32 = 20;
+
+impl Part {
+    /// That of `out`, without the rows of images that are not wanted or were not finished.
+    fn open(out: &Path, options: &RunOptions, images: &[(u32, u32)]) -> Result<Part, RunError> {
+        let mut path = out.as_os_str().to_owned();
+        path.push(".part");
+        let path = PathBuf::from(path);
+        let mut record = RunRecord::open(&path, "detector", options)?;
+        let mut rows = if path.exists() { DetectionRows::read(&path)? } else { DetectionRows::default() };
+        rows.keep_images(|scene_id, im_id| images.binary_search(&(scene_id, im_id)).is_ok());
+        record.forget_unless_whole(rows.images());
+        rows.keep_images(|scene_id, im_id| record.is_done(scene_id, im_id));
+        Ok(Part { path, rows, record, saved: Instant::now(), cost: Duration::ZERO })
+    }
+
+    fn save(&mut self) -> Result<(), RunError> {
+        let start = Instant::now();
+        self.rows.write(&self.path)?;
+        self.record.save()?;
+        (self.saved, self.cost) = (Instant::now(), start.elapsed());
+        Ok(())
+    }
+
+    fn save_if_due(&mut self) -> Result<(), RunError> {
+        let due = self.record.is_due() && self.saved.elapsed() >= SAVING * self.cost;
+        if due { self.save() } else { Ok(()) }
+    }
+
+    /// Removes both files: the rows are where they belong. Without the first, the record alone says nothing to the next run.
+    fn remove(self) -> Result<(), RunError> {
+        if self.path.exists() {
+            std::fs::remove_file(&self.path).map_err(|source| RunError::Io { path: self.path, source })?;
+        }
+        self.record.remove()
+    }
+}
+
 impl DetectionRun<'_> {
-    /// Looks at all images and writes what was found to `out`, whole at the end. An image that cannot be read is left out and
-    /// reported. One run at a time writes a file.
+    /// Searches all images and writes what was found to `out`, whole at the end. An image that cannot be read is left out and
+    /// reported. Stops between images when `stop` is set; a later run with the same options resumes, where the images that are
+    /// done have the same contents. After a run that left images out, the next one searches these only. One run at a time writes a
+    /// file.
     ///
     /// # Errors
     /// [`RunError`].
     pub fn run(
         &self,
         out: &Path,
+        stop: &AtomicBool,
         events: &mut dyn FnMut(DetectionEvent<'_>),
     ) -> Result<DetectionSummary, RunError> {
         let _lock = WriteLock::take(out)?;
-        let (mut all, mut skipped, mut seconds) = (vec![], vec![], vec![]);
-        let mut scene: Option<Scene> = None;
-        for &(scene_id, im_id) in self.images {
-            let scene = match scene.take().filter(|s| s.scene_id == scene_id) {
-                Some(same) => scene.insert(same),
-                None => scene.insert(self.dataset.scene(scene_id)?),
-            };
-            match self.look(scene, im_id, events) {
-                Ok((found, time)) => {
-                    all.extend(found);
-                    seconds.push(time);
-                }
-                Err(error) => skipped.push(format!("image {scene_id}/{im_id}: {}", describe(&error))),
-            }
-            events(DetectionEvent::Image(format!("{scene_id}/{im_id}")));
+        let mut part = Part::open(out, self.options, self.images)?;
+        let mut scene = None;
+        part.record.check_images(stop, |scene_id, im_id| match self.scene(&mut scene, scene_id) {
+            Ok(scene) => Inputs::of_colour(scene, im_id),
+            // That it cannot be read is said when its images are searched.
+            Err(_) => Inputs::default(),
+        })?;
+        let (mut skipped, mut seconds) = (vec![], vec![]);
+        let done = self.images(&mut part, &mut skipped, &mut seconds, stop, events);
+        // What is done is done, whatever ended the loop.
+        part.save()?;
+        done?;
+        part.rows.sort_by_image();
+        part.rows.write(out)?;
+        let detections = part.rows.len();
+        if skipped.is_empty() {
+            part.remove()?;
         }
-        write_detections(out, &all)?;
         Ok(DetectionSummary {
             images: self.images.len(),
-            detections: all.len(),
+            detections,
             skipped,
             seconds_per_image: (!seconds.is_empty())
                 .then(|| seconds.iter().sum::<f64>() / seconds.len() as f64),
@@ -149,8 +216,50 @@ impl DetectionRun<'_> {
         })
     }
 
+    /// Searches all images that are not done.
+    fn images(
+        &self,
+        part: &mut Part,
+        skipped: &mut Vec<String>,
+        seconds: &mut Vec<f64>,
+        stop: &AtomicBool,
+        events: &mut dyn FnMut(DetectionEvent<'_>),
+    ) -> Result<(), RunError> {
+        let mut scene: Option<Scene> = None;
+        for &(scene_id, im_id) in self.images {
+            check(stop)?;
+            let image = format!("{scene_id}/{im_id}");
+            if part.record.is_done(scene_id, im_id) {
+                events(DetectionEvent::Image { image, earlier: true });
+                continue;
+            }
+            let scene = self.scene(&mut scene, scene_id)?;
+            // Hashed before it is read: what changes in between makes the next run refuse, never believe.
+            let inputs = Inputs::of_colour(scene, im_id);
+            match self.search(scene, im_id, events) {
+                Ok((found, time)) => {
+                    part.rows.add(&found);
+                    part.record.add((scene_id, im_id), found.len(), &inputs);
+                    part.save_if_due()?;
+                    seconds.push(time);
+                }
+                Err(error) => skipped.push(format!("image {image}: {}", describe(&error))),
+            }
+            events(DetectionEvent::Image { image, earlier: false });
+        }
+        Ok(())
+    }
+
+    /// A scene, read unless it is the last one again.
+    fn scene<'s>(&self, last: &'s mut Option<Scene>, scene_id: u32) -> Result<&'s Scene, RunError> {
+        Ok(match last.take().filter(|s| s.scene_id == scene_id) {
+            Some(same) => last.insert(same),
+            None => last.insert(self.dataset.scene(scene_id)?),
+        })
+    }
+
     /// What is found in an image, and in how many seconds.
-    fn look(
+    fn search(
         &self,
         scene: &Scene,
         im_id: u32,
@@ -163,5 +272,152 @@ impl DetectionRun<'_> {
         let time = start.elapsed().as_secs_f64();
         events(DetectionEvent::Found { scene, im_id, image: &image, detections: &found });
         Ok((found, time))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+    use std::sync::atomic::Ordering;
+
+    use sixfold_bop::{GroundTruth, NewImage, SceneWriter};
+    use sixfold_estimator::{DetectedObject, EstimatorError, Region};
+    use sixfold_geometry::{Camera, Pose, Rect, Vec3};
+
+    use super::*;
+
+    /// Finds one box an image, at a score that the image's colour decides; keeps the colours that it was asked about and asks to
+    /// stop after some.
+    struct Colours {
+        seen: Mutex<Vec<u8>>,
+        stop_after: usize,
+        stop: AtomicBool,
+    }
+
+    impl Colours {
+        fn new(stop_after: usize) -> Colours {
+            Colours { seen: Mutex::default(), stop_after, stop: AtomicBool::new(false) }
+        }
+    }
+
+    impl ObjectDetector for Colours {
+        fn check_object(&self, _: u32) -> Result<(), EstimatorError> {
+            Ok(())
+        }
+
+        fn detect(&self, image: &RgbImage) -> Result<Vec<DetectedObject>, EstimatorError> {
+            let mut seen = self.seen.lock().unwrap();
+            let colour = image[(0, 0)][0];
+            seen.push(colour);
+            self.stop.store(seen.len() >= self.stop_after, Ordering::Relaxed);
+            let bbox = Rect { x: 1.0, y: 2.0, width: f64::from(colour) / 7.0, height: 3.0 };
+            let score = f64::from(f32::from(colour) / 255.0);
+            let region = Region { bbox, score, mask: None, exact: false };
+            Ok(vec![DetectedObject { object_id: 3, region }])
+        }
+    }
+
+    /// Four images of two scenes; image 4 of scene 2 is grey 9, say.
+    fn dataset(root: &Path) -> Vec<(u32, u32)> {
+        let camera = Camera::new(60.0, 60.0, 31.5, 23.5, 64, 48).unwrap();
+        let images = [(1, 0, 40), (1, 5, 80), (2, 4, 9), (2, 7, 200)];
+        for scene_id in [1, 2] {
+            let mut writer = SceneWriter::new(root, "test", scene_id);
+            for (_, im_id, grey) in images.iter().filter(|i| i.0 == scene_id) {
+                let rgb = RgbImage::filled(64, 48, [*grey; 3]);
+                let truth = [GroundTruth::new(3, Pose::from_translation(Vec3::z()))];
+                let image = NewImage::new(*im_id, &camera);
+                writer.add(&NewImage { rgb: Some(&rgb), ground_truth: &truth, ..image }).unwrap();
+            }
+            writer.finish().unwrap();
+        }
+        images.map(|(scene_id, im_id, _)| (scene_id, im_id)).to_vec()
+    }
+
+    fn options(threshold: &str) -> RunOptions {
+        let mut options = RunOptions::default();
+        options.add("threshold", threshold);
+        options
+    }
+
+    /// Runs until the detector asks to stop; the images that it saw.
+    fn run(
+        root: &Path,
+        images: &[(u32, u32)],
+        detector: &Colours,
+        options: &RunOptions,
+    ) -> (Result<DetectionSummary, RunError>, Vec<u8>) {
+        let dataset = BopDataset::open(root, "test").unwrap();
+        let run = DetectionRun { detector, dataset: &dataset, images, ids: &[], options };
+        let summary = run.run(&root.join("found.json"), &detector.stop, &mut |_| ());
+        (summary, std::mem::take(&mut *detector.seen.lock().unwrap()))
+    }
+
+    /// The file without what a clock measured.
+    fn found(root: &Path) -> String {
+        let text = std::fs::read_to_string(root.join("found.json")).unwrap();
+        let rows = text.lines().map(|line| line.split("\"time\"").next().unwrap().to_owned());
+        rows.collect::<Vec<_>>().join("\n")
+    }
+
+    fn is_whole(root: &Path) -> bool {
+        !root.join("found.json.part").exists() && !root.join("found.json.part.run.json").exists()
+    }
+
+    #[test]
+    fn a_stopped_run_resumes_and_ends_with_the_same_file() {
+        let whole = tempfile::tempdir().unwrap();
+        let images = dataset(whole.path());
+        let (summary, seen) = run(whole.path(), &images, &Colours::new(9), &options("0.1"));
+        assert_eq!((summary.unwrap().detections, seen), (4, vec![40, 80, 9, 200]));
+        assert!(is_whole(whole.path()));
+
+        let stopped = tempfile::tempdir().unwrap();
+        let root = stopped.path();
+        dataset(root);
+        let (ended, seen) = run(root, &images, &Colours::new(2), &options("0.1"));
+        assert!(matches!(ended, Err(RunError::Interrupted)) && seen == [40, 80]);
+        assert!(!root.join("found.json").exists() && !is_whole(root));
+        // Not with other options, nor with another image under a number that is done.
+        let other = run(root, &images, &Colours::new(9), &options("0.2")).0.unwrap_err().to_string();
+        assert!(other.contains("threshold: 0.1, now 0.2") && other.contains("found.json.part"), "{other}");
+        let image = root.join("test/000001/rgb/000005.png");
+        let before = std::fs::read(&image).unwrap();
+        sixfold_io::write_rgb(&image, &RgbImage::filled(64, 48, [7; 3])).unwrap();
+        let other = run(root, &images, &Colours::new(9), &options("0.1")).0.unwrap_err().to_string();
+        assert!(other.contains("colour image of image 1/5") && other.contains("has changed"), "{other}");
+        std::fs::write(&image, before).unwrap();
+        // Rows that the record does not have are searched again.
+        let record = root.join("found.json.part.run.json");
+        let text = std::fs::read_to_string(&record).unwrap();
+        std::fs::write(&record, text.replace("\"rows\": 1", "\"rows\": 2")).unwrap();
+        let (ended, seen) = run(root, &images, &Colours::new(1), &options("0.1"));
+        assert!(matches!(ended, Err(RunError::Interrupted)) && seen == [40]);
+        let (summary, seen) = run(root, &images, &Colours::new(9), &options("0.1"));
+        assert_eq!((summary.unwrap().detections, seen), (4, vec![80, 9, 200]));
+        assert!(is_whole(root));
+        assert_eq!(found(root), found(whole.path()));
+    }
+
+    #[test]
+    fn an_image_that_was_left_out_is_all_that_the_next_run_searches() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path();
+        let images = dataset(root);
+        let image = root.join("test/000002/rgb/000004.png");
+        let before = std::fs::read(&image).unwrap();
+        std::fs::write(&image, b"no image").unwrap();
+        let (summary, seen) = run(root, &images, &Colours::new(9), &options("0.1"));
+        let summary = summary.unwrap();
+        assert_eq!((summary.detections, summary.skipped.len(), seen), (3, 1, vec![40, 80, 200]));
+        std::fs::write(&image, before).unwrap();
+        // Of fewer images this time: rows of the others go.
+        let (summary, seen) = run(root, &images[1..], &Colours::new(9), &options("0.1"));
+        assert_eq!((summary.unwrap().detections, seen), (3, vec![9]));
+        assert!(is_whole(root));
+        let ids: Vec<bool> = ["\"image_id\":5", "\"image_id\":4", "\"image_id\":7", "\"image_id\":0"]
+            .map(|id| found(root).contains(id))
+            .to_vec();
+        assert_eq!(ids, [true, true, true, false]);
     }
 }

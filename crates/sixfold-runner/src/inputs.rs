@@ -1,4 +1,4 @@
-//! What an image's poses are computed from, by the hashes of its contents.
+//! What an image's poses or detections are computed from, by the hashes of its contents.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -62,6 +62,13 @@ impl Inputs {
             let poses = image.map(|i| (&i.ground_truth, &i.info));
             inputs.value("ground truth", &poses, place("scene_gt.json"));
         }
+        inputs
+    }
+
+    /// What a detector reads of an image.
+    pub fn of_colour(scene: &Scene, im_id: u32) -> Inputs {
+        let mut inputs = Inputs::default();
+        inputs.file("colour image", scene.rgb_path(im_id));
         inputs
     }
 

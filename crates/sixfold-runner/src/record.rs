@@ -1,6 +1,6 @@
 //! What a result file was made with, kept beside it so that a later run resumes with the same.
 //!
-//! The record `FILE.csv.run.json` holds version, method and options, for every object a hash of its model and of its entry in
+//! The record `FILE.run.json` holds version, method and options, for every object a hash of its model and of its entry in
 //! `models_info.json`, and for every finished image hashes of what its poses were computed from: camera, targets, the images that
 //! the method reads, ground truth where the boxes are its. Contents count, not paths. Where any of them has changed the whole run
 //! is refused and names the input: poses of the former contents and of the present ones must not stand in one file as if they
@@ -15,7 +15,6 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use sixfold_bop::Estimate;
 use sixfold_io::{fnv1a_of_file, write_atomically};
 
 use crate::dataset::check;
@@ -81,7 +80,9 @@ const SAVED_EVERY: Duration = Duration::from_secs(1);
 impl RunRecord {
     /// The record of `results`: a new one, or the one that is there if it was made with the same options.
     pub fn open(results: &Path, method: &str, options: &RunOptions) -> Result<RunRecord, RunError> {
-        let path = results.with_extension("csv.run.json");
+        let mut path = results.as_os_str().to_owned();
+        path.push(".run.json");
+        let path = PathBuf::from(path);
         let record = Record {
             version: env!("CARGO_PKG_VERSION").into(),
             method: method.into(),
@@ -123,7 +124,11 @@ impl RunRecord {
     }
 
     /// An error where an image that is done was done with other inputs than `now` says.
-    pub fn check_images(&self, stop: &AtomicBool, now: impl Fn(u32, u32) -> Inputs) -> Result<(), RunError> {
+    pub fn check_images(
+        &self,
+        stop: &AtomicBool,
+        mut now: impl FnMut(u32, u32) -> Inputs,
+    ) -> Result<(), RunError> {
         let same = |done: &DoneImage| {
             check(stop)?;
             let image = format!("image {}/{}", done.scene_id, done.im_id);
@@ -147,26 +152,36 @@ impl RunRecord {
         self.done.contains(&(scene_id, im_id))
     }
 
-    /// Forgets the images that have not as many rows in the result file as they were written with.
-    pub fn forget_unless_whole(&mut self, rows: &[Estimate]) {
+    /// Forgets the images that have not as many rows in the result file as they were written with. `rows`: scene and image of each.
+    pub fn forget_unless_whole(&mut self, rows: impl Iterator<Item = (u32, u32)>) {
         let mut counts: BTreeMap<(u32, u32), usize> = BTreeMap::new();
-        for row in rows {
-            *counts.entry((row.scene_id, row.im_id)).or_default() += 1;
+        for image in rows {
+            *counts.entry(image).or_default() += 1;
         }
         self.record.done.retain(|d| counts.get(&(d.scene_id, d.im_id)).copied().unwrap_or(0) == d.rows);
         self.done = self.record.done.iter().map(|d| (d.scene_id, d.im_id)).collect();
     }
 
     /// Takes down an image with this many rows, which are on the disk.
-    pub fn finished(
-        &mut self,
-        (scene_id, im_id): (u32, u32),
-        rows: usize,
-        inputs: &Inputs,
-    ) -> Result<(), RunError> {
+    pub fn finished(&mut self, image: (u32, u32), rows: usize, inputs: &Inputs) -> Result<(), RunError> {
+        self.add(image, rows, inputs);
+        if self.is_due() { self.save() } else { Ok(()) }
+    }
+
+    /// Takes down an image with this many rows, which will be on the disk before the record is saved.
+    pub fn add(&mut self, (scene_id, im_id): (u32, u32), rows: usize, inputs: &Inputs) {
         self.done.insert((scene_id, im_id));
         self.record.done.push(DoneImage { scene_id, im_id, rows, inputs: inputs.hashes() });
-        if self.saved.elapsed() < SAVED_EVERY { Ok(()) } else { self.save() }
+    }
+
+    /// Whether it is time to save the record.
+    pub fn is_due(&self) -> bool {
+        self.saved.elapsed() >= SAVED_EVERY
+    }
+
+    /// Removes the record of results that have gone elsewhere.
+    pub fn remove(self) -> Result<(), RunError> {
+        std::fs::remove_file(&self.path).map_err(|source| RunError::Io { path: self.path, source })
     }
 
     pub fn save(&mut self) -> Result<(), RunError> {

@@ -9,6 +9,7 @@ pub mod folder;
 pub mod found;
 pub mod frames;
 pub mod grasp;
+pub mod idle;
 pub mod meshes;
 pub mod objects;
 pub mod output;

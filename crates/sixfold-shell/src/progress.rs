@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::screen::{self, Failure, plain};
+use crate::screen::{self, Failure, printable};
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 /// Whether the command looks at [`INTERRUPTED`]: it has something to finish or to keep.
@@ -69,7 +69,7 @@ impl Progress {
     /// One step is done.
     pub fn step(&mut self, message: String) {
         self.set(self.bar.position() as usize + 1);
-        self.bar.set_message(plain(&message).into_owned());
+        self.bar.set_message(printable(&message));
     }
 
     /// What is shown behind the bar.
@@ -79,7 +79,7 @@ impl Progress {
         {
             eprintln!("  {message}");
         }
-        self.bar.set_message(plain(&message).into_owned());
+        self.bar.set_message(printable(&message));
     }
 
     /// `done` steps are done.

@@ -1,18 +1,22 @@
 //! What the programs print, all of it at this one place. Control characters of names and messages that were read from files never
-//! reach a terminal, and a result that could not be printed never passes for printed.
+//! reach a terminal, nor does the password in a server's address, wherever on the command line it was given, and a result that could
+//! not be printed never passes for printed.
 //!
 //! The macros have the names of the standard ones and take their place: no line of the programs can go around them.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fmt;
 use std::io::{self, Write};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use clap::Parser;
 use serde_json::json;
+
+use crate::idle::{Idle, refuse};
 
 /// Prints a line to standard output as [`std::println`] does, without control characters and without a panic.
 #[macro_export]
@@ -42,12 +46,12 @@ static FAILED: Mutex<Option<io::Error>> = Mutex::new(None);
 /// What the macros call for standard output. A failure is kept for the end of the program.
 pub fn out(text: fmt::Arguments<'_>) {
     PRINTED.store(true, Ordering::Relaxed);
-    kept(io::stdout().write_all(plain(&text.to_string()).as_bytes()));
+    kept(io::stdout().write_all(printable(&text.to_string()).as_bytes()));
 }
 
 /// What the macros call for standard error. There is nowhere to report that it cannot be written.
 pub fn err(text: fmt::Arguments<'_>) {
-    if let Err(error) = io::stderr().write_all(plain(&text.to_string()).as_bytes()) {
+    if let Err(error) = io::stderr().write_all(printable(&text.to_string()).as_bytes()) {
         end_with_the_reader(&error);
     }
 }
@@ -90,6 +94,84 @@ pub fn plain(text: &str) -> Cow<'_, str> {
     Cow::Owned(safe)
 }
 
+/// What can be printed of a text: [`plain`], and the addresses of servers that are among the program's arguments without passwords.
+pub(crate) fn printable(text: &str) -> String {
+    plain(&without_addresses(text, addresses())).into_owned()
+}
+
+/// An address of a server that stands on the command line, where it belongs or not, and what of it can be shown.
+#[derive(Debug, PartialEq)]
+struct Address {
+    given: String,
+    shown: String,
+}
+
+/// The addresses among the arguments of this program.
+fn addresses() -> &'static [Address] {
+    static ADDRESSES: OnceLock<Vec<Address>> = OnceLock::new();
+    ADDRESSES.get_or_init(|| addresses_of(std::env::args_os().skip(1)))
+}
+
+/// The addresses among arguments, and among what stands behind their equals signs; the longest first.
+fn addresses_of(arguments: impl Iterator<Item = OsString>) -> Vec<Address> {
+    let mut found = vec![];
+    for argument in arguments {
+        let argument = argument.to_string_lossy();
+        let value = argument.split_once('=').map(|(_, value)| value);
+        for given in [Some(&*argument), value].into_iter().flatten() {
+            if let Some(shown) = shown_address(given).filter(|shown| shown != given) {
+                found.push(Address { given: given.to_owned(), shown });
+            }
+        }
+    }
+    found.sort_by_key(|address| std::cmp::Reverse(address.given.len()));
+    found
+}
+
+/// What can be shown of the address of a server; `None` for what is no address.
+#[cfg(feature = "experience")]
+fn shown_address(text: &str) -> Option<String> {
+    match sixfold_experience::StorePlace::from(text) {
+        sixfold_experience::StorePlace::File(_) => None,
+        place => Some(place.to_string()),
+    }
+}
+
+/// No option of this program takes an address.
+#[cfg(not(feature = "experience"))]
+fn shown_address(_: &str) -> Option<String> {
+    None
+}
+
+/// A text with addresses as they can be shown.
+fn without_addresses<'t>(text: &'t str, addresses: &[Address]) -> Cow<'t, str> {
+    let mut text = Cow::Borrowed(text);
+    for Address { given, shown } in addresses {
+        if text.contains(given.as_str()) {
+            text = Cow::Owned(text.replace(given.as_str(), shown));
+        }
+    }
+    text
+}
+
+/// A message about the command line without passwords. One that shows a part of an address, such as what stands before a comma,
+/// gives way to `kind`, which names no argument.
+fn without_passwords(message: &str, kind: &str, addresses: &[Address]) -> String {
+    fn words(text: &str) -> impl Iterator<Item = &str> {
+        text.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty())
+    }
+    let safe = without_addresses(message, addresses);
+    let in_message: BTreeSet<&str> = words(&safe).collect();
+    let public: BTreeSet<&str> = addresses.iter().flat_map(|a| words(&a.shown)).collect();
+    let secret = |a: &Address| words(&a.given).any(|w| in_message.contains(w) && !public.contains(w));
+    if addresses.iter().any(secret) {
+        return format!(
+            "error: {kind}; what was given is not shown, for there is a server's address in it\n"
+        );
+    }
+    safe.into_owned()
+}
+
 /// What the caller of a program wanted and did not get.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Failure {
@@ -128,16 +210,35 @@ fn json_wanted(arguments: impl Iterator<Item = OsString>) -> bool {
 }
 
 /// The command line of a program; where it is wrong, or asks for help, all has been printed and the exit status is the error.
-pub fn parse<A: Parser>() -> Result<A, ExitCode> {
-    A::try_parse().map_err(|error| {
-        let printed = error.print();
+/// Options that would be ignored by `idle` are wrong.
+pub fn parse<A: Parser>(idle: &[Idle]) -> Result<A, ExitCode> {
+    let mut command = A::command();
+    let parsed = command.try_get_matches_from_mut(std::env::args_os()).and_then(|matches| {
+        let arguments = A::from_arg_matches(&matches);
+        arguments
+            .and_then(|arguments| refuse(idle, &command, &matches).map(|()| arguments))
+            .map_err(|error| error.format(&mut command))
+    });
+    parsed.map_err(|error| {
         if error.use_stderr() {
-            let text = error.render().to_string();
+            let kind = error.kind().as_str().unwrap_or("the command line is wrong");
+            let text = match addresses() {
+                [] => {
+                    // With colours; there is nowhere to report that it cannot be printed.
+                    drop(error.print());
+                    error.render().to_string()
+                }
+                addresses => {
+                    let text = without_passwords(&error.render().to_string(), kind, addresses);
+                    err(format_args!("{text}"));
+                    text
+                }
+            };
             let end = ["\n\nUsage:", "\n\nFor more information"].iter().filter_map(|e| text.find(e)).min();
             let message = text[..end.unwrap_or(text.len())].trim();
             fail_as_json(message.strip_prefix("error: ").unwrap_or(message), Failure::Usage);
         } else {
-            kept(printed);
+            kept(error.print());
         }
         finish(u8::try_from(error.exit_code()).unwrap_or(2))
     })
@@ -170,6 +271,33 @@ mod tests {
         let text = json!({ "name": hostile }).to_string();
         let back: serde_json::Value = serde_json::from_str(&plain(&text)).unwrap();
         assert_eq!(back["name"], hostile);
+    }
+
+    #[cfg(feature = "experience")]
+    #[test]
+    fn addresses_on_the_command_line_are_shown_without_passwords() {
+        let of = |text: &str| addresses_of(text.split_whitespace().map(OsString::from));
+        assert!(
+            of("grasp propose --depth d.png --camera=c.json --box 1,2,3,4 --experiences a.db").is_empty()
+        );
+        // What shows no password is left as it is.
+        assert!(of("grasp store list postgres://robot@server:5432/fleet").is_empty());
+        let address = "postgres://robot:secret@server/fleet";
+        let given = of(&format!("grasp learn {address}"));
+        let message = format!("error: unexpected argument '{address}' found\n\nUsage: sixfold grasp learn");
+        let safe = without_passwords(&message, "unexpected argument found", &given);
+        assert_eq!(safe, message.replace(":secret", ""));
+        // The value alone of an option, the whole of an option that is none.
+        let given = of(&format!("--outbox={address} --{address}"));
+        for shown in [address.to_owned(), format!("--{address}"), format!("--outbox={address}")] {
+            let safe = without_passwords(&format!("found '{shown}', expected none"), "wrong", &given);
+            assert!(safe.starts_with("found '") && !safe.contains("secret"), "{safe}");
+        }
+        // A part of it.
+        let given = of("detect --ids postgres://robot:sec,ret@server/fleet");
+        let safe =
+            without_passwords("error: invalid value 'ret@server/fleet' for --ids", "invalid value", &given);
+        assert!(safe.starts_with("error: invalid value; ") && !safe.contains("server/fleet"), "{safe}");
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! `sixfold detect`: boxes and masks of a detector's objects, in images or in all of a dataset. Nothing is written before the end.
+//! `sixfold detect`: boxes and masks of a detector's objects, in images, of which nothing is written before the end, or in all
+//! of a dataset, resumable.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -11,7 +12,7 @@ use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::model::DetectorModel;
 use sixfold_geometry::RgbImage;
 use sixfold_io::read_rgb;
-use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, detections};
+use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, RunOptions, detections};
 
 use super::detect_arguments::DetectArguments;
 use sixfold_shell::Outcome;
@@ -20,7 +21,7 @@ use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{report, write_atomically};
 use sixfold_shell::overlay::detections_over;
 use sixfold_shell::pictures::Pictures;
-use sixfold_shell::progress::Progress;
+use sixfold_shell::progress::{Progress, interrupted};
 use sixfold_shell::ranges::without_duplicates;
 
 #[derive(Serialize)]
@@ -50,6 +51,8 @@ struct Whole {
 
 pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     without_duplicates("--ids", &a.ids)?;
+    // The weights are hashed before they are read: what changes in between is never taken for the same.
+    let of_run = run_options(a);
     let model = DetectorModel::load(&a.weights)?;
     for id in &a.ids {
         model.check_object(*id).with_context(|| "--ids".to_string())?;
@@ -68,11 +71,44 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     options.check().map_err(|message| anyhow!(message))?;
     let detector = TrainedDetector::new(model, options);
     match (&a.dataset, &a.rgb[..]) {
-        (Some(root), _) => in_dataset(a, &detector, root),
+        (Some(root), _) => in_dataset(a, &detector, root, &of_run),
         (None, [file]) => in_image(a, &detector, file),
         (None, []) => bail!("give --rgb FILE or --dataset DIR"),
         (None, files) => in_images(a, &detector, files),
     }
+}
+
+/// What decides about the detections of an image. Which images are searched does not.
+fn run_options(a: &DetectArguments) -> RunOptions {
+    // All fields, so that a new one is decided about.
+    let DetectArguments {
+        weights,
+        dataset,
+        split,
+        ids,
+        threshold,
+        overlap,
+        per_object,
+        most,
+        no_masks,
+        rgb: _,
+        targets: _,
+        except: _,
+        out: _,
+        overlays: _,
+        json: _,
+    } = a;
+    let mut options = RunOptions::default();
+    options.add("weights", &weights.to_string_lossy());
+    options.add("dataset", &dataset.as_deref().map_or_else(String::new, |d| d.to_string_lossy().into()));
+    options.add("split", split);
+    options.add("ids", &format!("{ids:?}"));
+    options.add("threshold", &format!("{threshold:?}"));
+    options.add("overlap", &overlap.to_string());
+    options.add("per-object", &per_object.to_string());
+    options.add("most", &most.to_string());
+    options.add("no-masks", &no_masks.to_string());
+    options
 }
 
 /// The outcome of so many detections.
@@ -181,7 +217,12 @@ fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf])
     Ok(outcome(many.detections, &many.skipped))
 }
 
-fn in_dataset(a: &DetectArguments, detector: &TrainedDetector, root: &Path) -> Result<Outcome> {
+fn in_dataset(
+    a: &DetectArguments,
+    detector: &TrainedDetector,
+    root: &Path,
+    options: &RunOptions,
+) -> Result<Outcome> {
     let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
     if out.extension().is_none_or(|e| e != "json") {
         bail!("--out: found {}, expected a file that ends in .json", out.display());
@@ -196,9 +237,10 @@ fn in_dataset(a: &DetectArguments, detector: &TrainedDetector, root: &Path) -> R
     let mut progress = Progress::new("images", images.len());
     let mut pictures = Pictures::of(a.overlays.as_deref().map(OutputFolder::take).transpose()?);
     let sure = f64::from(detector.model().usage().threshold);
-    let run = DetectionRun { detector, dataset: &dataset, images: &images, ids: &a.ids };
-    let summary = run.run(out, &mut |event| match event {
-        DetectionEvent::Image(image) => progress.step(image),
+    let run = DetectionRun { detector, dataset: &dataset, images: &images, ids: &a.ids, options };
+    let summary = run.run(out, interrupted(), &mut |event| match event {
+        DetectionEvent::Image { image, earlier: true } => progress.step(format!("{image} was done")),
+        DetectionEvent::Image { image, earlier: false } => progress.step(image),
         DetectionEvent::Found { scene, im_id, image, detections } => {
             if a.overlays.is_some() {
                 let shown: Vec<Detection> = detections.iter().filter(|d| d.score >= sure).cloned().collect();

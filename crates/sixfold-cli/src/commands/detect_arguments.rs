@@ -13,7 +13,7 @@ pub(crate) struct DetectArguments {
     /// Colour images: PNG or JPEG of any size, grey or colour
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]
     pub rgb: Vec<PathBuf>,
-    /// BOP dataset folder: detect in the images of its targets
+    /// BOP dataset folder: detect in the images of its targets. Stopped, the same command resumes
     #[arg(long, value_name = "DIR", requires = "out")]
     pub dataset: Option<PathBuf>,
     /// Split of the dataset

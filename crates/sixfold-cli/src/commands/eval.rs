@@ -16,7 +16,6 @@ use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
-use sixfold_shell::ranges::in_range;
 
 #[derive(Debug, Args)]
 pub(crate) struct EvalArguments {
@@ -39,7 +38,7 @@ pub(crate) struct EvalArguments {
     #[arg(long, value_name = "FILE")]
     pub except: Option<PathBuf>,
     /// With --detections: score from which on detections count for recall and false detections, 0 to 1
-    #[arg(long, value_name = "SCORE", default_value = "0.4")]
+    #[arg(long, value_name = "SCORE", default_value = "0.4", value_parser = score)]
     pub min_score: f64,
     /// With --detections: write the ground truth that they were scored with as a COCO file
     #[arg(long, value_name = "FILE.json", requires = "detections", conflicts_with = "results")]
@@ -60,6 +59,12 @@ pub(crate) struct EvalArguments {
     pub json: JsonArguments,
 }
 
+/// A score from 0 to 1.
+fn score(text: &str) -> Result<f64, String> {
+    let score: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    if (0.0..=1.0).contains(&score) { Ok(score) } else { Err(format!("found {score}, expected 0 to 1")) }
+}
+
 #[derive(Serialize)]
 struct Whole {
     #[serde(flatten)]
@@ -69,7 +74,6 @@ struct Whole {
 }
 
 pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
-    in_range("--min-score", a.min_score, 0.0..=1.0)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     if a.detections.is_some() {
         return coco(a, &dataset);

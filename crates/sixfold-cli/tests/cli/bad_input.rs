@@ -342,3 +342,84 @@ fn detections_off_the_image_or_broken() {
         &["d.json", "entry 0", "field bbox"],
     );
 }
+
+#[cfg(all(feature = "experience", feature = "physics"))]
+#[test]
+fn options_that_would_be_ignored_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let one = "--depth d.png --camera c.json";
+    let found = "--object part.ply --unit mm";
+    for (arguments, option, reason) in [
+        ("estimate --dataset lmo --out r.csv --unit mm", "--unit", "with --dataset"),
+        ("estimate --dataset lmo --out r.csv --store objects", "--store", "with --dataset"),
+        ("estimate --dataset lmo --out r.csv --instances 3", "--instances", "with --dataset"),
+        ("estimate ONE FOUND --split train", "--split", "without --dataset"),
+        (
+            "estimate --method pix2pose --weights w --rgb c.png --camera c.json FOUND --depth-scale 1",
+            "--depth-scale",
+            "without --depth",
+        ),
+        ("estimate ONE FOUND --object-id 3", "--object-id", "with --method ppf without --detector"),
+        (
+            "estimate --method mttm ONE FOUND --object-id 3",
+            "--object-id",
+            "with --method mttm without --detector",
+        ),
+        ("estimate --dataset lmo --out r.csv --boxes gt --detector d", "--detector", "with --boxes gt"),
+        (
+            "estimate --dataset lmo --out r.csv --boxes b.json --detector d",
+            "--detector",
+            "with --boxes b.json",
+        ),
+        (
+            "estimate --method mttm --matcher points --weights w ONE FOUND",
+            "--weights",
+            "with --matcher points",
+        ),
+        ("estimate ONE FOUND --cache folder --no-cache", "--cache", "with --no-cache"),
+        ("detect --weights w --rgb c.png --split train", "--split", "without --dataset"),
+        ("eval --dataset lmo --results r.csv --min-score 0.5", "--min-score", "without --detections"),
+        ("eval --dataset lmo --detections d.json --detection-ap", "--detection-ap", "with --detections"),
+        ("eval --dataset lmo --detections d.json --no-vsd", "--no-vsd", "with --detections"),
+        ("eval --dataset lmo --detections d.json --curves c.png", "--curves", "with --detections"),
+        ("object add mug mug.ply --unit mm --model-id 3", "--model-id", "without --models-info"),
+        ("object add mug ONE --mask m.png --unit mm", "--unit", "with --depth"),
+        ("object add mug ONE --mask m.png --models-info i --model-id 3", "--models-info", "with --depth"),
+        ("object add mug ONE --mask m.png --turns-about z", "--turns-about", "with --depth"),
+        ("synthesize --photographs p.json --out out --split train", "--split", "without --dataset"),
+        ("synthesize --dataset lmo --out out --no-refine --rough 3,1", "--rough", "with --no-refine"),
+        ("synthesize --dataset lmo --out out --no-refine --scene still", "--scene", "with --no-refine"),
+        ("simulate-scenes --toys 1 --out out --unit mm", "--unit", "without --object"),
+        ("simulate-scenes --toys 1 --out out --store objects", "--store", "without --object"),
+        ("train pix2pose FOUND --out out --split train", "--split", "without --dataset"),
+        ("train pix2pose --dataset lmo --out out --unit mm", "--unit", "without --object"),
+        (
+            "train pix2pose --dataset lmo --out out --no-adversarial",
+            "--no-adversarial",
+            "with --network compact",
+        ),
+        ("train detector FOUND --out out --split train", "--split", "without --dataset"),
+        ("train detector --dataset lmo --out out --store objects", "--store", "without --object"),
+        ("grasp propose ONE --weights w", "--weights", "without --experiences"),
+        ("grasp propose ONE --rgb c.png", "--rgb", "without --out"),
+        ("grasp try FOUND --grasp g.json --approach 0,0,1", "--approach", "with --grasp"),
+        ("grasp try FOUND --grasp g.json --closing 0,1,0", "--closing", "with --grasp"),
+        ("grasp learn --experiences e.db --families can --out out --unit mm", "--unit", "without --object"),
+        (
+            "grasp learn --experiences e.db --families can --out out --store objects",
+            "--store",
+            "without --object",
+        ),
+    ] {
+        let arguments = arguments.replace("ONE", one).replace("FOUND", found);
+        fails(dir.path(), &arguments, &[&format!("{option} has no effect"), reason]);
+    }
+    // It is no option where nothing shows colours.
+    fails(dir.path(), "grasp store add e.db --rgb c.png", &["unexpected argument", "--rgb"]);
+    // What stands in the environment is meant for other commands.
+    let mut command = std::process::Command::new(crate::PROGRAM);
+    command.args(["grasp", "propose", "--depth", "d.png", "--camera", "c.json"]).current_dir(dir.path());
+    let output = command.env("SIXFOLD_DGCM", "w.safetensors").output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("c.json") && !stderr.contains("no effect"), "{stderr}");
+}

@@ -136,6 +136,40 @@ fn images_of_all_kinds() {
     std::fs::write(path("tiny/test/000007/rgb/000004.png"), b"no image").unwrap();
     let run = sixfold(tiny.path(), &detect("--dataset tiny --threshold 0 --out found.json")).expect(2);
     assert!(run.stderr.contains("skipped image 7/4"), "{}", run.stderr);
+    assert!(path("found.json.part").exists());
+}
+
+#[test]
+fn a_dataset_with_an_image_left_out_is_completed_by_the_same_command() {
+    let tiny = Tiny::coloured();
+    sixfold(tiny.path(), &format!("{TRAIN} --steps 1")).expect(0);
+    let all = |out: &str| detect(&format!("--dataset tiny --threshold 0 --out {out} --json"));
+    let whole = sixfold(tiny.path(), &all("whole.json")).expect(0).json();
+    let other = format!("{TRAIN} --steps 1 --seed 3").replace("--out detector", "--out other");
+    sixfold(tiny.path(), &other).expect(0);
+    let image = tiny.file("test/000007/rgb/000004.png");
+    let before = std::fs::read(&image).unwrap();
+    std::fs::write(&image, b"no image").unwrap();
+    let part = sixfold(tiny.path(), &all("found.json")).expect(2).json();
+    assert!(part["detections"].as_u64().unwrap() < whole["detections"].as_u64().unwrap(), "{part}");
+    // Not with another threshold, nor with other weights.
+    let other = all("found.json").replace("--threshold 0", "--threshold 0.1");
+    fails(tiny.path(), &other, &["found.json.part", "threshold", "remove both"]);
+    let other = all("found.json").replace("detector/model", "other/model");
+    fails(tiny.path(), &other, &["found.json.part", "weights", "remove both"]);
+
+    std::fs::write(&image, before).unwrap();
+    let again = sixfold(tiny.path(), &all("found.json")).expect(0).json();
+    assert_eq!((&again["images"], &again["detections"]), (&whole["images"], &whole["detections"]));
+    for name in ["found.json.part", "found.json.part.run.json"] {
+        assert!(!tiny.path().join(name).exists(), "{name}");
+    }
+    let timeless = |name: &str| {
+        let mut all = json_of(&tiny.path().join(name));
+        all.as_array_mut().unwrap().iter_mut().for_each(|d| d["time"] = 0.into());
+        all
+    };
+    assert_eq!(timeless("found.json"), timeless("whole.json"));
 }
 
 #[test]

@@ -30,6 +30,50 @@ fn errors_are_json_where_json_was_asked_for() {
     }
 }
 
+#[cfg(feature = "experience")]
+#[test]
+fn passwords_are_not_shown_wherever_an_address_is_given() {
+    let dir = tempfile::tempdir().unwrap();
+    for address in [
+        "postgres://robot:secret@127.0.0.1:1/fleet",
+        "Postgres://robot%3Asecret@127.0.0.1:1/fleet",
+        "password=secret",
+        "robot:sec,secret,ret@127.0.0.1/fleet",
+    ] {
+        for arguments in [
+            "ADDRESS",
+            "--ADDRESS",
+            "--threads ADDRESS object list",
+            "grasp ADDRESS",
+            "grasp learn ADDRESS",
+            "grasp learn --ADDRESS",
+            "grasp learn --attempts ADDRESS",
+            "grasp learn --attempts=ADDRESS",
+            "grasp learn --out ADDRESS",
+            "grasp store ADDRESS",
+            "grasp store list a.db ADDRESS",
+            "grasp store show a.db ADDRESS",
+            "grasp store merge a.db ADDRESS",
+            "grasp compare ADDRESS",
+            "reproduce ADDRESS",
+            "detect --weights w.safetensors --dataset lmo --out found.json --ids ADDRESS",
+            "estimate --depth ADDRESS --camera c.json --object part.ply --unit mm",
+            "estimate --method ADDRESS",
+            "eval --dataset ADDRESS --results results.csv",
+            "object show ADDRESS",
+            "render --object ADDRESS --unit mm --out out",
+            "completions ADDRESS",
+        ] {
+            for json in ["", " --json"] {
+                let run = sixfold(dir.path(), &(arguments.replace("ADDRESS", address) + json));
+                assert!(run.code != 0 && !run.stderr.is_empty(), "{arguments}: {run:?}");
+                let printed = format!("{}{}", run.stdout, run.stderr);
+                assert!(!printed.contains("secret"), "{arguments}: {printed}");
+            }
+        }
+    }
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn output_that_cannot_be_printed_is_an_error_not_a_panic() {

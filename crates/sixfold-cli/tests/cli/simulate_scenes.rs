@@ -80,6 +80,13 @@ fn scenes_are_a_dataset_of_their_own() {
     assert!(score["ar_mssd"].as_f64().unwrap() > 0.999, "{score}");
     assert!(image::open(dir.join("new/preview.png")).is_ok());
 
+    // Its camera file is one that `estimate` takes.
+    let found = sixfold(
+        dir,
+        "estimate --depth new/test/000000/depth/000000.png --camera new/camera.json --object part.ply --unit mm",
+    );
+    assert!([0, 1].contains(&found.code), "{found:?}");
+
     // A scene that was not finished is made again, with the same bytes, by one thread as by many.
     let before = files(&dir.join("new"));
     std::fs::remove_file(dir.join("new/test/000001/scene_gt_info.json")).unwrap();

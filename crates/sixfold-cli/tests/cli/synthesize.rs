@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 use sixfold_bop::BopDataset;
 use sixfold_geometry::Mask;
-use sixfold_io::{read_mask, read_rgb, write_mask};
+use sixfold_io::{read_mask, read_rgb, write_depth, write_mask};
+use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::support::*;
 
@@ -82,6 +83,32 @@ fn a_training_set_of_new_views() {
     let train = "train pix2pose --dataset new --split train_nol --render-share 0 --size 64 --steps 2 --out trained --json";
     let trained = sixfold(tiny.path(), train).expect(0).json();
     assert_eq!(trained["photographs"], 18);
+}
+
+#[test]
+fn the_camera_file_is_one_that_estimate_takes() {
+    let tiny = Tiny::coloured();
+    let dir = tiny.path();
+    sixfold(dir, &few("new")).expect(0);
+    let dataset = BopDataset::open(&dir.join("new"), "train_nol").unwrap();
+    let scene = dataset.scene(1).unwrap();
+    let first = scene.image_ids()[0];
+    let file = sixfold_io::CameraFile::read(&dir.join("new/camera.json")).unwrap();
+    let (written, of_image) = (file.camera, scene.camera(first).unwrap());
+    assert!(file.sized && written == of_image, "{written:?} {of_image:?}");
+    // What that camera sees at the first image's pose; the part's own sides are the only planes.
+    let pose = scene.image(first).unwrap().ground_truth[0].camera_from_object;
+    let part = part();
+    let part = SceneObject { mesh: &part, camera_from_object: pose };
+    let mut frame = VisibilityBuffer::new(&written);
+    frame.render(&[part], &RenderOptions::default());
+    write_depth(&dir.join("depth.png"), &frame.depth(), 1e-4).unwrap();
+    let found = sixfold(
+        dir,
+        "estimate --depth depth.png --depth-scale 0.1 --camera new/camera.json --object tiny/models/obj_000001.ply --unit mm --keep-plane --json",
+    );
+    let poses = found.expect(0).json();
+    assert_near(&pose_of(&poses["poses"][0]["camera_from_object"]), &pose);
 }
 
 #[test]

@@ -127,15 +127,29 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
             Ok(value) => timeless(value).to_string().into_bytes(),
             Err(_) => bytes,
         },
-        // The cells of a table that hold seconds: one number of two digits, or a sum of two.
         "md" => {
+            // The cells of a table that hold seconds: one number of two digits, or a sum of two.
             let of_a_clock = |cell: &str| {
                 cell.contains('.')
                     && cell.chars().all(|c| c.is_ascii_digit() || matches!(c, '.' | '+' | ' '))
                     && cell.contains(" + ")
             };
-            let cells = text.split('|').map(|cell| if of_a_clock(cell) { " seconds " } else { cell });
-            cells.collect::<Vec<_>>().join("|").into_bytes()
+            // The columns whose head says milliseconds.
+            let mut columns: Vec<bool> = vec![];
+            let lines = text.lines().map(|line| {
+                let cells: Vec<&str> = line.split('|').collect();
+                if cells.len() == 1 {
+                    columns.clear();
+                } else if columns.is_empty() {
+                    columns = cells.iter().map(|cell| cell.trim().starts_with("ms ")).collect();
+                }
+                let timeless = cells.iter().enumerate().map(|(at, cell)| {
+                    let in_column = columns.get(at).is_some_and(|of_time| *of_time);
+                    if in_column || of_a_clock(cell) { " time " } else { cell }
+                });
+                timeless.collect::<Vec<_>>().join("|")
+            });
+            lines.collect::<Vec<_>>().join("\n").into_bytes()
         }
         _ => bytes,
     }

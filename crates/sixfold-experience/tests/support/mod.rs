@@ -4,6 +4,9 @@
 #[cfg(all(feature = "postgres", unix))]
 pub mod server;
 
+use std::ffi::OsStr;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
 use rand::{RngExt, SeedableRng};
@@ -14,6 +17,25 @@ use sixfold_experience::{
 };
 use sixfold_geometry::{Camera, Image, Mask, Plane, Pose, Vec3};
 use sixfold_grasp::{AntipodalQuality, GraspDescription, Gripper};
+
+/// This test binary again, as a process of its own in which only its test `helper_process` runs, on `file` and with another word;
+/// what it prints can be read, its errors are dropped.
+pub fn helper(file: impl AsRef<OsStr>, word: &str) -> Command {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command
+        .args(["--exact", "helper_process", "--nocapture", "--ignored"])
+        .env("SIXFOLD_HELPER_FILE", file)
+        .env("SIXFOLD_HELPER", word)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null());
+    command
+}
+
+/// In the process of [`helper`], the file and the word; `None` where somebody runs all ignored tests.
+pub fn helped() -> Option<(PathBuf, String)> {
+    let file = std::env::var_os("SIXFOLD_HELPER_FILE")?;
+    Some((file.into(), std::env::var("SIXFOLD_HELPER").ok()?))
+}
 
 fn crop() -> Crop {
     let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();

@@ -171,14 +171,12 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         gripper: real,
         mass: options.trial.mass,
     };
-    let (mut journal, mut rows) = Journal::open::<Row>(&a.out.join("trials.jsonl"), &recorded)?;
+    let file = a.out.join("trials.jsonl");
+    let (mut journal, mut rows) = Journal::open_groups::<Row>(&file, &recorded, METHODS.len())?;
     let mut progress = Progress::new("scenes", objects.len() * a.trials as usize);
     let scenes = Scenes { a, setting: &setting, gripper, options, network: &network };
     for (class, name, mesh) in &objects {
-        // A scene whose rows are not all there is made again.
-        let done = |number: u64| {
-            rows.iter().filter(|r| r.object == *name && r.number == number).count() >= METHODS.len()
-        };
+        let done = |number: u64| rows.iter().any(|r| r.object == *name && r.number == number);
         let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
         (missing.len()..a.trials as usize).for_each(|_| progress.step(name.clone()));
         if missing.is_empty() {
@@ -187,11 +185,9 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
         for number in missing {
             check_interrupt("finished scenes are kept; run the same command again to continue")?;
-            rows.retain(|r| r.object != *name || r.number != number);
-            for row in scenes.rows(class, name, mesh, &parts, number, &mut memory)? {
-                journal.row(&row)?;
-                rows.push(row);
-            }
+            let new = scenes.rows(class, name, mesh, &parts, number, &mut memory)?;
+            journal.group(&new)?;
+            rows.extend(new);
             progress.step(name.clone());
         }
     }

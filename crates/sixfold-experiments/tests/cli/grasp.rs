@@ -1,18 +1,7 @@
 //! `sixfold grasp measure` and `sixfold grasp compare`.
 
-use clap::Parser;
-use sixfold_shell::grasp::learn::{LearnArguments, learn};
-
+use crate::made::{NETWORK, experiences};
 use crate::support::*;
-
-/// The network that comes with Sixfold.
-const NETWORK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../weights/dgcm.safetensors");
-
-#[derive(Parser)]
-struct Learn {
-    #[command(flatten)]
-    arguments: LearnArguments,
-}
 
 #[test]
 fn the_planner_is_measured() {
@@ -32,11 +21,7 @@ fn the_planner_is_measured() {
 fn experience_is_compared_with_geometry() {
     let case = OneImage::new();
     let path = case.path();
-    let folder = path.display();
-    let words = format!(
-        "learn --experiences {folder}/e.db --object {folder}/part.ply --unit mm --attempts 3 --tries 3 --near 9 --weights {NETWORK} --out {folder}/learn"
-    );
-    learn(&Learn::parse_from(words.split_whitespace()).arguments).unwrap();
+    experiences(path);
     let compare = &format!(
         "grasp compare --experiences e.db --object part.ply --unit mm --trials 2 --weights {NETWORK} --out compare --json"
     );
@@ -48,4 +33,16 @@ fn experience_is_compared_with_geometry() {
         path.join("compare/part-0-both.png").exists() || path.join("compare/part-ply-0-both.png").exists()
     );
     assert_eq!(sixfold(path, compare).json()["classes"], table["classes"]);
+}
+
+#[test]
+fn objects_of_a_list_have_units_of_their_own() {
+    let dir = tempfile::tempdir().unwrap();
+    for command in ["measure --list l.json", "compare --list l.json --experiences e.db --out out"] {
+        let refused = |option: &str| {
+            fails(dir.path(), &format!("grasp {command} {option}"), &[option.split(' ').next().unwrap()]);
+        };
+        refused("--unit mm");
+        refused("--store objects");
+    }
 }

@@ -1,6 +1,8 @@
 //! The program as a user runs it: the real binary, in a temporary folder, on inputs made by the tests themselves.
 
 mod grasp;
+#[path = "../support/made.rs"]
+mod made;
 mod mttm;
 mod nol;
 mod pix2pose;

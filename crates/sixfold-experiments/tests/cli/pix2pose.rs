@@ -1,41 +1,14 @@
 //! `sixfold reproduce pix2pose`, on images that the test renders.
 
-use std::sync::atomic::AtomicBool;
-
-use sixfold_data::{FrameSelection, TrainingSet};
-use sixfold_nn::recipe::{Session, train as train_recipe};
-use sixfold_pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
-
+use crate::made::pix2pose;
 use crate::support::*;
 
 const WEIGHTS: &str = "trained/model.safetensors";
 
-/// Trains object 1 on the images of frames.json, a small network for three steps.
-fn train(tiny: &Tiny) {
-    let frames = FrameSelection::File(tiny.path().join("frames.json"));
-    let material = TrainingSet::of_dataset(&tiny.file(""), "test", &[1], &frames, MIN_VISIBILITY).unwrap();
-    let recipe = Pix2PoseRecipe {
-        steps: Some(3),
-        per_object: Some(4),
-        rotation: 0.0,
-        render_share: 0.0,
-        size: 64,
-        ..Pix2PoseRecipe::default()
-    };
-    let (out, stop) = (tiny.path().join("trained"), AtomicBool::new(false));
-    let mut events = |_: sixfold_nn::recipe::TrainingEvent<'_>| ();
-    train_recipe(&recipe, material, &mut Session::new(&out, &stop, &mut events)).unwrap();
-}
-
 #[test]
 fn the_table_is_made_row_by_row() {
     let tiny = Tiny::coloured();
-    std::fs::write(
-        tiny.path().join("frames.json"),
-        "[{\"scene_id\": 7, \"im_id\": 0}, {\"scene_id\": 7, \"im_id\": 11}]",
-    )
-    .unwrap();
-    train(&tiny);
+    pix2pose(tiny.path());
     tiny.write_truth_as_results("perfect.csv");
     let command = format!(
         "reproduce pix2pose --dataset tiny --frames frames.json --weights {WEIGHTS} --published perfect.csv --out table"

@@ -13,6 +13,8 @@ mod commands;
 mod driver;
 #[path = "../../../sixfold-cli/tests/faults/kill.rs"]
 mod kill;
+#[path = "../support/made.rs"]
+mod made;
 #[path = "../../../sixfold-cli/tests/faults/outputs.rs"]
 mod outputs;
 #[path = "../../../sixfold-cli/tests/faults/space.rs"]

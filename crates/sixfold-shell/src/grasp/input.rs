@@ -1,6 +1,6 @@
 //! A depth image from files, prepared for grasping.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
@@ -25,9 +25,6 @@ pub struct InputArguments {
     /// The object's mask: PNG, above zero inside (default: the largest thing on the table)
     #[arg(long, value_name = "FILE")]
     pub mask: Option<PathBuf>,
-    /// Colour image for the overlay
-    #[arg(long, value_name = "FILE")]
-    pub rgb: Option<PathBuf>,
 }
 
 /// What was read, without distortion.
@@ -44,11 +41,11 @@ pub struct Input {
     pub began: std::time::Instant,
 }
 
-/// Reads and prepares the view of the masked object, or of the largest thing on the table.
+/// Reads and prepares the view of the masked object, or of the largest thing on the table; `rgb`: a colour image for overlays.
 ///
 /// # Errors
 /// For files that cannot be read or do not go together.
-pub fn read(a: &InputArguments, seed: u64) -> Result<Input> {
+pub fn read(a: &InputArguments, rgb: Option<&Path>, seed: u64) -> Result<Input> {
     let file = CameraFile::read(&a.camera)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
         anyhow!(
@@ -62,7 +59,7 @@ pub fn read(a: &InputArguments, seed: u64) -> Result<Input> {
     let depth = read_depth(&a.depth, scale / 1000.0)?;
     let camera = file.for_image(depth.width(), depth.height(), &a.camera)?;
     let depth = undistort_depth(&depth, &camera)?;
-    let rgb = match &a.rgb {
+    let rgb = match rgb {
         None => None,
         Some(path) => {
             Some(undistort_rgb(&read_rgb(path)?, &camera).with_context(|| path.display().to_string())?)

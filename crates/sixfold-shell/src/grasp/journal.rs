@@ -31,8 +31,20 @@ impl Journal {
     /// # Errors
     /// When the file belongs to a measurement with other options, or another process writes it.
     pub fn open<T: DeserializeOwned>(path: &Path, options: &impl Serialize) -> Result<(Journal, Vec<T>)> {
+        Self::open_groups(path, options, 1)
+    }
+
+    /// As [`Journal::open`], where each `group` rows belong together: what is there of the last group, if not all, is dropped.
+    ///
+    /// # Errors
+    /// As [`Journal::open`].
+    pub fn open_groups<T: DeserializeOwned>(
+        path: &Path,
+        options: &impl Serialize,
+        group: usize,
+    ) -> Result<(Journal, Vec<T>)> {
         let options = serde_json::to_string(options)?;
-        let journal = Self::with_header(path, |found| match found {
+        let journal = Self::with_header(path, group, |found| match found {
             None => Ok(options.clone()),
             Some(found) if found == options => Ok(options.clone()),
             Some(_) => bail!(other_options(path)),
@@ -41,8 +53,12 @@ impl Journal {
         Ok((journal, rows))
     }
 
-    /// `header` makes the first line, or tests the one that is there.
-    fn with_header(path: &Path, header: impl FnOnce(Option<&str>) -> Result<String>) -> Result<Journal> {
+    /// `header` makes the first line, or tests the one that is there; rows come in groups of `group`.
+    fn with_header(
+        path: &Path,
+        group: usize,
+        header: impl FnOnce(Option<&str>) -> Result<String>,
+    ) -> Result<Journal> {
         let name = path.display();
         if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
             std::fs::create_dir_all(parent).with_context(|| format!("folder {}", parent.display()))?;
@@ -55,16 +71,20 @@ impl Journal {
         };
         // A line without an end was being written when the program was stopped.
         let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
-        let mut lines = whole.lines();
-        let header = header(lines.next())?;
-        let rows = lines.map(str::to_owned).collect();
+        let mut lines = whole.split_inclusive('\n');
+        let first = lines.next();
+        let header = header(first.map(str::trim_end))?;
+        let mut rows: Vec<&str> = lines.collect();
+        rows.truncate(rows.len() / group * group);
+        let length = first.map_or(0, str::len) + rows.iter().map(|row| row.len()).sum::<usize>();
+        let rows = rows.into_iter().map(|row| row.trim_end().to_owned()).collect();
         let mut file = OpenOptions::new()
             .create(true)
             .truncate(false)
             .write(true)
             .open(path)
             .with_context(|| name.to_string())?;
-        file.set_len(whole.len() as u64)?;
+        file.set_len(length as u64)?;
         std::io::Seek::seek(&mut file, std::io::SeekFrom::End(0))?;
         let mut journal = Journal { file, path: path.to_path_buf(), rows, _lock: lock };
         if whole.is_empty() {
@@ -87,9 +107,15 @@ impl Journal {
         self.line(&serde_json::to_string(row)?)
     }
 
+    /// Writes rows that belong together.
+    pub fn group(&mut self, rows: &[impl Serialize]) -> Result<()> {
+        let lines: Vec<String> = rows.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+        self.line(&lines.join("\n"))
+    }
+
     /// Writes a row that is text already.
     pub fn line(&mut self, line: &str) -> Result<()> {
-        // One write, so that little else than a whole line is ever there.
+        // One write, so that little else than a whole line, or a whole group, is ever there.
         self.file
             .write_all(format!("{line}\n").as_bytes())
             .and_then(|()| self.file.flush())
@@ -119,7 +145,7 @@ impl StoreJournal {
     pub fn open(path: &Path, options: &impl Serialize) -> Result<StoreJournal> {
         let end = format!("\",\"options\":{}}}", serde_json::to_string(options)?);
         let mut name = random_name();
-        let journal = Journal::with_header(path, |found| {
+        let journal = Journal::with_header(path, 1, |found| {
             if let Some(line) = found {
                 let named = line.strip_prefix(HEADER).and_then(|rest| rest.strip_suffix(&end));
                 name = named.with_context(|| other_options(path))?.to_owned();
@@ -195,6 +221,28 @@ mod tests {
         assert!(second.contains("rows.jsonl") && second.contains("another process"), "{second}");
         drop(first);
         assert_eq!(Journal::open::<u32>(&file, &"options").unwrap().1, [1]);
+    }
+
+    #[test]
+    fn a_group_of_rows_is_whole_or_not_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rows.jsonl");
+        let open = || Journal::open_groups::<u32>(&file, &"options", 3).unwrap();
+        let (mut journal, rows) = open();
+        assert!(rows.is_empty());
+        journal.group(&[1, 2, 3]).unwrap();
+        drop(journal);
+        let whole = std::fs::read_to_string(&file).unwrap();
+        assert_eq!(whole, "\"options\"\n1\n2\n3\n");
+        // Cut off within the next group, within a row or between two.
+        for more in ["4", "4\n", "4\n5\n", "4\n5\n6"] {
+            std::fs::write(&file, format!("{whole}{more}")).unwrap();
+            let (mut journal, rows) = open();
+            assert_eq!(rows, [1, 2, 3]);
+            journal.group(&[7, 8, 9]).unwrap();
+            drop(journal);
+            assert_eq!(open().1, [1, 2, 3, 7, 8, 9]);
+        }
     }
 
     #[test]

@@ -12,15 +12,19 @@ use sixfold_simulation::{AttemptOptions, AttemptOutcome, TrialOptions};
 
 use super::gripper::gripper;
 
+/// Mass of an object in the usual setting and in the hard one, kg.
+const MASS: f64 = 0.2;
+const HARD_MASS: f64 = 0.5;
+
 /// Numbers of the simulated trial.
 #[derive(Debug, Args)]
 pub struct PhysicsArguments {
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
-    /// Mass of the objects, kg
-    #[arg(long, value_name = "KG", default_value = "0.2")]
-    pub mass: f64,
+    /// Mass of the objects, kg (default: 0.2; with --hard, where there is that, 0.5)
+    #[arg(long, value_name = "KG")]
+    pub mass: Option<f64>,
     /// Friction coefficient of the pads (default: the gripper's)
     #[arg(long, value_name = "MU")]
     pub friction: Option<f64>,
@@ -38,7 +42,7 @@ pub fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
     gripper.friction = a.friction.unwrap_or(gripper.friction);
     gripper.force = a.force.unwrap_or(gripper.force);
     gripper.check(&a.gripper).context("--friction and --force change the gripper")?;
-    let options = TrialOptions { mass: a.mass, ..TrialOptions::default() };
+    let options = TrialOptions { mass: a.mass.unwrap_or(MASS), ..TrialOptions::default() };
     options.check()?;
     Ok((gripper, options))
 }
@@ -81,8 +85,7 @@ pub fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
     if hard {
         // A --friction that was asked for is known to both.
         real.friction = a.friction.unwrap_or(0.25);
-        // The command line's default is the easy setting's mass.
-        trial.mass = if a.mass == 0.2 { 0.5 } else { a.mass };
+        trial.mass = a.mass.unwrap_or(HARD_MASS);
         error = Some((0.005, 3f64.to_radians()));
         let kinect = DepthSensor::kinect();
         options.sensor = Some(DepthSensor {
@@ -105,5 +108,24 @@ pub fn outcome_name(ending: AttemptOutcome) -> String {
             map.values().next().and_then(|v| v.as_str()).unwrap_or("tried").to_owned()
         }
         _ => format!("{ending:?}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_asked_for_holds_in_the_hard_setting_too() {
+        let of = |mass, friction, hard| {
+            let arguments = PhysicsArguments { gripper: "jaws-140".to_owned(), mass, friction, force: None };
+            let set = hardness(&arguments, hard).unwrap();
+            (set.options.trial.mass, set.real.friction)
+        };
+        let usual = Gripper::built_in("jaws-140").unwrap().friction;
+        assert_eq!(of(None, None, false), (0.2, usual));
+        assert_eq!(of(None, None, true), (0.5, 0.25));
+        assert_eq!(of(Some(0.2), Some(0.4), true), (0.2, 0.4));
+        assert_eq!(of(Some(0.3), None, false), (0.3, usual));
     }
 }

@@ -28,6 +28,9 @@ use sixfold_shell::ranges::count;
 pub(crate) struct ProposeArguments {
     #[command(flatten)]
     pub input: InputArguments,
+    /// Colour image for the overlay in --out
+    #[arg(long, value_name = "FILE")]
+    pub rgb: Option<PathBuf>,
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
@@ -63,7 +66,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
-    let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.seed)?;
+    let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.rgb.as_deref(), a.seed)?;
     let proposed: Vec<Proposed> = match &view {
         None => vec![],
         Some(view) => {

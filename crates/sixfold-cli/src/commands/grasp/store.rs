@@ -159,7 +159,7 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
     let grasp = read_grasp(&a.grasp, a.number)?;
     let network = model(&a.network)?;
-    let input = input::read(&a.input, 0)?;
+    let input = input::read(&a.input, None, 0)?;
     let Some(view) = &input.view else {
         bail!("{}: nothing stands on the table; give --mask", a.input.depth.display());
     };

@@ -13,7 +13,6 @@ use serde::Serialize;
 use sixfold_bop::write_camera;
 use sixfold_data::{RoughImages, RoughObject};
 use sixfold_geometry::stats::upper_median;
-use sixfold_geometry::{Camera, RgbImage};
 use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
@@ -24,6 +23,7 @@ use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use self::arguments::WeightingKind;
 pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
+use self::views::Written;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
@@ -86,19 +86,24 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     folder.write_models(images.objects.iter().map(|o| (o.id, &o.mesh, &o.info)))?;
     let views = Views { a, backgrounds: backgrounds(a)?, model };
     let mut progress = Progress::new("views", a.grid().count() * images.objects.len());
-    let (mut rows, mut objects) = (vec![], vec![]);
+    let (mut rows, mut objects, mut first_camera) = (vec![], vec![], None);
     for (object, count) in images.objects.iter().zip(&counts) {
         if object.images.is_empty() {
             eprintln!("note: object {}: none of its photographs can be used; left out", object.id);
             continue;
         }
-        let (summary, preview) = views.of_object(object, *count, &poses, &mut progress)?;
+        let (summary, written) = views.of_object(object, *count, &poses, &mut progress)?;
         objects.push(summary);
-        rows.push(preview);
+        rows.push(written.preview);
+        first_camera = first_camera.or(written.camera);
     }
     progress.finish();
     sheets.did(pictures::sheet(&a.out.join("preview.png"), &rows));
-    write_size(a, &images)?;
+    // BOP has one such file a dataset, for tools that need any camera: that of the first image. Each image's own intrinsics are
+    // in scene_camera.json.
+    if let Some(camera) = first_camera {
+        write_camera(&a.out, &camera, 1e-3)?;
+    }
     let found = !objects.is_empty();
     let summary = Summary {
         out: a.out.display().to_string(),
@@ -150,14 +155,14 @@ struct Views<'a> {
 }
 
 impl Views<'_> {
-    /// Writes the views of one object; what is said of them, and some of them with a text each.
+    /// Writes the views of one object; what is said of them, and what was written.
     fn of_object(
         &self,
         object: &RoughObject,
         count: usize,
         poses: &PoseFile,
         progress: &mut Progress,
-    ) -> Result<(ObjectSummary, Vec<(RgbImage, String)>)> {
+    ) -> Result<(ObjectSummary, Written)> {
         let weighting = match (&self.model, self.a.weighting) {
             (Some(model), _) => Weighting::Network(model),
             (None, WeightingKind::Best) => Weighting::Best,
@@ -184,18 +189,8 @@ impl Views<'_> {
             median_moved_mm: median(of_object().map(|p| p.moved_mm)),
             median_turned_degrees: median(of_object().map(|p| p.turned_degrees)),
         };
-        Ok((summary, written.preview))
+        Ok((summary, written))
     }
-}
-
-/// The dataset's camera file. Every image has its own camera; this one gives the size.
-fn write_size(a: &SynthesizeArguments, images: &RoughImages) -> Result<()> {
-    let camera = Camera::new(1.0, 1.0, 0.0, 0.0, a.size, a.size)?;
-    if let Some(first) = images.objects.iter().flat_map(|o| &o.images).next() {
-        let photograph = first.posed.camera();
-        write_camera(&a.out, &Camera { fx: photograph.fx, fy: photograph.fy, ..camera }, 1e-3)?;
-    }
-    Ok(())
 }
 
 fn table(a: &SynthesizeArguments, summary: &Summary) {

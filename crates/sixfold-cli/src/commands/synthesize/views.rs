@@ -26,7 +26,10 @@ pub(super) struct Written {
     pub images: usize,
     /// Fraction of the object's pixels in all views that no photograph shows.
     pub unseen: f64,
+    /// Some of the images with a text each.
     pub preview: Vec<(RgbImage, String)>,
+    /// Of the first image.
+    pub camera: Option<Camera>,
 }
 
 /// The folder of the object's scene.
@@ -45,7 +48,7 @@ pub(super) fn write(
     let photographs: Vec<&PosedImage> = object.images.iter().map(|i| &i.posed).collect();
     let places = a.grid().placed(&object.mesh, &photographs, object.id);
     let mut writer = SceneWriter::new(&a.out, &a.new_split, object.id);
-    let mut written = Written { images: 0, unseen: 0.0, preview: vec![] };
+    let mut written = Written { images: 0, unseen: 0.0, preview: vec![], camera: None };
     let every = places.len().div_ceil(PREVIEWED).max(1);
     for (number, place) in places.iter().enumerate() {
         check_interrupt("give the same command again to continue")?;
@@ -76,6 +79,7 @@ pub(super) fn write(
                 .with_context(|| coordinates.display().to_string())?;
         }
         written.images += 1;
+        written.camera.get_or_insert(camera);
         progress.step(format!("object {}", object.id));
     }
     if a.with_photographs {

@@ -232,7 +232,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
 
 /// The command line's defaults.
 fn physics() -> PhysicsArguments {
-    PhysicsArguments { gripper: "jaws-140".to_owned(), mass: 0.2, friction: None, force: None }
+    PhysicsArguments { gripper: "jaws-140".to_owned(), mass: None, friction: None, force: None }
 }
 
 impl ReproduceDgcmArguments {

@@ -1,0 +1,123 @@
+//! Options that would be without effect beside the others that were given: refused by name rather than ignored.
+//!
+//! `clap` has `requires` and `conflicts_with`. They do not do for options with a default or an environment variable, which count
+//! as given, nor for values of other options, nor where one of the required options conflicts with what is given.
+
+use clap::error::ErrorKind;
+use clap::parser::ValueSource;
+use clap::{ArgMatches, Command};
+
+/// What else has to be so for an option to be without effect. Options by `clap`'s names for them.
+#[derive(Debug, Clone, Copy)]
+pub enum When {
+    /// This option is not given.
+    Without(&'static str),
+    /// This option is given.
+    With(&'static str),
+    /// This option has one of these values, given or by default.
+    Is(&'static str, &'static [&'static str]),
+    /// This option is given, with another value than this one.
+    IsNot(&'static str, &'static str),
+}
+
+/// Options of a command that are without effect when all of `when` is so.
+#[derive(Debug)]
+pub struct Idle {
+    /// The command, its words separated by blanks.
+    pub command: &'static str,
+    /// The options, by `clap`'s names for them.
+    pub options: &'static [&'static str],
+    /// When.
+    pub when: &'static [When],
+}
+
+/// Whether somebody gave the option: on the command line, or else in the environment.
+fn is_given(matches: &ArgMatches, id: &str) -> bool {
+    matches.value_source(id).is_some_and(|source| source != ValueSource::DefaultValue)
+}
+
+/// The option's value as text, given or by default.
+fn value(matches: &ArgMatches, id: &str) -> Option<String> {
+    let mut values = matches.try_get_raw(id).ok().flatten()?;
+    values.next().map(|value| value.to_string_lossy().into_owned())
+}
+
+impl When {
+    /// The option that it is about.
+    fn option(&self) -> &'static str {
+        match self {
+            When::Without(id) | When::With(id) | When::Is(id, _) | When::IsNot(id, _) => id,
+        }
+    }
+
+    fn holds(&self, matches: &ArgMatches) -> bool {
+        match self {
+            When::Without(id) => !is_given(matches, id),
+            When::With(id) => is_given(matches, id),
+            When::Is(id, values) => value(matches, id).is_some_and(|v| values.contains(&v.as_str())),
+            When::IsNot(id, other) => {
+                is_given(matches, id) && value(matches, id).is_some_and(|v| v != *other)
+            }
+        }
+    }
+
+    /// As the message has it.
+    fn text(&self, command: &Command, matches: &ArgMatches) -> String {
+        let option = typed(command, self.option());
+        match self {
+            When::Without(_) => format!("without {option}"),
+            When::With(_) => format!("with {option}"),
+            When::Is(id, _) | When::IsNot(id, _) => {
+                format!("with {option} {}", value(matches, id).unwrap_or_default())
+            }
+        }
+    }
+}
+
+/// An option as it is typed.
+fn typed(command: &Command, id: &str) -> String {
+    let argument = command.get_arguments().find(|a| a.get_id() == id);
+    match argument.and_then(clap::Arg::get_long) {
+        Some(long) => format!("--{long}"),
+        None => id.to_uppercase(),
+    }
+}
+
+/// The command of some words below another one, where this program has it.
+fn below<'c>(command: &'c Command, words: &str) -> Option<&'c Command> {
+    words.split(' ').try_fold(command, |command, word| command.find_subcommand(word))
+}
+
+impl Idle {
+    /// The message, where an option was typed that is without effect. One from the environment stands there for other commands.
+    fn refusal(&self, root: &Command, matches: &ArgMatches) -> Option<String> {
+        let command = below(root, self.command)?;
+        let matches = self.command.split(' ').try_fold(matches, |m, word| m.subcommand_matches(word))?;
+        if !self.when.iter().all(|when| when.holds(matches)) {
+            return None;
+        }
+        let typed_in = |id: &&&str| matches.value_source(id) == Some(ValueSource::CommandLine);
+        let option = self.options.iter().find(typed_in)?;
+        let when: Vec<String> = self.when.iter().map(|when| when.text(command, matches)).collect();
+        Some(format!("{} has no effect {}", typed(command, option), when.join(" ")))
+    }
+
+    /// The first name that is none of an option of the command, or the command's where there is no such; for tests of the tables.
+    pub fn unknown(&self, root: &Command) -> Option<String> {
+        let Some(command) = below(root, self.command) else { return Some(self.command.to_owned()) };
+        let known = |id: &str| command.get_arguments().any(|a| a.get_id() == id);
+        let ids = self.options.iter().copied().chain(self.when.iter().map(When::option));
+        ids.into_iter().find(|id| !known(id)).map(|id| format!("{}: {id}", self.command))
+    }
+}
+
+/// An error for the first option that would be without effect.
+///
+/// # Errors
+/// `clap`'s, of the kind of conflicting options.
+pub fn refuse(table: &[Idle], root: &Command, matches: &ArgMatches) -> Result<(), clap::Error> {
+    match table.iter().find_map(|idle| idle.refusal(root, matches)) {
+        Some(text) => Err(clap::Error::raw(ErrorKind::ArgumentConflict, format!("{text}\n"))),
+        None => Ok(()),
+    }
+}
