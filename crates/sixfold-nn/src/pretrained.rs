@@ -184,6 +184,23 @@ impl PretrainedFile {
         self.entries.iter().map(|(name, entry)| (name.as_str(), entry.shape.as_slice()))
     }
 
+    /// The numbers of one tensor; `network` is for the message.
+    ///
+    /// # Errors
+    /// [`PretrainedError`] where it is missing, of another shape or not of finite numbers.
+    pub fn tensor(&self, name: &str, shape: &[usize], network: &str) -> Result<Vec<f32>, PretrainedError> {
+        let (file, tensor, expected) = (self.path.clone(), name.to_owned(), shape.to_vec());
+        let network = network.to_owned();
+        let Some(entry) = self.entries.get(name) else {
+            return Err(PretrainedError::Missing { file, tensor, expected, network });
+        };
+        if entry.shape != shape {
+            let found = entry.shape.clone();
+            return Err(PretrainedError::Shape { file, tensor, expected, found, network });
+        }
+        self.numbers(name, entry)
+    }
+
     fn numbers(&self, name: &str, entry: &Entry) -> Result<Vec<f32>, PretrainedError> {
         let unusable = |found: String| PretrainedError::Numbers {
             file: self.path.clone(),

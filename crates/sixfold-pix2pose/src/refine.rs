@@ -11,8 +11,8 @@
 
 use crate::estimate::{Found, ThresholdHypothesis, View};
 use crate::samples::second_stage::GREY;
-use sixfold_align::outline::{MIN_LINES, Outline, add_lines, log_odds, motion, sample, tukey};
-use sixfold_geometry::{Camera, Mat3, NormalEquations, OptionError, Pose, RgbImage, Vec2, Vec3};
+use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds, sample};
+use sixfold_geometry::{Camera, OptionError, Pose, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::{Patch, Window};
 
@@ -67,6 +67,18 @@ impl Default for OutlineRefinementOptions {
 const MIN_CROP: usize = 16;
 
 impl OutlineRefinementOptions {
+    /// The part that [`Alignment`] takes.
+    fn alignment(&self) -> AlignmentOptions {
+        AlignmentOptions {
+            reaches: self.reaches.clone(),
+            iterations: self.iterations,
+            correspondences: self.correspondences,
+            shape: self.shape,
+            line: self.line,
+            robust: self.robust,
+        }
+    }
+
     /// Checks every field.
     ///
     /// # Errors
@@ -147,7 +159,8 @@ pub fn refine(
         })
         .collect();
     let (low, high) = mesh.bounding_box();
-    let mut aligner = Aligner {
+    let alignment = options.alignment();
+    let mut aligner = Alignment {
         camera,
         outline: Outline::new(mesh, &crop, log_odds(&patch, &network, options.color))
             .with_edges(&patch, options.edges),
@@ -159,26 +172,14 @@ pub fn refine(
             .copied()
             .zip(found.image_points.iter().copied())
             .collect(),
-        options,
+        options: &alignment,
     };
-    let mut pose = *camera_from_object;
-    for reach in &options.reaches {
-        for _ in 0..options.iterations {
-            let Some((next, moved)) = aligner.step(*reach, &pose) else { break };
-            pose = next;
-            // A fortieth of a pixel of the crop.
-            if moved < 0.025 {
-                break;
-            }
-        }
-    }
-    let last = options.reaches.last().copied().unwrap_or(3.0);
-    let lines = aligner.outline.lines(last, &pose);
-    if lines.len() < MIN_LINES || !pose.translation().iter().all(|t| t.is_finite()) {
-        return unchanged;
-    }
-    let distance = lines.iter().map(|l| l.offset.abs()).sum::<f64>() / lines.len() as f64;
-    Refined { camera_from_object: pose, lines: lines.len(), distance, improved: true }
+    aligner.run(camera_from_object).map_or(unchanged, |aligned| Refined {
+        camera_from_object: aligned.camera_from_object,
+        lines: aligned.lines,
+        distance: aligned.distance,
+        improved: true,
+    })
 }
 
 /// How probably the object is visible at a position in 0..1 of a view's sides.
@@ -187,103 +188,12 @@ fn seen(view: &View, u: f64, v: f64) -> f32 {
     sample(&view.prediction.visible, side, u * side as f64 - 0.5, v * side as f64 - 0.5)
 }
 
-struct Aligner<'a> {
-    camera: &'a Camera,
-    outline: Outline<'a>,
-    crop: Camera,
-    /// The object's centre, about which it is rotated.
-    centre: Vec3,
-    correspondences: Vec<(Vec3, Vec2)>,
-    options: &'a OutlineRefinementOptions,
-}
-
-impl Aligner<'_> {
-    /// The next pose, and how far the outline moved in crop pixels.
-    fn step(&mut self, reach: f64, pose: &Pose) -> Option<(Pose, f64)> {
-        let lines = self.outline.lines(reach, pose);
-        if lines.len() < MIN_LINES {
-            return None;
-        }
-        let centre = pose.transform_point(&self.centre);
-        let mut equations = NormalEquations::default();
-        add_lines(&mut equations, &lines, &self.crop, &centre, reach, self.options.line, self.options.robust);
-        self.add_correspondences(&mut equations, pose, &centre);
-        let step = equations.solve(1e-3)?;
-        let about = Pose::from_translation(centre);
-        let next = about * Pose::exp(&step) * about.inverse() * *pose;
-        let t = next.translation();
-        if !(t.z > 0.01 && t.iter().all(|v| v.is_finite())) {
-            return None;
-        }
-        let moved = lines.iter().filter_map(|line| {
-            let after = about * Pose::exp(&step) * about.inverse();
-            let (a, b) =
-                (self.crop.project(&line.point)?, self.crop.project(&after.transform_point(&line.point))?);
-            Some((a - b).norm())
-        });
-        let moved = moved.fold(0.0, f64::max);
-        Some((next, moved))
-    }
-
-    fn add_correspondences(&self, equations: &mut NormalEquations, pose: &Pose, centre: &Vec3) {
-        let pairs = self.correspondences.iter();
-        let errors: Vec<(Vec3, Vec2)> = pairs
-            .filter_map(|(object, image)| {
-                let point = pose.transform_point(object);
-                Some((point, self.camera.project(&point)? - image))
-            })
-            .collect();
-        if errors.len() < 6 {
-            return;
-        }
-        let mut sizes: Vec<f64> = errors.iter().map(|(_, e)| e.norm()).collect();
-        let middle = sizes.len() / 2;
-        let noise = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.3);
-        let full = self.options.correspondences / errors.len() as f64 / (noise * noise);
-        let shape = self.options.shape / errors.len() as f64 / (noise * noise);
-        // Rows of every pair: x and y, each with its Jacobian, error, weight and its part in the common shift and scale.
-        let mut rows: Vec<([f64; 6], f64, f64, [f64; 3])> = Vec::with_capacity(2 * errors.len());
-        let middle =
-            errors.iter().filter_map(|(p, _)| self.camera.project(p)).sum::<Vec2>() / errors.len() as f64;
-        for (point, error) in &errors {
-            let weight = tukey(error.norm() / noise);
-            let Some(pixel) = self.camera.project(point) else { continue };
-            let arm = pixel - middle;
-            let [first, second] = motion(self.camera, point, centre);
-            rows.push((first, error.x, weight, [1.0, 0.0, arm.x]));
-            rows.push((second, error.y, weight, [0.0, 1.0, arm.y]));
-        }
-        // Least squares of Jacobians and errors on shift and scale, to be taken out of them.
-        let mut gram = Mat3::zeros();
-        let mut sums = [Vec3::zeros(); 7];
-        for (jacobian, error, weight, common) in &rows {
-            let common = Vec3::from(*common);
-            gram += common * common.transpose() * *weight;
-            for (sum, value) in sums.iter_mut().zip(jacobian.iter().chain([error])) {
-                *sum += common * (weight * value);
-            }
-        }
-        let inverse = gram.try_inverse();
-        for (jacobian, error, weight, common) in &rows {
-            equations.add(jacobian, *error, weight * full);
-            if let Some(inverse) = &inverse {
-                let common = inverse * Vec3::from(*common);
-                let rest: [f64; 7] = std::array::from_fn(|k| {
-                    jacobian.get(k).copied().unwrap_or(*error) - common.dot(&sums[k])
-                });
-                let [a, b, c, d, e, f, residual] = rest;
-                equations.add(&[a, b, c, d, e, f], residual, weight * shape);
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::model::Prediction;
-    use sixfold_geometry::Rect;
     use sixfold_geometry::nalgebra::UnitQuaternion;
+    use sixfold_geometry::{Rect, Vec3};
     use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
     /// A box with a tower on one corner: no rotation maps it onto itself.

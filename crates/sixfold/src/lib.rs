@@ -24,6 +24,8 @@ pub use sixfold_nn as nn;
 pub use sixfold_nol as nol;
 #[cfg(feature = "networks")]
 pub use sixfold_pix2pose as pix2pose;
+#[cfg(feature = "networks")]
+pub use sixfold_views as views;
 
 #[cfg(feature = "grasp")]
 pub use sixfold_grasp as grasp;

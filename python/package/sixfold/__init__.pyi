@@ -367,7 +367,7 @@ class Estimator:
 
     def __new__(
         cls,
-        method: Literal["ppf", "mttm", "pix2pose"],
+        method: Literal["ppf", "mttm", "pix2pose", "views"],
         *,
         weights: Path | None = None,
         keep_plane: bool = False,
@@ -378,7 +378,8 @@ class Estimator:
         icp: bool = False,
         seed: int = 0,
     ) -> Estimator:
-        """weights: pix2pose (needed), mttm; keep_plane: ppf, mttm; matcher, templates_only: mttm; others: pix2pose."""
+        """weights: pix2pose (needed), mttm, views; keep_plane: ppf, mttm; matcher, templates_only: mttm; refine: pix2pose, views;
+        others: pix2pose."""
     @property
     def name(self) -> str: ...
     @property
@@ -937,6 +938,16 @@ def train_nol(
     lstm: bool = True,
     decoder: bool = True,
     encoder: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...
+def train_views(
+    out: Path,
+    *,
+    steps: int = 12000,
+    learning_rate: float = 0.001,
+    batch: int = 8,
+    backgrounds: Path | None = None,
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...

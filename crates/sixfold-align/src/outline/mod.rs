@@ -6,8 +6,10 @@
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
+mod alignment;
 mod lines;
 mod odds;
 
+pub use alignment::{AlignedOutline, Alignment, AlignmentOptions};
 pub use lines::{Line, MIN_LINES, Outline, add_lines, motion, outline_mesh, sample, tukey};
 pub use odds::{color_odds, log_odds};

@@ -93,6 +93,7 @@ fn good() -> BTreeMap<&'static str, Row> {
         ("train pix2pose", of("train_pix2pose")),
         ("train detector", of("train_detector")),
         ("train nol", of("train_nol")),
+        ("train views", of("train_views")),
         ("train mttm", of("train_mttm")),
         ("train dgcm", of("train_dgcm")),
         ("simulate-depth", of("simulate_depth")),

@@ -63,6 +63,8 @@ pub(crate) static METHODS: &[Method] = &[
     Method::of::<PpfArguments>("ppf", "point pair features on depth, no training"),
     #[cfg(feature = "networks")]
     networks::PIX2POSE,
+    #[cfg(feature = "networks")]
+    networks::VIEWS,
     Method::of::<MttmArguments>(
         "mttm",
         "templates in depth, from a mesh or from depth images of the object, no training",

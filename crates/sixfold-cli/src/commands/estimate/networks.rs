@@ -15,6 +15,7 @@ use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_pix2pose::estimator::Pix2PoseEstimator;
 use sixfold_runner::RegionSource;
 use sixfold_shell::ranges::count;
+use sixfold_views::estimator::ViewsEstimator;
 
 use super::arguments::CommonArguments;
 use super::methods::{Method, MethodArguments};
@@ -32,9 +33,37 @@ pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
     "object coordinates from colour by a trained network, in boxes",
 );
 
+/// Poses from colour without training for the object.
+pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
+    "views",
+    "rendered views of a mesh matched with a colour image, in boxes, no training",
+);
+
+#[derive(Debug, Args)]
+struct ViewsArguments {
+    /// Another network than that within the program
+    #[arg(long, value_name = "FILE.safetensors")]
+    weights: Option<PathBuf>,
+    /// Leave out the last step, which aligns the rendered mesh with the image
+    #[arg(long)]
+    no_refine: bool,
+}
+
+impl MethodArguments for ViewsArguments {
+    fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
+        let mut estimator = match &self.weights {
+            Some(file) => ViewsEstimator::load(file).context("--weights")?,
+            None => ViewsEstimator::shipped().context("the network within the program")?,
+        };
+        estimator.options.seed = common.seed;
+        estimator.options.outline = !self.no_refine;
+        Ok(Box::new(estimator))
+    }
+}
+
 #[derive(Debug, Args)]
 struct Pix2PoseArguments {
-    /// Trained model that `sixfold train pix2pose` wrote; for mttm another network than that within the program
+    /// Trained model that `sixfold train pix2pose` wrote; for mttm and views another network than that within the program
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     /// Leave out the last step, which aligns the rendered mesh with the image

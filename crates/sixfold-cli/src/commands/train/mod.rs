@@ -11,6 +11,7 @@ mod options;
 mod pix2pose;
 #[cfg(test)]
 mod tests;
+mod views;
 
 use std::path::Path;
 
@@ -32,6 +33,7 @@ pub(crate) use self::dgcm::TrainDgcmArguments;
 pub(crate) use self::mttm::TrainMttmArguments;
 pub(crate) use self::nol::TrainNolArguments;
 pub(crate) use self::pix2pose::{TrainPix2PoseArguments, train_pix2pose};
+pub(crate) use self::views::TrainViewsArguments;
 use crate::arguments::Arguments;
 
 #[derive(Debug, Args)]
@@ -70,6 +72,10 @@ pub(crate) enum TrainCommand {
     #[command(after_help = "Example:\n  sixfold train nol --backgrounds photographs --out out/nol\n\n\
         Interrupted, it resumes when the same command is given again.")]
     Nol(Box<TrainNolArguments>),
+    /// Train the network that matches rendered views of any object with colour images, on procedural objects
+    #[command(after_help = "Example:\n  sixfold train views --backgrounds photographs --out out/views\n\n\
+        Interrupted, it resumes when the same command is given again.")]
+    Views(Box<TrainViewsArguments>),
 }
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
@@ -85,6 +91,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
                 }
             })
         }
+        TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {
             let summary = mttm::train_mttm(of)?;

@@ -66,6 +66,13 @@ fn without_options_the_command_line_asks_for_the_recipes_defaults() {
         }
         _ => panic!(),
     }
+    let command = command_line();
+    match parsed("views") {
+        TrainCommand::Views(a) => {
+            same(a.recipe(), sixfold_views::recipe::ViewsRecipe { command, ..Default::default() });
+        }
+        _ => panic!(),
+    }
 }
 
 #[test]
@@ -208,6 +215,16 @@ fn the_stub_of_python_shows_the_defaults_of_the_others() {
             ("lstm", word(d.parts.integrator.name() == "lstm")),
             ("decoder", word(d.parts.decoder)),
             ("seed", d.seed.to_string()),
+        ],
+    );
+    let d = sixfold_views::recipe::ViewsRecipe::default().options;
+    check(
+        "train_views",
+        vec![
+            ("steps", d.common.steps.to_string()),
+            ("learning_rate", d.common.learning_rate.to_string()),
+            ("batch", d.batch.to_string()),
+            ("seed", d.common.seed.to_string()),
         ],
     );
 }

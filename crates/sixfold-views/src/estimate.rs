@@ -1,0 +1,503 @@
+//! Poses from a crop: templates that look alike, correspondences with the best of them, PnP, then render, compare and move (the structure
+//! of FoundPose: Örnek et al. 2024; of its parts only the order is theirs).
+
+use rayon::prelude::*;
+use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds};
+use sixfold_geometry::{
+    Camera, OptionError, PnpOptions, Pose, Rect, RefineOptions, RgbImage, Vec2, Vec3, pnp_ransac, refine_pose,
+};
+use sixfold_mesh::Mesh;
+use sixfold_nn::xfeat::{CELL, MULTIPLE};
+use sixfold_render::VisibilityBuffer;
+use sixfold_synth::augment::Patch;
+
+use crate::crop::Crop;
+use crate::error::ViewsError;
+use crate::features::{Extractor, FeatureMap};
+use crate::matching::{Match, best_near, dot, mutual_matches, similarity};
+use crate::network::input;
+use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
+
+/// How poses are estimated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewsOptions {
+    /// Side of a crop, pixels; that of the templates.
+    pub side: usize,
+    /// How far a feature may lie from where the template has it while templates are compared, cells.
+    pub reach: usize,
+    /// Templates that correspondences are looked for with.
+    pub candidates: usize,
+    /// How far correspondences may lie apart, cells.
+    pub match_reach: usize,
+    /// Inlier threshold of PnP, crop pixels.
+    pub reprojection: f64,
+    /// Poses that are rendered and compared.
+    pub hypotheses: usize,
+    /// How often each is rendered, compared and moved.
+    pub refinements: usize,
+    /// How far a rendered feature is looked for then, cells.
+    pub refine_reach: usize,
+    /// Poses that are refined once more in a crop about the whole object.
+    pub close: usize,
+    /// Side of that crop, pixels.
+    pub close_side: usize,
+    /// Align the outline there.
+    pub outline: bool,
+    /// Seed of RANSAC.
+    pub seed: u64,
+}
+
+impl Default for ViewsOptions {
+    fn default() -> Self {
+        ViewsOptions {
+            side: 160,
+            reach: 2,
+            candidates: 32,
+            match_reach: 6,
+            reprojection: 6.0,
+            hypotheses: 6,
+            refinements: 3,
+            refine_reach: 2,
+            close: 2,
+            close_side: 224,
+            outline: true,
+            seed: 0,
+        }
+    }
+}
+
+impl ViewsOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        for (option, side) in [("side", self.side), ("close_side", self.close_side)] {
+            if !(side.is_multiple_of(MULTIPLE) && (MULTIPLE..=512).contains(&side)) {
+                return Err(OptionError::new(option, side, "a multiple of 32 from 32 to 512 pixels"));
+            }
+        }
+        OptionError::unless_some("candidates", self.candidates)?;
+        OptionError::unless_some("hypotheses", self.hypotheses)?;
+        OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")
+    }
+}
+
+/// A pose with what speaks for it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// From the object's frame to the camera's; to the crop's while it is refined there.
+    pub camera_from_object: Pose,
+    /// How alike the object rendered there and the crop are, -1 to 1: the mean of the products of features.
+    pub similarity: f64,
+    /// Correspondences that agreed with it.
+    pub inliers: usize,
+}
+
+/// What was found in a crop.
+#[derive(Debug, Clone)]
+pub struct Found {
+    /// The crop.
+    pub crop: Crop,
+    /// Its colours.
+    pub patch: Patch,
+    /// Poses, best first.
+    pub hypotheses: Vec<Hypothesis>,
+    /// The most similar templates, best first: number and similarity.
+    pub templates: Vec<(usize, f32)>,
+}
+
+/// Everything that estimating one object's poses needs.
+pub struct Views<'a> {
+    /// Makes features.
+    pub extractor: &'a Extractor,
+    /// The object's surface.
+    pub mesh: &'a Mesh,
+    /// The same for its outline ([`sixfold_align::outline::outline_mesh`]).
+    pub outline: &'a Mesh,
+    /// Its templates.
+    pub templates: &'a [Template],
+    /// How.
+    pub options: &'a ViewsOptions,
+}
+
+/// The box of a whole object is at most this many times as large as what is seen of it.
+const MAX_GROWTH: f64 = 4.0;
+/// Objects that are rendered this near are inside the camera, diameters.
+const MIN_DISTANCE: f64 = 0.3;
+
+impl Views<'_> {
+    /// Looks for the object in a box of a pinhole image; `None` for a box that shows nothing.
+    ///
+    /// # Errors
+    /// [`ViewsError`].
+    pub fn find(&self, image: &RgbImage, camera: &Camera, bbox: &Rect) -> Result<Option<Found>, ViewsError> {
+        let options = self.options;
+        let Some(crop) = Crop::of_box(camera, bbox, CROP_FACTOR, options.side) else { return Ok(None) };
+        let patch = crop.cut(image, camera, [0.5; 3]);
+        let maps = self.extractor.features(&[input(&patch.data)], options.side)?;
+        let Some(map) = maps.first() else { return Ok(None) };
+        let mut ranked: Vec<(usize, f32)> =
+            self.templates.par_iter().map(|t| similarity(t, map, options.reach)).enumerate().collect();
+        ranked.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        ranked.truncate(options.candidates);
+        let mut first: Vec<Hypothesis> = ranked
+            .par_iter()
+            .filter_map(|(i, _)| self.from_template(&self.templates[*i], map, &crop))
+            .collect();
+        first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
+        let mut kept: Vec<Hypothesis> = Vec::new();
+        for hypothesis in first {
+            if kept.len() < options.hypotheses && kept.iter().all(|k| !self.same(k, &hypothesis)) {
+                kept.push(hypothesis);
+            }
+        }
+        let mut hypotheses = self.refined(kept, map, &crop)?;
+        for hypothesis in &mut hypotheses {
+            hypothesis.camera_from_object = crop.to_camera(&hypothesis.camera_from_object);
+        }
+        hypotheses.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
+        for hypothesis in hypotheses.iter_mut().take(options.close) {
+            *hypothesis = self.closer(*hypothesis, image, camera, bbox)?;
+        }
+        let close = options.close.min(hypotheses.len());
+        hypotheses[..close].sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
+        Ok(Some(Found { crop, patch, hypotheses, templates: ranked }))
+    }
+
+    /// A pose refined in a crop about the whole object as the pose has it, of more pixels, and its outline aligned there.
+    fn closer(
+        &self,
+        hypothesis: Hypothesis,
+        image: &RgbImage,
+        camera: &Camera,
+        bbox: &Rect,
+    ) -> Result<Hypothesis, ViewsError> {
+        let Some(whole) = projected_box(self.outline, camera, &hypothesis.camera_from_object) else {
+            return Ok(hypothesis);
+        };
+        if whole.width.max(whole.height) > MAX_GROWTH * bbox.width.max(bbox.height) {
+            return Ok(hypothesis);
+        }
+        let side = self.options.close_side;
+        let Some(crop) = Crop::of_box(camera, &whole, CROP_FACTOR, side) else { return Ok(hypothesis) };
+        let patch = crop.cut(image, camera, [0.5; 3]);
+        let maps = self.extractor.features(&[input(&patch.data)], side)?;
+        let Some(map) = maps.first() else { return Ok(hypothesis) };
+        let start =
+            Hypothesis { camera_from_object: crop.to_crop(&hypothesis.camera_from_object), ..hypothesis };
+        let mut refined = self.refined(vec![start], map, &crop)?;
+        let Some(best) = refined.first_mut() else { return Ok(hypothesis) };
+        if self.options.outline {
+            self.align(best, &patch, &crop, map)?;
+        }
+        Ok(Hypothesis { camera_from_object: crop.to_camera(&best.camera_from_object), ..*best })
+    }
+
+    /// Whether two poses are so near that refining both is no use.
+    fn same(&self, a: &Hypothesis, b: &Hypothesis) -> bool {
+        let (a, b) = (&a.camera_from_object, &b.camera_from_object);
+        a.rotation_angle_to(b) < 0.17 && a.distance_to(b) < 0.05 * a.translation().norm()
+    }
+
+    /// The pose that correspondences with a template give.
+    fn from_template(&self, template: &Template, map: &FeatureMap, crop: &Crop) -> Option<Hypothesis> {
+        let matches = mutual_matches(template, map, self.options.match_reach);
+        let (points, pixels): (Vec<Vec3>, Vec<Vec2>) = matches
+            .iter()
+            .map(|m: &Match| {
+                let point = template.points[m.index].map(f64::from);
+                (Vec3::from(point), peak(template.feature(m.index), map, m.cell))
+            })
+            .unzip();
+        let options = PnpOptions {
+            threshold_px: self.options.reprojection,
+            max_iterations: 400,
+            min_iterations: 60,
+            seed: self.options.seed,
+            ..PnpOptions::default()
+        };
+        let report = pnp_ransac(&points, &pixels, &crop.camera, &options).ok()?;
+        let similarity = matches
+            .iter()
+            .zip(&report.inliers)
+            .filter(|(_, inlier)| **inlier)
+            .map(|(m, _)| f64::from(m.similarity))
+            .sum();
+        Some(Hypothesis {
+            camera_from_object: report.camera_from_object,
+            similarity,
+            inliers: report.inlier_count,
+        })
+    }
+
+    /// Renders the object at each pose, compares and moves, several times.
+    fn refined(
+        &self,
+        mut hypotheses: Vec<Hypothesis>,
+        map: &FeatureMap,
+        crop: &Crop,
+    ) -> Result<Vec<Hypothesis>, ViewsError> {
+        let mut best = hypotheses.clone();
+        for pass in 0..=self.options.refinements {
+            let compared = self.compared(&hypotheses, map, crop)?;
+            for ((hypothesis, best), compared) in hypotheses.iter_mut().zip(&mut best).zip(compared) {
+                let Some(compared) = compared else { continue };
+                hypothesis.similarity = compared.similarity;
+                if pass == 0 || compared.similarity > best.similarity {
+                    *best = *hypothesis;
+                }
+                let refined = refine_pose(
+                    &compared.points,
+                    &compared.pixels,
+                    &crop.camera,
+                    &hypothesis.camera_from_object,
+                    &RefineOptions { threshold_px: self.options.reprojection, ..RefineOptions::default() },
+                );
+                if let Ok(refined) = refined {
+                    hypothesis.camera_from_object = refined.camera_from_object;
+                    hypothesis.inliers = refined.inlier_count;
+                }
+            }
+        }
+        Ok(best)
+    }
+
+    /// The object rendered at each pose against the crop; `None` where it cannot be seen.
+    fn compared(
+        &self,
+        hypotheses: &[Hypothesis],
+        map: &FeatureMap,
+        crop: &Crop,
+    ) -> Result<Vec<Option<Compared>>, ViewsError> {
+        let side = crop.camera.width;
+        let rendered: Vec<_> = hypotheses
+            .par_iter()
+            .map_init(
+                || VisibilityBuffer::new(&crop.camera),
+                |frame, h| {
+                    let t = h.camera_from_object.translation();
+                    if t.z < MIN_DISTANCE * self.templates_diameter() {
+                        return None;
+                    }
+                    let rendered = render(frame, self.mesh, &h.camera_from_object, None);
+                    let (cells, points) = cells_on_object(&rendered, side / CELL);
+                    (!cells.is_empty()).then(|| (input_over_grey(&rendered), cells, points))
+                },
+            )
+            .collect();
+        let inputs: Vec<Vec<f32>> = rendered.iter().flatten().map(|r| r.0.clone()).collect();
+        let mut maps = self.extractor.features(&inputs, side)?.into_iter();
+        let mut out = Vec::with_capacity(rendered.len());
+        for one in rendered {
+            let Some((_, cells, points)) = one else {
+                out.push(None);
+                continue;
+            };
+            let Some(seen) = maps.next() else { break };
+            let features = gathered(&seen, &cells);
+            out.push(Some(compare(&cells, &features, &points, map, self.options.refine_reach)));
+        }
+        Ok(out)
+    }
+
+    fn templates_diameter(&self) -> f64 {
+        let (low, high) = self.mesh.bounding_box();
+        (high - low).norm()
+    }
+
+    /// Aligns the outline of a pose; keeps it where the features agree less afterwards.
+    fn align(
+        &self,
+        best: &mut Hypothesis,
+        patch: &Patch,
+        crop: &Crop,
+        map: &FeatureMap,
+    ) -> Result<(), ViewsError> {
+        let compared = self.compared(&[*best], map, crop)?;
+        let Some(Some(compared)) = compared.into_iter().next() else { return Ok(()) };
+        let prior = self.prior(&best.camera_from_object, crop);
+        let options = AlignmentOptions {
+            reaches: vec![8.0, 5.0, 3.0],
+            iterations: 5,
+            correspondences: 5.0,
+            shape: 30.0,
+            line: 0.3,
+            robust: 1.0,
+        };
+        let (low, high) = self.mesh.bounding_box();
+        let mut alignment = Alignment {
+            camera: &crop.camera,
+            outline: Outline::new(self.outline, &crop.camera, log_odds(patch, &prior, 2.0))
+                .with_edges(patch, 8.0),
+            crop: crop.camera,
+            centre: (low + high) * 0.5,
+            correspondences: compared.points.into_iter().zip(compared.pixels).collect(),
+            options: &options,
+        };
+        if let Some(aligned) = alignment.run(&best.camera_from_object) {
+            let moved = Hypothesis { camera_from_object: aligned.camera_from_object, ..*best };
+            let again = self.compared(&[moved], map, crop)?.into_iter().next().flatten();
+            if let Some(again) = again
+                && again.similarity
+                    > best.similarity - std::env::var("TOL").map_or(0.02, |t| t.parse().unwrap())
+            {
+                *best = Hypothesis { similarity: again.similarity.max(best.similarity), ..moved };
+            }
+        }
+        Ok(())
+    }
+
+    /// How probably each pixel of the crop shows the object at a pose: not decided near its outline.
+    fn prior(&self, pose: &Pose, crop: &Crop) -> Vec<f32> {
+        let mut frame = VisibilityBuffer::new(&crop.camera);
+        let objects = [sixfold_render::SceneObject { mesh: self.outline, camera_from_object: *pose }];
+        frame.render(&objects, &sixfold_render::RenderOptions::default());
+        let side = crop.camera.width;
+        let mut soft = Patch::filled(side, side, [0.0; 3]);
+        for (v, z) in soft.data[..side * side].iter_mut().zip(frame.inverse_depth()) {
+            *v = f32::from(*z > 0.0);
+        }
+        soft.blur(5.0);
+        soft.data[..side * side].iter().map(|v| v.clamp(0.1, 0.9)).collect()
+    }
+}
+
+/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
+fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for vertex in mesh.vertices() {
+        let pixel = camera.project(&pose.transform_point(vertex))?;
+        (low, high) = (low.inf(&pixel), high.sup(&pixel));
+    }
+    let size = high - low;
+    (size.x >= 2.0 && size.y >= 2.0).then_some(Rect { x: low.x, y: low.y, width: size.x, height: size.y })
+}
+
+/// A render against a crop.
+struct Compared {
+    similarity: f64,
+    points: Vec<Vec3>,
+    pixels: Vec<Vec2>,
+}
+
+fn compare(cells: &[u16], features: &[f32], points: &[[f32; 3]], map: &FeatureMap, reach: usize) -> Compared {
+    let mut out = Compared { similarity: 0.0, points: Vec::new(), pixels: Vec::new() };
+    let width = features.len() / cells.len().max(1);
+    for ((cell, feature), point) in cells.iter().zip(features.chunks_exact(width.max(1))).zip(points) {
+        let cell = usize::from(*cell);
+        let (best, _) = best_near(feature, map, cell, reach);
+        let here = f64::from(dot(feature, map.feature(cell)));
+        let near = f64::from(best_near(feature, map, cell, 1).1);
+        out.similarity += match std::env::var("SCORE").as_deref() {
+            Ok("near") => near,
+            Ok("clip") => (here - 0.3).clamp(0.0, 0.4),
+            Ok("clip2") => (here - 0.4).clamp(0.0, 0.3),
+            Ok("sq") => here.max(0.0).powi(2),
+            Ok("here") => here,
+            _ => here.max(0.0).powi(2),
+        };
+        out.points.push(Vec3::from(point.map(f64::from)));
+        out.pixels.push(peak(feature, map, best));
+    }
+    out.similarity /= cells.len().max(1) as f64;
+    out
+}
+
+/// Where about a cell the product with a feature is largest, crop pixels: the top of a parabola along each axis.
+fn peak(feature: &[f32], map: &FeatureMap, cell: usize) -> Vec2 {
+    let n = map.cells;
+    let (x, y) = (cell % n, cell / n);
+    let value = |x: usize, y: usize| f64::from(dot(feature, map.feature(y * n + x)));
+    let here = value(x, y);
+    let top = |before: f64, after: f64| {
+        let curve = before - 2.0 * here + after;
+        if curve < -1e-6 { (0.5 * (before - after) / curve).clamp(-0.5, 0.5) } else { 0.0 }
+    };
+    let dx = if x > 0 && x + 1 < n { top(value(x - 1, y), value(x + 1, y)) } else { 0.0 };
+    let dy = if y > 0 && y + 1 < n { top(value(x, y - 1), value(x, y + 1)) } else { 0.0 };
+    Vec2::new((x as f64 + dx) * CELL as f64, (y as f64 + dy) * CELL as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::templates::{TemplateOptions, make_templates};
+    use sixfold_geometry::nalgebra::UnitQuaternion;
+    use sixfold_render::{Light, Material, RenderOptions, SceneObject, shade};
+
+    /// A body with an arm and a foot in three colours: no rotation maps it onto itself.
+    fn part() -> Mesh {
+        let cuboid = |low: [f64; 3], high: [f64; 3], color: [u8; 3]| {
+            let corner =
+                |i: usize| Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { low[axis] } else { high[axis] });
+            let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+            let faces = quads.iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect();
+            Mesh::new((0..8).map(corner).collect(), faces).unwrap().with_colors(vec![color; 8]).unwrap()
+        };
+        Mesh::merged(&[
+            cuboid([-0.06, -0.03, -0.03], [0.06, 0.03, 0.03], [200, 60, 40]),
+            cuboid([0.02, 0.0, 0.03], [0.06, 0.03, 0.09], [40, 90, 190]),
+            cuboid([-0.06, -0.09, -0.03], [-0.03, -0.03, 0.0], [220, 200, 60]),
+        ])
+        .unwrap()
+    }
+
+    #[test]
+    fn a_part_is_found_in_other_light_than_its_templates_have() {
+        let mesh = part();
+        let extractor = Extractor::shipped().unwrap();
+        let options = TemplateOptions { directions: 60, rotations: 12, ..TemplateOptions::default() };
+        let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &options).unwrap();
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let truth = Pose::new(UnitQuaternion::from_euler_angles(2.1, 0.5, 0.7), Vec3::new(0.15, -0.1, 0.9));
+        let mut frame = VisibilityBuffer::new(&camera);
+        let objects = [SceneObject { mesh: &mesh, camera_from_object: truth }];
+        frame.render(&objects, &RenderOptions::default());
+        let lights = [
+            Light::Ambient { color: [0.3; 3] },
+            Light::Directional { direction: Vec3::new(-0.8, 0.9, 0.6), color: [0.7; 3] },
+        ];
+        let table = RgbImage::from_fn(640, 480, |x, y| {
+            let noise = ((x / 9 * 7 + y / 7 * 13) % 37) as u8;
+            [120 + noise, 110 + noise, 100]
+        });
+        let image = shade(&frame, &objects, &lights, &Material::default(), Some(&table));
+        let bbox = frame.bounding_box().unwrap();
+        let find = |outline: bool, bbox: &Rect| {
+            let options = ViewsOptions { outline, ..ViewsOptions::default() };
+            let views = Views {
+                extractor: &extractor,
+                mesh: &mesh,
+                outline: &mesh,
+                templates: &templates,
+                options: &options,
+            };
+            views.find(&image, &camera, bbox).unwrap().unwrap().hypotheses
+        };
+        for outline in [false, true] {
+            let found = find(outline, &bbox);
+            let pose = found[0].camera_from_object;
+            let distance = |p: &Vec3| (pose.transform_point(p) - truth.transform_point(p)).norm();
+            let add = mesh.vertices().iter().map(distance).sum::<f64>() / mesh.vertices().len() as f64;
+            let bound = if outline { 0.05 } else { 0.1 };
+            assert!(add < bound * mesh.diameter(), "outline {outline}: {add} m off");
+        }
+        // The same where nothing of it is: less alike.
+        let beside = Rect { x: 40.0, y: 300.0, ..bbox };
+        let nothing = find(true, &beside).first().map_or(0.0, |h| h.similarity);
+        assert!(nothing < 0.6 * find(true, &bbox)[0].similarity, "{nothing}");
+    }
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let named = |options: ViewsOptions| options.check().map_err(|e| e.option);
+        let default = ViewsOptions::default;
+        assert_eq!(named(default()), Ok(()));
+        assert_eq!(named(ViewsOptions { candidates: 0, ..default() }), Err("candidates"));
+        assert_eq!(named(ViewsOptions { hypotheses: 0, ..default() }), Err("hypotheses"));
+        assert_eq!(named(ViewsOptions { reprojection: f64::NAN, ..default() }), Err("reprojection"));
+        assert_eq!(named(ViewsOptions { side: 100, ..default() }), Err("side"));
+        assert_eq!(named(ViewsOptions { close_side: 100, ..default() }), Err("close_side"));
+    }
+}

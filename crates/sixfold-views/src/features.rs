@@ -1,0 +1,79 @@
+//! Features of crops: one of length 1 for every 8x8 pixels.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_nn::xfeat::{CELL, CHANNELS};
+
+use crate::error::ViewsError;
+use crate::network::{INPUTS, ViewNetwork};
+
+/// Crops that go through the network together.
+const BATCH: usize = 16;
+
+/// The network, ready to run.
+#[derive(Debug)]
+pub struct Extractor {
+    network: ViewNetwork,
+    device: Device,
+}
+
+/// Features of a square crop, row by row, each of length 1.
+#[derive(Debug, Clone)]
+pub struct FeatureMap {
+    /// Cells along each side.
+    pub cells: usize,
+    /// [`CHANNELS`] numbers per cell.
+    pub features: Vec<f32>,
+}
+
+impl FeatureMap {
+    /// The feature of a cell.
+    pub fn feature(&self, cell: usize) -> &[f32] {
+        &self.features[cell * CHANNELS..(cell + 1) * CHANNELS]
+    }
+}
+
+impl Extractor {
+    /// The network within the program.
+    ///
+    /// # Errors
+    /// [`ViewsError::Weights`].
+    pub fn shipped() -> Result<Extractor, ViewsError> {
+        let device = Device::default();
+        Ok(Extractor { network: ViewNetwork::shipped(&device)?, device })
+    }
+
+    /// Another network, on the device of its tensors.
+    pub fn new(network: ViewNetwork, device: Device) -> Extractor {
+        Extractor { network, device }
+    }
+
+    /// Features of crops of `side` x `side` pixels as [`crate::network::input`] makes them.
+    ///
+    /// # Errors
+    /// [`ViewsError::Network`] where the network's output cannot be read.
+    pub fn features(&self, inputs: &[Vec<f32>], side: usize) -> Result<Vec<FeatureMap>, ViewsError> {
+        let cells = side / CELL;
+        let count = cells * cells;
+        let mut maps = Vec::with_capacity(inputs.len());
+        for batch in inputs.chunks(BATCH) {
+            let data = TensorData::new(batch.concat(), [batch.len(), INPUTS, side, side]);
+            let seen = self.network.forward(Tensor::<4>::from_data(data, &self.device));
+            let features =
+                seen.try_into_vec_as::<f32>().map_err(|e| ViewsError::Network { reason: e.to_string() })?;
+            for planes in features.chunks_exact(CHANNELS * count) {
+                let mut out = vec![0.0f32; CHANNELS * count];
+                for (cell, feature) in out.chunks_exact_mut(CHANNELS).enumerate() {
+                    let mut square = 0.0;
+                    for (c, value) in feature.iter_mut().enumerate() {
+                        *value = planes[c * count + cell];
+                        square += *value * *value;
+                    }
+                    let length = square.sqrt().max(1e-12);
+                    feature.iter_mut().for_each(|v| *v /= length);
+                }
+                maps.push(FeatureMap { cells, features: out });
+            }
+        }
+        Ok(maps)
+    }
+}

@@ -1,0 +1,173 @@
+//! Templates in a file: with the hash of what they were made from in front and a checksum behind.
+
+use std::io;
+use std::path::Path;
+
+use half::f16;
+use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::{Camera, Pose, Vec3};
+use sixfold_io::{fnv1a, limits, read_regular, write_atomically};
+use sixfold_nn::xfeat::CHANNELS;
+
+use crate::templates::Template;
+
+/// What such a file begins with; the digit is the format's version.
+const MAGIC: &[u8; 8] = b"sfviews1";
+/// Bytes of a template without its cells: pose, focal length, side, number of cells.
+const HEAD: usize = 8 * 8 + 2 * 4;
+/// Bytes of a cell: number, feature, point.
+const PER_CELL: usize = 2 + 2 * CHANNELS + 3 * 4;
+
+/// Writes templates that were made from what `key` is the hash of.
+pub(crate) fn write(path: &Path, key: u64, templates: &[Template]) -> io::Result<()> {
+    let mut out = Vec::new();
+    out.extend_from_slice(MAGIC);
+    out.extend_from_slice(&key.to_le_bytes());
+    out.extend_from_slice(&(templates.len() as u32).to_le_bytes());
+    for template in templates {
+        let rotation = template.crop_from_object.rotation();
+        let translation = template.crop_from_object.translation();
+        let numbers = rotation.coords.iter().chain(translation.iter()).chain([&template.camera.fx]);
+        numbers.for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+        out.extend_from_slice(&(template.camera.width as u32).to_le_bytes());
+        out.extend_from_slice(&(template.cells.len() as u32).to_le_bytes());
+        template.cells.iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
+        template.features.iter().for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
+        template.points.as_flattened().iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+    }
+    let sum = fnv1a(&out);
+    out.extend_from_slice(&sum.to_le_bytes());
+    write_atomically(path, &out)
+}
+
+/// Templates of a file, `None` where it holds others than `key` says, or is damaged.
+///
+/// # Errors
+/// Where it cannot be read for another reason than that it is not there.
+pub(crate) fn read(path: &Path, key: u64) -> io::Result<Option<Vec<Template>>> {
+    match read_regular(path, limits::DERIVED) {
+        Ok(bytes) => Ok(decode(&bytes, key)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+fn decode(bytes: &[u8], key: u64) -> Option<Vec<Template>> {
+    let (body, sum) = bytes.split_last_chunk::<8>()?;
+    let mut rest = Reader(body.strip_prefix(MAGIC)?);
+    if fnv1a(body).to_le_bytes() != *sum || u64::from_le_bytes(rest.take()?) != key {
+        return None;
+    }
+    let count = u32::from_le_bytes(rest.take()?) as usize;
+    if count > rest.0.len() / HEAD {
+        return None;
+    }
+    let mut templates = Vec::with_capacity(count);
+    for _ in 0..count {
+        templates.push(rest.template()?);
+    }
+    rest.0.is_empty().then_some(templates)
+}
+
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (first, rest) = self.0.split_first_chunk::<N>()?;
+        self.0 = rest;
+        Some(*first)
+    }
+
+    fn number(&mut self) -> Option<f64> {
+        Some(f64::from_le_bytes(self.take()?)).filter(|v| v.is_finite())
+    }
+
+    fn single(&mut self) -> Option<f32> {
+        Some(f32::from_le_bytes(self.take()?)).filter(|v| v.is_finite())
+    }
+
+    fn template(&mut self) -> Option<Template> {
+        let mut numbers = [0.0; 8];
+        for value in &mut numbers {
+            *value = self.number()?;
+        }
+        let [i, j, k, w, x, y, z, focal] = numbers;
+        let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), 1e-6)?;
+        let side = u32::from_le_bytes(self.take()?) as usize;
+        let count = u32::from_le_bytes(self.take()?) as usize;
+        if count > self.0.len() / PER_CELL || side > MAX_SIDE {
+            return None;
+        }
+        let centre = 0.5 * (side as f64 - 1.0);
+        let camera = Camera::new(focal, focal, centre, centre, side, side).ok()?;
+        let cells_of_side = (side / sixfold_nn::xfeat::CELL).pow(2);
+        let mut template = Template {
+            crop_from_object: Pose::new(rotation, Vec3::new(x, y, z)),
+            camera,
+            cells: Vec::with_capacity(count),
+            features: Vec::with_capacity(count * CHANNELS),
+            points: Vec::with_capacity(count),
+        };
+        for _ in 0..count {
+            let cell = u16::from_le_bytes(self.take()?);
+            if usize::from(cell) >= cells_of_side {
+                return None;
+            }
+            template.cells.push(cell);
+        }
+        for _ in 0..count * CHANNELS {
+            let value = f16::from_le_bytes(self.take()?).to_f32();
+            template.features.push(Some(value).filter(|v| v.is_finite())?);
+        }
+        for _ in 0..count {
+            template.points.push([self.single()?, self.single()?, self.single()?]);
+        }
+        Some(template)
+    }
+}
+
+/// Longest side of a crop, pixels: with more, cells have no 16-bit numbers.
+const MAX_SIDE: usize = 2048;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn template(count: usize) -> Template {
+        Template {
+            crop_from_object: Pose::exp(&[0.1, 0.2, 0.9, 0.3, -0.4, 0.5].into()),
+            camera: Camera::new(500.0, 500.0, 79.5, 79.5, 160, 160).unwrap(),
+            cells: (0..count as u16).map(|c| 3 * c).collect(),
+            features: (0..count * CHANNELS).map(|i| (i % 16) as f32 / 16.0).collect(),
+            points: (0..count).map(|i| [i as f32, 0.5, -0.25]).collect(),
+        }
+    }
+
+    #[test]
+    fn templates_come_back_and_damaged_or_foreign_files_do_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("views.bin");
+        assert!(read(&file, 7).unwrap().is_none(), "no file");
+        let templates = [template(5), template(0)];
+        write(&file, 7, &templates).unwrap();
+        let back = read(&file, 7).unwrap().unwrap();
+        assert_eq!(back.len(), 2);
+        for (back, template) in back.iter().zip(&templates) {
+            assert!(back.crop_from_object.distance_to(&template.crop_from_object) < 1e-12);
+            assert!(back.crop_from_object.rotation_angle_to(&template.crop_from_object) < 1e-7);
+            assert_eq!((back.camera, &back.cells), (template.camera, &template.cells));
+            assert_eq!((&back.features, &back.points), (&template.features, &template.points));
+        }
+        assert!(read(&file, 8).unwrap().is_none(), "of another object");
+        let whole = std::fs::read(&file).unwrap();
+        for length in 0..whole.len() {
+            assert!(decode(&whole[..length], 7).is_none(), "{length} bytes");
+        }
+        // A forged count behind a right checksum asks for no memory.
+        let mut forged = whole[..whole.len() - 8].to_vec();
+        forged[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
+        let sum = fnv1a(&forged);
+        forged.extend_from_slice(&sum.to_le_bytes());
+        assert!(decode(&forged, 7).is_none());
+    }
+}

@@ -1,0 +1,132 @@
+//! Templates against a crop, feature by feature.
+
+use sixfold_nn::xfeat::CHANNELS;
+
+use crate::features::FeatureMap;
+use crate::templates::Template;
+
+/// The product of two features.
+pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let (a, _) = a.as_chunks::<16>();
+    let (b, _) = b.as_chunks::<16>();
+    let mut sums = [0.0f32; 16];
+    for (a, b) in a.iter().zip(b) {
+        for i in 0..16 {
+            sums[i] += a[i] * b[i];
+        }
+    }
+    sums.iter().sum()
+}
+
+/// How alike a template and a crop are: the mean over the template's features of the best product with one of the crop's within
+/// `reach` cells.
+pub fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
+    if template.cells.is_empty() {
+        return 0.0;
+    }
+    let mut sum = 0.0;
+    for (i, cell) in template.cells.iter().enumerate() {
+        sum += best_near(template.feature(i), map, usize::from(*cell), reach).1;
+    }
+    sum / template.cells.len() as f32
+}
+
+/// The cell within `reach` of `cell` whose feature is nearest, and the product.
+pub fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
+    let n = map.cells;
+    let (x, y) = (cell % n, cell / n);
+    let mut best = (cell, f32::NEG_INFINITY);
+    for v in y.saturating_sub(reach)..(y + reach + 1).min(n) {
+        for u in x.saturating_sub(reach)..(x + reach + 1).min(n) {
+            let at = v * n + u;
+            let product = dot(feature, map.feature(at));
+            if product > best.1 {
+                best = (at, product);
+            }
+        }
+    }
+    best
+}
+
+/// A feature of the template and one of the crop that choose each other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Which of the template's features.
+    pub index: usize,
+    /// The cell of the crop.
+    pub cell: usize,
+    /// Their product.
+    pub similarity: f32,
+}
+
+/// Features that choose each other within `reach` cells.
+pub fn mutual_matches(template: &Template, map: &FeatureMap, reach: usize) -> Vec<Match> {
+    let n = map.cells;
+    let mut back: Vec<(f32, u32)> = vec![(f32::NEG_INFINITY, u32::MAX); n * n];
+    let mut forward = Vec::with_capacity(template.cells.len());
+    for (i, cell) in template.cells.iter().enumerate() {
+        let feature = &template.features[i * CHANNELS..(i + 1) * CHANNELS];
+        let cell = usize::from(*cell);
+        let (x, y) = (cell % n, cell / n);
+        let mut best = (cell, f32::NEG_INFINITY);
+        for v in y.saturating_sub(reach)..(y + reach + 1).min(n) {
+            for u in x.saturating_sub(reach)..(x + reach + 1).min(n) {
+                let at = v * n + u;
+                let product = dot(feature, map.feature(at));
+                if product > best.1 {
+                    best = (at, product);
+                }
+                if product > back[at].0 {
+                    back[at] = (product, i as u32);
+                }
+            }
+        }
+        forward.push(best);
+    }
+    let chosen = |(i, (cell, similarity)): (usize, (usize, f32))| {
+        (back[cell].1 == i as u32).then_some(Match { index: i, cell, similarity })
+    };
+    forward.into_iter().enumerate().filter_map(chosen).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::{Camera, Pose};
+
+    /// A map of 4 x 4 cells in which every cell has a feature of its own.
+    fn map() -> FeatureMap {
+        let mut features = vec![0.0; 16 * CHANNELS];
+        (0..16).for_each(|cell| features[cell * CHANNELS + 3 * cell] = 1.0);
+        FeatureMap { cells: 4, features }
+    }
+
+    /// A template whose `i`-th feature is that of the map's cell `of[i]` and lies at `at[i]`.
+    fn template(at: &[u16], of: &[usize]) -> Template {
+        Template {
+            crop_from_object: Pose::identity(),
+            camera: Camera::new(40.0, 40.0, 15.5, 15.5, 32, 32).unwrap(),
+            cells: at.to_vec(),
+            features: of.iter().flat_map(|c| map().feature(*c).to_vec()).collect(),
+            points: vec![[0.0; 3]; at.len()],
+        }
+    }
+
+    #[test]
+    fn features_are_found_within_reach_and_not_beyond() {
+        let map = map();
+        let moved = template(&[5, 10], &[6, 11]);
+        assert_eq!((similarity(&moved, &map, 1), similarity(&moved, &map, 0)), (1.0, 0.0));
+        assert_eq!(best_near(map.feature(15), &map, 0, 3), (15, 1.0));
+        assert_eq!(best_near(map.feature(15), &map, 0, 2).1, 0.0);
+        assert_eq!(similarity(&template(&[], &[]), &map, 1), 0.0);
+    }
+
+    #[test]
+    fn only_features_that_choose_each_other_match() {
+        // Two features of the template want the same cell: the first of equals gets it.
+        let found = mutual_matches(&template(&[5, 9, 10], &[6, 6, 11]), &map(), 2);
+        let pairs: Vec<(usize, usize)> = found.iter().map(|m| (m.index, m.cell)).collect();
+        assert_eq!(pairs, [(0, 6), (2, 11)]);
+    }
+}

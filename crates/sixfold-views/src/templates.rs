@@ -1,0 +1,271 @@
+//! Templates: an object rendered from all around, each view as features and the points of the object that they lie on.
+
+use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
+use sixfold_geometry::{Camera, KdTree, OptionError, Pose, Rect, RgbImage, Vec3};
+use sixfold_mesh::{Mesh, simplify};
+use sixfold_nn::xfeat::{CELL, CHANNELS, MULTIPLE};
+use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
+use sixfold_synth::augment::Patch;
+
+use crate::crop::Crop;
+use crate::error::ViewsError;
+use crate::features::{Extractor, FeatureMap};
+use crate::network::input;
+
+/// One view of an object.
+#[derive(Debug, Clone)]
+pub struct Template {
+    /// From the object's frame to the crop's.
+    pub crop_from_object: Pose,
+    /// The crop's camera.
+    pub camera: Camera,
+    /// Cells whose feature lies on the object.
+    pub cells: Vec<u16>,
+    /// Their features.
+    pub features: Vec<f32>,
+    /// Their points in the object's frame, metres.
+    pub points: Vec<[f32; 3]>,
+}
+
+impl Template {
+    /// The feature of the `i`-th cell.
+    pub fn feature(&self, i: usize) -> &[f32] {
+        &self.features[i * CHANNELS..(i + 1) * CHANNELS]
+    }
+}
+
+/// An object rendered in one crop.
+pub struct Rendered {
+    /// Its colours, before `background`.
+    pub image: RgbImage,
+    /// The points seen in the object's frame; NaN where nothing is seen.
+    pub coordinates: sixfold_geometry::PointImage,
+}
+
+/// The lamp that templates are lit with: at the camera.
+pub fn head_light() -> Vec<Light> {
+    vec![
+        Light::Ambient { color: [0.35; 3] },
+        Light::Directional { direction: Vec3::new(0.0, 0.0, 1.0), color: [0.65; 3] },
+    ]
+}
+
+/// Renders an object into a frame of its camera.
+pub fn render(
+    frame: &mut VisibilityBuffer,
+    mesh: &Mesh,
+    crop_from_object: &Pose,
+    background: Option<&RgbImage>,
+) -> Rendered {
+    let objects = [SceneObject { mesh, camera_from_object: *crop_from_object }];
+    frame.render(&objects, &RenderOptions::default());
+    let image = shade(frame, &objects, &head_light(), &Material::default(), background);
+    Rendered { image, coordinates: frame.object_coordinates(&objects) }
+}
+
+/// More faces than this do not show in a crop; chosen by hand, not swept.
+const MAX_FACES: usize = 12_000;
+
+/// The mesh with no more faces than its views need, in the same colours: scans have tens of thousands, and rendering them takes longer
+/// than all the rest. A mesh with a texture stays as it is.
+pub fn view_mesh(mesh: &Mesh) -> Mesh {
+    if mesh.faces().len() <= MAX_FACES || mesh.texture().is_some() {
+        return mesh.clone();
+    }
+    let simple = simplify(mesh, MAX_FACES);
+    let normals = simple.vertex_normals();
+    let Some(colors) = mesh.colors() else {
+        return simple.clone().with_normals(normals).unwrap_or(simple);
+    };
+    let tree = KdTree::new(mesh.vertices());
+    let nearest = |v: &Vec3| tree.nearest(v).and_then(|n| colors.get(n.index).copied()).unwrap_or_default();
+    let own = simple.vertices().iter().map(nearest).collect();
+    let coloured = simple.with_normals(normals).and_then(|m| m.with_colors(own));
+    coloured.unwrap_or_else(|_| mesh.clone())
+}
+
+/// How much darker or lighter than the object a template's background is.
+const CONTRAST: f32 = 0.4;
+
+/// The network's input of a render over plain grey that stands out from the object.
+pub fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
+    let mut planes = Patch::from_rgb(&rendered.image).data;
+    let area = planes.len() / 3;
+    let hidden: Vec<bool> = rendered.coordinates.as_slice().iter().map(|p| p[0].is_nan()).collect();
+    let (mut sum, mut count) = (0.0f64, 0usize);
+    for plane in planes.chunks_exact(area.max(1)) {
+        for (v, _) in plane.iter().zip(&hidden).filter(|(_, hidden)| !**hidden) {
+            sum += f64::from(*v);
+            count += 1;
+        }
+    }
+    let mean = (sum / count.max(1) as f64) as f32;
+    let grey = if mean > 0.5 { mean - CONTRAST } else { mean + CONTRAST };
+    for plane in planes.chunks_exact_mut(area.max(1)) {
+        plane.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = grey);
+    }
+    input(&planes)
+}
+
+/// Side of a crop over the longer side of the object's box; the network was trained with it.
+pub const CROP_FACTOR: f64 = 1.2;
+
+/// A camera in whose image an object of any side is seen as a whole; only its box is taken from it.
+pub fn wide_camera() -> Camera {
+    Camera {
+        fx: 600.0,
+        fy: 600.0,
+        cx: 127.5,
+        cy: 127.5,
+        width: 256,
+        height: 256,
+        distortion: Default::default(),
+    }
+}
+
+/// How templates are made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TemplateOptions {
+    /// Directions from which the object is seen, spread evenly over the sphere.
+    pub directions: usize,
+    /// Rotations in the image plane for each.
+    pub rotations: usize,
+    /// Side of a crop, pixels; a multiple of 32.
+    pub side: usize,
+    /// Side of a crop over the longer side of the object's box.
+    pub crop_factor: f64,
+    /// Distance of the camera over the object's diameter.
+    pub distance: f64,
+}
+
+impl Default for TemplateOptions {
+    fn default() -> Self {
+        TemplateOptions { directions: 120, rotations: 18, side: 160, crop_factor: CROP_FACTOR, distance: 6.0 }
+    }
+}
+
+impl TemplateOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`OptionError`] with the first field that is out of its range.
+    pub fn check(&self) -> Result<(), OptionError> {
+        OptionError::unless_within("templates.directions", self.directions, 1..=10_000, "1 to 10000")?;
+        OptionError::unless_within("templates.rotations", self.rotations, 1..=360, "1 to 360")?;
+        let fits = self.side.is_multiple_of(MULTIPLE) && (MULTIPLE..=512).contains(&self.side);
+        if !fits {
+            let expected = "a multiple of 32 from 32 to 512 pixels";
+            return Err(OptionError::new("templates.side", self.side, expected));
+        }
+        OptionError::unless_positive("templates.crop_factor", self.crop_factor, "a number above 0")?;
+        OptionError::unless_within("templates.distance", self.distance, 1.0..=1000.0, "1 to 1000 diameters")
+    }
+}
+
+/// Directions spread evenly over the sphere (Fibonacci's lattice).
+pub fn directions(count: usize) -> Vec<Vec3> {
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    (0..count)
+        .map(|i| {
+            let z = 1.0 - (2.0 * i as f64 + 1.0) / count as f64;
+            let r = (1.0 - z * z).max(0.0).sqrt();
+            let angle = golden * i as f64;
+            Vec3::new(r * angle.cos(), r * angle.sin(), z)
+        })
+        .collect()
+}
+
+/// The rotation of a camera that sees an object from a direction, with the object's z axis up as far as there is one, rotated in the image plane.
+fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
+    let up = if direction.z.abs() > 0.999 { Vec3::y() } else { Vec3::z() };
+    let z = -direction;
+    let x = z.cross(&up).normalize();
+    let y = z.cross(&x);
+    let rows = sixfold_geometry::Mat3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]);
+    let camera_from_object = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rows));
+    UnitQuaternion::from_axis_angle(&Vec3::z_axis(), roll) * camera_from_object
+}
+
+/// The cells of a render whose feature lies on the object, with their points.
+pub fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, Vec<[f32; 3]>) {
+    let mut on = Vec::new();
+    let mut points = Vec::new();
+    for cell in 0..cells * cells {
+        let (x, y) = (cell % cells * CELL, cell / cells * CELL);
+        let point = rendered.coordinates[(x, y)];
+        if !point[0].is_nan() {
+            on.push(cell as u16);
+            points.push(point);
+        }
+    }
+    (on, points)
+}
+
+/// Renders an object from all around; `mesh` is best one of [`view_mesh`].
+///
+/// # Errors
+/// [`ViewsError`].
+pub fn make_templates(
+    mesh: &Mesh,
+    name: &str,
+    diameter: f64,
+    extractor: &Extractor,
+    options: &TemplateOptions,
+) -> Result<Vec<Template>, ViewsError> {
+    let (low, high) = mesh.bounding_box();
+    let centre = (low + high) * 0.5;
+    let distance = options.distance * diameter;
+    // Wide enough for the whole object; only its box is taken from this image.
+    let wide = wide_camera();
+    let mut jobs = Vec::new();
+    for direction in directions(options.directions) {
+        for k in 0..options.rotations {
+            jobs.push((direction, std::f64::consts::TAU * k as f64 / options.rotations as f64));
+        }
+    }
+    use rayon::prelude::*;
+    let rendered: Vec<Option<(Pose, Camera, Vec<f32>, Vec<u16>, Vec<[f32; 3]>)>> = jobs
+        .par_iter()
+        .map_init(
+            || (VisibilityBuffer::new(&wide), None::<VisibilityBuffer>),
+            |(frame, close), (direction, roll)| {
+                let rotation = rotation_from(direction, *roll);
+                let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * centre);
+                let objects = [SceneObject { mesh, camera_from_object: pose }];
+                frame.render(&objects, &RenderOptions::default());
+                let bbox: Rect = frame.bounding_box()?;
+                let crop = Crop::of_box(&wide, &bbox, options.crop_factor, options.side)?;
+                let close = close.get_or_insert_with(|| VisibilityBuffer::new(&crop.camera));
+                close.set_camera(&crop.camera);
+                let pose = crop.to_crop(&pose);
+                let rendered = render(close, mesh, &pose, None);
+                let (cells, points) = cells_on_object(&rendered, options.side / CELL);
+                Some((pose, crop.camera, input_over_grey(&rendered), cells, points))
+            },
+        )
+        .collect();
+    let mut templates = Vec::with_capacity(rendered.len());
+    for chunk in rendered.chunks(64) {
+        let chunk: Vec<_> = chunk.iter().flatten().collect();
+        let images: Vec<Vec<f32>> = chunk.iter().map(|r| r.2.clone()).collect();
+        let maps = extractor.features(&images, options.side)?;
+        for ((pose, camera, _, cells, points), map) in chunk.into_iter().zip(maps) {
+            templates.push(Template {
+                crop_from_object: *pose,
+                camera: *camera,
+                features: gathered(&map, cells),
+                cells: cells.clone(),
+                points: points.clone(),
+            });
+        }
+    }
+    if templates.iter().all(|t| t.cells.is_empty()) {
+        return Err(ViewsError::Invisible { object: name.to_owned() });
+    }
+    Ok(templates)
+}
+
+/// The features of some cells.
+pub fn gathered(map: &FeatureMap, cells: &[u16]) -> Vec<f32> {
+    cells.iter().flat_map(|c| map.feature(usize::from(*c)).iter().copied()).collect()
+}
