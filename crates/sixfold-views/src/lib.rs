@@ -1,4 +1,9 @@
-//! Poses of known objects from colour, without training.
+//! Poses of known objects from one colour image, without training for the object: the mesh is rendered from all around, and local features
+//! of these views are matched with those of a region of the image.
+//!
+//! A region is cut out as a camera sees it that looks at its middle ([`crop`]). Its features ([`features`]) are compared with those of all
+//! [`templates`]; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
+//! ([`estimate`]). The network ([`network`]) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects ([`training`]).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
@@ -8,10 +13,10 @@ pub mod estimate;
 pub mod estimator;
 pub mod features;
 mod file;
-pub mod matching;
+mod matching;
 pub mod network;
 pub mod recipe;
-pub mod samples;
+mod samples;
 pub mod templates;
 pub mod training;
 
