@@ -193,7 +193,7 @@ impl PoseFile {
                 let found = published_rule_poses(&of, &object.mesh, model, side, PER_VIEW, &rule)?;
                 let (low, high) = object.mesh.bounding_box();
                 let centre = (low + high) * 0.5;
-                for ((image, pose), record) in of.iter().zip(&found).zip(&mut records) {
+                for ((image, (pose, _)), record) in of.iter().zip(&found).zip(&mut records) {
                     let given = image.camera_from_object();
                     let moved = pose.transform_point(&centre) - given.transform_point(&centre);
                     record.camera_from_object = rows(pose);
