@@ -31,8 +31,8 @@ fn pix2pose_trains_and_estimates_as_published() {
         "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --render-share 0 --steps 120 --out ours",
     )
     .expect(0);
-    let targets = [0, 4, 11]
-        .map(|im| serde_json::json!({"scene_id": 7, "im_id": im, "obj_id": 1, "inst_count": 1}));
+    let targets =
+        [0, 4, 11].map(|im| serde_json::json!({"scene_id": 7, "im_id": im, "obj_id": 1, "inst_count": 1}));
     std::fs::write(dir.join("targets.json"), Value::from(targets.to_vec()).to_string()).unwrap();
     let estimate = "estimate --method pix2pose --weights ours/model.safetensors --dataset tiny \
         --targets targets.json --boxes gt";

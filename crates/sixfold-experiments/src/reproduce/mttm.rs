@@ -337,7 +337,9 @@ fn measure(
         let instances: Vec<Vec<bool>> =
             truths.iter().map(|truth| visible(&render_depth(&k.mesh, truth, camera), depth)).collect();
         // Of several instances any may be found.
-        let error = |pose: &Pose| truths.iter().map(|t| k.error(t, pose)).fold(f64::INFINITY, f64::min);
+        let error = |pose: &Pose| {
+            truths.iter().map(|t| pose_error(&k.points, &k.info, t, pose)).fold(f64::INFINITY, f64::min)
+        };
         for (way, search) in WAYS.iter().zip(&searches) {
             let object = if way.mesh { &k.with_mesh } else { &k.alone };
             let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
@@ -376,12 +378,10 @@ fn measure(
     Ok(measured)
 }
 
-impl Known {
-    /// ADD, or ADI for symmetric objects, of the vertices that `sixfold eval` takes, as a fraction of the diameter.
-    fn error(&self, truth: &Pose, found: &Pose) -> f64 {
-        let of = if self.info.is_symmetric() { adi } else { add };
-        of(&self.points, found, truth) / self.info.diameter
-    }
+/// ADD, or ADI for symmetric objects, of the vertices that `sixfold eval` takes, as a fraction of the diameter.
+fn pose_error(points: &ModelPoints, info: &ModelInfo, truth: &Pose, found: &Pose) -> f64 {
+    let error = if info.is_symmetric() { adi(points, found, truth) } else { add(points, found, truth) };
+    error / info.diameter
 }
 
 /// Which pixels a rendered instance is seen at.
@@ -461,6 +461,8 @@ fn markdown(whole: &Whole) -> String {
 
 #[cfg(test)]
 mod tests {
+    use sixfold_geometry::Vec3;
+
     use super::*;
 
     #[test]
@@ -479,12 +481,21 @@ mod tests {
     }
 
     #[test]
+    fn masks_overlap_by_intersection_over_union() {
+        let visible: Vec<bool> = (0..100).map(|i| i < 40).collect();
+        let mask: Vec<u32> = (20..60).collect();
+        assert!((overlap(&mask, &visible) - 20.0 / 60.0).abs() < 1e-12);
+        assert_eq!(overlap(&[], &[false; 4]), 0.0);
+    }
+
+    #[test]
     fn the_error_is_a_share_of_the_diameter() {
         let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
+        let points = ModelPoints::new(&vertices).unwrap();
         let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();
         let info = ModelInfo::of_mesh(&mesh);
         let moved = Pose::from_translation(Vec3::new(0.0, 0.01, 0.0));
-        let error = pose_error(&mesh, &info, &Pose::identity(), &moved);
+        let error = pose_error(&points, &info, &Pose::identity(), &moved);
         assert!((error - 0.01 / info.diameter).abs() < 1e-9, "{error}");
     }
 }
