@@ -23,7 +23,7 @@ use crate::training::{Source, checked, choice, count, run, single, steps, summar
 /// near_photographs: fraction of renders, and of those near a photograph's pose; rotation: largest rotation of photographs in the
 /// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to continue from; encoder: torchvision's ResNet-50
 /// weights for "resnet50"; backgrounds: a folder of photographs; preset: symmetries, thresholds
-/// and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless".
+/// and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless", or all as "published".
 ///
 /// progress: called with a dict: stage ("training" or "measuring"), done, total, and while training seconds,
 /// learning_rate, samples_per_second, losses. Ctrl-C, or an error of the callback, ends the training after the current
@@ -68,7 +68,8 @@ pub(crate) fn train_pix2pose<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold::pix2pose::preset::Preset;
     use sixfold::pix2pose::recipe::{MIN_VISIBILITY, Pix2PoseRecipe};
-    let default = Pix2PoseRecipe::default();
+    let published = preset == Some("published");
+    let default = if published { Pix2PoseRecipe::published() } else { Pix2PoseRecipe::default() };
     let recipe = checked(Pix2PoseRecipe {
         network: choice("network", network, default.network)?,
         steps: self::steps(steps)?,
@@ -86,7 +87,11 @@ pub(crate) fn train_pix2pose<'py>(
         convex_hull: convex_hull.unwrap_or(default.convex_hull),
         transformer_loss: transformer_loss.unwrap_or(default.transformer_loss),
         view_limits: view_limits.unwrap_or(default.view_limits),
-        preset: preset.map(|name| choice("preset", Some(name), Preset::Bop)).transpose()?,
+        preset: preset
+            .filter(|_| !published)
+            .map(|name| choice("preset", Some(name), Preset::Bop))
+            .transpose()?,
+        published,
         backgrounds,
         seed: count("seed", seed, default.seed as usize)? as u64,
         command: "sixfold.train_pix2pose".to_owned(),
@@ -298,6 +303,7 @@ pub(crate) fn train_nol<'py>(
             integrator: integrator.unwrap_or(default.parts.integrator),
             decoder: decoder.unwrap_or(default.parts.decoder),
         },
+        losses: default.losses,
         backgrounds,
         steps: self::steps(steps)?,
         learning_rate,

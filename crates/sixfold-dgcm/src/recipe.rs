@@ -50,14 +50,18 @@ impl DgcmKind {
     pub fn options(self) -> DgcmTrainingOptions {
         match self {
             DgcmKind::Compact => DgcmTrainingOptions::default(),
-            DgcmKind::Paper => DgcmTrainingOptions::paper(),
+            DgcmKind::Paper => DgcmTrainingOptions::published(),
         }
     }
 
-    fn crop(self) -> CropOptions {
+    /// Crops, and the cameras' distances (table 6.1).
+    fn pool(self) -> GraspPoolOptions {
+        let default = GraspPoolOptions::default();
         match self {
-            DgcmKind::Compact => CropOptions::compact(),
-            DgcmKind::Paper => CropOptions::paper(),
+            DgcmKind::Compact => default,
+            DgcmKind::Paper => {
+                GraspPoolOptions { crop: CropOptions::paper(), distance: (1.0, 1.7), ..default }
+            }
         }
     }
 }
@@ -71,7 +75,7 @@ pub struct DgcmRecipe {
     pub encoder: Option<PathBuf>,
     /// Steps in all; `None`: the network's of [`DgcmKind::options`], as for the next three.
     pub steps: Option<u64>,
-    /// Positive pairs in a step.
+    /// Positive pairs in a step; the dissertation's network takes as many negative ones.
     pub pairs: Option<usize>,
     /// Highest learning rate.
     pub learning_rate: Option<f64>,
@@ -102,12 +106,18 @@ impl Default for DgcmRecipe {
 }
 
 impl DgcmRecipe {
+    /// The dissertation's training (section 6.2.2): its network and options on 166,000 views.
+    pub fn published() -> Self {
+        DgcmRecipe { network: DgcmKind::Paper, views: 166_000, ..DgcmRecipe::default() }
+    }
+
     /// How the network is trained.
     pub fn options(&self) -> DgcmTrainingOptions {
         let default = self.network.options();
         DgcmTrainingOptions {
             common: default.common.with(self.steps, self.learning_rate, self.seed),
             pairs: self.pairs.unwrap_or(default.pairs),
+            negatives: self.pairs.filter(|_| self.network == DgcmKind::Paper).unwrap_or(default.negatives),
             lambda: self.lambda.unwrap_or(default.lambda),
             ..default
         }
@@ -167,12 +177,7 @@ impl Recipe for DgcmRecipe {
             }
         };
         let options = self.options();
-        let pool = GraspPoolOptions {
-            views: self.views,
-            crop: self.network.crop(),
-            seed: self.seed,
-            ..GraspPoolOptions::default()
-        };
+        let pool = GraspPoolOptions { views: self.views, seed: self.seed, ..self.network.pool() };
         let mut card = ModelCard::new("", "DGCM-Net, grasps from experience");
         card.data = format!(
             "{} simulated depth views of procedural families (can, mug, cup, bottle, bowl, box, clamp, drill) with random axis scales; no scanned object and no photograph",

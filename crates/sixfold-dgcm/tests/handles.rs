@@ -6,7 +6,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::outcome::OutcomeModel;
-use sixfold_dgcm::transfer::{AlignmentHypothesis, Memory, ProposeOptions, propose, rank_on_part};
+use sixfold_dgcm::transfer::{
+    AlignmentHypothesis, Kind, Memory, ProposeOptions, grasps_as_published, propose, rank_on_part,
+};
 use sixfold_experience::{Crop, Experience, ExperienceStore, SqliteStore};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
@@ -76,13 +78,59 @@ impl Seen {
 }
 
 #[test]
+fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../weights/dgcm.safetensors");
+    let model = DgcmModel::load(&weights).unwrap();
+    let gripper = Gripper::built_in("jaws-140").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let (taught, now) = (seen(40, 0.2), seen(40, 0.3));
+    let planner = AntipodalOptions::default();
+    let wide = antipodal_grasps(&taught.view, &gripper, &planner).unwrap();
+    let crop = Crop::of_view(&taught.view, model.crop_options()).unwrap();
+    let mut store = SqliteStore::create(&folder.path().join("e.db")).unwrap();
+    for grasp in wide.iter().take(4) {
+        let experience = Experience::new(&model, crop.clone(), grasp, &gripper, "mug", None, 0, "a test");
+        store.add(&experience).unwrap();
+    }
+    let mut memory = Memory::new(Box::new(store), &model).unwrap();
+    let fitter = GraspFitter::new(&now.view, &gripper, &planner).unwrap();
+    let options = ProposeOptions::published();
+    let found = propose(&fitter, &model, &mut memory, &options).unwrap();
+    assert!(!found.proposals.is_empty() && found.middles.is_empty());
+    for p in &found.proposals {
+        assert_eq!((p.hypothesis, p.moved), (AlignmentHypothesis::Scaled, 0.0));
+        let reach = fitter.reach(&p.grasp.camera_from_gripper, gripper.max_opening).unwrap();
+        assert!((reach + 0.02).abs() < 1e-6, "{reach}");
+        assert!((p.score - (-p.from.distance).exp()).abs() < 1e-12);
+    }
+    // Ours adds other hypotheses to the same experiences.
+    let ours = propose(&fitter, &model, &mut memory, &ProposeOptions::default()).unwrap();
+    assert!(ours.proposals.iter().any(|p| p.hypothesis != AlignmentHypothesis::Scaled));
+    let published =
+        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, false).unwrap();
+    assert!(published.ranked.iter().all(|r| r.kind == Kind::Experience));
+    let combined =
+        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, true).unwrap();
+    assert!(combined.ranked.iter().all(|r| r.kind == Kind::Geometry));
+    for r in &combined.ranked {
+        let near = |p: &&sixfold_dgcm::transfer::Proposal| {
+            let (distance, angle) = r.grasp.difference(&p.grasp);
+            distance <= 0.05 && angle <= 15f64.to_radians()
+        };
+        let near: Vec<f64> = combined.found.proposals.iter().filter(near).map(|p| p.score).collect();
+        let mean = near.iter().sum::<f64>() / near.len().max(1) as f64;
+        assert!((r.experience - mean).abs() < 1e-12 && (r.score - 0.5 * (r.geometry + mean)).abs() < 1e-12);
+    }
+}
+
+#[test]
 fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../weights/dgcm.safetensors");
     let model = DgcmModel::load(&weights).unwrap();
     let gripper = Gripper::built_in("jaws-85").unwrap();
     let folder = tempfile::tempdir().unwrap();
     let clusters = ClusterOptions::default();
-    let mut first = 0;
+    let (mut first, mut transferred) = (0, 0);
     for (k, (there, here)) in [(0.2, -1.2), (-2.8, -0.4), (-1.4, 0.1), (-0.5, -2.7)].into_iter().enumerate() {
         let taught = seen(40 + k as u64, there);
         let crop = Crop::of_view(&taught.view, model.crop_options()).unwrap();
@@ -106,8 +154,8 @@ fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
         let right: f64 = found.crop.pixels().filter(|&i| on_handle(i)).map(|i| found.held_before[i]).sum();
         assert!(all > 5.0 && right > 0.6 * all, "{there} to {here}: {right} of {all}");
         // The transferred grasp closes along the way around the mug, as the taught one does.
-        let upright = found.proposals.iter().find(|p| p.hypothesis == AlignmentHypothesis::Upright);
-        if let Some(p) = upright {
+        if let Some(p) = found.proposals.iter().find(|p| p.hypothesis == AlignmentHypothesis::Upright) {
+            transferred += 1;
             let wanted = now.handle_grasp();
             let turned = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);
             let half = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
@@ -118,5 +166,6 @@ fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
         let ranked = rank_on_part(&geometry, &found, &clusters, &fitter, &OutcomeModel::default());
         first += usize::from(ranked.first().is_some_and(|r| now.part_of(&r.grasp) == "handle"));
     }
+    assert!(transferred >= 3, "a grasp is transferred by shape to {transferred} of 4 mugs");
     assert!(first >= 3, "the first grasp is on the handle of {first} of 4 mugs");
 }

@@ -9,6 +9,9 @@ use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2
 
 /// Levels of the ICP: rejection distance as a multiple of the tolerance of depths, and iterations. Chosen by hand; not swept.
 const LEVELS: [(f64, usize); 3] = [(1.5, 4), (0.8, 5), (0.5, 5)];
+/// Iterations before a region may be rejected (dissertation: 3).
+#[cfg(feature = "network")]
+const SHORT: usize = 3;
 /// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 50.0;
 /// A level ends at steps smaller than this, metres and radians; chosen by hand, below the noise of depth.
@@ -48,6 +51,25 @@ pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, t
     } else {
         start
     }
+}
+
+/// Three iterations of ICP alone: what the dissertation looks at before it rejects a region (section 5.2.5).
+#[cfg(feature = "network")]
+pub(crate) fn align_shortly(
+    scene: &DepthRegion,
+    cloud: &PointCloud,
+    camera_from_view: &Pose,
+    tolerance: f64,
+) -> Pose {
+    let target = DepthTarget { depth: scene.depth(), normals: scene.normals(), camera: scene.camera() };
+    let rejection_distance = LEVELS[0].0 * tolerance;
+    let options = IcpOptions {
+        levels: vec![IcpLevel { rejection_distance, iterations: SHORT, stride: 1 }],
+        max_angle: MAX_ANGLE.to_radians(),
+        convergence: CONVERGENCE,
+        min_correspondences: MIN_CORRESPONDENCES,
+    };
+    icp(cloud, &target, camera_from_view, &options).map_or(*camera_from_view, |r| r.target_from_source)
 }
 
 /// Moves the points along the ray by the median of the differences to the scene that are small enough to be the object's.

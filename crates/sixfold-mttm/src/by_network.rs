@@ -19,6 +19,7 @@ use crate::learned::Learned;
 use crate::matching::Entry;
 use crate::model::{Encoded, MttmModel, PairSays};
 use crate::patch::Patch;
+use crate::published::{self, visible_centre};
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
@@ -122,8 +123,12 @@ pub(crate) fn first_matching(
         let centred: Vec<Roi> = order
             .iter()
             .map(|&k| {
-                let place = Vec3::from(says[k].offset) * size;
-                Roi { centre: rois[chosen[k]].camera_from_roi().transform_point(&place) }
+                let roi = &rois[chosen[k]];
+                let place = match says[k].offset {
+                    Some(offset) => Vec3::from(offset) * size,
+                    None => visible_centre(scene, roi, size, &says[k].mask),
+                };
+                Roi { centre: roi.camera_from_roi().transform_point(&place) }
             })
             .collect();
         let template_size = object.templates.size;
@@ -135,7 +140,7 @@ pub(crate) fn first_matching(
         .enumerate()
         .map(|(n, &k)| {
             let (says, entry) = (&says[k], &entries[k]);
-            let start = start(learned, &rois[chosen[k]].camera_from_roi(), entry, says, options);
+            let start = start(scene, object, learned, &rois[chosen[k]], entry, says, options);
             let placed = place_at(scene, object, entry.template, start, trust(says), options);
             let Some((roi, found)) = by_points.as_ref().map(|all| &all[n]) else { return placed };
             let entry = object.matcher.entries()[found.entry];
@@ -210,7 +215,7 @@ pub(crate) fn second_matching(
         .par_iter()
         .zip(&says)
         .map(|((region, entry), says)| {
-            let start = start(learned, &rois[*region].camera_from_roi(), entry, says, options);
+            let start = start(scene, object, learned, &rois[*region], entry, says, options);
             // The seed itself may start better here.
             let known = is_known(object, &found[*region][1..], entry.template, &start);
             (!known).then(|| place_at(scene, object, entry.template, start, trust(says), options))
@@ -230,17 +235,23 @@ fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
 
 /// From where a template is aligned.
 fn start(
+    scene: &DepthRegion,
+    object: &KnownObject,
     learned: &Learned,
-    camera_from_roi: &Pose,
+    roi: &Roi,
     entry: &Entry,
     says: &PairSays,
     options: &MttmOptions,
 ) -> Pose {
-    if options.predicted_pose {
-        learned.camera_from_view(camera_from_roi, entry.turn, says)
-    } else {
-        camera_from_view(camera_from_roi, entry.turn)
+    let camera_from_roi = roi.camera_from_roi();
+    if !options.predicted_pose {
+        return camera_from_view(&camera_from_roi, entry.turn);
     }
+    learned.camera_from_view(&camera_from_roi, entry.turn, says).unwrap_or_else(|| {
+        let centre = visible_centre(scene, roi, learned.size(), &says.mask);
+        let centre = camera_from_roi.transform_point(&centre);
+        published::start(object, &camera_from_roi, &centre, entry, says, options)
+    })
 }
 
 fn trust(says: &PairSays) -> f64 {

@@ -1,6 +1,7 @@
 //! From a prepared scene and an object's templates to poses: sample regions, match, mask, merge, match again, align, verify
 //! (dissertation, sections 5.2.4 and 5.2.5).
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -15,7 +16,7 @@ use crate::mask::{Pixels, common, template_mask};
 use crate::matching::{Match, MatchOptions, Matcher};
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::ObjectTemplates;
-use crate::{by_network, learned::Learned, regions::RegionCache};
+use crate::{by_network, learned::Learned, published, regions::RegionCache};
 
 /// Who matches regions with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,10 +45,12 @@ pub struct MttmOptions {
     pub masked: usize,
     /// Regions left after merging.
     pub regions: usize,
-    /// Pose hypotheses of a region (dissertation: 5).
+    /// Pose hypotheses of a region (dissertation: 5) by points, and as published; beside points the network adds two of its own.
     pub hypotheses: usize,
     /// Hypotheses that are refined and verified with the mesh, where there is one.
     pub verified: usize,
+    /// Regions, masks and hypotheses as published, where there is a network: [`MttmOptions::published`].
+    pub published: bool,
     /// Lay matched templates on the scene's surface; otherwise a pose is that of the nearest template, as it was matched.
     pub align: bool,
     /// Thresholds of the scores.
@@ -108,6 +111,7 @@ impl Default for MttmOptions {
             regions: REGIONS,
             hypotheses: HYPOTHESES,
             verified: VERIFIED,
+            published: false,
             align: true,
             verification: VerificationOptions::default(),
             max_instances: 1,
@@ -116,7 +120,23 @@ impl Default for MttmOptions {
     }
 }
 
+/// Hypotheses that are refined and verified as published (section 5.3.3).
+const PUBLISHED_VERIFIED: usize = 15;
+
 impl MttmOptions {
+    /// The dissertation's form (sections 5.2.4, 5.2.5, 5.3.3): the network alone, masks before any alignment, five hypotheses a
+    /// region, regions rejected after three iterations of ICP, at most 50 of them, 15 hypotheses verified by the published score.
+    pub fn published() -> MttmOptions {
+        let default = MttmOptions::default();
+        MttmOptions {
+            matched_by: MatchedBy::Network,
+            published: true,
+            verified: PUBLISHED_VERIFIED,
+            verification: VerificationOptions { occluders_have_edges: false, ..default.verification },
+            ..default
+        }
+    }
+
     /// Checks every field, also those of proposals and verification.
     ///
     /// # Errors
@@ -198,7 +218,8 @@ pub struct MttmEstimate {
     pub score: VerificationScore,
     /// The matched template.
     pub template: usize,
-    /// Pixels of the object by the matched template, before any refinement with a mesh.
+    /// Pixels of the object by the matched template, before any refinement with a mesh; as published by the network, before any
+    /// alignment.
     pub mask: Pixels,
 }
 
@@ -234,6 +255,8 @@ pub(crate) struct Placed {
     pub score: VerificationScore,
     /// What decides: agreement of the surface, and of the match it came from.
     pub support: f64,
+    /// The pixels that the network says are the object's, where it was asked before anything was aligned.
+    pub mask: Option<Arc<Pixels>>,
 }
 
 /// A scene in which several objects are searched: what the network predicts for its regions is kept for objects of about the same
@@ -284,6 +307,14 @@ pub(crate) fn search(
         MatchedBy::Points => None,
         MatchedBy::Network | MatchedBy::Both => object.learned.as_ref(),
     };
+    if let (true, Some(learned)) = (options.published, network) {
+        let mut hypotheses = published::hypotheses(scene, object, learned, regions, options, &mut stages);
+        hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
+        stages.matching = lap();
+        let estimates = verify_all(scene, object, &hypotheses, options);
+        stages.verification = lap();
+        return (estimates, stages);
+    }
     let placed = match network {
         Some(learned) => by_network::first_matching(scene, object, learned, regions, options, &mut stages),
         None => first_matching(scene, object, options, &mut stages),
@@ -375,7 +406,7 @@ pub(crate) fn place_at(
     let threshold = options.verification.threshold_for(object.templates.diameter);
     let score = judge(scene, surface, &pose, threshold, &options.verification);
     let support = score.ranking() * trust;
-    Placed { template, camera_from_view: pose, score, support }
+    Placed { template, camera_from_view: pose, score, support, mask: None }
 }
 
 /// Whether a template at a pose says the same as one of those found. Views without poses have frames of their own: only the
@@ -492,8 +523,9 @@ fn verify_all(
             .zip(&kept)
             .enumerate()
             .map(|(i, (v, p))| {
-                // Two witnesses: the rendered mesh, and the template it came from.
-                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(TEMPLATE_POWER);
+                // Two witnesses: the rendered mesh, and the template it came from. As published it is the mesh alone.
+                let power = if options.published { 0.0 } else { TEMPLATE_POWER };
+                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(power);
                 (v.camera_from_object, confidence, v.score, i)
             })
             .collect(),
@@ -505,14 +537,11 @@ fn verify_all(
             break;
         }
         let template = kept[i].template;
-        let mask = template_mask(
-            scene,
-            &templates.templates[template],
-            templates.size,
-            &kept[i].camera_from_view,
-            object.matcher.tolerance(),
-            1,
-        );
+        let of_template = || {
+            let (pose, tolerance) = (&kept[i].camera_from_view, object.matcher.tolerance());
+            template_mask(scene, &templates.templates[template], templates.size, pose, tolerance, 1)
+        };
+        let mask = kept[i].mask.as_deref().cloned().unwrap_or_else(of_template);
         let shared =
             |other: &MttmEstimate| MAX_SHARED.1 * common(&mask, &other.mask) > MAX_SHARED.0 * mask.len();
         if mask.is_empty() || estimates.iter().any(shared) {

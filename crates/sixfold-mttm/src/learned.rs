@@ -112,11 +112,12 @@ impl Learned {
         all
     }
 
-    /// Where the network lays a template in the camera's frame: rotation and place of the reference point.
-    pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, says: &PairSays) -> Pose {
+    /// Where the network lays a template in the camera's frame: rotation and place of the reference point; `None` where no place
+    /// was taught.
+    pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, says: &PairSays) -> Option<Pose> {
         let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
-        let place = Vec3::from(says.offset) * self.size;
-        *camera_from_roi * Pose::new(says.rotation * turned, place)
+        let place = Vec3::from(says.offset?) * self.size;
+        Some(*camera_from_roi * Pose::new(says.rotation * turned, place))
     }
 }
 

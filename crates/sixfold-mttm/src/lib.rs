@@ -35,6 +35,8 @@ pub mod network;
 pub mod patch;
 pub mod pose_distance;
 #[cfg(feature = "network")]
+mod published;
+#[cfg(feature = "network")]
 pub mod quality;
 #[cfg(all(feature = "network", feature = "recipe"))]
 pub mod recipe;
@@ -51,7 +53,7 @@ mod views;
 #[cfg(not(feature = "network"))]
 mod without_network;
 #[cfg(not(feature = "network"))]
-use without_network::{self as by_network, self as learned, self as regions};
+use without_network::{self as by_network, self as learned, self as published, self as regions};
 
 pub use error::{StoreError, TemplateError};
 pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};

@@ -52,9 +52,10 @@ pub struct PairSays {
     pub mask: Vec<f32>,
     /// Region from template.
     pub rotation: UnitQuaternion<f64>,
-    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch's size.
-    pub offset: [f64; 3],
-    /// How likely both show the same object in about the same pose.
+    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch's size; `None` where the
+    /// training did not teach it, as the dissertation's does not.
+    pub offset: Option<[f64; 3]>,
+    /// How likely both show the same object in about the same pose; 1 where the training did not teach it.
     pub matching: f32,
 }
 
@@ -208,6 +209,7 @@ impl MttmModel {
         let rotations = numbers(compared.rotation);
         let offsets = numbers(compared.offset);
         let matching = numbers(sigmoid(compared.matching));
+        let (place, match_) = (self.taught("offset"), self.taught("matching"));
         (0..matching.len())
             .map(|i| {
                 let q: [f64; 4] = std::array::from_fn(|k| f64::from(rotations[4 * i + k]));
@@ -216,11 +218,16 @@ impl MttmModel {
                     mask: masks[i * MAP * MAP..(i + 1) * MAP * MAP].to_vec(),
                     rotation: UnitQuaternion::try_new(quaternion, 1e-3)
                         .unwrap_or_else(UnitQuaternion::identity),
-                    offset: std::array::from_fn(|k| f64::from(offsets[3 * i + k])),
-                    matching: matching[i],
+                    offset: place.then(|| std::array::from_fn(|k| f64::from(offsets[3 * i + k]))),
+                    matching: if match_ { matching[i] } else { 1.0 },
                 }
             })
             .collect()
+    }
+
+    /// Whether the training gave a loss of its own weight, as the card has it; files of before that was written down had it.
+    fn taught(&self, weight: &str) -> bool {
+        self.card.extra["training"][weight].as_f64().is_none_or(|weight| weight > 0.0)
     }
 
     fn tensor(&self, patches: &[&Patch]) -> Tensor<4> {
@@ -286,6 +293,23 @@ mod tests {
         assert!(one[0].mask.iter().all(|v| (0.0..=1.0).contains(v)) && one[0].mask.len() == 196);
         let described = model.describe_templates(70, patch);
         assert!(described[3].iter().zip(&model.describe(&templates)[3]).all(|(a, b)| (a - b).abs() < 1e-5));
+    }
+
+    #[test]
+    fn what_was_not_taught_is_not_used() {
+        let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
+        let says = |training: serde_json::Value| {
+            let extra = serde_json::json!({ "training": training });
+            let model = MttmModel::new(network.clone(), ModelCard { extra, ..ModelCard::new("", "test") });
+            let encoded = model.encode(&[&patch(1)]);
+            model.compare(&encoded, &model.encode_templates(&[patch(2)])).remove(0)
+        };
+        let all = says(serde_json::json!({ "offset": 4.0, "matching": 0.5 }));
+        assert!(all.offset.is_some() && all.matching < 1.0);
+        let published =
+            says(serde_json::to_value(crate::training::MttmTrainingOptions::published()).unwrap());
+        assert_eq!((published.offset, published.matching), (None, 1.0));
+        assert_eq!((published.mask, published.rotation), (all.mask, all.rotation));
     }
 
     #[test]

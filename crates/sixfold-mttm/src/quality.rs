@@ -47,7 +47,7 @@ impl Quality {
 pub fn quality(network: &Network, pool: &Pool) -> Quality {
     let device = Device::flex();
     let augmentation = Augmentation { hidden: 0.0, lost: 0.0, ..Augmentation::default() };
-    let options = PairBatchOptions { anchors: 40, without_object: 0, augmentation };
+    let options = PairBatchOptions { anchors: 40, without_object: 0, other_objects: 0.0, augmentation };
     let steps = (pool.with_object().len() / options.anchors).max(1);
     let (mut nearest, mut masks, mut matching) = (0usize, 0usize, 0usize);
     let mut rotation = [vec![], vec![]];

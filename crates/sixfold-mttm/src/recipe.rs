@@ -68,7 +68,7 @@ impl MttmKind {
     pub fn options(self) -> MttmTrainingOptions {
         match self {
             MttmKind::Compact => MttmTrainingOptions::default(),
-            MttmKind::Paper => MttmTrainingOptions::paper(),
+            MttmKind::Paper => MttmTrainingOptions::published(),
         }
     }
 }
@@ -116,6 +116,11 @@ impl Default for MttmRecipe {
 type Made<'a> = dyn FnMut(usize, usize) + Send + 'a;
 
 impl MttmRecipe {
+    /// The dissertation's training (sections 5.2.3 and 5.3.1): its network, its losses, 20,000 views of scenes.
+    pub fn published() -> Self {
+        MttmRecipe { network: MttmKind::Paper, scenes: 4000, ..MttmRecipe::default() }
+    }
+
     /// How the network is trained.
     pub fn options(&self) -> MttmTrainingOptions {
         let default = self.network.options();
@@ -185,7 +190,10 @@ impl Recipe for MttmRecipe {
                 Network::Paper(network.map_err(TrainError::about("encoder"))?)
             }
         };
-        let pool = DepthPoolOptions { seed: self.seed, ..DepthPoolOptions::for_side(network.side()) };
+        let default = DepthPoolOptions::for_side(network.side());
+        // As published, objects of which less than half is visible are not learnt from.
+        let visible = if self.network == MttmKind::Paper { 0.5 } else { default.visible };
+        let pool = DepthPoolOptions { visible, seed: self.seed, ..default };
         let mut card =
             ModelCard::new("", "Multi-task template matching, objects never trained on in depth images");
         card.data = format!(

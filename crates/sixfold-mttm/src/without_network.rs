@@ -1,4 +1,4 @@
-//! In the place of `by_network`, `learned` and `regions` when the feature `network` is off: no object is known to a network, so
+//! In the place of `by_network`, `learned`, `published` and `regions` when the feature `network` is off: no object is known to a network, so
 //! none of this is ever called.
 
 use sixfold_align::DepthRegion;
@@ -28,6 +28,17 @@ impl MttmEstimator {
 pub(crate) struct RegionCache;
 
 pub(crate) fn first_matching(
+    _scene: &DepthRegion,
+    _object: &KnownObject,
+    learned: &Learned,
+    _cache: &RegionCache,
+    _options: &MttmOptions,
+    _stages: &mut Stages,
+) -> Vec<Placed> {
+    match *learned {}
+}
+
+pub(crate) fn hypotheses(
     _scene: &DepthRegion,
     _object: &KnownObject,
     learned: &Learned,

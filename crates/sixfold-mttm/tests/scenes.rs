@@ -10,8 +10,9 @@ use sixfold_mttm::learned::Learned;
 use sixfold_mttm::mask::to_image;
 use sixfold_mttm::matching::{Entry, MatchOptions, Matcher};
 use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::network::MAP;
 use sixfold_mttm::patch::Patch;
-use sixfold_mttm::roi::Roi;
+use sixfold_mttm::roi::{Roi, UNKNOWN};
 use sixfold_mttm::{
     DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateOptions,
     estimate,
@@ -152,11 +153,12 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
     let entries = Matcher::new(&object, &MatchOptions::default()).entries().to_vec();
     let model = std::sync::Arc::new(MttmModel::shipped().unwrap());
     let learned = Learned::new(model.clone(), &object, &entries);
-    let (mut places, mut turns, mut sure) = (vec![], vec![], vec![]);
-    for k in 0..12 {
+    let (mut places, mut turns, mut sure, mut masks) = (vec![], vec![], vec![], vec![]);
+    for k in 0..36 {
         let angle = f64::from(k) * 0.9;
         let truth = on_table(0.1 * angle.cos(), 0.05 * angle.sin(), 2.3 * angle);
-        let scene = prepared(&look(&[(&mesh, truth)], k as u64).0);
+        let (depth, visible) = look(&[(&mesh, truth)], k as u64);
+        let scene = prepared(&depth);
         let centre = truth.transform_point(&object.templates[0].view_from_object.inverse().translation());
         let beside = Vec3::new(angle.sin(), angle.cos(), 0.3).normalize() * (0.12 * object.diameter);
         let roi = Roi { centre: centre + beside };
@@ -168,25 +170,67 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
         let mut order: Vec<usize> = (0..entries.len()).collect();
         order.sort_by(|a, b| angle_of(&entries[*a]).total_cmp(&angle_of(&entries[*b])));
         let region = model.encode(&[&Patch::of_scene(&scene, &roi, learned.size(), model.side(), |_| true)]);
-        let (right, wrong) = (entries[order[9]], entries[*order.last().unwrap()]);
+        // About 20 degrees off, as the templates of the training are at most.
+        let (right, wrong) = (entries[order[45]], entries[*order.last().unwrap()]);
         let says = model.compare(&region.select(&[0, 0]), &learned.templates(&[right, wrong]));
-        let pose = learned.camera_from_view(&camera_from_roi, right.turn, &says[0])
+        let pose = learned.camera_from_view(&camera_from_roi, right.turn, &says[0]).unwrap()
             * object.templates[right.template].view_from_object;
         let middle = pose.transform_point(&truth.inverse().transform_point(&centre));
         places.push((middle - centre).norm() / beside.norm());
         turns.push(pose.rotation_angle_to(&truth) / angle_of(&right));
         sure.push(says[0].matching - says[1].matching);
+        // Cells of the region that look at the object, and those that the mask head takes for it.
+        let cells = roi.look(&scene, learned.size(), MAP, |p| visible.as_slice()[p]);
+        let pairs: Vec<(bool, bool)> =
+            cells.iter().zip(&says[0].mask).map(|(c, m)| (*c != UNKNOWN, *m > 0.5)).collect();
+        let count = |of: fn(&(bool, bool)) -> bool| pairs.iter().filter(|p| of(p)).count() as f64;
+        masks.push(count(|p| p.0 && p.1) / count(|p| p.0 || p.1));
     }
     let median = |values: &[f64]| {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
         sorted[sorted.len() / 2]
     };
-    println!("{places:.2?} {turns:.2?} {sure:.2?}");
+    println!("{places:.2?} {turns:.2?} {sure:.2?} {masks:.2?}");
     // Fractions of what is off without the prediction.
     assert!(median(&places) < 0.6, "{places:.2?}");
-    assert!(median(&turns) < 0.9, "{turns:.2?}");
-    assert!(sure.iter().filter(|s| **s > 0.3).count() >= 10, "{sure:.2?}");
+    // The rotation is better in most regions: by chance alone it would be in 18 of 36, and in 27 or more once in 500 times.
+    assert!(turns.iter().filter(|t| **t < 1.0).count() >= 27, "{turns:.2?}");
+    assert!(turns.iter().sum::<f64>() / 36.0 < 0.87, "{turns:.2?}");
+    assert!(median(&masks) > 0.75, "{masks:.2?}");
+    assert!(sure.iter().filter(|s| **s > 0.3).count() >= 24, "{sure:.2?}");
+}
+
+/// The published form, with the network that ships: masks come before any alignment, and poses from them.
+#[test]
+fn as_published_masks_come_first_and_poses_from_them() {
+    let object = both_ways(known(true))[1].clone();
+    let options = MttmOptions::published();
+    assert_eq!((options.hypotheses, options.verified, options.masked), (5, 15, 50));
+    let (mut overlaps, mut right) = (vec![], 0);
+    for (i, (x, y, yaw)) in
+        [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4), (0.05, -0.1, 1.2)].into_iter().enumerate()
+    {
+        let truth = on_table(x, y, yaw);
+        let (depth, visible) = look(&[(&part(), truth)], i as u64);
+        let scene = prepared(&depth);
+        let (found, stages) = estimate(&scene, &object, &options);
+        assert!(stages.sampled > 20 && stages.regions > 0, "{stages:?}");
+        let Some(best) = found.first() else { continue };
+        overlaps.push(iou(best, &visible, &depth));
+        let (t, r) = off(best, &truth);
+        right += usize::from(t < 6.0 && r < 5.0);
+        // Nothing is moved by alignment: the mask is the network's wherever the pose ends up.
+        let unaligned = MttmOptions { align: false, ..options };
+        let (again, _) = estimate(&scene, &object, &unaligned);
+        if let Some(again) = again.iter().find(|e| e.template == best.template) {
+            assert_eq!(again.mask, best.mask);
+        }
+    }
+    println!("{overlaps:.2?} {right}");
+    // Measured: 0.15, 0.68, 0.76, 0.58, and two poses of four.
+    assert!(overlaps.iter().filter(|o| **o > 0.5).count() >= 3, "{overlaps:.2?}");
+    assert!(right >= 2, "{right} of 4");
 }
 
 #[test]

@@ -4,16 +4,22 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use sixfold_data::{RoughImage, RoughImages, TrainingSetError};
+use sixfold_data::{PosedImage, RoughImage, RoughImages, TrainingSetError};
 use sixfold_geometry::Pose;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_mesh::Mesh;
 
 use crate::error::NolError;
-use crate::refine::{PoseRefinementOptions, PosedSource, refine_scene};
+use crate::model::NolModel;
+use crate::refine::{
+    PoseRefinementOptions, PosedSource, PublishedRuleOptions, published_rule_poses, refine_scene,
+};
 
 /// A pose as four rows, translation in metres.
 type Rows = [[f64; 4]; 4];
+
+/// Other photographs in the published rule's first rendering (section 4.3.3: six at inference).
+const PER_VIEW: usize = 6;
 
 /// Why there are no better poses.
 #[derive(Debug, thiserror::Error)]
@@ -165,6 +171,39 @@ impl PoseFile {
         poses.write(file)?;
         // Numbers in text may lose their last digit, and a run that continues must not differ from one that was never stopped.
         PoseFile::read(file).map(Some)
+    }
+
+    /// The same by the published rule (section 4.2.3), without knowledge of what stood still; without a network each photograph is
+    /// compared with the mean of the others.
+    ///
+    /// # Errors
+    /// [`PoseFileError`].
+    pub fn refined_as_published(
+        images: &RoughImages,
+        model: Option<&NolModel>,
+        disturbed: bool,
+        file: &Path,
+    ) -> Result<PoseFile, PoseFileError> {
+        if !file.exists() {
+            let mut poses = PoseFile::given(images, true, disturbed);
+            let mut records = poses.photographs.iter_mut();
+            for object in &images.objects {
+                let of: Vec<PosedImage> = object.images.iter().map(|i| i.posed.clone()).collect();
+                let (side, rule) = (PoseRefinementOptions::default().side, PublishedRuleOptions::default());
+                let found = published_rule_poses(&of, &object.mesh, model, side, PER_VIEW, &rule)?;
+                let (low, high) = object.mesh.bounding_box();
+                let centre = (low + high) * 0.5;
+                for ((image, (pose, _)), record) in of.iter().zip(&found).zip(&mut records) {
+                    let given = image.camera_from_object();
+                    let moved = pose.transform_point(&centre) - given.transform_point(&centre);
+                    record.camera_from_object = rows(pose);
+                    record.moved_mm = 1e3 * moved.norm();
+                    record.turned_degrees = pose.rotation_angle_to(given).to_degrees();
+                }
+            }
+            poses.write(file)?;
+        }
+        PoseFile::read(file)
     }
 
     fn refine(

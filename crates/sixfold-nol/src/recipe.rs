@@ -17,7 +17,7 @@ use crate::loss::Perceptual;
 use crate::model::NolModel;
 use crate::network::{CompactConfig, Network, PaperConfig, Parts};
 use crate::quality::{Quality, QualityOptions, quality};
-use crate::training::{NolTraining, NolTrainingOptions};
+use crate::training::{NolLosses, NolTraining, NolTrainingOptions};
 
 /// Fraction of procedural textures between the photographs.
 const PROCEDURAL_FRACTION: f32 = 0.2;
@@ -55,7 +55,7 @@ impl NolKind {
     pub fn options(self) -> NolTrainingOptions {
         match self {
             NolKind::Compact => NolTrainingOptions::default(),
-            NolKind::Paper => NolTrainingOptions::paper(),
+            NolKind::Paper => NolTrainingOptions::published(),
         }
     }
 }
@@ -69,6 +69,8 @@ pub struct NolRecipe {
     pub encoder: Option<PathBuf>,
     /// How sources are integrated, and whether there is a decoder.
     pub parts: Parts,
+    /// Which losses are summed up; `None`: the network's of [`NolKind::options`].
+    pub losses: Option<NolLosses>,
     /// Folder of photographs for textures, backgrounds and clutter; procedural textures only without.
     pub backgrounds: Option<PathBuf>,
     /// Steps in all; `None`: the network's of [`NolKind::options`], as for the next one.
@@ -82,9 +84,18 @@ pub struct NolRecipe {
 }
 
 impl NolRecipe {
+    /// The dissertation's training (section 4.3.3): its network, its losses, eight sources with rough poses.
+    pub fn published() -> Self {
+        NolRecipe { network: NolKind::Paper, ..NolRecipe::default() }
+    }
+
     /// How the network is trained.
     pub fn options(&self) -> NolTrainingOptions {
         let default = self.network.options();
+        let default = match self.losses {
+            Some(losses) => default.with_losses(losses),
+            None => default,
+        };
         NolTrainingOptions {
             common: default.common.with(self.steps, self.learning_rate, self.seed),
             ..default
@@ -121,7 +132,7 @@ impl Recipe for NolRecipe {
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
         // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
         #[rustfmt::skip]
-        let NolRecipe { network, encoder, parts, backgrounds, steps: _, learning_rate: _, seed: _, command: _ } = self;
+        let NolRecipe { network, encoder, parts, backgrounds, losses: _, steps: _, learning_rate: _, seed: _, command: _ } = self;
         let backgrounds =
             background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
         Fingerprint::of(&self.options())?

@@ -22,6 +22,9 @@ const POINTS: usize = 3000;
 /// Side of the crops in which they are looked up, pixels.
 const SIDE: usize = 96;
 
+/// Images whose cameras are nearer than this (metres, and radians) are not both taken (section 4.3.3).
+const APART: [f64; 2] = [0.3, std::f64::consts::FRAC_PI_4];
+
 /// Leaves the images that add most of the object's surface, at most `most` of them; a note for each that cannot be used.
 ///
 /// # Errors
@@ -54,6 +57,18 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
         notes.push(format!("object {}: its photographs and masks show nothing of its surface", object.id));
     }
     Ok(notes)
+}
+
+/// As [`choose_images`], by the distance of the poses: [`choose_by_pose`] with the dissertation's numbers for images in which nothing
+/// hides the objects.
+pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
+    let poses: Vec<Pose> = object.images.iter().map(|i| *i.posed.camera_from_object()).collect();
+    let chosen = choose_by_pose(&poses, APART, most, seed);
+    let mut number = 0;
+    object.images.retain(|_| {
+        number += 1;
+        chosen.contains(&(number - 1))
+    });
 }
 
 /// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times

@@ -5,6 +5,8 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::choice::Choice;
+use sixfold_nn::critic::Critic;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::recurrent::gather;
@@ -25,6 +27,9 @@ pub struct NolTrainingOptions {
     pub common: TrainingOptions,
     /// Weights of colours, features and smoothness.
     pub weights: [f64; 3],
+    /// Weight of the adversarial loss against a discriminator, which trains beside the network; 0 for none.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub adversarial: f64,
     /// How samples are made.
     pub samples: ViewSampleOptions,
     /// How many in a step.
@@ -43,9 +48,11 @@ impl Default for NolTrainingOptions {
                 seed: 0,
             },
             weights: WEIGHTS,
+            adversarial: 0.0,
             samples: ViewSampleOptions::default(),
             batch: ViewBatchOptions {
                 sides: vec![96, 128, 160],
+                min_sources: 1,
                 max_sources: 8,
                 sources: 10,
                 max_samples: 4,
@@ -55,14 +62,34 @@ impl Default for NolTrainingOptions {
 }
 
 impl NolTrainingOptions {
-    /// The dissertation's: one target with eight sources of 256x256 pixels in a step, 35 epochs of 10,000 images.
-    pub fn paper() -> Self {
+    /// The dissertation's (section 4.3.3): one target with eight sources of 256x256 pixels in a step, all of them with rough poses;
+    /// 35 epochs of 10,000 images.
+    pub fn published() -> Self {
         let default = Self::default();
         NolTrainingOptions {
             common: TrainingOptions { steps: 350_000, learning_rate: 1e-3, ..default.common },
-            batch: ViewBatchOptions { sides: vec![256], max_sources: 8, sources: 8, max_samples: 1 },
+            samples: ViewSampleOptions { good_poses: 0.0, ..default.samples },
+            batch: ViewBatchOptions {
+                sides: vec![256],
+                min_sources: 8,
+                max_sources: 8,
+                sources: 8,
+                max_samples: 1,
+            },
             ..default
         }
+    }
+
+    /// The same with the losses of one column of table 4.6.
+    pub fn with_losses(self, losses: NolLosses) -> Self {
+        let [colours, features, smoothness] = WEIGHTS;
+        let (weights, adversarial) = match losses {
+            NolLosses::L1 => ([colours, 0.0, 0.0], 0.0),
+            NolLosses::Image => ([colours, features, 0.0], 0.0),
+            NolLosses::Smooth => ([colours, features, smoothness], 0.0),
+            NolLosses::Gan => ([colours, features, smoothness], 1.0),
+        };
+        NolTrainingOptions { weights, adversarial, ..self }
     }
 
     /// Checks every number.
@@ -78,7 +105,50 @@ impl NolTrainingOptions {
         OptionError::unless(all, "batch.sides", format!("{sides:?}"), expected)?;
         let sources = self.batch.max_sources;
         OptionError::unless((1..=16).contains(&sources), "batch.max_sources", sources, "1 to 16")?;
+        let least = self.batch.min_sources;
+        let expected = "1 to batch.max_sources";
+        OptionError::unless((1..=sources).contains(&least), "batch.min_sources", least, expected)?;
+        OptionError::unless_weight("adversarial", self.adversarial)?;
         self.weights.iter().try_for_each(|weight| OptionError::unless_weight("weights", *weight))
+    }
+}
+
+fn is_zero(weight: &f64) -> bool {
+    *weight == 0.0
+}
+
+/// Which losses a training sums up: the columns of table 4.6, each with one more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NolLosses {
+    /// Colours alone.
+    L1,
+    /// Equation 4.1: colours and features.
+    Image,
+    /// Equations 4.1 and 4.2: with smoothness.
+    Smooth,
+    /// With an adversarial loss. The dissertation does not say its weight; it is 1 here.
+    Gan,
+}
+
+impl Choice for NolLosses {
+    const ALL: &'static [NolLosses] = &[NolLosses::L1, NolLosses::Image, NolLosses::Smooth, NolLosses::Gan];
+
+    fn name(self) -> &'static str {
+        match self {
+            NolLosses::L1 => "l1",
+            NolLosses::Image => "image",
+            NolLosses::Smooth => "smooth",
+            NolLosses::Gan => "gan",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            NolLosses::L1 => "L1 of the colours alone",
+            NolLosses::Image => "Colours and features (equation 4.1)",
+            NolLosses::Smooth => "The same and smoothness (equation 4.2)",
+            NolLosses::Gan => "The same and a discriminator that trains beside the network",
+        }
     }
 }
 
@@ -122,6 +192,7 @@ pub(crate) fn pass(network: &Network, batch: Batch, device: &Device) -> Passed {
 /// A network in training.
 pub struct NolTraining {
     learner: Learner<Network>,
+    critic: Option<Critic>,
     parts: Parts,
     perceptual: Perceptual,
     preview: Option<Preview>,
@@ -142,7 +213,9 @@ impl NolTraining {
     ) -> Self {
         let learner = Learner::adam_w("network", network, &options.common);
         let pace = Pace { checkpoint_every: 100, ..Pace::default() };
-        NolTraining { learner, parts, perceptual, preview: None, options, pace, device }
+        let critic =
+            (options.adversarial > 0.0).then(|| Critic::new("discriminator", options.common.seed, &device));
+        NolTraining { learner, critic, parts, perceptual, preview: None, options, pace, device }
     }
 
     /// Draws `preview.png` beside every checkpoint: a row a synthetic object with textures from `textures`: sources, the true
@@ -183,6 +256,7 @@ impl Training for NolTraining {
 
     fn step(&mut self, batch: Batch, rate: f64) -> Losses {
         let (_, averaging) = batch.average();
+        let number_of_step = batch.step;
         let out = pass(self.learner.network(), batch, &self.device);
         let (colours, features) =
             image_loss(out.image.clone(), out.target.clone(), out.mask.clone(), &self.perceptual);
@@ -192,7 +266,7 @@ impl Training for NolTraining {
             let (target, mask) = (out.target.clone().inner(), out.mask.clone().inner());
             f64::from(squared_error(image.clone().inner(), target, mask).into_scalar::<f32>())
         };
-        let losses = [
+        let mut losses = vec![
             ("colours", number(&colours)),
             ("features", number(&features)),
             ("smoothness", number(&smoothness)),
@@ -201,13 +275,23 @@ impl Training for NolTraining {
             ("squared error of averaging", averaging),
         ];
         let [of_colours, of_features, of_smoothness] = self.options.weights;
-        let sum = colours * of_colours + features * of_features + smoothness * of_smoothness;
+        let mut sum = colours * of_colours + features * of_features + smoothness * of_smoothness;
+        if let Some(critic) = &mut self.critic {
+            // What no source sees is left out of both.
+            let (image, target) = (out.image * out.mask.clone(), out.target * out.mask);
+            let told = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
+            let adversarial = critic.generator_loss(image);
+            losses.extend([("discriminator", told), ("adversarial", number(&adversarial))]);
+            sum = sum + adversarial * self.options.adversarial;
+        }
         self.learner.descend(rate, sum);
         losses.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
     }
 
     fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
-        vec![&mut self.learner]
+        let mut learners: Vec<&mut dyn Checkpointed> = vec![&mut self.learner];
+        learners.extend(self.critic.iter_mut().map(|critic| &mut critic.learner as &mut dyn Checkpointed));
+        learners
     }
 
     fn before_checkpoint(&mut self, folder: &Path) {
@@ -238,7 +322,13 @@ mod tests {
         let default = NolTrainingOptions::default();
         NolTrainingOptions {
             common: TrainingOptions { steps, warm_up: 2, ..default.common },
-            batch: ViewBatchOptions { sides: vec![48, 64], max_sources: 3, sources: 4, max_samples: 2 },
+            batch: ViewBatchOptions {
+                sides: vec![48, 64],
+                min_sources: 1,
+                max_sources: 3,
+                sources: 4,
+                max_samples: 2,
+            },
             ..default
         }
     }

@@ -4,7 +4,6 @@
 //! Each iteration trains the discriminator on rendered and on generated coordinate images, then the generator on
 //! `lambda_1 * reconstruction + lambda_2 * error + adversarial`.
 
-use crate::critic::Critic;
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::{paper_input, resnet_input};
 use crate::networks::ResNet50Generator;
@@ -14,6 +13,7 @@ use crate::samples::{Sample, SampleSource};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::critic::Critic;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace};
@@ -43,6 +43,8 @@ pub struct AdversarialOptions {
     pub adversarial: bool,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
+    /// Equation 3.1 with its beta on hidden pixels of the object too; otherwise on visible ones alone, as in the author's code.
+    pub whole_mask: bool,
     /// Seed of samples and labels.
     pub seed: u64,
 }
@@ -58,6 +60,7 @@ impl Default for AdversarialOptions {
             error: 50.0,
             adversarial: true,
             transformer_loss: true,
+            whole_mask: false,
             seed: 0,
         }
     }
@@ -217,6 +220,7 @@ impl<G: Generator> Training for AdversarialTraining<G> {
         };
         let weights = LossOptions {
             error: options.error / options.reconstruction,
+            whole_mask: options.whole_mask,
             ..LossOptions::of(OutputKind::Paper)
         };
         let scale = options.reconstruction / count as f32;

@@ -2,7 +2,7 @@
 //!
 //! The first pass sees the box with its surroundings, finds the object's pixels and centres the crop on them. The second
 //! sees the crop without background, once for every outlier threshold, all in one batch. The candidate with most inliers
-//! wins; the others stay as hypotheses.
+//! wins; the others stay as hypotheses. [`Pix2PoseOptions::published`] is the dissertation's form.
 
 use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
@@ -22,8 +22,17 @@ pub struct Pix2PoseOptions {
     pub two_stages: bool,
     /// Side of the crop over the longer side of the box.
     pub crop_factor: f64,
-    /// Inlier threshold of PnP in pixels of the network's output; at least 1.5 image pixels are allowed.
-    pub reprojection: f64,
+    /// Expected error below which a pixel of the second pass is a correspondence, the dissertation's theta_i; `None`: the
+    /// outlier threshold of the pass, at least 0.3.
+    pub inlier_threshold: Option<f32>,
+    /// Reprojection error below which PnP takes a correspondence for an inlier, the dissertation's theta_re.
+    pub reprojection: Reprojection,
+    /// What turns a sample of correspondences into poses.
+    pub solver: PnpSolver,
+    /// What the second crop is centred on.
+    pub recentring: Recentring,
+    /// Whether the second crop with its background is a candidate beside those without.
+    pub open_candidate: bool,
     /// Seed of RANSAC.
     pub seed: u64,
     /// The author's bugs, one by one.
@@ -36,14 +45,49 @@ impl Default for Pix2PoseOptions {
             thresholds: Vec::new(),
             two_stages: true,
             crop_factor: 1.5,
-            reprojection: 1.5,
+            inlier_threshold: None,
+            reprojection: Reprojection::NetworkPixels(1.5),
+            solver: PnpSolver::Ap3p,
+            recentring: Recentring::Box,
+            open_candidate: true,
             seed: 0,
             quirks: Quirks::default(),
         }
     }
 }
 
+/// Unit of the reprojection error's threshold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Reprojection {
+    /// Pixels of the network's output; at least 1.5 image pixels are allowed.
+    NetworkPixels(f64),
+    /// Pixels of the image.
+    ImagePixels(f64),
+}
+
+/// What the second crop is centred on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Recentring {
+    /// The box of the object's pixels, uncertain ones included; the crop shrinks with it.
+    Box,
+    /// The centroid of the mask of the pass' own outlier threshold; the crop keeps its size.
+    Centroid,
+}
+
 impl Pix2PoseOptions {
+    /// The dissertation's two stages (sections 3.3.1 and 3.3.2) with its standard parameters (section 3.4.1): theta_i = 0.1,
+    /// theta_re = 3 pixels, EPnP in RANSAC, the crop centred on the mask's centroid and without background.
+    pub fn published() -> Self {
+        Self {
+            inlier_threshold: Some(0.1),
+            reprojection: Reprojection::ImagePixels(3.0),
+            solver: PnpSolver::Epnp,
+            recentring: Recentring::Centroid,
+            open_candidate: false,
+            ..Self::default()
+        }
+    }
+
     /// Checks every field.
     ///
     /// # Errors
@@ -55,7 +99,13 @@ impl Pix2PoseOptions {
             }
         }
         OptionError::unless_positive("crop_factor", self.crop_factor, "a finite number above 0")?;
-        OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")
+        if let Some(threshold) = self.inlier_threshold
+            && (threshold.is_nan() || threshold <= 0.0)
+        {
+            return Err(OptionError::new("inlier_threshold", threshold, "a number above 0"));
+        }
+        let (Reprojection::NetworkPixels(pixels) | Reprojection::ImagePixels(pixels)) = self.reprojection;
+        OptionError::unless_positive("reprojection", pixels, "pixels above 0")
     }
 }
 
@@ -136,7 +186,8 @@ pub struct Found {
     pub hypotheses: Vec<ThresholdHypothesis>,
     /// What the network saw and said last, for the best hypothesis.
     pub view: View,
-    /// The same with the background left in: where the object's border is, a crop without background cannot tell.
+    /// The same with the background left in: where the object's border is, a crop without background cannot tell. Without
+    /// [`Pix2PoseOptions::open_candidate`] that of the last outlier threshold.
     pub open_view: View,
     /// The first pass: the box as it was given.
     pub first_view: View,
@@ -193,22 +244,32 @@ pub fn estimate(
         return Ok(context.best(vec![(thresholds[thresholds.len() / 2], crop, first)], open.clone(), open));
     }
     let first_view = view(&crop, &first);
+    let cut = |window: Window| Crop::cut(image, camera, window, model.sizes().input);
     // The crop follows the object's pixels; it does not grow.
-    let window = recentred(&window, &mask, first.side, options);
-    let scaled = Crop::cut(image, camera, window, model.sizes().input);
+    let scaled = cut(recentred(&window, &mask, first.side, options));
     let mut candidates: Vec<(f32, Crop)> = Vec::new();
     for &threshold in thresholds {
         let mask = object_mask(&first, threshold);
-        if mask.iter().filter(|m| **m).count() >= MIN_PIXELS {
-            let mask = grown(&mask, first.side);
-            candidates.push((threshold, scaled.without_background(&crop.window, &mask, first.side)));
+        if mask.iter().filter(|m| **m).count() < MIN_PIXELS {
+            continue;
         }
+        let closed = match options.recentring {
+            Recentring::Box => scaled.without_background(&crop.window, &grown(&mask, first.side), first.side),
+            Recentring::Centroid => cut(on_centroid(&crop.window, &mask, first.side)).without_background(
+                &crop.window,
+                &mask,
+                first.side,
+            ),
+        };
+        candidates.push((threshold, closed));
     }
     if candidates.is_empty() {
         return Ok(None);
     }
-    // The last of the batch keeps its background; it is a candidate too.
-    candidates.push((thresholds.iter().copied().fold(0.0, f32::max), scaled));
+    if options.open_candidate {
+        // The last of the batch keeps its background; it is a candidate too.
+        candidates.push((thresholds.iter().copied().fold(0.0, f32::max), scaled));
+    }
     let batch: Vec<f32> = candidates.iter().flat_map(|(_, crop)| crop.pixels.iter().copied()).collect();
     let predictions = model.predict(index, &batch);
     let views: Vec<(f32, Crop, Prediction)> =
@@ -282,6 +343,17 @@ fn recentred(window: &Window, mask: &[bool], side: usize, options: &Pix2PoseOpti
     let longest = (high - low).max() + 1.0;
     let new_side = (longest * step * options.crop_factor).clamp(0.6 * window.side, window.side);
     Window { centre: window.centre + shift * step, side: new_side }
+}
+
+/// The window moved to the centroid of the object's pixels (section 3.3.1); its size stays.
+fn on_centroid(window: &Window, mask: &[bool], side: usize) -> Window {
+    let (mut sum, mut count) = (Vec2::zeros(), 0usize);
+    for index in (0..mask.len()).filter(|i| mask[*i]) {
+        sum += Vec2::new((index % side) as f64, (index / side) as f64);
+        count += 1;
+    }
+    let shift = sum / count.max(1) as f64 - Vec2::repeat(0.5 * (side as f64 - 1.0));
+    Window { centre: window.centre + shift * (window.side / side as f64), side: window.side }
 }
 
 /// A square crop at the network's size.
@@ -390,7 +462,7 @@ impl Context<'_> {
         let step = crop.window.side / side as f64;
         let corner = crop.window.centre - Vec2::repeat(0.5 * crop.window.side);
         let scale = self.object.scale();
-        let mask = object_mask(prediction, threshold.max(0.3));
+        let mask = object_mask(prediction, self.options.inlier_threshold.unwrap_or(threshold.max(0.3)));
         let (mut object_points, mut image_points) = (Vec::new(), Vec::new());
         for index in (0..mask.len()).filter(|i| mask[*i]) {
             let mut n = prediction.coordinates[index];
@@ -415,9 +487,13 @@ impl Context<'_> {
             }
         } else {
             PnpOptions {
-                threshold_px: (self.options.reprojection * step).max(1.5),
+                threshold_px: match self.options.reprojection {
+                    Reprojection::NetworkPixels(pixels) => (pixels * step).max(1.5),
+                    Reprojection::ImagePixels(pixels) => pixels,
+                },
                 max_iterations: 1000,
                 seed: self.options.seed,
+                solver: self.options.solver,
                 ..PnpOptions::default()
             }
         };
@@ -439,3 +515,6 @@ impl Context<'_> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -15,7 +15,7 @@ use sixfold_mesh::Mesh;
 
 use crate::aligned::{AlignOptions, estimate_aligned};
 use crate::depth::align;
-use crate::estimate::{EstimateError, Found, View, estimate};
+use crate::estimate::{EstimateError, Found, Pix2PoseOptions, View, estimate};
 use crate::model::Pix2PoseModel;
 use crate::object::ObjectEntry;
 
@@ -54,6 +54,17 @@ impl Pix2PoseEstimator {
             icp: false,
             object_id: None,
         }
+    }
+
+    /// The same in the dissertation's form: its two stages with its parameters, one pass, no alignment of the outline.
+    pub fn published(self) -> Pix2PoseEstimator {
+        let options = AlignOptions {
+            estimate: Pix2PoseOptions::published(),
+            looks: 1,
+            correct: false,
+            ..AlignOptions::default()
+        };
+        Pix2PoseEstimator { options, refine: false, ..self }
     }
 
     /// What the model knows of an object; without an id, of its only one.

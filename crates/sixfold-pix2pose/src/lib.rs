@@ -5,7 +5,6 @@
 
 pub mod adversarial;
 pub mod aligned;
-mod critic;
 pub mod depth;
 pub mod estimate;
 pub mod estimator;
@@ -13,6 +12,7 @@ pub mod loss;
 pub mod model;
 pub mod networks;
 pub mod object;
+pub mod outlier_threshold;
 pub mod preset;
 pub mod recipe;
 pub mod refine;

@@ -31,8 +31,10 @@ impl OutputKind {
 /// Weights of the terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossOptions {
-    /// Weight of visible object pixels, beta of equation 3.1.
+    /// Weight of object pixels, beta of equation 3.1.
     pub beta: f32,
+    /// Whether hidden pixels of the object weigh beta too, as in equation 3.1; otherwise visible ones alone, as in the author's code.
+    pub whole_mask: bool,
     /// Weight of the error prediction relative to the reconstruction, `lambda_2 / lambda_1` of equation 3.5.
     pub error: f32,
     /// Weight of the visibility (compact network only).
@@ -43,8 +45,8 @@ impl LossOptions {
     /// The dissertation's weights; for the compact network a larger one for the error, which counts on the object only.
     pub fn of(kind: OutputKind) -> Self {
         match kind {
-            OutputKind::Paper => Self { beta: 3.0, error: 0.5, visibility: 0.0 },
-            OutputKind::Compact => Self { beta: 3.0, error: 2.0, visibility: 0.3 },
+            OutputKind::Paper => Self { beta: 3.0, whole_mask: false, error: 0.5, visibility: 0.0 },
+            OutputKind::Compact => Self { beta: 3.0, whole_mask: false, error: 2.0, visibility: 0.3 },
         }
     }
 }
@@ -126,7 +128,8 @@ struct Image<'a> {
 
 impl Image<'_> {
     fn weight(&self, pixel: usize) -> f32 {
-        if self.visible[pixel] > 0.5 {
+        let weighty = if self.options.whole_mask { self.object } else { self.visible };
+        if weighty[pixel] > 0.5 {
             return self.options.beta;
         }
         match self.kind {
@@ -305,6 +308,21 @@ mod tests {
         };
         assert!(value(&[IDENTITY, HALF_TURN]) < 1e-6);
         assert!(value(&[IDENTITY]) > 0.1);
+    }
+
+    #[test]
+    fn hidden_pixels_weigh_beta_in_equation_3_1() {
+        // Four pixels: visible, hidden, hidden, background; each with an error of its own, of which the hidden weigh 3 times.
+        let errors = [0.1, 0.2, 0.4, 0.8f32];
+        let raw: Vec<f32> = (0..16).map(|i| if i < 12 { errors[i % 4] } else { 0.0 }).collect();
+        let object = [1.0, 1.0, 1.0, 0.0];
+        let targets = Targets { coordinates: &[0.0; 12], object: &object, visible: &[1.0, 0.0, 0.0, 0.0] };
+        let value = |whole_mask| {
+            let options = LossOptions { whole_mask, ..LossOptions::of(OutputKind::Paper) };
+            loss(&raw, &targets, 4, &[IDENTITY], OutputKind::Paper, &options, 1.0).coordinates
+        };
+        assert!((value(true) - (3.0 * (0.1 + 0.2 + 0.4) + 0.8) / 4.0).abs() < 1e-6, "{}", value(true));
+        assert!((value(false) - (3.0 * 0.1 + 0.2 + 0.4 + 0.8) / 4.0).abs() < 1e-6, "{}", value(false));
     }
 
     #[test]

@@ -212,6 +212,16 @@ impl Pix2PoseModel {
                 object.correction = *correction;
             }
         }
+        self.describe_objects();
+    }
+
+    /// Sets the outlier thresholds of all its objects.
+    pub fn set_thresholds(&mut self, thresholds: &[f32]) {
+        self.objects.iter_mut().for_each(|object| object.thresholds = thresholds.to_vec());
+        self.describe_objects();
+    }
+
+    fn describe_objects(&mut self) {
         self.card.objects =
             self.objects.iter().map(|o| serde_json::to_value(o).unwrap_or_default()).collect();
     }

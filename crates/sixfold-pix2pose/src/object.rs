@@ -57,7 +57,7 @@ fn millimetres(sides: &[f64; 3]) -> String {
 }
 
 impl ObjectEntry {
-    /// The entry of an object with the thresholds of the BOP entries (section 3.4.4).
+    /// The entry of an object with the thresholds of the BOP entries (section 3.4.5).
     pub fn new(id: u32, info: &ModelInfo, scale: &BoundingBoxScale) -> Self {
         Self {
             id,
@@ -147,7 +147,7 @@ impl Correction {
     }
 }
 
-/// Outlier thresholds of the entries to the BOP challenge (section 3.4.4).
+/// Outlier thresholds of the entries to the BOP challenge (section 3.4.5).
 pub const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
 
 /// A symmetry as a map of normalised coordinates: `linear * n + offset`.

@@ -24,6 +24,7 @@ use crate::networks::{
     Compact, CompactConfig, PaperGenerator, PaperGeneratorConfig, ResNet50Generator, ResNet50GeneratorConfig,
 };
 use crate::object::{ObjectEntry, SymmetryMap, symmetry_deviation};
+use crate::outlier_threshold::choose;
 use crate::preset::Preset;
 use crate::samples::{SampleOptions, SampleSource};
 use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
@@ -60,7 +61,7 @@ impl Choice for NetworkKind {
                 "ImageNet encoder shared by all objects, a small decoder for each; trains on two cores"
             }
             NetworkKind::Paper => {
-                "The dissertation's generator with its discriminator, one object; asks for a GPU or patience"
+                "The dissertation's generator with its discriminator, one object; a step of 50 images takes about 20 s on two cores"
             }
             NetworkKind::ResNet50 => "The same with a ResNet-50 encoder, as in the entry to BOP 2020",
         }
@@ -107,6 +108,8 @@ pub struct Pix2PoseRecipe {
     /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as they
     /// are stated, the thresholds of its BOP entries.
     pub preset: Option<Preset>,
+    /// Samples, loss and choice of the outlier threshold as in the dissertation ([`Pix2PoseRecipe::published`]).
+    pub published: bool,
     /// Folder of photographs for backgrounds; procedural textures without.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
@@ -136,6 +139,7 @@ impl Default for Pix2PoseRecipe {
             transformer_loss: true,
             view_limits: false,
             preset: None,
+            published: false,
             backgrounds: None,
             seed: 0,
             command: String::new(),
@@ -159,6 +163,21 @@ pub struct Context {
 }
 
 impl Pix2PoseRecipe {
+    /// The dissertation's training (section 3.4.1): its generator and discriminator, 25,000 batches of 50 that imitate the first
+    /// and the second stage in turns, colours of table 3.2, photographs on random backgrounds partly hidden by them (table 3.3),
+    /// beta on the whole mask (equation 3.1), and an outlier threshold that is chosen on training images with artificial
+    /// occlusion, unless `preset` names it.
+    pub fn published() -> Self {
+        let samples = SampleOptions::published(1);
+        Pix2PoseRecipe {
+            network: NetworkKind::Paper,
+            render_share: samples.render_share,
+            rotation: samples.rotation,
+            published: true,
+            ..Pix2PoseRecipe::default()
+        }
+    }
+
     /// How the compact network is trained.
     pub fn compact_options(&self) -> Pix2PoseTrainingOptions {
         let default = Pix2PoseTrainingOptions::default();
@@ -181,6 +200,7 @@ impl Pix2PoseRecipe {
             learning_rate: self.learning_rate.unwrap_or(default.learning_rate),
             adversarial: self.adversarial.unwrap_or(default.adversarial),
             transformer_loss: self.transformer_loss && !self.view_limits,
+            whole_mask: self.published,
             seed: self.seed,
             ..default
         }
@@ -188,8 +208,12 @@ impl Pix2PoseRecipe {
 
     /// How samples are made.
     fn sample_options(&self, sizes: ImageSizes) -> SampleOptions {
-        let default = SampleOptions::default();
+        let default = match self.published {
+            true => SampleOptions::published(self.dissertation_options().batch as u64),
+            false => SampleOptions::default(),
+        };
         SampleOptions {
+            synchronised_masks: self.published && (self.convex_hull || self.preset == Some(Preset::Tless)),
             size: sizes.input,
             target_size: Some(sizes.output),
             render_share: self.render_share,
@@ -330,6 +354,9 @@ impl Recipe for Pix2PoseRecipe {
         OptionError::unless_samples("per_object", self.per_object.unwrap_or(1), 1, "1 or more")?;
         let expected = "1 or more, or weights to begin with, whose alignment is then measured again";
         OptionError::unless(self.steps != Some(0) || self.init.is_some(), "steps", 0, expected)?;
+        let fits = !self.published || self.network != NetworkKind::Compact;
+        let found = format!("published with the {} network", self.network.name());
+        OptionError::unless(fits, "preset", found, "network paper or resnet50 with it")?;
         let wrong = self.encoder.is_some() && self.network != NetworkKind::ResNet50;
         let found = format!("one for the {} network", self.network.name());
         OptionError::unless(!wrong, "encoder", found, "network resnet50; the others bring theirs along")?;
@@ -348,7 +375,7 @@ impl Recipe for Pix2PoseRecipe {
         #[rustfmt::skip]
         let Pix2PoseRecipe {
             network, encoder, render_share, near_photographs, rotation, size, init, mesh_colors, convex_hull, view_limits, preset,
-            backgrounds,
+            published, backgrounds,
             // In the training's options.
             steps: _, per_object: _, learning_rate: _, adversarial: _, frozen_stages: _, transformer_loss: _, seed: _,
             // Changes nothing.
@@ -369,6 +396,7 @@ impl Recipe for Pix2PoseRecipe {
             .with("convex_hull", *convex_hull)
             .with("view_limits", *view_limits)
             .with("preset", preset.map(Preset::name))
+            .with("published", *published)
             .with_contents(material.contents())
             .with_file("encoder", encoder.as_deref())?
             .with_file("init", init.as_deref())?
@@ -410,7 +438,8 @@ impl Recipe for Pix2PoseRecipe {
             objects.len(),
             real.len()
         ));
-        let objects = std::mem::take(objects);
+        // The published form makes further samples at the end.
+        let objects = if self.published { objects.clone() } else { std::mem::take(objects) };
         SampleSource::new(objects, real.clone(), backgrounds, self.sample_options(*sizes))
             .map(Some)
             .map_err(TrainError::method)
@@ -422,10 +451,18 @@ impl Recipe for Pix2PoseRecipe {
         Prepared { training, card, context }: Prepared<Pix2PoseTraining, Context>,
         session: &mut Session<'_>,
     ) -> Result<Option<()>, TrainError> {
-        let Context { real, entries, sizes, outlines, .. } = context;
+        let Context { objects, real, entries, sizes, outlines } = context;
         let mut model = match (&self.init, self.steps) {
             (Some(file), Some(0)) => Pix2PoseModel::load(file).map_err(TrainError::method)?.with_card(card),
-            _ => Pix2PoseModel::new(training.into_network(), entries, sizes, card),
+            _ => {
+                let mut model = Pix2PoseModel::new(training.into_network(), entries, sizes, card);
+                if self.published && self.preset.is_none() {
+                    let threshold = self.outlier_threshold(&model, objects, &real, sizes)?;
+                    session.note(&format!("outlier threshold, chosen on training images: {threshold}"));
+                    model.set_thresholds(&[threshold]);
+                }
+                model
+            }
         };
         let path = session.model();
         model.save(&path).map_err(TrainError::method)?;
@@ -441,6 +478,23 @@ impl Recipe for Pix2PoseRecipe {
         model.set_corrections(&corrections);
         model.save(&path).map_err(TrainError::method)?;
         Ok(Some(()))
+    }
+}
+
+impl Pix2PoseRecipe {
+    /// The outlier threshold of the one object, on images of the first stage that are all partly hidden.
+    fn outlier_threshold(
+        &self,
+        model: &Pix2PoseModel,
+        objects: Vec<TrainingObject>,
+        real: &[PosedImage],
+        sizes: ImageSizes,
+    ) -> Result<f32, TrainError> {
+        let backgrounds = backgrounds_with_images(self.backgrounds.as_deref(), real, &objects)
+            .map_err(TrainError::method)?;
+        let options = SampleOptions { second_stage_fraction: 0.0, ..self.sample_options(sizes) };
+        let source = SampleSource::new(objects, real.to_vec(), backgrounds, options);
+        Ok(choose(model, 0, &source.map_err(TrainError::method)?, self.seed.wrapping_add(1)))
     }
 }
 

@@ -1,6 +1,5 @@
 //! The training of the compact network: what a step is, and the samples that it learns from.
 
-use crate::critic::Critic;
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::network_input;
 use crate::networks::Compact;
@@ -9,6 +8,7 @@ use crate::samples::SampleSource;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::critic::Critic;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
 use sixfold_nn::train_error::TrainError;

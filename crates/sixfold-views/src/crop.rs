@@ -102,8 +102,8 @@ impl Crop {
                     }
                 }
                 if all {
-                    for c in 0..3 {
-                        patch.data[c * area + y * side + x] = sum[c] * weight;
+                    for (c, sum) in sum.into_iter().enumerate() {
+                        patch.data[c * area + y * side + x] = sum * weight;
                     }
                 }
             }

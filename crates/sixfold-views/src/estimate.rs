@@ -154,10 +154,8 @@ impl Views<'_> {
             self.templates.par_iter().map(|t| similarity(t, map, options.reach)).enumerate().collect();
         ranked.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         ranked.truncate(options.candidates);
-        let mut first: Vec<Hypothesis> = ranked
-            .par_iter()
-            .filter_map(|(i, _)| self.from_template(&self.templates[*i], map, &crop))
-            .collect();
+        let mut first: Vec<Hypothesis> =
+            ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], map, &crop)).collect();
         first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in first {
@@ -214,7 +212,7 @@ impl Views<'_> {
     }
 
     /// The pose that correspondences with a template give.
-    fn from_template(&self, template: &Template, map: &FeatureMap, crop: &Crop) -> Option<Hypothesis> {
+    fn pose_by(&self, template: &Template, map: &FeatureMap, crop: &Crop) -> Option<Hypothesis> {
         let matches = mutual_matches(template, map, self.options.match_reach);
         let (points, pixels): (Vec<Vec3>, Vec<Vec2>) = matches
             .iter()

@@ -19,7 +19,7 @@ use crate::training::{ViewsTraining, ViewsTrainingOptions};
 const PROCEDURAL_FRACTION: f32 = 0.2;
 
 /// How the network is trained.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct ViewsRecipe {
     /// Folder of photographs for textures, backgrounds and occluders; procedural textures only without.
     pub backgrounds: Option<PathBuf>,
@@ -27,12 +27,6 @@ pub struct ViewsRecipe {
     pub options: ViewsTrainingOptions,
     /// What was asked for, for the model's card.
     pub command: String,
-}
-
-impl Default for ViewsRecipe {
-    fn default() -> Self {
-        ViewsRecipe { backgrounds: None, options: ViewsTrainingOptions::default(), command: String::new() }
-    }
 }
 
 impl Recipe for ViewsRecipe {

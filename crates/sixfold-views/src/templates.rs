@@ -1,5 +1,8 @@
 //! Templates: an object rendered from all around, each view as features and the points of the object that they lie on.
 
+use std::f64::consts::TAU;
+
+use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::{Camera, KdTree, OptionError, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::{Mesh, simplify};
@@ -138,8 +141,8 @@ pub struct TemplateOptions {
     pub distance: f64,
 }
 
-/// On 86 targets of every ninth LM-O development frame 1500 templates of 192 pixels and 2160 of 224 gave AR_MSPD .666 and .676 instead
-/// of .642, ADD(-S) recall .209 and .233 instead of .302, in twice and four times the time.
+/// On 86 targets of every ninth LM-O development frame 1500 templates of 192 pixels gave AR_MSSD / AR_MSPD / ADD(-S) recall
+/// .424 / .666 / .209, these .447 / .642 / .302 in half the time.
 impl Default for TemplateOptions {
     fn default() -> Self {
         TemplateOptions { directions: 80, rotations: 12, side: 160, crop_factor: CROP_FACTOR, distance: 6.0 }
@@ -214,57 +217,59 @@ pub fn make_templates(
     extractor: &Extractor,
     options: &TemplateOptions,
 ) -> Result<Vec<Template>, ViewsError> {
-    let (low, high) = mesh.bounding_box();
-    let centre = (low + high) * 0.5;
-    let distance = options.distance * diameter;
-    // Wide enough for the whole object; only its box is taken from this image.
-    let wide = wide_camera();
-    let mut jobs = Vec::new();
-    for direction in directions(options.directions) {
-        for k in 0..options.rotations {
-            jobs.push((direction, std::f64::consts::TAU * k as f64 / options.rotations as f64));
-        }
-    }
-    use rayon::prelude::*;
-    let rendered: Vec<Option<(Pose, Camera, Vec<f32>, Vec<u16>, Vec<[f32; 3]>)>> = jobs
-        .par_iter()
-        .map_init(
-            || (VisibilityBuffer::new(&wide), None::<VisibilityBuffer>),
-            |(frame, close), (direction, roll)| {
-                let rotation = rotation_from(direction, *roll);
-                let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * centre);
-                let objects = [SceneObject { mesh, camera_from_object: pose }];
-                frame.render(&objects, &RenderOptions::default());
-                let bbox: Rect = frame.bounding_box()?;
-                let crop = Crop::of_box(&wide, &bbox, options.crop_factor, options.side)?;
-                let close = close.get_or_insert_with(|| VisibilityBuffer::new(&crop.camera));
-                close.set_camera(&crop.camera);
-                let pose = crop.to_crop(&pose);
-                let rendered = render(close, mesh, &pose, None);
-                let (cells, points) = cells_on_object(&rendered, options.side / CELL);
-                Some((pose, crop.camera, input_over_grey(&rendered), cells, points))
-            },
-        )
+    let rolls = (0..options.rotations).map(|k| TAU * k as f64 / options.rotations as f64);
+    let sides: Vec<UnitQuaternion<f64>> = directions(options.directions)
+        .iter()
+        .flat_map(|direction| rolls.clone().map(|roll| rotation_from(direction, roll)))
         .collect();
-    let mut templates = Vec::with_capacity(rendered.len());
-    for chunk in rendered.chunks(64) {
-        let chunk: Vec<_> = chunk.iter().flatten().collect();
-        let images: Vec<Vec<f32>> = chunk.iter().map(|r| r.2.clone()).collect();
-        let maps = extractor.features(&images, options.side)?;
-        for ((pose, camera, _, cells, points), map) in chunk.into_iter().zip(maps) {
-            templates.push(Template {
-                crop_from_object: *pose,
-                camera: *camera,
-                features: gathered(&map, cells),
-                cells: cells.clone(),
-                points: points.clone(),
-            });
+    let wide = wide_camera();
+    let mut templates = Vec::with_capacity(sides.len());
+    // Inputs are large: not all at once.
+    for chunk in sides.chunks(CHUNK) {
+        let rendered: Vec<(Template, Vec<f32>)> = chunk
+            .par_iter()
+            .map_init(
+                || (VisibilityBuffer::new(&wide), VisibilityBuffer::new(&wide)),
+                |frames, rotation| render_side(frames, mesh, rotation, diameter, options),
+            )
+            .flatten()
+            .collect();
+        let (mut made, inputs): (Vec<Template>, Vec<Vec<f32>>) = rendered.into_iter().unzip();
+        let maps = extractor.features(&inputs, options.side)?;
+        for (template, map) in made.iter_mut().zip(maps) {
+            template.features = gathered(&map, &template.cells);
         }
+        templates.append(&mut made);
     }
     if templates.iter().all(|t| t.cells.is_empty()) {
         return Err(ViewsError::Invisible { object: name.to_owned() });
     }
     Ok(templates)
+}
+
+/// Templates that are rendered before their features are computed.
+const CHUNK: usize = 64;
+
+/// A template without features, and the network's input for these; `None` for a side from which nothing is seen.
+fn render_side(
+    (wide, close): &mut (VisibilityBuffer, VisibilityBuffer),
+    mesh: &Mesh,
+    rotation: &UnitQuaternion<f64>,
+    diameter: f64,
+    options: &TemplateOptions,
+) -> Option<(Template, Vec<f32>)> {
+    let (low, high) = mesh.bounding_box();
+    let away = Vec3::new(0.0, 0.0, options.distance * diameter);
+    let pose = Pose::new(*rotation, away - rotation * ((low + high) * 0.5));
+    wide.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
+    let bbox: Rect = wide.bounding_box()?;
+    let crop = Crop::of_box(wide.camera(), &bbox, options.crop_factor, options.side)?;
+    close.set_camera(&crop.camera);
+    let crop_from_object = crop.to_crop(&pose);
+    let rendered = render(close, mesh, &crop_from_object, None);
+    let (cells, points) = cells_on_object(&rendered, options.side / CELL);
+    let input = input_over_grey(&rendered);
+    Some((Template { crop_from_object, camera: crop.camera, cells, features: vec![], points }, input))
 }
 
 /// The features of some cells.

@@ -60,7 +60,7 @@ impl ViewsTrainingOptions {
         OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
         let temperature = self.temperature;
         OptionError::unless(
-            temperature.is_finite() && temperature >= 0.01 && temperature <= 10.0,
+            (0.01..=10.0).contains(&temperature),
             "temperature",
             temperature,
             "a number from 0.01 to 10",

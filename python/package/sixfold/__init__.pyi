@@ -871,7 +871,7 @@ def train_pix2pose(
     convex_hull: bool = False,
     transformer_loss: bool = True,
     view_limits: bool = False,
-    preset: Literal["bop", "linemod", "lmo", "tless"] | None = None,
+    preset: Literal["published", "bop", "linemod", "lmo", "tless"] | None = None,
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...

@@ -16,6 +16,7 @@ use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
+use sixfold_shell::ranges::in_range;
 
 #[derive(Debug, Args)]
 pub(crate) struct EvalArguments {
@@ -52,6 +53,10 @@ pub(crate) struct EvalArguments {
     /// Leave out VSD, which renders every pose
     #[arg(long)]
     pub no_vsd: bool,
+    /// VSD's tolerance of depth in visibility, millimetres (default: as in the BOP Challenge, 5 for a dataset folder named itodd, 15
+    /// for all others)
+    #[arg(long, value_name = "MM", conflicts_with_all = ["no_vsd", "detections"])]
+    pub vsd_delta: Option<f64>,
     /// Plot of the recall curves
     #[arg(long, value_name = "FILE.png")]
     pub curves: Option<PathBuf>,
@@ -63,6 +68,19 @@ pub(crate) struct EvalArguments {
 fn score(text: &str) -> Result<f64, String> {
     let score: f64 = text.parse().map_err(|error| format!("{error}"))?;
     if (0.0..=1.0).contains(&score) { Ok(score) } else { Err(format!("found {score}, expected 0 to 1")) }
+}
+
+/// The delta of ITODD in the BOP Challenge, metres; of all others it is that of [`EvalOptions`].
+const ITODD: (&str, f64) = ("itodd", 0.005);
+
+/// VSD's delta in metres.
+fn vsd_delta(a: &EvalArguments) -> Result<f64> {
+    if let Some(millimetres) = a.vsd_delta {
+        in_range("--vsd-delta", millimetres, 0.0..=1000.0)?;
+        return Ok(1e-3 * millimetres);
+    }
+    let itodd = a.dataset.file_name().is_some_and(|name| name.eq_ignore_ascii_case(ITODD.0));
+    Ok(if itodd { ITODD.1 } else { EvalOptions::default().vsd.delta })
 }
 
 #[derive(Serialize)]
@@ -94,7 +112,8 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
     let mut targets = dataset.targets(a.targets.as_deref())?;
     let left_out = excepted(&dataset, a.except.as_deref())?;
     targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
-    let options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::default() };
+    let mut options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::default() };
+    options.vsd.delta = vsd_delta(a)?;
     let progress = std::sync::Mutex::new(None);
     let localisation = evaluate(&dataset, &estimates, &targets, &options, &|p| {
         if let Ok(mut bar) = progress.lock() {

@@ -27,6 +27,37 @@ fn ground_truth_scores_one() {
 }
 
 #[test]
+fn itodd_has_a_delta_of_its_own() {
+    let tiny = Tiny::new(true);
+    let dir = tiny.path();
+    // Poses 12 mm behind the truth: what of them is visible depends on whether the delta is 5 or 15 mm.
+    tiny.write_truth_as_results("results.csv");
+    let text = std::fs::read_to_string(dir.join("results.csv")).unwrap();
+    let moved = |line: &str| {
+        let mut fields: Vec<String> = line.split(',').map(str::to_owned).collect();
+        let mut t: Vec<f64> = fields[5].split(' ').map(|v| v.parse().unwrap()).collect();
+        t[2] += 12.0;
+        fields[5] = t.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        fields.join(",")
+    };
+    let (head, rows) = text.split_once('\n').unwrap();
+    let rows: Vec<String> = rows.lines().map(moved).collect();
+    std::fs::write(dir.join("results.csv"), format!("{head}\n{}\n", rows.join("\n"))).unwrap();
+    let vsd = |arguments: &str| {
+        let json = sixfold(dir, &format!("{arguments} --json")).expect(0).json();
+        json["ar_vsd"].as_f64().unwrap()
+    };
+    let (default, five) = (vsd(ARGUMENTS), vsd(&format!("{ARGUMENTS} --vsd-delta 5")));
+    assert_eq!(default, vsd(&format!("{ARGUMENTS} --vsd-delta 15")));
+    assert!((five - default).abs() > 1e-3, "{five} {default}");
+    std::fs::rename(dir.join("tiny"), dir.join("itodd")).unwrap();
+    let itodd = ARGUMENTS.replace("tiny", "itodd");
+    assert_eq!(vsd(&itodd), five);
+    assert_eq!(vsd(&format!("{itodd} --vsd-delta 15")), default);
+    fails(dir, &format!("{itodd} --vsd-delta 5000"), &["--vsd-delta", "5000"]);
+}
+
+#[test]
 fn what_cannot_be_computed_is_null_with_a_reason() {
     let tiny = Tiny::new(false);
     tiny.write_truth_as_results("results.csv");

@@ -19,6 +19,10 @@ mod objects;
 #[cfg(feature = "networks")]
 mod pix2pose;
 mod printing;
+#[cfg(feature = "networks")]
+mod published;
+#[cfg(feature = "networks")]
+mod shipped;
 mod simulate;
 #[cfg(feature = "physics")]
 mod simulate_scenes;

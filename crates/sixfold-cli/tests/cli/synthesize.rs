@@ -120,13 +120,24 @@ fn disturbed_poses_come_back() {
         serde_json::from_slice(&std::fs::read(tiny.path().join("new/poses.json")).unwrap()).unwrap();
     let list = poses["photographs"].as_array().unwrap();
     assert_eq!(list.len(), 3);
+    let (mut before, mut after) = (vec![], vec![]);
     for entry in list {
         let given = pose_of(&entry["given"]);
         let truth = tiny.truth_of(entry["frame"][1].as_u64().unwrap() as u32, 1);
         assert!(given.distance_to(&truth) > 1e-4);
         assert!(pose_of(&entry["undisturbed"]).distance_to(&truth) < 1e-6);
         assert!(entry["moved_mm"].as_f64().unwrap() > 0.0);
+        // Across the optical axis, where an image says most.
+        let across = |pose: &sixfold_geometry::Pose| {
+            let off = pose.translation() - truth.translation();
+            off.x.hypot(off.y)
+        };
+        before.push(across(&given));
+        after.push(across(&pose_of(&entry["camera_from_object"])));
     }
+    let mean = |all: &[f64]| all.iter().sum::<f64>() / all.len() as f64;
+    println!("{before:.5?} {after:.5?}");
+    assert!(mean(&after) < 0.5 * mean(&before), "{before:.5?} {after:.5?}");
     let same = sixfold(tiny.path(), &format!("{} --ids 1 --no-refine --json", few("as-they-are"))).expect(0);
     assert_eq!(same.json()["refined"], false);
 }

@@ -25,6 +25,8 @@ pub struct ExperienceAlignmentOptions {
     pub icp_distance: f64,
     /// ICP may turn the alignment by this, radians.
     pub icp_angle: f64,
+    /// Align normalised coordinates alone (equation 6.5); otherwise also metres, and the object's own VD-NOC.
+    pub only_scaled: bool,
 }
 
 impl Default for ExperienceAlignmentOptions {
@@ -35,6 +37,7 @@ impl Default for ExperienceAlignmentOptions {
             max_residual: 0.3,
             icp_distance: 0.03,
             icp_angle: 25f64.to_radians(),
+            only_scaled: false,
         }
     }
 }
@@ -116,9 +119,9 @@ pub fn transfer(
     let anchors: Vec<Vec3> = wanted.iter().step_by(stride).map(|&i| noc(&experience.vd_noc[i])).collect();
     let experience_points: Vec<Vec3> = wanted.iter().map(|&i| experience.point(i)).collect();
     let mut found: Vec<Transferred> = vec![];
-    for hypothesis in
-        [AlignmentHypothesis::Scaled, AlignmentHypothesis::Turned, AlignmentHypothesis::SameSide]
-    {
+    let hypotheses =
+        [AlignmentHypothesis::Scaled, AlignmentHypothesis::Turned, AlignmentHypothesis::SameSide];
+    for hypothesis in hypotheses.into_iter().take(if options.only_scaled { 1 } else { hypotheses.len() }) {
         let own = hypothesis == AlignmentHypothesis::SameSide;
         let coordinates = if own { &input.vd_noc } else { coordinates };
         let here = pixels_near(input, coordinates, &anchors, options.threshold);

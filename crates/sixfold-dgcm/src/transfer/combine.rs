@@ -5,7 +5,8 @@
 //! are candidates as well, judged by the same numbers; and what came of earlier attempts says how much each number counts
 //! ([`crate::outcome`]).
 
-use sixfold_geometry::Pose;
+use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 
 use super::{Proposal, Proposals};
@@ -69,9 +70,75 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
     chosen
 }
 
-/// Ranks the planner's grasps as the dissertation does (section 6.3.2): by the mean of quality and agreement, and nothing
-/// but experience's own proposals is left out. For comparison: where all of the planner's grasps are bad, so is the best.
+/// Ranks experience's grasps as the dissertation does for its network alone (section 6.3.2): those within 5 cm and 15 degrees
+/// of the best one left are a cluster, whose grasp is their mean pose and whose score is the sum of equation 6.6.
+pub fn rank_experience_as_published(experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
+    let mut left: Vec<usize> = (0..experience.len()).collect();
+    left.sort_by(|&a, &b| experience[b].score.total_cmp(&experience[a].score).then(a.cmp(&b)));
+    let mut ranked: Vec<Ranked> = vec![];
+    while let Some(&seed) = left.first() {
+        let best = &experience[seed].grasp;
+        let (members, others): (Vec<usize>, Vec<usize>) =
+            left.iter().partition(|&&i| i == seed || near(best, &experience[i].grasp, clusters));
+        let score = members.iter().map(|&i| experience[i].score).sum();
+        let poses: Vec<Pose> = members.iter().map(|&i| experience[i].grasp.camera_from_gripper).collect();
+        ranked.push(Ranked {
+            grasp: Grasp { camera_from_gripper: mean_pose(&poses), ..*best },
+            kind: Kind::Experience,
+            score,
+            geometry: best.quality.total(),
+            experience: score,
+            proposal: Some(seed),
+            members: members.len(),
+        });
+        left = others;
+    }
+    ranked.sort_by(|a, b| b.score.total_cmp(&a.score));
+    ranked
+}
+
+/// The mean of poses that are near to one another, as grippers: the half turn of each that is nearer to the first.
+fn mean_pose(poses: &[Pose]) -> Pose {
+    let half_turn = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
+    let (mut translation, mut rotation) = (Vec3::zeros(), Quaternion::from_parts(0.0, Vec3::zeros()));
+    let first = poses.first().copied().unwrap_or_else(Pose::identity);
+    for pose in poses {
+        let turned = *pose * half_turn;
+        let nearer =
+            if turned.rotation_angle_to(&first) < pose.rotation_angle_to(&first) { turned } else { *pose };
+        let q = nearer.rotation().into_inner();
+        let sign = if q.dot(&first.rotation().into_inner()) < 0.0 { -1.0 } else { 1.0 };
+        rotation += q * sign;
+        translation += pose.translation();
+    }
+    Pose::new(UnitQuaternion::new_normalize(rotation), translation / poses.len().max(1) as f64)
+}
+
+/// Ranks the planner's grasps as the dissertation does with its network ("GPD + DGCM-Net", section 6.3.2): the mean of the
+/// planner's score, brought to 0..1, and of the experience's score, which is the average of equation 6.6 over the proposals within
+/// 5 cm and 15 degrees, 0 where there are none.
 pub fn rank_as_published(
+    geometry: &[Grasp],
+    experience: &[Proposal],
+    clusters: &ClusterOptions,
+) -> Vec<Ranked> {
+    let mut candidates = candidates(geometry, experience, clusters);
+    candidates.retain(|c| c.kind == Kind::Geometry);
+    let qualities = || geometry.iter().map(|g| g.quality.total());
+    let (low, high) = (qualities().fold(f64::INFINITY, f64::min), qualities().fold(0.0, f64::max));
+    for c in &mut candidates {
+        let range = high - low;
+        c.geometry = if range > 0.0 { (c.grasp.quality.total() - low) / range } else { 1.0 };
+        let agreeing = || experience.iter().filter(|p| near(&c.grasp, &p.grasp, clusters)).map(|p| p.score);
+        c.experience = agreeing().sum::<f64>() / agreeing().count().max(1) as f64;
+        c.score = 0.5 * (c.geometry + c.experience);
+    }
+    joined(candidates, clusters).0
+}
+
+/// Ranks the planner's grasps by the mean of quality over the best one's and of the fraction of experience that agrees; nothing
+/// but experience's own proposals is left out. For comparison: where all of the planner's grasps are bad, so is the best.
+pub fn rank_by_agreement(
     geometry: &[Grasp],
     experience: &[Proposal],
     clusters: &ClusterOptions,
@@ -218,7 +285,7 @@ mod tests {
     use super::*;
     use crate::transfer::AlignmentHypothesis;
     use sixfold_experience::{Attempt, Crop, CropOptions, Match};
-    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
+    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud};
     use sixfold_grasp::{
         AntipodalOptions, AntipodalQuality, GraspDescription, GraspView, Gripper, gripper_pose,
     };
@@ -367,11 +434,47 @@ mod tests {
     }
 
     #[test]
-    fn as_printed_only_the_planner_proposes() {
-        let geometry = [grasp(0.0, 0.5), grasp(0.3, 0.45)];
-        let found = [proposal(0.29, 0.6), proposal(-0.4, 0.9)];
-        let ranked = rank_as_published(&geometry, &found, &ClusterOptions::default());
+    fn as_published_the_planners_score_and_the_mean_of_the_near_experience_are_averaged() {
+        // Qualities 0.3 + 0.7 a: 0.3, 0.65 and 1, which become 0, 0.5 and 1.
+        let geometry = [grasp(0.0, 0.0), grasp(0.3, 0.5), grasp(-0.3, 1.0)];
+        // Two near to the second, whose mean counts, and one near to nothing.
+        let proposals = [proposal(0.29, 0.6), proposal(0.33, 0.9), proposal(0.1, 1.0)];
+        let ranked = rank_as_published(&geometry, &proposals, &ClusterOptions::default());
         assert!(ranked.iter().all(|r| r.kind == Kind::Geometry && r.proposal.is_none()));
-        assert!(ranked[0].grasp.camera_from_gripper.translation().x > 0.2, "experience agrees with it");
+        let found: Vec<[f64; 4]> = ranked
+            .iter()
+            .map(|r| [r.grasp.camera_from_gripper.translation().x, r.geometry, r.experience, r.score])
+            .collect();
+        let expected = [[0.3, 0.5, 0.75, 0.625], [-0.3, 1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0]];
+        for (found, expected) in found.iter().zip(&expected) {
+            for (a, b) in found.iter().zip(expected) {
+                assert!((a - b).abs() < 1e-9, "{found:?} {expected:?}");
+            }
+        }
+        // By the fraction of experience that agrees, 1.5 of 2.5, it is another number.
+        let agreed = rank_by_agreement(&geometry, &proposals, &ClusterOptions::default());
+        assert!((agreed[0].score - 0.5 * (0.65 + 0.6)).abs() < 1e-9, "{}", agreed[0].score);
+    }
+
+    #[test]
+    fn as_published_a_cluster_is_its_mean_pose_and_its_summed_score() {
+        let at = |x: f64, angle: f64, score: f64| {
+            let mut p = proposal(x, score);
+            p.grasp.camera_from_gripper =
+                Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, angle].into()).with_translation(Vec3::new(x, 0.0, 0.6));
+            p
+        };
+        let half = std::f64::consts::PI;
+        // The best one alone; three that mean the same, one of them half a turn on.
+        let found = [at(0.0, 0.1, 0.4), at(0.3, 0.0, 0.7), at(0.04, 0.3, 0.3), at(0.02, 0.2 + half, 0.5)];
+        let ranked = rank_experience_as_published(&found, &ClusterOptions::default());
+        assert_eq!(ranked.iter().map(|r| r.members).collect::<Vec<_>>(), [3, 1]);
+        assert!((ranked[0].score - 1.2).abs() < 1e-12 && (ranked[1].score - 0.7).abs() < 1e-12);
+        assert_eq!(ranked[0].proposal, Some(3), "its best member");
+        let mean = ranked[0].grasp.camera_from_gripper;
+        assert!((mean.translation() - Vec3::new(0.02, 0.0, 0.6)).norm() < 1e-9);
+        let expected = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.2 + half].into());
+        assert!(mean.rotation_angle_to(&expected) < 1e-6);
+        assert!(rank_experience_as_published(&[], &ClusterOptions::default()).is_empty());
     }
 }

@@ -6,7 +6,8 @@ use sixfold_grasp::{
 use thiserror::Error;
 
 use super::{
-    Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
+    Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_as_published, rank_by_outcome,
+    rank_experience_as_published, rank_on_part,
 };
 use crate::model::DgcmModel;
 
@@ -53,6 +54,32 @@ pub fn grasps_from_experience(
     let ranked = match part {
         None => rank_by_outcome(&geometry, &found.proposals, &clusters, &fitter, &outcomes),
         Some(_) => rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes),
+    };
+    Ok(RankedGrasps { found, ranked })
+}
+
+/// As [`grasps_from_experience`], in the dissertation's form (sections 6.2.3 and 6.3.2): the network's transfer alone, its clusters
+/// by their summed scores; or, `with_planner`, the planner's grasps, whose scores are averaged with those of experience nearby.
+///
+/// # Errors
+/// [`GraspsError`].
+pub fn grasps_as_published(
+    view: &GraspView,
+    gripper: &Gripper,
+    planner: &AntipodalOptions,
+    network: &DgcmModel,
+    memory: &mut Memory,
+    part: Option<&str>,
+    with_planner: bool,
+) -> Result<RankedGrasps, GraspsError> {
+    let options = ProposeOptions { part: part.map(str::to_owned), ..ProposeOptions::published() };
+    let fitter = GraspFitter::new(view, gripper, planner)?;
+    let found = propose(&fitter, network, memory, &options)?;
+    let clusters = ClusterOptions::default();
+    let ranked = if with_planner {
+        rank_as_published(&antipodal_grasps(view, gripper, planner)?, &found.proposals, &clusters)
+    } else {
+        rank_experience_as_published(&found.proposals, &clusters)
     };
     Ok(RankedGrasps { found, ranked })
 }

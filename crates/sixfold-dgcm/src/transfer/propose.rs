@@ -40,6 +40,11 @@ pub struct ProposeOptions {
     pub neighbours: usize,
     /// How they are aligned.
     pub align: ExperienceAlignmentOptions,
+    /// Compare the shapes of upright objects too, beside what the network predicts.
+    pub shapes: bool,
+    /// How far the tips reach over the nearest point of the object's surface, metres: the dissertation's fixed distance, at which a
+    /// grasp is taken as it was transferred. `None`: as far as in the experience, at the nearest place where the gripper is free.
+    pub reach: Option<f64>,
     /// Only experiences on parts of this name.
     pub part: Option<String>,
     /// Only the experiences with these numbers.
@@ -53,6 +58,8 @@ impl Default for ProposeOptions {
         ProposeOptions {
             neighbours: 10,
             align: ExperienceAlignmentOptions::default(),
+            shapes: true,
+            reach: None,
             part: None,
             only: None,
             without_object: None,
@@ -60,13 +67,28 @@ impl Default for ProposeOptions {
     }
 }
 
+/// [`ProposeOptions::reach`] of the published form. The dissertation does not say how far; chosen by hand, not swept.
+const PUBLISHED_REACH: f64 = 0.02;
+
 impl ProposeOptions {
+    /// The network alone (section 6.2.3): ten neighbours, theta_c = 0.3, the rotation of equation 6.5, the translation by extents,
+    /// ICP, and the gripper at a fixed distance from the surface. What would hit something is left out.
+    pub fn published() -> ProposeOptions {
+        ProposeOptions {
+            align: ExperienceAlignmentOptions { only_scaled: true, ..ExperienceAlignmentOptions::default() },
+            shapes: false,
+            reach: Some(PUBLISHED_REACH),
+            ..ProposeOptions::default()
+        }
+    }
+
     /// Checks every field, also those of the alignment.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         OptionError::unless_some("neighbours", self.neighbours)?;
+        OptionError::unless_weight("reach", self.reach.unwrap_or(0.0))?;
         self.align.check()
     }
 }
@@ -230,7 +252,11 @@ pub fn propose(
                 .iter()
                 .filter_map(|t| {
                     let source = Source { copy, grasp: &turned_grasp, opening: e.opening, width: e.width };
-                    place(fitter, gripper, &source, t).map(|(grasp, moved, firm)| Proposal {
+                    let placed = match options.reach {
+                        None => place(fitter, gripper, &source, t),
+                        Some(reach) => at_distance(fitter, &source, t, reach).map(|g| (g, 0.0, false)),
+                    };
+                    placed.map(|(grasp, moved, firm)| Proposal {
                         grasp,
                         score: (-from.distance).exp(),
                         from: *from,
@@ -244,7 +270,9 @@ pub fn propose(
         .collect();
     let proposals: Vec<Proposal> = found.into_iter().flatten().collect();
     let mut found = Proposals { nearest, crop, proposals, held_before, middles: vec![] };
-    found.add_shapes(fitter, memory, &in_shapes[..in_shapes.len().min(IN_SHAPES)])?;
+    if options.shapes {
+        found.add_shapes(fitter, memory, &in_shapes[..in_shapes.len().min(IN_SHAPES)])?;
+    }
     Ok(found)
 }
 
@@ -318,6 +346,15 @@ pub(super) fn place(
         }
     }
     best.map(|(_, grasp, moved)| (grasp, moved, true)).or(loose.map(|(grasp, moved)| (grasp, moved, false)))
+}
+
+/// The transferred grasp, moved along its approach until its tips reach so far over the object's surface (section 6.2.3); `None`
+/// where nothing is between its pads there, or the gripper hits something.
+fn at_distance(fitter: &GraspFitter<'_>, source: &Source<'_>, t: &Transferred, reach: f64) -> Option<Grasp> {
+    let pose = t.camera_from_experience * *source.grasp;
+    let opening = fitter.gripper().max_opening;
+    let surface = fitter.reach(&pose, opening)?;
+    fitter.accept(&(pose * Pose::from_translation(Vec3::z() * (surface + reach))), opening)
 }
 
 /// Contacts that are this many times as far apart as in the experience, or as little, are on another part.

@@ -1,7 +1,8 @@
 //! `sixfold grasp compare`: geometry, experience and both, on the same simulated scenes (table 6.2).
 //!
-//! Five ways to choose the grasp: the planner alone; experience alone (equation 6.6); the two as the dissertation joins them
-//! (section 6.3.2); the planner's grasps by what came of earlier attempts; and the grasps of both kinds by that.
+//! Seven ways to choose the grasp: the planner alone; experience alone (equation 6.6); the network alone and joined with the planner,
+//! both as published (section 6.3.2); the planner's grasps by quality and by the fraction of experience that agrees; the planner's
+//! grasps by what came of earlier attempts; and the grasps of both kinds by that.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -11,7 +12,8 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{
-    Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_outcome,
+    Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_agreement, rank_by_outcome,
+    rank_experience_as_published,
 };
 use sixfold_experience::StorePlace;
 use sixfold_grasp::{
@@ -36,7 +38,8 @@ use sixfold_shell::ranges::in_range;
 /// Images of this many scenes of each object are kept.
 const PICTURES: u64 = 2;
 /// The methods, in the order of the table.
-pub(crate) const METHODS: [&str; 5] = ["geometry", "experience", "printed", "outcomes", "both"];
+pub(crate) const METHODS: [&str; 7] =
+    ["geometry", "experience", "network", "published", "agreement", "outcomes", "both"];
 
 #[derive(Debug, Args)]
 pub(crate) struct CompareArguments {
@@ -103,6 +106,7 @@ struct Recorded<'a> {
     network: String,
     experiences: usize,
     outcomes: usize,
+    methods: [&'a str; METHODS.len()],
     gripper: &'a Gripper,
     mass: f64,
 }
@@ -168,6 +172,7 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         network: network.fingerprint(),
         experiences: memory.len(),
         outcomes: memory.outcomes(&gripper.name).attempts,
+        methods: METHODS,
         gripper: real,
         mass: options.trial.mass,
     };
@@ -256,6 +261,9 @@ impl Scenes<'_> {
         let of_fitter = began.elapsed().as_secs_f64();
         let found = propose(&fitter, self.network, memory, &ProposeOptions::default())?;
         let of_experience = began.elapsed().as_secs_f64();
+        let began = Instant::now();
+        let alone = propose(&fitter, self.network, memory, &ProposeOptions::published())?;
+        let of_network = of_fitter + began.elapsed().as_secs_f64();
         let clusters = ClusterOptions::default();
         let began = Instant::now();
         let outcomes = memory.outcomes(&self.gripper.name);
@@ -265,13 +273,17 @@ impl Scenes<'_> {
         let ranked = [
             rank(&geometry, &[], &clusters),
             rank(&[], &found.proposals, &clusters),
-            rank_as_published(&geometry, &found.proposals, &clusters),
+            rank_experience_as_published(&alone.proposals, &clusters),
+            rank_as_published(&geometry, &alone.proposals, &clusters),
+            rank_by_agreement(&geometry, &found.proposals, &clusters),
             by_outcome(&[]),
             both,
         ];
         let seconds = [
             of_geometry,
             of_experience,
+            of_network,
+            of_geometry + of_network,
             of_geometry + of_experience,
             of_geometry + of_fitter + of_outcomes,
             of_geometry + of_experience + of_outcomes,

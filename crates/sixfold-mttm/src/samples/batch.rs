@@ -6,6 +6,7 @@ use sixfold_geometry::random::stream;
 
 use super::anchor::{Anchor, SeenPatch};
 use super::pool::Pool;
+use crate::loss::GAMMA;
 use crate::network::MAP;
 use crate::patch::PLANES;
 
@@ -37,14 +38,27 @@ pub struct PairBatchOptions {
     pub anchors: usize,
     /// Regions without one.
     pub without_object: usize,
+    /// Fraction of the regions whose negative template is one of another object (dissertation: half); the others have one of the
+    /// same object.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub other_objects: f64,
     /// How regions are changed.
     pub augmentation: Augmentation,
 }
 
 impl Default for PairBatchOptions {
     fn default() -> Self {
-        PairBatchOptions { anchors: 40, without_object: 8, augmentation: Augmentation::default() }
+        PairBatchOptions {
+            anchors: 40,
+            without_object: 8,
+            other_objects: 0.0,
+            augmentation: Augmentation::default(),
+        }
     }
+}
+
+fn is_zero(fraction: &f64) -> bool {
+    *fraction == 0.0
 }
 
 /// Numbers of tensors: regions with an object first, then those without.
@@ -66,8 +80,9 @@ pub struct Batch {
     pub rotations: Vec<f32>,
     /// Where the positive template's reference point lies.
     pub offsets: Vec<f32>,
-    /// Pose distances (equation 5.2) of the negative templates, 0 where there is none.
-    pub distances: Vec<f32>,
+    /// Margins of the negative templates (equation 5.4): twice the pose distance for one of the same object, gamma for one of another;
+    /// 0 where there is none.
+    pub margins: Vec<f32>,
     /// Numbers of the objects.
     pub objects: Vec<usize>,
 }
@@ -92,7 +107,26 @@ impl Batch {
                 }
             }
         }
+        if options.other_objects > 0.0 {
+            batch.take_others(options.other_objects, side, &mut random);
+        }
         batch
+    }
+
+    /// Gives a fraction of the regions a positive template of another object in the batch as their negative one.
+    fn take_others(&mut self, fraction: f64, side: usize, random: &mut impl Rng) {
+        let (patch, cells, count) = (PLANES * side * side, MAP * MAP, self.objects.len());
+        for k in 0..count {
+            let others: Vec<usize> = (0..count).filter(|&j| self.objects[j] != self.objects[k]).collect();
+            if others.is_empty() || !random.random_bool(fraction) {
+                continue;
+            }
+            let j = others[random.random_range(0..others.len())];
+            self.negatives[k * patch..][..patch].copy_from_slice(&self.positives[j * patch..][..patch]);
+            self.negative_masks[k * cells..][..cells]
+                .copy_from_slice(&self.positive_masks[j * cells..][..cells]);
+            self.margins[k] = GAMMA as f32;
+        }
     }
 
     fn add(&mut self, anchor: &Anchor, side: usize, how: &Augmentation, random: &mut impl Rng) {
@@ -115,12 +149,12 @@ impl Batch {
                 let (patch, mask) = change.template(&negative.patch);
                 self.negatives.extend(patch);
                 self.negative_masks.extend(to_cells(&mask, side));
-                self.distances.push(negative.distance);
+                self.margins.push(2.0 * negative.distance);
             }
             None => {
                 self.negatives.extend(std::iter::repeat_n(0.0, PLANES * side * side));
                 self.negative_masks.extend(std::iter::repeat_n(0.0, MAP * MAP));
-                self.distances.push(0.0);
+                self.margins.push(0.0);
             }
         }
         self.objects.push(anchor.object.unwrap_or(usize::MAX));

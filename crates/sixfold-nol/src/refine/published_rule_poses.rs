@@ -19,7 +19,7 @@ use crate::surface::outwards;
 /// Points of the surface by which sources are chosen.
 const POINTS: usize = 3000;
 
-/// New poses of photographs of one object by the published rule, in their order. The first rendering has `per_view` other
+/// New poses of photographs of one object by the published rule, in their order, with the rule's own error before and after. The first rendering has `per_view` other
 /// photographs beside the one that moves (dissertation: 6), in crops of `side` pixels (a multiple of 16). With a network it has
 /// colours (-1 to 1) and features; without one it is the mean colour of the photographs.
 ///
@@ -32,7 +32,7 @@ pub fn published_rule_poses(
     side: usize,
     per_view: usize,
     options: &PublishedRuleOptions,
-) -> Result<Vec<Pose>, NolError> {
+) -> Result<Vec<(Pose, [f64; 2])>, NolError> {
     let views: Vec<SourceView> =
         photographs.iter().map(|p| SourceView::new(p, mesh, side)).collect::<Result<_, _>>()?;
     let features: Vec<SourceFeatures> = model.map_or(vec![], |model| model.encode(&views));
@@ -61,7 +61,7 @@ pub fn published_rule_poses(
                 None => average(&target, &chosen, &views, &maps),
             };
             let mut view = views[k].clone();
-            published_rule(&mut view, &maps[k], mesh, &target, &rendered, &known, options).0
+            published_rule(&mut view, &maps[k], mesh, &target, &rendered, &known, options)
         })
         .collect())
 }

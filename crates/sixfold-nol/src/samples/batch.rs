@@ -76,7 +76,10 @@ fn colour(patch: &Patch, [x, y]: [f32; 2]) -> [f32; COLOURS] {
 pub struct ViewBatchOptions {
     /// Sides of the crops, pixels; a step has one of them.
     pub sides: Vec<usize>,
-    /// Most sources of a sample; a step has from 1 to this many, each as likely.
+    /// Fewest sources of a sample.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub min_sources: usize,
+    /// Most sources of a sample; a step has from `min_sources` to this many, each as likely.
     #[serde(rename = "most_sources")]
     pub max_sources: usize,
     /// Sources in a step at the smallest side; fewer at a larger one.
@@ -86,9 +89,19 @@ pub struct ViewBatchOptions {
     pub max_samples: usize,
 }
 
+fn one() -> usize {
+    1
+}
+
+fn is_one(number: &usize) -> bool {
+    *number == 1
+}
+
 /// Some samples as the numbers of tensors; `K` sources, `B` samples, source by source.
 #[derive(Debug, Clone)]
 pub struct Batch {
+    /// Which step it is of; 0 where it is of none.
+    pub step: u64,
     /// Side of all crops, pixels.
     pub side: usize,
     /// `K`.
@@ -118,7 +131,8 @@ impl Batch {
     ) -> Batch {
         // Streams with odd numbers choose the batch, those with even ones make samples.
         let mut random = stream(seed, 2 * step + 1);
-        let sources = random.random_range(1..=options.max_sources.max(1));
+        let sources = random
+            .random_range(options.min_sources.max(1)..=options.max_sources.max(options.min_sources.max(1)));
         let side = options.sides[random.random_range(0..options.sides.len())];
         let smallest = options.sides.iter().copied().min().unwrap_or(side);
         let budget = options.sources as f64 * (smallest as f64 / side as f64).powi(2);
@@ -129,7 +143,7 @@ impl Batch {
                 make_sample(textures, samples, side, sources, seed, number)
             })
             .collect();
-        Batch::of_samples(&made)
+        Batch { step, ..Batch::of_samples(&made) }
     }
 
     /// Samples of one side and number of sources.
@@ -141,6 +155,7 @@ impl Batch {
         let (count, pixels) = (samples.len(), side * side);
         let all = sources * count;
         let mut batch = Batch {
+            step: 0,
             side,
             sources,
             samples: count,

@@ -1,4 +1,4 @@
-//! The dissertation's generator (section 3.3): an auto-encoder with skip connections from a colour image of 128 x 128 pixels
+//! The dissertation's generator (section 3.2.1): an auto-encoder with skip connections from a colour image of 128 x 128 pixels
 //! to object coordinates and expected error of every pixel, 25.7 million parameters.
 //!
 //! The authors' code has two parallel convolutions in each stage of the encoder and concatenates them; here they are one

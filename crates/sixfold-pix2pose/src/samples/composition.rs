@@ -112,6 +112,9 @@ impl Scenery<'_> {
 
     fn material(&self, random: &mut Random) -> Patch {
         let size = self.options.size;
+        if self.options.background_occluders {
+            return self.background(random);
+        }
         match random.random_range(0..10u32) {
             0..=1 => Patch::filled(size, size, std::array::from_fn(|_| random.random())),
             2..=4 => procedural_texture(size, size, random),

@@ -1,5 +1,7 @@
 //! What samples look like.
 
+use std::f32::consts::FRAC_PI_4;
+
 use super::error::SampleError;
 use rand::RngExt;
 use sixfold_data::{PoseVariation, image_color_augmentation};
@@ -37,6 +39,11 @@ pub struct SampleOptions {
     pub occlusion_probability: f32,
     /// Fraction of the visible object that occluders hide (table 3.3).
     pub occlusion: [f32; 2],
+    /// What occluders show: other parts of the background, as in the dissertation; otherwise also plain colours and textures.
+    pub background_occluders: bool,
+    /// Targets and silhouette of a photograph end where the photograph's own mask of the object ends: a CAD model or a hull
+    /// is larger than what is seen (section 3.4.4). For photographs of unoccluded objects.
+    pub synchronised_masks: bool,
     /// Probability that an occluder is an image of another object, where there are others.
     pub object_occluder_probability: f32,
     /// Most images of other objects pasted behind the object.
@@ -94,6 +101,8 @@ impl Default for SampleOptions {
             keep_background_probability: 0.5,
             occlusion_probability: 0.7,
             occlusion: [0.04, 0.5],
+            background_occluders: false,
+            synchronised_masks: false,
             object_occluder_probability: 0.5,
             clutter: 3,
             paste_gain: [0.8, 1.2],
@@ -117,6 +126,26 @@ impl Default for SampleOptions {
 }
 
 impl SampleOptions {
+    /// The dissertation's samples (section 3.4.1, tables 3.2 and 3.3): parts of photographs on random backgrounds, of each a
+    /// part replaced by the background, whole batches of `batch` alternately for the first and the second stage.
+    pub fn published(batch: u64) -> Self {
+        SampleOptions {
+            render_share: 0.0,
+            visible_box_probability: 0.0,
+            cut_probability: 0.0,
+            rotation: FRAC_PI_4,
+            keep_background_probability: 0.0,
+            occlusion_probability: 1.0,
+            object_occluder_probability: 0.0,
+            background_occluders: true,
+            clutter: 0,
+            paste_gain: [1.0, 1.0],
+            second_stage_block: Some(batch),
+            color: ColorAugmentation::table_3_2(),
+            ..SampleOptions::default()
+        }
+    }
+
     /// The side of coordinates and masks, pixels.
     pub fn target(&self) -> usize {
         self.target_size.unwrap_or(self.size)

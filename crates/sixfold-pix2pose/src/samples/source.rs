@@ -5,7 +5,7 @@ use super::error::SampleError;
 use super::options::SampleOptions;
 use super::second_stage;
 use super::symmetry::canonical;
-use super::targets::targets;
+use super::targets::{synchronise, targets};
 use super::window::{Extent, rotated_pixel, turned, window_around};
 use rand::RngExt;
 use sixfold_data::{
@@ -191,12 +191,15 @@ impl SampleSource {
         let (mut patch, inside) =
             Patch::warp(crop.image(), &map, options.size, options.size, [second_stage::GREY; 3]);
         let visible = crop.visible(&map, options.size);
-        let (coordinates, mask) = targets(
+        let (mut coordinates, mut mask) = targets(
             &object.drawn.mesh,
             &object.scale,
             &window.camera(camera, options.target()),
             &canonical(&pose, &object.info, options.view_limits),
         );
+        if options.synchronised_masks {
+            synchronise(&mut coordinates, &mut mask, &visible.resampled(options.target(), options.target()));
+        }
         let composition = if random.random::<f32>() < options.keep_background_probability {
             scenery.keep(patch, &inside, visible, random)
         } else {

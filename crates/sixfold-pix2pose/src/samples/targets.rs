@@ -32,3 +32,28 @@ pub(super) fn targets(
     }
     (coordinates, silhouette)
 }
+
+/// Takes what lies outside the mask of the photograph away from coordinates and silhouette (section 3.4.4): CAD models and
+/// convex hulls cover pixels that the object does not.
+pub(super) fn synchronise(coordinates: &mut [f32], silhouette: &mut Coverage, seen: &Coverage) {
+    let pixels = silhouette.data.len();
+    for pixel in (0..pixels).filter(|pixel| seen.data[*pixel] <= 0.4) {
+        silhouette.data[pixel] = 0.0;
+        (0..3).for_each(|c| coordinates[c * pixels + pixel] = 0.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_end_where_the_photographs_mask_ends() {
+        let mut silhouette = Coverage { width: 2, height: 2, data: vec![1.0, 1.0, 1.0, 0.0] };
+        let mut coordinates: Vec<f32> = (1..=12).map(|n| n as f32).collect();
+        let seen = Coverage { width: 2, height: 2, data: vec![1.0, 0.0, 0.5, 1.0] };
+        synchronise(&mut coordinates, &mut silhouette, &seen);
+        assert_eq!(silhouette.data, [1.0, 0.0, 1.0, 0.0]);
+        assert_eq!(coordinates, [1.0, 0.0, 3.0, 4.0, 5.0, 0.0, 7.0, 8.0, 9.0, 0.0, 11.0, 12.0]);
+    }
+}

@@ -479,3 +479,37 @@ fn a_texture_is_drawn_also_when_the_mesh_is_simplified() {
         assert!(red > 0.2 && green < 0.35 && (green - blue).abs() < 0.1, "{red} {green} {blue}");
     }
 }
+
+#[test]
+fn published_samples_are_photographs_on_backgrounds_with_the_stages_in_turns() {
+    let published = SampleOptions::published(50);
+    assert_eq!(published.color, sixfold_synth::augment::ColorAugmentation::table_3_2());
+    assert_eq!((published.second_stage_block, published.render_share), (Some(50), 0.0));
+    assert_eq!((published.keep_background_probability, published.cut_probability), (0.0, 0.0));
+    assert!((published.rotation.to_degrees() - 45.0).abs() < 1e-4);
+    assert!(published.check().is_ok());
+    // Nothing but the object, its surroundings and what hides it: on an even background that is grey.
+    let even = SampleOptions {
+        size: 64,
+        target_size: Some(64),
+        second_stage_fraction: 0.0,
+        rotation: 0.0,
+        border_blur: [0.0, 0.0],
+        occlusion: [0.3, 0.5],
+        color: sixfold_synth::augment::ColorAugmentation::none(),
+        ..published
+    };
+    let crops = vec![photograph(7, poses()[0])];
+    let source = SampleSource::new(vec![object(7, colored_box())], crops, grey_background(), even).unwrap();
+    for number in 0..8 {
+        let s = source.sample(0, 3, number);
+        let pixels = s.object.len();
+        let hidden: Vec<usize> = (0..pixels).filter(|i| s.object[*i] > 0.5 && s.visible[*i] < 0.5).collect();
+        let share = hidden.len() as f32 / s.object.iter().sum::<f32>();
+        assert!((0.2..0.6).contains(&share), "{number}: {share}");
+        let grey = |i: &usize| (0..3).all(|c| (s.rgb[c * pixels + i] - s.rgb[c * pixels]).abs() < 0.03);
+        let wrong = hidden.iter().filter(|i| !grey(i)).count();
+        // Pixels along the occluder's rim show some of both.
+        assert!(wrong * 5 < hidden.len(), "{number}: {wrong} of {}", hidden.len());
+    }
+}

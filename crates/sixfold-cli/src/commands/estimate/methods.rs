@@ -53,6 +53,28 @@ impl Method {
     }
 }
 
+/// Which form of a method of the dissertation runs.
+#[derive(Debug, Args)]
+pub(super) struct PresetArguments {
+    /// Run the method as it is published, in place of ours (docs/published.md says what that is, and what still differs)
+    #[arg(long, value_name = "NAME", value_enum)]
+    preset: Option<Preset>,
+}
+
+impl PresetArguments {
+    /// Whether the published form was asked for.
+    pub fn published(&self) -> bool {
+        matches!(self.preset, Some(Preset::Published))
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Preset {
+    /// As in the dissertation
+    #[value(alias = "paper")]
+    Published,
+}
+
 /// The options of a method.
 pub(crate) trait MethodArguments: Args {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>>;
@@ -92,8 +114,10 @@ struct MttmArguments {
     /// Another network than that within the program
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
-    /// Who matches regions with templates
-    #[arg(long, value_enum, default_value = networks::DEFAULT_MATCHER)]
+    #[command(flatten)]
+    preset: PresetArguments,
+    /// Who matches regions with templates; with --preset published the network alone
+    #[arg(long, value_enum, default_value = networks::DEFAULT_MATCHER, conflicts_with = "preset")]
     matcher: Matcher,
     /// Judge poses by the templates alone, as if there were no mesh
     #[arg(long)]
@@ -105,9 +129,14 @@ struct MttmArguments {
 
 impl MethodArguments for MttmArguments {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
+        let options = if self.preset.published() {
+            MttmOptions::published()
+        } else {
+            MttmOptions { matched_by: self.matcher.matched_by(), ..MttmOptions::default() }
+        };
         let estimator = MttmEstimator {
             depth: depth_options(self.keep_plane, common),
-            options: MttmOptions { matched_by: self.matcher.matched_by(), ..MttmOptions::default() },
+            options,
             templates_only: self.templates_only,
             ..MttmEstimator::default()
         };

@@ -18,7 +18,7 @@ use sixfold_shell::ranges::count;
 use sixfold_views::estimator::ViewsEstimator;
 
 use super::arguments::CommonArguments;
-use super::methods::{Method, MethodArguments};
+use super::methods::{Method, MethodArguments, PresetArguments};
 
 /// Who matches with `--method mttm`, unless `--matcher` says so.
 pub(super) const DEFAULT_MATCHER: &str = "both";
@@ -66,12 +66,14 @@ struct Pix2PoseArguments {
     /// Trained model that `sixfold train pix2pose` wrote; for mttm and views another network than that within the program
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
+    #[command(flatten)]
+    preset: PresetArguments,
     /// Leave out the last step, which aligns the rendered mesh with the image
     #[arg(long)]
     no_refine: bool,
     /// Most passes over an object: each but the first is into the box of the pose before, which helps where boxes are poor and
     /// takes as long again (default: 1)
-    #[arg(long, alias = "looks", value_name = "N", value_parser = count::<100>)]
+    #[arg(long, alias = "looks", value_name = "N", value_parser = count::<100>, conflicts_with = "preset")]
     passes: Option<NonZeroUsize>,
     /// Align poses with the depth image (ICP)
     #[arg(long)]
@@ -86,11 +88,14 @@ impl MethodArguments for Pix2PoseArguments {
             )
         })?;
         let mut estimator = Pix2PoseEstimator::load(weights)?;
+        if self.preset.published() {
+            estimator = estimator.published();
+        }
         estimator.options.estimate.seed = common.seed;
         if let Some(passes) = self.passes {
             estimator.options.looks = passes.get();
         }
-        estimator.refine = !self.no_refine;
+        estimator.refine &= !self.no_refine;
         estimator.icp = self.icp;
         estimator.object_id = common.object_id;
         Ok(Box::new(estimator))

@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 #[cfg(feature = "experience")]
-use sixfold_dgcm::transfer::grasps_from_experience;
+use sixfold_dgcm::transfer::{grasps_as_published, grasps_from_experience};
 use sixfold_grasp::AntipodalOptions;
 #[cfg(feature = "experience")]
 use sixfold_grasp::{GraspView, Gripper};
@@ -49,6 +49,10 @@ pub(crate) struct ProposeArguments {
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", requires = "experiences")]
     pub part: Option<String>,
+    /// Propose as published, in place of our way (docs/published.md says what that is, and what still differs)
+    #[cfg(feature = "experience")]
+    #[arg(long, value_name = "NAME", value_enum, requires = "experiences")]
+    pub preset: Option<Preset>,
     /// Take only what was seen: assume nothing of the object's far side
     #[arg(long)]
     pub seen_only: bool,
@@ -60,6 +64,17 @@ pub(crate) struct ProposeArguments {
     pub seed: u64,
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+/// How experience is used in the dissertation.
+#[cfg(feature = "experience")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Preset {
+    /// DGCM-Net alone: transferred grasps, clusters by their summed scores
+    #[value(alias = "paper")]
+    Published,
+    /// The planner's grasps, their scores averaged with those of experience nearby
+    PublishedCombined,
 }
 
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
@@ -120,6 +135,8 @@ struct Whole {
 #[cfg(feature = "experience")]
 fn method(a: &ProposeArguments) -> &'static str {
     match (&a.experiences, &a.part) {
+        (Some(_), _) if a.preset == Some(Preset::Published) => "dgcm as published",
+        (Some(_), _) if a.preset == Some(Preset::PublishedCombined) => "antipodal and dgcm as published",
         (None, _) => "antipodal",
         (Some(_), None) => "antipodal and dgcm",
         (Some(_), Some(_)) => "dgcm on a part",
@@ -143,7 +160,13 @@ fn with_experience(
     let network = experience::model(&a.network)?;
     let mut memory = experience::memory(place, &network)?;
     let part = a.part.as_deref();
-    let grasps = grasps_from_experience(view, gripper, planner, &network, &mut memory, part)?;
+    let grasps = match a.preset {
+        None => grasps_from_experience(view, gripper, planner, &network, &mut memory, part)?,
+        Some(preset) => {
+            let with_planner = preset == Preset::PublishedCombined;
+            grasps_as_published(view, gripper, planner, &network, &mut memory, part, with_planner)?
+        }
+    };
     experience::note_left_out(&memory.take_left_out(), &place.to_string());
     if grasps.found.nearest.is_empty() {
         let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));

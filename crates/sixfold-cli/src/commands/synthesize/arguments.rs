@@ -32,6 +32,32 @@ pub(crate) enum SceneArgument {
     Moving,
 }
 
+/// By what photographs are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum SelectKind {
+    /// Those that add most of the surface
+    Surface,
+    /// At random, no two with poses nearer than 0.3 m and 45 degrees
+    Pose,
+}
+
+/// How poses are refined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RefinementKind {
+    /// All photographs together, on points of the surface
+    Ours,
+    /// Each photograph against a rendering from the others (equation 4.3)
+    Published,
+}
+
+/// Which form of the method runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Preset {
+    /// As in the dissertation
+    #[value(alias = "paper")]
+    Published,
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct SynthesizeArguments {
     /// BOP dataset folder with models and posed images
@@ -61,7 +87,13 @@ pub(crate) struct SynthesizeArguments {
     /// Name of the new dataset's split
     #[arg(long, value_name = "NAME", default_value = "train_nol", value_parser = ranges::folder_name)]
     pub new_split: String,
-    /// Most photographs of an object; those that add most of its surface are taken
+    /// Make views as published, in place of our way: --select pose, --refinement published, --turns 7 (docs/published.md)
+    #[arg(long, value_name = "NAME", value_enum)]
+    pub preset: Option<Preset>,
+    /// By what photographs are chosen (default: surface; with --preset published: pose)
+    #[arg(long, value_name = "BY", value_enum)]
+    pub select: Option<SelectKind>,
+    /// Most photographs of an object
     #[arg(long, value_name = "N", default_value = "16")]
     pub sources: usize,
     /// Photographs behind each new view
@@ -83,6 +115,9 @@ pub(crate) struct SynthesizeArguments {
     /// Take the poses as they are
     #[arg(long)]
     pub no_refine: bool,
+    /// How poses are made better (default: ours; with --preset published: published)
+    #[arg(long, value_name = "HOW", value_enum, conflicts_with = "no_refine")]
+    pub refinement: Option<RefinementKind>,
     /// Whether objects moved between the photographs
     #[arg(long, value_enum, default_value = "judge")]
     pub scene: SceneArgument,
@@ -98,9 +133,10 @@ pub(crate) struct SynthesizeArguments {
     /// Elevation of the camera over the object's xy plane, lowest and highest, degrees
     #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [0.0, 85.0], allow_hyphen_values = true)]
     pub elevation: Vec<f64>,
-    /// Images of each view, each with a turn of its own in the image plane (up to 45 degrees)
-    #[arg(long, value_name = "N", default_value = "1")]
-    pub turns: usize,
+    /// Images of each view, each with a rotation of its own in the image plane (up to 45 degrees) (default: 1; with --preset
+    /// published: 7, every 15 degrees)
+    #[arg(long, value_name = "N")]
+    pub turns: Option<usize>,
     /// Side of the new images in pixels
     #[arg(long, value_name = "PIXELS", default_value = "192")]
     pub size: usize,
@@ -146,8 +182,8 @@ impl SynthesizeArguments {
                 "--elevation: found {low},{high}, expected two angles from -90 to 90 degrees, the lower one first"
             );
         }
-        if !(1..=72).contains(&self.turns) {
-            bail!("--turns: found {}, expected 1 to 72", self.turns);
+        if !(1..=72).contains(&self.turns()) {
+            bail!("--turns: found {}, expected 1 to 72", self.turns());
         }
         in_range("views of an object by --step, --elevation and --turns", self.grid().count(), 1..=200_000)?;
         if !(32..=1024).contains(&self.size) {
@@ -178,10 +214,26 @@ impl SynthesizeArguments {
         }
     }
 
+    /// Images of each view.
+    fn turns(&self) -> usize {
+        self.turns.unwrap_or(if self.preset.is_some() { 7 } else { 1 })
+    }
+
+    /// By what photographs are chosen.
+    pub fn select(&self) -> SelectKind {
+        self.select.unwrap_or(if self.preset.is_some() { SelectKind::Pose } else { SelectKind::Surface })
+    }
+
+    /// How poses are made better, where they are.
+    pub fn refinement_kind(&self) -> RefinementKind {
+        let default = if self.preset.is_some() { RefinementKind::Published } else { RefinementKind::Ours };
+        self.refinement.unwrap_or(default)
+    }
+
     /// Where the views are taken from.
     pub fn grid(&self) -> ViewGrid {
         let (step, elevation) = (self.step, [self.elevation[0], self.elevation[1]]);
-        ViewGrid { step, elevation, turns: self.turns, size: self.size, seed: self.seed }
+        ViewGrid { step, elevation, turns: self.turns(), size: self.size, seed: self.seed }
     }
 
     /// How poses are made better; none where they are taken as they are.
@@ -206,7 +258,8 @@ impl SynthesizeArguments {
             "weighting": format!("{:?}", self.weighting), "weights": self.weights,
             "detector": self.detector, "no_refine": self.no_refine, "scene": format!("{:?}", self.scene),
             "rough": self.rough, "disturb": self.disturb, "step": self.step, "elevation": self.elevation,
-            "turns": self.turns, "size": self.size, "backgrounds": self.backgrounds,
+            "turns": self.turns(), "select": format!("{:?}", self.select()),
+            "refinement": format!("{:?}", self.refinement_kind()), "size": self.size, "backgrounds": self.backgrounds,
             "with_photographs": self.with_photographs, "seed": self.seed,
         })
     }

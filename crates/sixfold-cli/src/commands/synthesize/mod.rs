@@ -17,12 +17,12 @@ use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::pose_file::PoseFile;
-use sixfold_nol::select::choose_images;
+use sixfold_nol::select::{choose_images, choose_images_by_pose};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
-use self::arguments::WeightingKind;
 pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
+use self::arguments::{RefinementKind, SelectKind, WeightingKind};
 use self::views::Written;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
@@ -73,16 +73,21 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     }
     folder.begin(&input::contents(a, &images)?)?;
     for object in &mut images.objects {
-        choose_images(object, a.sources)?.iter().for_each(|note| eprintln!("note: {note}"));
+        match a.select() {
+            SelectKind::Surface => {
+                choose_images(object, a.sources)?.iter().for_each(|note| eprintln!("note: {note}"));
+            }
+            SelectKind::Pose => choose_images_by_pose(object, a.sources, a.seed),
+        }
     }
     let counts: Vec<usize> = images.objects.iter().map(|o| o.images.len()).collect();
     let mut sheets = Pictures::default();
-    let poses = refined_poses(a, &mut images, &mut sheets)?;
     let model = match (a.weighting, &a.weights) {
         (WeightingKind::Network, Some(file)) => Some(NolModel::load(file)?),
         (WeightingKind::Network, None) => Some(NolModel::shipped()?),
         _ => None,
     };
+    let poses = refined_poses(a, &mut images, model.as_ref(), &mut sheets)?;
     folder.write_models(images.objects.iter().map(|o| (o.id, &o.mesh, &o.info)))?;
     let views = Views { a, backgrounds: backgrounds(a)?, model };
     let mut progress = Progress::new("views", a.grid().count() * images.objects.len());
@@ -123,16 +128,22 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
 fn refined_poses(
     a: &SynthesizeArguments,
     images: &mut RoughImages,
+    model: Option<&NolModel>,
     sheets: &mut Pictures,
 ) -> Result<PoseFile> {
     let file = a.out.join("poses.json");
     let mut progress = Progress::new("poses, per cent", 100);
     let stop = interrupted();
     let options = a.refinement();
-    let poses = PoseFile::refined(images, options.as_ref(), !a.disturb.is_empty(), &file, |done| {
-        progress.set((100.0 * done) as usize);
-        !stop.load(std::sync::atomic::Ordering::Relaxed)
-    })?;
+    let disturbed = !a.disturb.is_empty();
+    let poses = if options.is_some() && a.refinement_kind() == RefinementKind::Published {
+        Some(PoseFile::refined_as_published(images, model, disturbed, &file)?)
+    } else {
+        PoseFile::refined(images, options.as_ref(), disturbed, &file, |done| {
+            progress.set((100.0 * done) as usize);
+            !stop.load(std::sync::atomic::Ordering::Relaxed)
+        })?
+    };
     progress.finish();
     let Some(poses) = poses else { bail!("interrupted; give the same command again") };
     sheets.did(pictures::refinement(&a.out.join("poses.png"), images, &poses));

@@ -7,7 +7,7 @@ use clap::Args;
 use sixfold_detect::recipe::{DetectorKind, DetectorRecipe, MIN_VISIBILITY};
 use sixfold_nn::choice::Choice;
 
-use super::options::{Degrees, choices};
+use super::options::{Degrees, Preset, choices, presets};
 use super::{
     LearntFrom, MaterialArguments, Shown, Summary, checked, command_line, loss, summary, train_in,
     training_set,
@@ -17,6 +17,13 @@ fn default() -> DetectorRecipe {
     DetectorRecipe::default()
 }
 
+fn published() -> DetectorRecipe {
+    DetectorRecipe::published()
+}
+
+const PHOTOGRAPHS: &str = "Fraction of training images that are parts of photographs, 0 to 1";
+const RENDERS: &str = "Fraction of renders among pasted objects that have photographs, 0 to 1";
+
 #[derive(Debug, Args)]
 pub(crate) struct TrainDetectorArguments {
     #[command(flatten)]
@@ -24,9 +31,11 @@ pub(crate) struct TrainDetectorArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Which network learns
-    #[arg(long, value_parser = choices::<DetectorKind>(), default_value = default().network.name())]
-    pub network: DetectorKind,
+    /// Train as published, as far as that is here (docs/published.md): ResNet-50, objects cut out of photographs alone
+    #[arg(long, value_parser = choices::<Preset>())]
+    pub preset: Option<Preset>,
+    #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Which network learns", default().network.name(), published().network.name()))]
+    pub network: Option<DetectorKind>,
     /// Training steps
     #[arg(long, value_name = "N", default_value_t = default().steps)]
     pub steps: u64,
@@ -48,12 +57,10 @@ pub(crate) struct TrainDetectorArguments {
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
     #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
     pub size: usize,
-    /// Fraction of training images that are parts of photographs, 0 to 1
-    #[arg(long, value_name = "FRACTION", default_value_t = default().photograph_share)]
-    pub photograph_share: f32,
-    /// Fraction of renders among pasted objects that have photographs, 0 to 1
-    #[arg(long, value_name = "FRACTION", default_value_t = default().render_share)]
-    pub render_share: f32,
+    #[arg(long, value_name = "FRACTION", help = presets(PHOTOGRAPHS, default().photograph_share, published().photograph_share))]
+    pub photograph_share: Option<f32>,
+    #[arg(long, value_name = "FRACTION", help = presets(RENDERS, default().render_share, published().render_share))]
+    pub render_share: Option<f32>,
     /// Largest rotation in the image plane, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
     pub rotation: Degrees,
@@ -79,8 +86,9 @@ pub(crate) struct TrainDetectorArguments {
 
 impl TrainDetectorArguments {
     pub(super) fn recipe(&self) -> DetectorRecipe {
+        let default = if self.preset.is_some() { published() } else { default() };
         DetectorRecipe {
-            network: self.network,
+            network: self.network.unwrap_or(default.network),
             steps: self.steps,
             batch: self.batch,
             learning_rate: self.learning_rate,
@@ -88,8 +96,8 @@ impl TrainDetectorArguments {
             frozen_stages: self.frozen_stages,
             encoder: self.encoder.clone(),
             size: self.size,
-            photograph_share: self.photograph_share,
-            render_share: self.render_share,
+            photograph_share: self.photograph_share.unwrap_or(default.photograph_share),
+            render_share: self.render_share.unwrap_or(default.render_share),
             rotation: self.rotation.radians,
             mesh_colors: !self.no_mesh_colors,
             longest_side: self.longest_side,

@@ -8,12 +8,18 @@ use serde::Serialize;
 use sixfold_dgcm::recipe::{DgcmKind, DgcmRecipe};
 use sixfold_nn::choice::Choice;
 
-use super::options::{by_network, choices};
+use super::options::{Preset, by_network, choices, presets};
 use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> DgcmRecipe {
     DgcmRecipe::default()
 }
+
+fn published() -> DgcmRecipe {
+    DgcmRecipe::published()
+}
+
+const VIEWS: &str = "Simulated views to learn from, made at the start (about 35 kB of memory each)";
 
 /// Help with the defaults of both networks.
 fn help(what: &str, of: impl Fn(DgcmKind) -> String) -> String {
@@ -28,9 +34,11 @@ fn pairs_help() -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainDgcmArguments {
-    /// Network
-    #[arg(long, value_parser = choices::<DgcmKind>(), default_value = default().network.name())]
-    pub network: DgcmKind,
+    /// Train as published (docs/published.md): the dissertation's network, pairs, rate and views
+    #[arg(long, value_parser = choices::<Preset>())]
+    pub preset: Option<Preset>,
+    #[arg(long, value_parser = choices::<DgcmKind>(), help = presets("Network", default().network.name(), published().network.name()))]
+    pub network: Option<DgcmKind>,
     /// ImageNet weights of ResNet-50 in torchvision's layout (.pth), for --network paper
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
@@ -50,9 +58,8 @@ pub(crate) struct TrainDgcmArguments {
         help = help("Weight of the coordinates' loss beside the features'", |k| k.options().lambda.to_string())
     )]
     pub lambda: Option<f64>,
-    /// Simulated views to learn from, made at the start (about 35 kB of memory each)
-    #[arg(long, value_name = "N", default_value_t = default().views)]
-    pub views: usize,
+    #[arg(long, value_name = "N", help = presets(VIEWS, default().views, published().views))]
+    pub views: Option<usize>,
     /// Seed of weights, objects, views and pairs
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
@@ -66,14 +73,15 @@ pub(crate) struct TrainDgcmArguments {
 
 impl TrainDgcmArguments {
     pub(super) fn recipe(&self) -> DgcmRecipe {
+        let default = if self.preset.is_some() { published() } else { default() };
         DgcmRecipe {
-            network: self.network,
+            network: self.network.unwrap_or(default.network),
             encoder: self.encoder.clone(),
             steps: self.steps,
             pairs: self.pairs,
             learning_rate: self.learning_rate,
             lambda: self.lambda,
-            views: self.views,
+            views: self.views.unwrap_or(default.views),
             seed: self.seed,
             command: command_line(),
         }
@@ -104,5 +112,5 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<Views>> {
         },
     };
     let trained = train_in(&recipe, (), &a.out, a.export, shown)?;
-    Ok(summary(trained, |()| Views { views: a.views }))
+    Ok(summary(trained, |()| Views { views: recipe.views }))
 }

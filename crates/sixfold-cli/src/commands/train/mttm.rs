@@ -9,12 +9,14 @@ use sixfold_mttm::quality::Quality;
 use sixfold_mttm::recipe::{MttmKind, MttmRecipe};
 use sixfold_nn::choice::Choice;
 
-use super::options::{by_network, choices};
+use super::options::{Preset, by_network, choices, presets};
 use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> MttmRecipe {
     MttmRecipe::default()
 }
+
+const SCENES: &str = "Scenes in which they fall on a table, made at the start; each is seen by five cameras";
 
 /// Help with the defaults of both networks.
 fn help(what: &str, of: impl Fn(MttmKind) -> String) -> String {
@@ -23,9 +25,11 @@ fn help(what: &str, of: impl Fn(MttmKind) -> String) -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainMttmArguments {
-    /// Network
-    #[arg(long, value_parser = choices::<MttmKind>(), default_value = default().network.name())]
-    pub network: MttmKind,
+    /// Train as published (docs/published.md): the dissertation's network, losses, negative templates and number of scenes
+    #[arg(long, value_parser = choices::<Preset>())]
+    pub preset: Option<Preset>,
+    #[arg(long, value_parser = choices::<MttmKind>(), help = presets("Network", default().network.name(), MttmRecipe::published().network.name()))]
+    pub network: Option<MttmKind>,
     /// ImageNet weights of ResNet-50 in torchvision's layout (.pth), for --network paper
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
@@ -46,9 +50,8 @@ pub(crate) struct TrainMttmArguments {
     /// Synthetic objects: half of them household shapes, half of them toys
     #[arg(long, value_name = "N", default_value_t = default().objects)]
     pub objects: usize,
-    /// Scenes in which they fall on a table, made at the start; each is seen by five cameras
-    #[arg(long, value_name = "N", default_value_t = default().scenes)]
-    pub scenes: usize,
+    #[arg(long, value_name = "N", help = presets(SCENES, default().scenes, MttmRecipe::published().scenes))]
+    pub scenes: Option<usize>,
     /// Seed of weights, objects, scenes and samples
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
@@ -62,14 +65,15 @@ pub(crate) struct TrainMttmArguments {
 
 impl TrainMttmArguments {
     pub(super) fn recipe(&self) -> MttmRecipe {
+        let default = if self.preset.is_some() { MttmRecipe::published() } else { default() };
         MttmRecipe {
-            network: self.network,
+            network: self.network.unwrap_or(default.network),
             encoder: self.encoder.clone(),
             steps: self.steps,
             anchors: self.anchors,
             learning_rate: self.learning_rate,
             objects: self.objects,
-            scenes: self.scenes,
+            scenes: self.scenes.unwrap_or(default.scenes),
             seed: self.seed,
             command: command_line(),
         }

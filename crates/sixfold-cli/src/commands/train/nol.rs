@@ -9,8 +9,9 @@ use sixfold_nol::loss::psnr;
 use sixfold_nol::network::{IntegratorKind, Parts};
 use sixfold_nol::quality::Quality;
 use sixfold_nol::recipe::{NolKind, NolRecipe};
+use sixfold_nol::training::NolLosses;
 
-use super::options::{by_network, choices};
+use super::options::{Preset, by_network, choices, presets};
 use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> NolRecipe {
@@ -24,9 +25,14 @@ fn help(what: &str, of: impl Fn(NolKind) -> String) -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainNolArguments {
-    /// Network
-    #[arg(long, value_parser = choices::<NolKind>(), default_value = default().network.name())]
-    pub network: NolKind,
+    /// Train as published (docs/published.md): the dissertation's network and losses, eight sources, all poses rough
+    #[arg(long, value_parser = choices::<Preset>())]
+    pub preset: Option<Preset>,
+    #[arg(long, value_parser = choices::<NolKind>(), help = presets("Network", default().network.name(), NolRecipe::published().network.name()))]
+    pub network: Option<NolKind>,
+    /// Which losses are summed up: the columns of the dissertation's table 4.6 (default: smooth)
+    #[arg(long, value_parser = choices::<NolLosses>())]
+    pub loss: Option<NolLosses>,
     /// ImageNet weights of DenseNet-121 in torchvision's layout (.pth), for --network paper
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
@@ -64,8 +70,10 @@ pub(crate) struct TrainNolArguments {
 
 impl TrainNolArguments {
     pub(super) fn recipe(&self) -> NolRecipe {
+        let default = if self.preset.is_some() { NolRecipe::published() } else { default() };
         NolRecipe {
-            network: self.network,
+            network: self.network.unwrap_or(default.network),
+            losses: self.loss,
             encoder: self.encoder.clone(),
             parts: Parts { integrator: self.integrator, decoder: !self.no_decoder },
             backgrounds: self.backgrounds.clone(),

@@ -6,16 +6,50 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use sixfold_nn::choice::Choice;
 
+/// A preset, and its older name, which help does not show.
+const PUBLISHED: &str = "published";
+const PAPER: &str = "paper";
+
 /// Parses one of the names of a choice.
 pub(super) fn choices<C: Choice + Send + Sync>() -> impl TypedValueParser<Value = C> {
-    let values = C::ALL.iter().map(|choice| PossibleValue::new(choice.name()).help(choice.help()));
-    PossibleValuesParser::new(values)
-        .try_map(|name| C::named(&name).ok_or_else(|| format!("{name} is none of the names")))
+    let value = |choice: &C| {
+        let value = PossibleValue::new(choice.name()).help(choice.help());
+        if choice.name() == PUBLISHED { value.alias(PAPER) } else { value }
+    };
+    PossibleValuesParser::new(C::ALL.iter().map(value)).try_map(|name| {
+        // The older name of a preset; networks are still called so.
+        let name = if C::named(&name).is_none() && name == PAPER { PUBLISHED } else { &name };
+        C::named(name).ok_or_else(|| format!("{name} is none of the names"))
+    })
+}
+
+/// The published form of a training, where there is no other preset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Preset {
+    /// As in the dissertation.
+    Published,
+}
+
+impl Choice for Preset {
+    const ALL: &'static [Preset] = &[Preset::Published];
+
+    fn name(self) -> &'static str {
+        PUBLISHED
+    }
+
+    fn help(self) -> &'static str {
+        "As in the dissertation; other options still count (docs/published.md)"
+    }
 }
 
 /// Help for an option whose default depends on the network.
 pub(super) fn by_network(what: &str, default: impl fmt::Display, paper: impl fmt::Display) -> String {
     format!("{what} (default: {default}; the dissertation's network: {paper})")
+}
+
+/// Help for an option whose default depends on the preset.
+pub(super) fn presets(what: &str, default: impl fmt::Display, published: impl fmt::Display) -> String {
+    format!("{what} (default: {default}; with --preset published: {published})")
 }
 
 /// An angle in the image plane: degrees from 0 to 180 on the command line, radians inside.

@@ -10,7 +10,7 @@ use sixfold_pix2pose::preset::Preset;
 use sixfold_pix2pose::recipe::{MIN_VISIBILITY, NetworkKind, Pix2PoseRecipe};
 use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
 
-use super::options::{Degrees, choices};
+use super::options::{self, Degrees, choices, presets};
 use super::{
     LearntFrom, MaterialArguments, Shown, Summary, checked, command_line, loss, summary, train_in,
     training_set,
@@ -21,12 +21,12 @@ fn default() -> Pix2PoseRecipe {
 }
 
 /// Of the compact network, and of the dissertation's.
-fn options() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
+fn defaults() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
     (default().compact_options(), default().dissertation_options())
 }
 
 fn steps_help() -> String {
-    let (compact, paper) = options();
+    let (compact, paper) = defaults();
     format!(
         "Training steps; each takes so many images of every object (default: {}; the dissertation's networks: {}). 0: the \
          weights of --init as they are, with their alignment's constant error measured again",
@@ -35,15 +35,61 @@ fn steps_help() -> String {
 }
 
 fn per_object_help() -> String {
-    let (compact, paper) = options();
+    let (compact, paper) = defaults();
     let (compact, paper) = (compact.per_object, paper.batch);
     format!("Images of every object in a step (default: {compact}; the dissertation's networks: {paper})")
 }
 
 fn learning_rate_help() -> String {
-    let (compact, paper) = options();
+    let (compact, paper) = defaults();
     let (compact, paper) = (compact.common.learning_rate, paper.learning_rate);
     format!("Highest learning rate (default: {compact}; the dissertation's networks: {paper})")
+}
+
+fn network_help() -> String {
+    let (ours, published) = (default().network.name(), Pix2PoseRecipe::published().network.name());
+    presets("Which network learns", ours, published)
+}
+
+fn render_share_help() -> String {
+    let (ours, published) = (default().render_share, Pix2PoseRecipe::published().render_share);
+    presets("Fraction of renders among the images, 0 to 1", ours, published)
+}
+
+/// The published training, or the parameters of one of its experiments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum TrainingPreset {
+    /// As in the dissertation.
+    Published,
+    /// The parameters of one of its experiments.
+    Of(Preset),
+}
+
+impl TrainingPreset {
+    fn experiment(self) -> Option<Preset> {
+        match self {
+            TrainingPreset::Published => None,
+            TrainingPreset::Of(preset) => Some(preset),
+        }
+    }
+}
+
+impl Choice for TrainingPreset {
+    const ALL: &'static [TrainingPreset] = &[
+        TrainingPreset::Published,
+        TrainingPreset::Of(Preset::Bop),
+        TrainingPreset::Of(Preset::Linemod),
+        TrainingPreset::Of(Preset::Lmo),
+        TrainingPreset::Of(Preset::Tless),
+    ];
+
+    fn name(self) -> &'static str {
+        self.experiment().map_or(options::Preset::Published.name(), Preset::name)
+    }
+
+    fn help(self) -> &'static str {
+        self.experiment().map_or(options::Preset::Published.help(), Preset::help)
+    }
 }
 
 #[derive(Debug, Args)]
@@ -53,9 +99,8 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Which network learns
-    #[arg(long, value_parser = choices::<NetworkKind>(), default_value = default().network.name())]
-    pub network: NetworkKind,
+    #[arg(long, value_parser = choices::<NetworkKind>(), help = network_help())]
+    pub network: Option<NetworkKind>,
     #[arg(long, value_name = "N", help = steps_help())]
     pub steps: Option<u64>,
     #[arg(long, value_name = "N", help = per_object_help())]
@@ -74,9 +119,8 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Stages of the ImageNet encoder that stay as they are, of five
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    /// Fraction of renders among the images, 0 to 1
-    #[arg(long, value_name = "FRACTION", default_value_t = default().render_share)]
-    pub render_share: f32,
+    #[arg(long, value_name = "FRACTION", help = render_share_help())]
+    pub render_share: Option<f32>,
     /// Fraction of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
     #[arg(long, value_name = "FRACTION", default_value_t = default().near_photographs)]
     pub near_photographs: f32,
@@ -101,10 +145,10 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Plain L1 with one side of a symmetric object standing for all, instead of the transformer loss
     #[arg(long)]
     pub view_limits: bool,
-    /// Symmetric poses, outlier thresholds and occlusion of an experiment of the dissertation (its appendix A) (default:
-    /// symmetries of the dataset, thresholds of the BOP entries)
-    #[arg(long, value_parser = choices::<Preset>())]
-    pub preset: Option<Preset>,
+    /// Train as published; or take symmetric poses, outlier thresholds and occlusion of an experiment of the dissertation (its
+    /// appendix A); or both, with a comma (default: symmetries of the dataset, thresholds of the BOP entries)
+    #[arg(long, value_name = "NAME[,NAME]", value_parser = choices::<TrainingPreset>(), value_delimiter = ',')]
+    pub preset: Vec<TrainingPreset>,
     /// Train no further: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
@@ -115,15 +159,18 @@ pub(crate) struct TrainPix2PoseArguments {
 
 impl TrainPix2PoseArguments {
     pub(super) fn recipe(&self) -> Pix2PoseRecipe {
+        let published = self.preset.contains(&TrainingPreset::Published);
+        let default = if published { Pix2PoseRecipe::published() } else { default() };
         Pix2PoseRecipe {
-            network: self.network,
+            network: self.network.unwrap_or(default.network),
+            published,
             steps: self.steps,
             per_object: self.per_object,
             learning_rate: self.learning_rate,
             adversarial: self.adversarial.then_some(true).or(self.no_adversarial.then_some(false)),
             encoder: self.encoder.clone(),
             frozen_stages: self.frozen_stages,
-            render_share: self.render_share,
+            render_share: self.render_share.unwrap_or(default.render_share),
             near_photographs: self.near_photographs,
             rotation: self.rotation.radians,
             size: self.size,
@@ -132,7 +179,7 @@ impl TrainPix2PoseArguments {
             convex_hull: self.convex_hull,
             transformer_loss: !self.no_transformer_loss,
             view_limits: self.view_limits,
-            preset: self.preset,
+            preset: self.preset.iter().find_map(|preset| preset.experiment()),
             backgrounds: self.material.backgrounds.clone(),
             seed: self.seed,
             command: command_line(),

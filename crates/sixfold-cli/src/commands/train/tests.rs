@@ -76,6 +76,71 @@ fn without_options_the_command_line_asks_for_the_recipes_defaults() {
 }
 
 #[test]
+fn the_preset_published_asks_for_the_published_recipes_and_other_options_still_count() {
+    // The older name is understood too.
+    for name in ["published", "paper"] {
+        let command = command_line();
+        match parsed(&format!("pix2pose --object mug.ply --preset {name}")) {
+            TrainCommand::Pix2pose(a) => {
+                let published = sixfold_pix2pose::recipe::Pix2PoseRecipe::published();
+                assert_eq!(a.recipe(), sixfold_pix2pose::recipe::Pix2PoseRecipe { command, ..published });
+            }
+            _ => panic!(),
+        }
+        let command = command_line();
+        match parsed(&format!("detector --object mug.ply --preset {name}")) {
+            TrainCommand::Detector(a) => {
+                let published = sixfold_detect::recipe::DetectorRecipe::published();
+                assert_eq!(a.recipe(), sixfold_detect::recipe::DetectorRecipe { command, ..published });
+            }
+            _ => panic!(),
+        }
+        let command = command_line();
+        match parsed(&format!("nol --preset {name}")) {
+            TrainCommand::Nol(a) => {
+                let published = sixfold_nol::recipe::NolRecipe::published();
+                assert_eq!(a.recipe(), sixfold_nol::recipe::NolRecipe { command, ..published });
+            }
+            _ => panic!(),
+        }
+        #[cfg(feature = "physics")]
+        match parsed(&format!("mttm --preset {name}")) {
+            TrainCommand::Mttm(a) => {
+                let (command, published) = (command_line(), sixfold_mttm::recipe::MttmRecipe::published());
+                assert_eq!(a.recipe(), sixfold_mttm::recipe::MttmRecipe { command, ..published });
+            }
+            _ => panic!(),
+        }
+        #[cfg(feature = "experience")]
+        match parsed(&format!("dgcm --preset {name}")) {
+            TrainCommand::Dgcm(a) => {
+                let (command, published) = (command_line(), sixfold_dgcm::recipe::DgcmRecipe::published());
+                assert_eq!(a.recipe(), sixfold_dgcm::recipe::DgcmRecipe { command, ..published });
+            }
+            _ => panic!(),
+        }
+    }
+    match parsed("pix2pose --object mug.ply --preset published,lmo --network resnet50 --render-share 0.25") {
+        TrainCommand::Pix2pose(a) => {
+            let recipe = a.recipe();
+            assert!(recipe.published && recipe.render_share == 0.25);
+            assert_eq!(recipe.network, sixfold_pix2pose::recipe::NetworkKind::ResNet50);
+            assert_eq!(recipe.preset, Some(sixfold_pix2pose::preset::Preset::Lmo));
+        }
+        _ => panic!(),
+    }
+    match parsed("nol --loss gan") {
+        TrainCommand::Nol(a) => {
+            assert_eq!(
+                (a.recipe().options().weights, a.recipe().options().adversarial),
+                ([5.0, 10.0, 1.0], 1.0)
+            );
+        }
+        _ => panic!(),
+    }
+}
+
+#[test]
 fn help_shows_the_defaults() {
     let shown = [
         ("pix2pose", "(default: 8000; the dissertation's networks: 25000). 0: the weights"),

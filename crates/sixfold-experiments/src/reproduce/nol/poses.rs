@@ -114,7 +114,8 @@ pub(super) fn refine(
                     sources.iter().filter(|s| s.object == *object).map(|s| s.photograph.clone()).collect();
                 let options = PublishedRuleOptions::default();
                 let side = PoseRefinementOptions::default().side;
-                poses.extend(published_rule_poses(&of, mesh, model, side, PER_VIEW, &options)?);
+                let found = published_rule_poses(&of, mesh, model, side, PER_VIEW, &options)?;
+                poses.extend(found.into_iter().map(|(pose, _)| pose));
             }
             let none = vec![None; poses.len()];
             (poses, none, None)

@@ -19,7 +19,7 @@ use serde::Serialize;
 use sixfold_bop::{BopDataset, Models, Target, read_results};
 use sixfold_geometry::{FrameId, Rect};
 use sixfold_mesh::Mesh;
-use sixfold_pix2pose::estimate::Quirks;
+use sixfold_pix2pose::estimate::{Pix2PoseOptions, Quirks};
 
 use self::model::Pix2Pose;
 use self::row::{Row, Setting};
@@ -228,8 +228,12 @@ fn settings(bench: &Bench) -> Vec<Setting> {
             looks: 2,
             ..plain("two-looks", "default, with a second pass into the box of the aligned pose")
         },
-        plain("no-refinement", "two stages, PnP (the dissertation's method)"),
+        plain("no-refinement", "two stages, PnP"),
     ];
+    let mut published =
+        plain("as-published", "as published: theta_i 0.1, theta_re 3 px, EPnP, centroid, no open candidate");
+    (published.options, published.correct) = (Pix2PoseOptions::published(), false);
+    all.push(published);
     let mut one_stage = plain("one-stage", "one stage, PnP");
     one_stage.options.two_stages = false;
     all.push(one_stage);

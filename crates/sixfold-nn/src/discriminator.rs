@@ -1,15 +1,15 @@
-//! The discriminator of the dissertation's adversarial training (section 3.3): is an image of object coordinates a rendered
-//! one or the generator's? It sees the coordinates alone, not the photograph.
+//! The discriminator of the dissertation's adversarial training (section 3.2.5): is an image (of object coordinates; of an object, in
+//! chapter 4) a rendered one or the generator's? It sees that image alone, not what the generator sees.
 
+use crate::batch_norm::{BatchNorm, BatchNormConfig};
+use crate::conv_norm::{BareConv, BareConvConfig};
+use crate::dense::dense;
+use crate::kernels::ConvSpec;
 use burn::module::Module;
 use burn::nn::Linear;
 use burn::tensor::{Device, Tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sixfold_nn::batch_norm::{BatchNorm, BatchNormConfig};
-use sixfold_nn::conv_norm::{BareConv, BareConvConfig};
-use sixfold_nn::dense::dense;
-use sixfold_nn::kernels::ConvSpec;
 
 const CHANNELS: [usize; 8] = [3, 64, 128, 256, 512, 512, 512, 512];
 const KERNEL: usize = 3;
@@ -53,15 +53,16 @@ struct Stage {
 }
 
 impl Discriminator {
-    /// Coordinates in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones. Smaller images, of at
-    /// least 16 pixels, have come down to one pixel before the last stages, which are then left out.
-    pub fn forward(&self, coordinates: Tensor<4>) -> Tensor<2> {
-        let x = self.stages.iter().fold(coordinates, |x, stage| match x.dims() {
+    /// Images in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones. Smaller images, of at least 16
+    /// pixels, have come down to one pixel before the last stages, which are then left out; of larger ones the mean is taken.
+    pub fn forward(&self, images: Tensor<4>) -> Tensor<2> {
+        let x = self.stages.iter().fold(images, |x, stage| match x.dims() {
             [_, _, 1, 1] => x,
             _ => stage.conv.forward_norm(x, &stage.norm, None, SLOPE),
         });
         let [batch, channels, height, width] = x.dims();
-        self.judge.forward(x.reshape([batch, channels * height * width]))
+        self.judge
+            .forward(x.reshape([batch, channels, height * width]).mean_dim(2).reshape([batch, channels]))
     }
 }
 
@@ -81,8 +82,8 @@ mod tests {
         let gradients = logits.square().mean().backward();
         assert!(x.grad(&gradients).unwrap().abs().max().into_scalar::<f32>() > 0.0);
         assert_eq!(GradientsParams::from_grads(gradients, &network).len(), 7 * 3 + 2);
-        // The compact network's images, and its smallest.
-        for (side, stages) in [(64, 6), (16, 4)] {
+        // NOL's images, Pix2Pose's compact network's, and its smallest.
+        for (side, stages) in [(256, 7), (64, 6), (16, 4)] {
             let x = Tensor::<4>::random([2, 3, side, side], burn::tensor::Distribution::Default, &device);
             let logits = network.forward(x);
             assert_eq!(logits.dims(), [2, 1]);

@@ -1,0 +1,94 @@
+//! The weights in `weights/` on real frames: scores that a change may not lower unnoticed. What they are compared with is what
+//! `benches/results.sh` measured and keeps in `results/`, less two standard errors. Needs the folder that `SIXFOLD_DATA` names, or
+//! `../shared/data` beside the repository, and skips without.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+use sixfold_bop::BopDataset;
+use sixfold_nn::weights::read_card;
+
+use crate::support::*;
+
+/// The repository.
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
+}
+
+/// LM-O, where it is.
+fn lmo() -> Option<PathBuf> {
+    let folder =
+        std::env::var_os("SIXFOLD_DATA").map_or_else(|| root().join("../shared/data"), PathBuf::from);
+    let lmo = folder.join("lmo");
+    if lmo.join("test").is_dir() {
+        return Some(lmo.canonicalize().unwrap());
+    }
+    println!("skipped: no LM-O at {}", lmo.display());
+    None
+}
+
+/// Every eighth of the frames that the weights were not trained on, as a file of targets; how many targets.
+fn every_eighth(lmo: &Path, weights: &Path, file: &Path) -> usize {
+    let card = read_card(weights).unwrap();
+    let trained: BTreeSet<(u32, u32)> =
+        card.training_frames.iter().flatten().map(|f| (f.scene_id, f.im_id)).collect();
+    let targets = BopDataset::open(lmo, "test").unwrap().targets(None).unwrap();
+    let frames: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
+    let chosen: Vec<(u32, u32)> = frames.difference(&trained).copied().step_by(8).collect();
+    let rows: Vec<Value> = targets
+        .iter()
+        .filter(|t| chosen.contains(&(t.scene_id, t.im_id)))
+        .filter_map(|t| t.object.map(|o| (t, o)))
+        .map(|(t, o)| {
+            let (scene_id, im_id, inst_count) = (t.scene_id, t.im_id, o.inst_count);
+            json!({"scene_id": scene_id, "im_id": im_id, "obj_id": o.obj_id, "inst_count": inst_count})
+        })
+        .collect();
+    std::fs::write(file, Value::from(rows.clone()).to_string()).unwrap();
+    rows.len()
+}
+
+/// What is kept of a run of `benches/results.sh`.
+fn kept(name: &str) -> Value {
+    let text = std::fs::read_to_string(root().join("results").join(format!("{name}.json"))).unwrap();
+    serde_json::from_str::<Value>(&text).unwrap()["values"]["scores"].clone()
+}
+
+/// Each score is at least what was measured, less two standard errors of a fraction of so many.
+fn assert_kept(found: &Value, measured: &Value, scores: &[&str], count: usize) {
+    for score in scores {
+        let (found, measured) = [found, measured].map(|v| v.pointer(score).unwrap().as_f64().unwrap()).into();
+        let error = (measured * (1.0 - measured) / count as f64).sqrt();
+        println!("{score}: {found:.3}, measured {measured:.3}, standard error {error:.3}");
+        assert!(found > measured - 2.0 * error, "{score}: {found}, measured {measured} +- {error}");
+    }
+}
+
+#[test]
+fn the_shipped_pix2pose_on_real_frames() {
+    let Some(lmo) = lmo() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let weights = root().join("weights/pix2pose-lmo.safetensors");
+    let count = every_eighth(&lmo, &weights, &dir.path().join("targets.json"));
+    let data = format!("--dataset {} --targets targets.json", lmo.display());
+    let model = format!("--method pix2pose --weights {}", weights.display());
+    sixfold(dir.path(), &format!("estimate {model} {data} --boxes gt --out r.csv")).expect(0);
+    let eval = format!("eval {data} --results r.csv --no-vsd --json");
+    let (scores, kept) = (sixfold(dir.path(), &eval).expect(0).json(), kept("pix2pose"));
+    assert_eq!((&scores["targets"], &kept["targets"]), (&count.into(), &count.into()));
+    assert_kept(&scores, &kept, &["/ar_mssd", "/ar_mspd", "/add_s_recall/mean"], count);
+}
+
+#[test]
+fn the_shipped_detector_on_real_frames() {
+    let Some(lmo) = lmo() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let weights = root().join("weights/detector-lmo.safetensors");
+    let count = every_eighth(&lmo, &weights, &dir.path().join("targets.json"));
+    let data = format!("--dataset {} --targets targets.json", lmo.display());
+    let detect = format!("detect --weights {} {data} --out d.json", weights.display());
+    sixfold(dir.path(), &detect).expect(0);
+    let scores = sixfold(dir.path(), &format!("eval {data} --detections d.json --json")).expect(0).json();
+    assert_kept(&scores, &kept("detector"), &["/box/ap", "/box/ap50"], count);
+}

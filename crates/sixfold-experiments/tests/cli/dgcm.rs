@@ -1,0 +1,51 @@
+//! `sixfold reproduce dgcm`: all five parts, quickly, on one object that the test writes.
+
+use crate::support::*;
+
+/// The network that comes with Sixfold.
+const NETWORK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../weights/dgcm.safetensors");
+
+#[test]
+fn the_tables_of_chapter_6_are_made_and_kept() {
+    let case = OneImage::new();
+    let dir = case.path();
+    std::fs::write(
+        dir.join("objects.json"),
+        r#"[{"class": "part", "mesh": "part.ply", "unit": "mm",
+             "part": {"name": "handle", "low": [-0.065, -0.045, 0.03], "high": [-0.015, 0.015, 0.115]}}]"#,
+    )
+    .unwrap();
+    let command = format!("reproduce dgcm --list objects.json --weights {NETWORK} --quick --out out --json");
+    let json = sixfold(dir, &command).expect(0).json();
+    // Table 6.2: one scene for each way to choose a grasp, the published ones among them; rates of four tries.
+    let class = &json["compare"]["classes"][0];
+    let rates: Vec<f64> = class["rates"].as_array().unwrap().iter().map(|r| r.as_f64().unwrap()).collect();
+    assert_eq!((rates.len(), &class["class"]), (7, &"part".into()));
+    assert!(rates.iter().all(|r| (4.0 * r).fract() == 0.0 && (0.0..=1.0).contains(r)), "{rates:?}");
+    // Figure 6.7: of its own class and of all, for each number of experiences; with one object they are the same.
+    let curves = json["curves"].as_array().unwrap();
+    assert_eq!(curves.len(), 8, "{curves:?}");
+    assert!(curves.iter().all(|c| c["asked"].as_u64().unwrap() > 0), "{curves:?}");
+    assert_eq!(json["pairs"].as_array().unwrap().len(), 1);
+    let table = std::fs::read_to_string(dir.join("out/table.md")).unwrap();
+    let head =
+        "| class | scenes | geometry | experience | network | published | agreement | outcomes | both |";
+    assert!(table.contains(head), "{table}");
+    let mean = table.lines().find(|l| l.starts_with("| mean of classes")).unwrap();
+    let cells: Vec<f64> = mean.split('|').filter_map(|c| c.trim().parse().ok()).collect();
+    assert!(
+        cells.iter().zip(&rates).all(|(c, r)| (c - r).abs() < 1e-3) && cells.len() == 7,
+        "{mean} {rates:?}"
+    );
+    for file in ["experience-5cm.png", "between-objects-1cm.png", "incremental.png", "reproduce.json"] {
+        assert!(dir.join("out").join(file).is_file(), "{file}");
+    }
+    // Again, everything is there.
+    let trials = std::fs::read(dir.join("out/compare/trials.jsonl")).unwrap();
+    let again = sixfold(dir, &command).expect(0).json();
+    assert_eq!(
+        (&again["compare"]["classes"], &again["curves"]),
+        (&json["compare"]["classes"], &json["curves"])
+    );
+    assert_eq!(std::fs::read(dir.join("out/compare/trials.jsonl")).unwrap(), trials);
+}

@@ -1,0 +1,322 @@
+//! Regions and hypotheses as published (dissertation, section 5.2.4): descriptors alone choose templates, the mask head says which
+//! pixels are the object's before anything is aligned, masks that overlap are one region, and each region has the five nearest
+//! templates of a second matching without its background. A region whose first hypothesis does not cover its mask after three
+//! iterations of ICP is left out (section 5.2.5).
+//!
+//! The text leaves open how many regions get a mask, and what the 30 % of overlap are of: here [`SELECTED`], and intersection over
+//! union. A template is placed where its visible centroid meets that of the predicted mask.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use sixfold_align::DepthRegion;
+use sixfold_geometry::{Pose, Vec2, Vec3};
+
+use crate::align::align_shortly;
+use crate::estimate::{KnownObject, MttmOptions, Placed, SAME_ROTATION, Stages, place_at};
+use crate::learned::Learned;
+use crate::mask::{Pixels, common, template_mask};
+use crate::matching::Entry;
+use crate::model::{Encoded, PairSays};
+use crate::network::MAP;
+use crate::patch::Patch;
+use crate::regions::RegionCache;
+use crate::roi::{Roi, UNKNOWN, ray_rotation};
+
+/// Regions of the first matching whose masks are predicted: those with the nearest templates. Chosen by hand; not swept.
+const SELECTED: usize = 200;
+/// Pairs that go through the network at a time; of no influence on the result.
+const AT_A_TIME: usize = 32;
+/// A cell, or a pixel, belongs to the object from this probability on.
+const INSIDE: f32 = 0.5;
+/// Masks that share more than this fraction of the smaller one are of one object (section 5.2.4).
+const MERGED: f64 = 0.5;
+/// Regions whose first hypothesis overlaps their mask by less are left out (section 5.2.5).
+const MIN_OVERLAP: f64 = 0.3;
+/// Masks are compared on every n-th column and row; chosen by hand, not swept.
+const STRIDE: usize = 2;
+/// Fewest pixels of a mask there; chosen by hand, not swept.
+const MIN_MASK: usize = 20;
+/// Nearest templates among which a region's hypotheses are looked for, for each of them. Chosen by hand; not swept.
+const NEAREST: usize = 60;
+
+/// A region's hypotheses, laid on the scene; all carry its mask.
+pub(crate) fn hypotheses(
+    scene: &DepthRegion,
+    object: &KnownObject,
+    learned: &Learned,
+    cache: &RegionCache,
+    options: &MttmOptions,
+    stages: &mut Stages,
+) -> Vec<Placed> {
+    let regions = cache.of(scene, learned);
+    stages.sampled = regions.sampled;
+    let nearest = learned.nearest(&regions.descriptors);
+    let mut order: Vec<usize> = (0..regions.rois.len()).collect();
+    order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
+    order.truncate(SELECTED);
+    // The first mask prediction, and one region of all masks that overlap: the seed has the nearest template.
+    let entries: Vec<Entry> = order.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
+    let says: Vec<Vec<PairSays>> = order
+        .par_chunks(AT_A_TIME)
+        .zip(entries.par_chunks(AT_A_TIME))
+        .map(|(rois, entries)| learned.model().compare(&regions.encoded(rois), &learned.templates(entries)))
+        .collect();
+    let size = learned.size();
+    let masks: Vec<(Roi, Pixels)> = order
+        .par_iter()
+        .zip(says.concat())
+        .map(|(&i, says)| (regions.rois[i], mask_pixels(scene, &regions.rois[i], size, &says.mask, STRIDE)))
+        .collect();
+    let kept = merged(masks, options.masked);
+    stages.regions = kept.len();
+    let centred: Vec<(Roi, Pixels)> = kept
+        .into_iter()
+        .filter_map(|(_, mask)| Some((Roi { centre: centroid(scene, &mask)? }, mask)))
+        .collect();
+    // In turn: each region asks the network by itself.
+    let found: Vec<Vec<Placed>> =
+        centred.par_iter().map(|(roi, mask)| region(scene, object, learned, roi, mask, options)).collect();
+    found.concat()
+}
+
+/// The masks without those that overlap an earlier one, at most so many.
+fn merged(masks: Vec<(Roi, Pixels)>, most: usize) -> Vec<(Roi, Pixels)> {
+    let mut kept: Vec<(Roi, Pixels)> = vec![];
+    for (roi, mask) in masks {
+        let overlaps =
+            |other: &Pixels| common(&mask, other) as f64 > MERGED * mask.len().min(other.len()) as f64;
+        if kept.len() < most && mask.len() >= MIN_MASK && !kept.iter().any(|(_, other)| overlaps(other)) {
+            kept.push((roi, mask));
+        }
+    }
+    kept
+}
+
+/// The second matching of one region, and whether its first hypothesis covers its mask.
+fn region(
+    scene: &DepthRegion,
+    object: &KnownObject,
+    learned: &Learned,
+    roi: &Roi,
+    first_mask: &Pixels,
+    options: &MttmOptions,
+) -> Vec<Placed> {
+    let (model, size) = (learned.model(), learned.size());
+    let patch = Patch::of_scene(scene, roi, size, model.side(), |_| true);
+    let encoded = model.encode(&[&patch]);
+    let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
+    let Some(descriptor) = model.describe(&bare).into_iter().next() else { return vec![] };
+    let camera_from_roi = roi.camera_from_roi();
+    let turned = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
+    let pose = |e: &Entry| object.object_pose(&turned(e), e.template);
+    let mut entries: Vec<Entry> = vec![];
+    for (_, number) in learned.ranked(&descriptor).into_iter().take(NEAREST * options.hypotheses) {
+        if entries.len() == options.hypotheses {
+            break;
+        }
+        let entry = object.matcher.entries()[number];
+        if !entries.iter().any(|e| pose(e).rotation_angle_to(&pose(&entry)) < SAME_ROTATION) {
+            entries.push(entry);
+        }
+    }
+    if entries.is_empty() {
+        return vec![];
+    }
+    let regions = Encoded::joined(&vec![encoded; entries.len()]);
+    let says = model.compare(&regions, &learned.templates(&entries));
+    // One mask a region, by its first hypothesis.
+    let mask = Arc::new(mask_pixels(scene, roi, size, &says[0].mask, 1));
+    let Some(centre) = centroid(scene, &mask) else { return vec![] };
+    let starts: Vec<Pose> = entries
+        .iter()
+        .zip(&says)
+        .map(|(entry, says)| start(object, &camera_from_roi, &centre, entry, says, options))
+        .collect();
+    if !covers(scene, object, &entries[0], &starts[0], &mask) {
+        return vec![];
+    }
+    entries
+        .iter()
+        .zip(starts)
+        .map(|(entry, start)| Placed {
+            mask: Some(mask.clone()),
+            ..place_at(scene, object, entry.template, start, 1.0, options)
+        })
+        .collect()
+}
+
+/// Where a template lies whose visible centroid is at `centre`, rotated as the network says.
+pub(crate) fn start(
+    object: &KnownObject,
+    camera_from_roi: &Pose,
+    centre: &Vec3,
+    entry: &Entry,
+    says: &PairSays,
+    options: &MttmOptions,
+) -> Pose {
+    let turned = crate::align::camera_from_view(camera_from_roi, entry.turn);
+    let rotation = if options.predicted_pose {
+        camera_from_roi.rotation()
+            * says.rotation
+            * (camera_from_roi.rotation().inverse() * turned.rotation())
+    } else {
+        turned.rotation()
+    };
+    let of_template = object.surfaces[entry.template].dense.centroid().unwrap_or_else(Vec3::zeros);
+    Pose::new(rotation, centre - rotation * of_template)
+}
+
+/// Whether a hypothesis, after three iterations of ICP, covers enough of its mask.
+fn covers(scene: &DepthRegion, object: &KnownObject, entry: &Entry, start: &Pose, mask: &Pixels) -> bool {
+    let surface = &object.surfaces[entry.template];
+    let aligned = align_shortly(scene, &surface.sparse, start, object.matcher.tolerance());
+    let template = &object.templates.templates[entry.template];
+    let area = template_mask(scene, template, object.templates.size, &aligned, f64::INFINITY, 1);
+    overlap(&area, mask) >= MIN_OVERLAP
+}
+
+/// Intersection over union.
+fn overlap(a: &Pixels, b: &Pixels) -> f64 {
+    let both = common(a, b);
+    both as f64 / (a.len() + b.len() - both).max(1) as f64
+}
+
+/// The measured pixels whose cell of a predicted mask (14 x 14) is the object's, of every `stride`-th column and row.
+fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: usize) -> Pixels {
+    let camera = scene.camera();
+    let rotation = ray_rotation(&roi.centre);
+    let (right, down, axis) = (rotation * Vec3::x(), rotation * Vec3::y(), rotation * Vec3::z());
+    let distance = roi.centre.norm();
+    let half = 0.5 * size;
+    let corners = [(-half, -half), (half, -half), (half, half), (-half, half)];
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for (u, v) in corners {
+        let Some(p) = camera.project(&(roi.centre + right * u + down * v)) else { return vec![] };
+        (low, high) = (low.inf(&p), high.sup(&p));
+    }
+    let first = |v: f64| (v.floor().max(0.0) as usize).next_multiple_of(stride);
+    let last = |v: f64, size: usize| (v.ceil().max(0.0) as usize).min(size);
+    let mut pixels = vec![];
+    for y in (first(low.y)..last(high.y, camera.height)).step_by(stride) {
+        for x in (first(low.x)..last(high.x, camera.width)).step_by(stride) {
+            if scene.depth()[(x, y)] <= 0.0 {
+                continue;
+            }
+            // Where the pixel's ray meets the region's square.
+            let ray = camera.unproject(&Vec2::new(x as f64, y as f64), 1.0);
+            let p = ray * (distance / axis.dot(&ray)) - roi.centre;
+            let cell = |along: f64| ((along / size + 0.5) * MAP as f64).floor();
+            let (u, v) = (cell(right.dot(&p)), cell(down.dot(&p)));
+            let within = |k: f64| (0.0..MAP as f64).contains(&k);
+            if within(u) && within(v) && mask[v as usize * MAP + u as usize] >= INSIDE {
+                pixels.push((y * camera.width + x) as u32);
+            }
+        }
+    }
+    pixels
+}
+
+/// Which cells of a region look at pixels of a mask that was taken on every [`STRIDE`]-th column and row.
+fn cells_of(scene: &DepthRegion, roi: &Roi, size: f64, mask: &Pixels) -> Vec<f32> {
+    let width = scene.camera().width;
+    let inside = |pixel: usize| {
+        let (x, y) = (pixel % width / STRIDE * STRIDE, pixel / width / STRIDE * STRIDE);
+        mask.binary_search(&((y * width + x) as u32)).is_ok()
+    };
+    let cells = roi.look(scene, size, MAP, inside);
+    cells.iter().map(|c| f32::from(u8::from(*c != UNKNOWN))).collect()
+}
+
+/// The centroid of what a mask's pixels show, camera frame: the median of depth decides what is the object's and what is seen past
+/// it, as a mask of 14 x 14 cells is coarse. `None` for an empty mask.
+fn centroid(scene: &DepthRegion, mask: &Pixels) -> Option<Vec3> {
+    let camera = scene.camera();
+    let point = |&p: &u32| {
+        let (x, y) = (p as usize % camera.width, p as usize / camera.width);
+        camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(scene.depth()[(x, y)]))
+    };
+    let mut depths: Vec<f64> = mask.iter().map(|p| point(p).z).collect();
+    let median = sixfold_geometry::stats::upper_median(&mut depths)?;
+    let sum: Vec3 = mask.iter().map(point).sum();
+    let mean = sum / mask.len() as f64;
+    Some(mean * (median / mean.z))
+}
+
+/// The centre of what a region's cells of the mask show, in the region's frame; the region's own centre where they show nothing. For
+/// a network whose place was never trained.
+pub(crate) fn visible_centre(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32]) -> Vec3 {
+    let pixels = mask_pixels(scene, roi, size, mask, STRIDE);
+    let centre = centroid(scene, &pixels).unwrap_or(roi.centre);
+    roi.camera_from_roi().inverse().transform_point(&centre)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_align::{DepthOptions, PreparedDepth};
+    use sixfold_geometry::{Camera, DepthImage};
+
+    /// A wall at 0.8 m with a plate of 10 cm, 5 cm in front of it, about the centre of the image.
+    fn scene() -> DepthRegion {
+        let camera = Camera::new(500.0, 500.0, 159.5, 119.5, 320, 240).unwrap();
+        let on_plate = |x: usize, y: usize| x.abs_diff(160) < 33 && y.abs_diff(120) < 33;
+        let depth = DepthImage::from_fn(320, 240, |x, y| if on_plate(x, y) { 0.75 } else { 0.8 });
+        let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+        DepthRegion::whole(&PreparedDepth::new(&depth, &camera, &options).unwrap())
+    }
+
+    fn roi(x: f64) -> Roi {
+        Roi { centre: Vec3::new(x, 0.0, 0.75) }
+    }
+
+    #[test]
+    fn a_mask_of_cells_becomes_the_pixels_that_it_covers() {
+        let scene = scene();
+        // The left half of a region of 20 cm straight ahead: columns 160 - 67 to 160.
+        let mask: Vec<f32> = (0..MAP * MAP).map(|i| f32::from(u8::from(i % MAP < MAP / 2))).collect();
+        let pixels = mask_pixels(&scene, &roi(0.0), 0.2, &mask, 1);
+        let columns: Vec<usize> = pixels.iter().map(|p| *p as usize % 320).collect();
+        let (low, high) = (columns.iter().min().unwrap(), columns.iter().max().unwrap());
+        assert!(low.abs_diff(93) <= 1 && high.abs_diff(159) <= 1, "{low} {high}");
+        assert!(pixels.len().abs_diff(67 * 133) < 300, "{}", pixels.len());
+        assert!(mask_pixels(&scene, &roi(0.0), 0.2, &[0.4; MAP * MAP], 1).is_empty());
+        // And back, in a region 2 cm to the right: its left half ends 1.4 cells further to the left.
+        let coarse = mask_pixels(&scene, &roi(0.0), 0.2, &mask, STRIDE);
+        let cells = cells_of(&scene, &roi(0.02), 0.2, &coarse);
+        let in_row = |v: usize| (0..MAP).filter(|u| cells[v * MAP + u] > 0.5).count();
+        assert!((5..=6).contains(&in_row(7)), "{}", in_row(7));
+    }
+
+    #[test]
+    fn the_centroid_lies_on_what_most_of_the_mask_shows() {
+        let scene = scene();
+        let mask: Vec<f32> = (0..MAP * MAP)
+            .map(|i| f32::from(u8::from((3..11).contains(&(i % MAP)) && (3..11).contains(&(i / MAP)))))
+            .collect();
+        let pixels = mask_pixels(&scene, &roi(0.0), 0.2, &mask, 1);
+        let centre = centroid(&scene, &pixels).unwrap();
+        assert!((centre - Vec3::new(0.0, 0.0, 0.75)).norm() < 3e-3, "{centre}");
+        assert!(centroid(&scene, &vec![]).is_none());
+        let place = visible_centre(&scene, &roi(0.03), 0.2, &[0.0; MAP * MAP]);
+        assert!(place.norm() < 1e-9, "nothing seen: the region's own centre");
+    }
+
+    #[test]
+    fn masks_that_overlap_by_more_than_half_are_one_region() {
+        let mask = |range: std::ops::Range<u32>| (roi(0.0), range.collect::<Pixels>());
+        // The second shares 60 of its 100 pixels with the first, the third 40, and the last is too small.
+        let masks = vec![mask(0..100), mask(40..140), mask(60..160), mask(500..510)];
+        let kept = merged(masks.clone(), 50);
+        assert_eq!(kept.iter().map(|k| k.1[0]).collect::<Vec<_>>(), [0, 60]);
+        assert_eq!(merged(masks, 1).len(), 1);
+    }
+
+    #[test]
+    fn overlap_is_intersection_over_union() {
+        let set = |range: std::ops::Range<u32>| range.collect::<Pixels>();
+        assert!((overlap(&set(0..100), &set(50..130)) - 50.0 / 130.0).abs() < 1e-12);
+        assert_eq!(overlap(&set(0..10), &set(10..20)), 0.0);
+        assert_eq!(overlap(&vec![], &vec![]), 0.0);
+    }
+}
