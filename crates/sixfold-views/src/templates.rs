@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use half::f16;
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::{Camera, KdTree, OptionError, Pose, Rect, RgbImage, Vec3};
@@ -238,6 +239,8 @@ pub fn make_templates(
         let maps = extractor.features(&inputs, options.side)?;
         for (template, map) in made.iter_mut().zip(maps) {
             template.features = gathered(&map, &template.cells);
+            // As the file has them: kept templates and new ones give the same poses.
+            template.features.iter_mut().for_each(|v| *v = f16::from_f32(*v).to_f32());
         }
         templates.append(&mut made);
     }
