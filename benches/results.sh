@@ -13,10 +13,10 @@
 #   --work DIR       folder for what the commands write (OUT in the commands; default: out/results)
 #   --commit NAME    what to write as the commit (default: git's HEAD); a work folder belongs to one commit
 #
-# Needs bash, python3, paths without spaces, and about 20 minutes of one core.
+# Needs bash, python3, paths without spaces, and about 30 minutes of one core.
 set -euo pipefail
 
-PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows pix2pose detector grasp experience nol)
+PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows pix2pose views detector grasp experience nol)
 # Asked for by name only: chapter 6 in small, about eight minutes more.
 MORE=(dgcm)
 
@@ -324,6 +324,13 @@ part_pix2pose() {
     typed "sixfold eval $common --no-vsd --results OUT/pix2pose-detected.csv --json OUT/pix2pose-detected.json"
     freeze pix2pose 0 poses=pix2pose.csv scores=pix2pose.json \
         poses_in_detected_boxes=pix2pose-detected.csv scores_in_detected_boxes=pix2pose-detected.json
+}
+
+# Poses from colour without training for the object, in ground-truth boxes of all targets.
+part_views() {
+    typed "sixfold estimate --method views --dataset DIR/lmo --boxes gt --out OUT/views.csv"
+    typed "sixfold eval --dataset DIR/lmo --no-vsd --results OUT/views.csv --json OUT/views.json"
+    freeze views 0 poses=views.csv scores=views.json
 }
 
 # Boxes and masks, and their average precision.

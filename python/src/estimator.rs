@@ -203,7 +203,7 @@ impl PyEstimator {
     /// then); id: which of the weights' objects it is, not needed where they know one. depth (H, W) metres; rgb (H, W, 3) uint8;
     /// images are without lens distortion, and what the method does not use is ignored (`needs`). box (4,) x, y, width,
     /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: max number of poses;
-    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0 for pix2pose and views). What is
+    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0.25 for views, 0 for pix2pose). What is
     /// derived from an object is kept for the next call. The same input gives the same result at any number of threads. Ctrl-C
     /// is heard.
     ///

@@ -24,6 +24,12 @@ pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "train pix2pose", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "train pix2pose", options: &["unit", "store"], when: &[Without("objects")] },
     Idle { command: "train pix2pose", options: &["no_adversarial"], when: &[Is("network", &["compact"])] },
+    // Without a preset, the network is the compact one.
+    Idle {
+        command: "train pix2pose",
+        options: &["no_adversarial"],
+        when: &[Without("network"), Without("preset")],
+    },
     Idle { command: "train detector", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "train detector", options: &["unit", "store"], when: &[Without("objects")] },
     Idle { command: "grasp propose", options: &["weights"], when: &[Without("experiences")] },

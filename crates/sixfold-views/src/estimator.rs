@@ -136,8 +136,10 @@ impl PoseEstimator for ViewsEstimator {
         Needs { depth: Need::Unused, rgb: Need::Required, region: Need::Required, object: Need::Required }
     }
 
+    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 71 % lie above 0.25, 92 % of those within a fifth of the
+    /// diameter among them; 85 % of them are within half of it, of all 67 % (`benches/views_confidence.py`).
     fn min_confidence(&self) -> MinConfidence {
-        MinConfidence { image: 0.0, dataset: 0.0 }
+        MinConfidence { image: 0.25, dataset: 0.0 }
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {

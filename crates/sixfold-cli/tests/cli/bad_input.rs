@@ -394,9 +394,14 @@ fn options_that_would_be_ignored_are_refused() {
         ("train pix2pose FOUND --out out --split train", "--split", "without --dataset"),
         ("train pix2pose --dataset lmo --out out --unit mm", "--unit", "without --object"),
         (
-            "train pix2pose --dataset lmo --out out --no-adversarial",
+            "train pix2pose --dataset lmo --out out --no-adversarial --network compact",
             "--no-adversarial",
             "with --network compact",
+        ),
+        (
+            "train pix2pose --dataset lmo --out out --no-adversarial",
+            "--no-adversarial",
+            "without --network without --preset",
         ),
         ("train detector FOUND --out out --split train", "--split", "without --dataset"),
         ("train detector --dataset lmo --out out --store objects", "--store", "without --object"),
