@@ -9,6 +9,7 @@ use crate::estimate::{EstimateError, Found, Pix2PoseOptions, estimate};
 use crate::model::Pix2PoseModel;
 use crate::object::Correction;
 use crate::refine::{OutlineRefinementOptions, refine};
+use sixfold_align::outline::projected_box;
 use sixfold_data::PosedImage;
 use sixfold_geometry::stats::upper_median;
 use sixfold_geometry::{Camera, OptionError, Pose, Rect, RgbImage, Vec2};
@@ -105,17 +106,6 @@ pub fn estimate_aligned(
         best.camera_from_object = correction.apply(camera, &best.camera_from_object);
     }
     Ok(Some(best))
-}
-
-/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
-fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
-    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
-    for vertex in mesh.vertices() {
-        let pixel = camera.project(&pose.transform_point(vertex))?;
-        (low, high) = (low.inf(&pixel), high.sup(&pixel));
-    }
-    let size = high - low;
-    (size.x >= 2.0 && size.y >= 2.0).then_some(Rect { x: low.x, y: low.y, width: size.x, height: size.y })
 }
 
 /// Whether the box of a pose can be that of an object seen in `region`: it covers most of it, and is not many times larger.

@@ -1,4 +1,4 @@
-//! Square views of a region: a camera in the same place that looks at the middle of a box, turned so that the box is in the centre
+//! Square views of a region: a camera in the same place that looks at the centre of a box, rotated so that the box is in the centre
 //! of its image. What a crop shows then depends on the object alone, not on where in the image it is seen.
 
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};

@@ -2,7 +2,7 @@
 //! of FoundPose: Örnek et al. 2024; of its parts only the order is theirs).
 
 use rayon::prelude::*;
-use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds};
+use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds, projected_box};
 use sixfold_geometry::{
     Camera, OptionError, PnpOptions, Pose, Rect, RefineOptions, RgbImage, Vec2, Vec3, pnp_ransac, refine_pose,
 };
@@ -372,17 +372,6 @@ impl Views<'_> {
         soft.blur(UNDECIDED);
         soft.data[..side * side].iter().map(|v| v.clamp(1.0 - DECIDED, DECIDED)).collect()
     }
-}
-
-/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
-fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
-    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
-    for vertex in mesh.vertices() {
-        let pixel = camera.project(&pose.transform_point(vertex))?;
-        (low, high) = (low.inf(&pixel), high.sup(&pixel));
-    }
-    let size = high - low;
-    (size.x >= 2.0 && size.y >= 2.0).then_some(Rect { x: low.x, y: low.y, width: size.x, height: size.y })
 }
 
 /// A render against a crop.

@@ -33,19 +33,21 @@ pub fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
 
 /// The cell within `reach` of `cell` whose feature is nearest, and the product.
 pub fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
-    let n = map.cells;
-    let (x, y) = (cell % n, cell / n);
     let mut best = (cell, f32::NEG_INFINITY);
-    for v in y.saturating_sub(reach)..(y + reach + 1).min(n) {
-        for u in x.saturating_sub(reach)..(x + reach + 1).min(n) {
-            let at = v * n + u;
-            let product = dot(feature, map.feature(at));
-            if product > best.1 {
-                best = (at, product);
-            }
+    for at in near(map.cells, cell, reach) {
+        let product = dot(feature, map.feature(at));
+        if product > best.1 {
+            best = (at, product);
         }
     }
     best
+}
+
+/// The cells within `reach` of a cell of a map of `n` x `n`, row by row.
+fn near(n: usize, cell: usize, reach: usize) -> impl Iterator<Item = usize> {
+    let (x, y) = (cell % n, cell / n);
+    let range = move |at: usize| at.saturating_sub(reach)..(at + reach + 1).min(n);
+    range(y).flat_map(move |v| range(x).map(move |u| v * n + u))
 }
 
 /// A feature of the template and one of the crop that choose each other.
@@ -67,18 +69,14 @@ pub fn mutual_matches(template: &Template, map: &FeatureMap, reach: usize) -> Ve
     for (i, cell) in template.cells.iter().enumerate() {
         let feature = &template.features[i * CHANNELS..(i + 1) * CHANNELS];
         let cell = usize::from(*cell);
-        let (x, y) = (cell % n, cell / n);
         let mut best = (cell, f32::NEG_INFINITY);
-        for v in y.saturating_sub(reach)..(y + reach + 1).min(n) {
-            for u in x.saturating_sub(reach)..(x + reach + 1).min(n) {
-                let at = v * n + u;
-                let product = dot(feature, map.feature(at));
-                if product > best.1 {
-                    best = (at, product);
-                }
-                if product > back[at].0 {
-                    back[at] = (product, i as u32);
-                }
+        for at in near(n, cell, reach) {
+            let product = dot(feature, map.feature(at));
+            if product > best.1 {
+                best = (at, product);
+            }
+            if product > back[at].0 {
+                back[at] = (product, i as u32);
             }
         }
         forward.push(best);

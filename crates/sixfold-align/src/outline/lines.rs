@@ -2,7 +2,7 @@
 //! pixels on either side, which are theirs, an edge of the image speaks for a border (ours): `w g^2 / (g^2 + EDGE^2)` is added to
 //! its log likelihood, where `g` is the change of colour across it and `w` the weight of [`Outline::with_edges`].
 
-use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
+use sixfold_geometry::{Camera, NormalEquations, Pose, Rect, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Patch;
@@ -45,6 +45,17 @@ const TUKEY: f64 = 4.685;
 /// longer than all the rest.
 pub fn outline_mesh(mesh: &Mesh) -> Mesh {
     if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }
+}
+
+/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
+pub fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for vertex in mesh.vertices() {
+        let pixel = camera.project(&pose.transform_point(vertex))?;
+        (low, high) = (low.inf(&pixel), high.sup(&pixel));
+    }
+    let size = high - low;
+    (size.x >= 2.0 && size.y >= 2.0).then_some(Rect { x: low.x, y: low.y, width: size.x, height: size.y })
 }
 
 /// Value of a square map at pixel `(x, y)`.

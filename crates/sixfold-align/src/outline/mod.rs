@@ -11,5 +11,5 @@ mod lines;
 mod odds;
 
 pub use alignment::{AlignedOutline, Alignment, AlignmentOptions};
-pub use lines::{Line, MIN_LINES, Outline, add_lines, motion, outline_mesh, sample, tukey};
+pub use lines::{Line, MIN_LINES, Outline, add_lines, motion, outline_mesh, projected_box, sample, tukey};
 pub use odds::{color_odds, log_odds};
