@@ -78,11 +78,9 @@ fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Plac
             ];
             let free = |place: &Place| !taken.iter().any(|t| overlap(*t, *place));
             let step = STEP * dot;
-            let all = || {
-                (0..=last_y)
-                    .step_by(step)
-                    .flat_map(move |y| (0..=last_x).step_by(step).map(move |x| [x, y, width, height]))
-            };
+            // The last row and column too, or narrow images have no room.
+            let grid = move |last: usize| (0..=last).step_by(step).chain([last]);
+            let all = || grid(last_y).flat_map(move |y| grid(last_x).map(move |x| [x, y, width, height]));
             let place = if free(&wanted) {
                 wanted
             } else {
