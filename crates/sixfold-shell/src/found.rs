@@ -7,7 +7,7 @@ use sixfold_runner::{FoundObject, ImageReport, pose_table};
 use crate::Outcome;
 use crate::folder::OutputFolder;
 use crate::output::{JsonArguments, report, write_atomically};
-use crate::overlay::{self, Drawn};
+use crate::overlay::{self, Drawn, Shape};
 use crate::pictures::Pictures;
 
 /// An image and the objects that were searched in it.
@@ -80,7 +80,7 @@ impl SearchedImage<'_> {
 
     /// The poses over the image; where an object has no mesh, its mask.
     fn overlay(&self) -> RgbImage {
-        let mut background = match (self.rgb, self.depth) {
+        let background = match (self.rgb, self.depth) {
             (Some(rgb), _) => rgb.clone(),
             (None, Some(depth)) => overlay::depth_picture(depth),
             (None, None) => RgbImage::filled(self.camera.width, self.camera.height, [0; 3]),
@@ -88,15 +88,17 @@ impl SearchedImage<'_> {
         let mut drawn = vec![];
         for (i, f) in self.found.iter().enumerate() {
             for estimate in &f.estimates {
-                match (f.object.mesh(), &estimate.mask) {
-                    (Some(mesh), _) => drawn.push(Drawn {
-                        mesh,
-                        camera_from_object: estimate.camera_from_object,
-                        color: overlay::color(i),
-                    }),
-                    (None, Some(mask)) => overlay::tint(&mut background, mask, overlay::color(i)),
-                    (None, None) => {}
-                }
+                let shape = match (f.object.mesh(), &estimate.mask) {
+                    (Some(mesh), _) => Shape::Mesh(mesh, estimate.camera_from_object),
+                    (None, Some(mask)) => Shape::Pixels(mask),
+                    (None, None) => continue,
+                };
+                drawn.push(Drawn {
+                    shape,
+                    color: overlay::color(i),
+                    name: f.object.name().to_owned(),
+                    certainty: overlay::certainty(estimate),
+                });
             }
         }
         overlay::draw(&background, self.camera, &drawn)

@@ -10,6 +10,7 @@ pub mod found;
 pub mod frames;
 pub mod grasp;
 pub mod idle;
+pub mod labels;
 pub mod meshes;
 pub mod objects;
 pub mod output;

@@ -8,8 +8,9 @@ use sixfold_grasp::{
     antipodal_grasps, cluster_grasps, draw_grasps,
 };
 
+use crate::labels::{Label, draw_labels};
 use crate::output::pose_rows;
-use crate::overlay::depth_picture;
+use crate::overlay::{caption, depth_picture};
 
 /// The best grasp's colour; the others are blue.
 const BEST: [u8; 3] = [60, 220, 80];
@@ -110,7 +111,7 @@ pub fn of_both(grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
     grasps.ranked.iter().map(proposed).collect()
 }
 
-/// The grippers over the colour image or, without one, the depth image.
+/// The grippers over the colour image or, without one, the depth image, each with its number and quality.
 ///
 /// # Errors
 /// For a gripper that has no mesh.
@@ -132,7 +133,20 @@ pub fn picture(
             color: if i == 0 { BEST } else { OTHER },
         })
         .collect();
-    Ok(draw_grasps(&background, Some(depth), camera, gripper, &drawn)?)
+    let mut out = draw_grasps(&background, Some(depth), camera, gripper, &drawn)?;
+    // Number and quality at each, where the hand begins.
+    let label = |(i, p): (usize, &Proposed)| {
+        let at = camera.project(&p.pose.translation())?;
+        Some(Label {
+            text: caption(&(i + 1).to_string(), p.quality),
+            of: [at.x, at.y, at.x, at.y],
+            color: if i == 0 { BEST } else { OTHER },
+            is_sure: true,
+        })
+    };
+    let labels: Vec<Label> = proposed.iter().enumerate().filter_map(label).collect();
+    draw_labels(&mut out, &labels);
+    Ok(out)
 }
 
 /// Prints the grasps, one a line.

@@ -128,11 +128,8 @@ fn with_model(
                     confidence: posed.score,
                     seconds: start.elapsed().as_secs_f64(),
                 });
-                drawn.push(Drawn {
-                    mesh,
-                    camera_from_object: posed.camera_from_object,
-                    color: overlay::color(o.obj_id as usize),
-                });
+                let pose = posed.camera_from_object;
+                drawn.push(Drawn::of_dataset(o.obj_id, mesh, pose, posed.score));
             }
             let picture = overlay::draw(&image, &camera, &drawn);
             colour.pictures.extend(out.write(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture));

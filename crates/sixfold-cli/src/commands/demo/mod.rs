@@ -94,7 +94,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
                         e.confidence,
                         e.camera_from_object,
                     ));
-                    found.push((o.obj_id, e.camera_from_object));
+                    found.push((o.obj_id, e.camera_from_object, e.confidence));
                     if let Some(truth) = truth {
                         let error = add_s(k, e.camera_from_object, truth);
                         rows.push(Row {
@@ -132,16 +132,12 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     Ok(out.outcome(if whole.poses.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
 }
 
-/// Poses by object, to be drawn.
-fn drawn<'a>(found: &[(u32, Pose)], known: &'a BTreeMap<u32, Known>) -> Vec<Drawn<'a>> {
+/// Poses by object with their confidence, to be drawn.
+fn drawn<'a>(found: &[(u32, Pose, f64)], known: &'a BTreeMap<u32, Known>) -> Vec<Drawn<'a>> {
     found
         .iter()
-        .filter_map(|(id, camera_from_object)| {
-            Some(Drawn {
-                mesh: known.get(id)?.mesh()?,
-                camera_from_object: *camera_from_object,
-                color: overlay::color(*id as usize),
-            })
+        .filter_map(|(id, pose, confidence)| {
+            Some(Drawn::of_dataset(*id, known.get(id)?.mesh()?, *pose, *confidence))
         })
         .collect()
 }

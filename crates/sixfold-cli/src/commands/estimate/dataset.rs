@@ -120,10 +120,9 @@ fn draw(folder: &mut OutputFolder, result: &ImageResult<'_>) -> Result<()> {
     let drawn: Vec<Drawn<'_>> = result
         .found
         .iter()
-        .map(|p| Drawn {
-            mesh: p.mesh,
-            camera_from_object: p.estimate.camera_from_object,
-            color: overlay::color(p.obj_id as usize),
+        .map(|p| {
+            let certainty = overlay::certainty(&p.estimate);
+            Drawn::of_dataset(p.obj_id, p.mesh, p.estimate.camera_from_object, certainty)
         })
         .collect();
     let name = format!("{:06}_{im_id:06}.png", result.scene_id);
