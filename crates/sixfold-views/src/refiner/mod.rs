@@ -255,6 +255,7 @@ fn sigmoid(x: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::crop::Crop;
+    use crate::estimate::tests::cuboid;
     use crate::network::input;
     use crate::refiner::samples::{RENDERS, make_sample};
     use crate::templates::wide_camera;
@@ -273,13 +274,6 @@ mod tests {
 
     /// An object in two colours without a symmetry, and a crop that shows it.
     fn scene() -> (Mesh, Crop, Pose, Patch) {
-        let cuboid = |low: [f64; 3], high: [f64; 3], color: [u8; 3]| {
-            let corner =
-                |i: usize| Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { low[axis] } else { high[axis] });
-            let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-            let faces = quads.iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect();
-            Mesh::new((0..8).map(corner).collect(), faces).unwrap().with_colors(vec![color; 8]).unwrap()
-        };
         let mesh = Mesh::merged(&[
             cuboid([-0.06, -0.03, -0.03], [0.06, 0.03, 0.03], [200, 60, 40]),
             cuboid([0.02, 0.0, 0.03], [0.06, 0.03, 0.09], [40, 90, 190]),

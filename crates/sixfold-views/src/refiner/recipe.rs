@@ -10,15 +10,13 @@ use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::{ModelCard, save_weights, write_card_markdown};
-use sixfold_synth::augment::{Backgrounds, PhotographOptions};
+use sixfold_synth::augment::Backgrounds;
 
 use super::network::{ARCHITECTURE, RefinerNetwork};
 use super::training::{RefinerTraining, RefinerTrainingOptions, Source};
 use crate::features::Extractor;
 use crate::network::shipped_hash;
-
-/// Fraction of procedural textures between the photographs.
-const PROCEDURAL_FRACTION: f32 = 0.2;
+use crate::recipe::{described, textures};
 
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -70,21 +68,9 @@ impl Recipe for RefinerRecipe {
     ) -> Result<Prepared<RefinerTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
         let network = RefinerNetwork::random(self.seed(), &device);
-        let textures = match &self.backgrounds {
-            Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())
-                .map_err(TrainError::about("backgrounds"))?
-                .with_procedural_fraction(PROCEDURAL_FRACTION),
-            None => Backgrounds::procedural(),
-        };
+        let textures = textures(self.backgrounds.as_deref())?;
         let mut card = ModelCard::new(ARCHITECTURE, "Refiner of poses of known objects in colour images");
-        let images = match textures.images() {
-            0 => "noise".to_owned(),
-            n => format!("{n} photographs and noise"),
-        };
-        card.data = format!(
-            "synthetic toys and household shapes with random colours, textures, backgrounds and occluders from {images}; no scanned object; \
-             features: those of the views within the program"
-        );
+        card.data = format!("{}; features: those of the views within the program", described(&textures));
         let options = self.options.clone();
         card.extra = serde_json::json!({ "training": options });
         Ok(Prepared { training: RefinerTraining::new(network, options, device), card, context: textures })
