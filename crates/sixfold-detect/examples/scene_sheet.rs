@@ -1,9 +1,11 @@
 //! A sheet of training images with their boxes and masks, and how long they take to make.
 //!
 //!     cargo run --release -p sixfold-detect --example scene_sheet -- DATASET FRAMES.json BACKGROUNDS OUT.png
+//!     cargo run --release -p sixfold-detect --example scene_sheet -- BACKGROUNDS OUT.png   # those of proposals
 
 use sixfold_bop::{BopDataset, Models};
 use sixfold_data::{FrameId, TrainingObject, read_posed_images};
+use sixfold_detect::proposals::ProposalsRecipe;
 use sixfold_detect::samples::{TrainingImageOptions, TrainingImageSource};
 use sixfold_detect::training::sample_time;
 use sixfold_geometry::{Image, RgbImage};
@@ -14,8 +16,12 @@ use std::path::Path;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
+    if let [backgrounds, out] = &args[..] {
+        let recipe = ProposalsRecipe { backgrounds: Some(backgrounds.into()), ..ProposalsRecipe::default() };
+        return sheet(&recipe.source()?, Path::new(out));
+    }
     let [dataset, frames, backgrounds, out] = &args[..] else {
-        return Err("usage: scene_sheet DATASET FRAMES.json BACKGROUNDS OUT.png".into());
+        return Err("usage: scene_sheet [DATASET FRAMES.json] BACKGROUNDS OUT.png".into());
     };
     let dataset = BopDataset::open(Path::new(dataset), "test")?;
     let frames: Vec<FrameId> = serde_json::from_slice(&std::fs::read(frames)?)?;
@@ -39,7 +45,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         backgrounds.with_procedural_fraction(0.15),
         TrainingImageOptions::default(),
     )?;
-    println!("{:.1} ms per image on all threads", sample_time(&source, 60));
+    sheet(&source, Path::new(out))
+}
+
+fn sheet(source: &TrainingImageSource, out: &Path) -> Result<(), Box<dyn Error>> {
+    println!("{:.1} ms per image on all threads", sample_time(source, 60));
     let side = source.options().size;
     let (columns, rows) = (6, 4);
     let mut sheet: RgbImage = Image::filled(columns * side, rows * side, [0; 3]);
@@ -70,5 +80,5 @@ fn main() -> Result<(), Box<dyn Error>> {
             }
         }
     }
-    Ok(write_rgb(Path::new(out), &sheet)?)
+    Ok(write_rgb(out, &sheet)?)
 }

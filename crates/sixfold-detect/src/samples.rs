@@ -5,6 +5,7 @@
 //! A photograph shows objects wherever it shows them: it is never a mere background, its annotations stay. Each sample is
 //! a function of seed and number alone.
 
+use crate::tabletop::{Tabletop, tabletop};
 use crate::targets::{Annotation, IGNORED, Instance};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
@@ -14,6 +15,7 @@ use sixfold_data::{
 };
 use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3};
+use sixfold_mesh::Mesh;
 use sixfold_synth::augment::{
     AffineMap, AugmentError, Backgrounds, ColorAugmentation, Coverage, Cutout, Patch, Shape,
     procedural_texture,
@@ -30,6 +32,8 @@ const PALETTE_PICTURES: usize = 6;
 const PALETTE_COLORS: usize = 40;
 /// Meshes with more faces are simplified, but for those with a texture.
 const FACES: usize = 5000;
+/// Different objects on a table, at most.
+const TABLETOP_CHOICE: usize = 40;
 /// Directions in which a mesh's farthest vertices decide about its box.
 const EXTREMES: usize = 200;
 
@@ -70,6 +74,17 @@ pub struct TrainingImageOptions {
     /// Fraction of rendered poses near one of a photograph, 0..1.
     #[serde(rename = "near_real_share")]
     pub near_real_fraction: f32,
+    /// Fraction of images that are rendered as a whole: the objects in their own colours on a table, 0..1.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub tabletop_fraction: f32,
+    /// All objects are of one class: the detector learns what an object is, not which.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub one_class: bool,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_zero(fraction: &f32) -> bool {
+    *fraction == 0.0
 }
 
 impl Default for TrainingImageOptions {
@@ -88,6 +103,8 @@ impl Default for TrainingImageOptions {
             min_visibility: 0.15,
             random_color_probability: 0.0,
             near_real_fraction: 0.6,
+            tabletop_fraction: 0.0,
+            one_class: false,
         }
     }
 }
@@ -277,8 +294,12 @@ impl TrainingImageSource {
         let mut random = stream(seed ^ 0x5ce9_e000, number);
         let random = &mut random;
         let options = &self.options;
+        // Those who do without them draw the same images as before there were any.
+        let tabletop = options.tabletop_fraction > 0.0 && random.random::<f32>() < options.tabletop_fraction;
         let kind = random.random::<f32>();
-        let mut canvas = if kind < options.photograph_share && !self.photographs.is_empty() {
+        let mut canvas = if tabletop {
+            self.tabletop(random)
+        } else if kind < options.photograph_share && !self.photographs.is_empty() {
             let mut canvas = self.photograph(random);
             for _ in 0..random.random_range(0..=options.max_added) {
                 self.paste_object(&mut canvas, random);
@@ -306,6 +327,18 @@ impl TrainingImageSource {
         self.color.apply(&mut canvas.image, random);
         let annotation = self.annotation(&mut canvas);
         TrainingImage { rgb: canvas.image.data, annotation }
+    }
+
+    /// Objects on a table.
+    fn tabletop(&self, random: &mut Random) -> Canvas {
+        let side = self.options.size;
+        let count = TABLETOP_CHOICE.min(self.objects.len());
+        let chosen: Vec<usize> = (0..count).map(|_| random.random_range(0..self.objects.len())).collect();
+        let meshes: Vec<&Mesh> = chosen.iter().map(|i| &self.objects[*i].drawn.mesh).collect();
+        let Tabletop { image, labels, whole } = tabletop(&meshes, &self.backgrounds, side, random);
+        let class = |index: usize| if self.options.one_class { 0 } else { chosen[index] };
+        let instances = whole.into_iter().map(|(index, pixels)| (class(index), pixels)).collect();
+        Canvas { image, labels, instances, side }
     }
 
     fn background(&self, random: &mut Random) -> Canvas {
@@ -388,7 +421,7 @@ impl TrainingImageSource {
         let feather = uniform(random, [0.4, 1.2]);
         let label = (canvas.instances.len() + 1) as u8;
         let pixels = canvas.paste(&patch, &cover, corner, feather, label);
-        canvas.instances.push((class, pixels));
+        canvas.instances.push((if self.options.one_class { 0 } else { class }, pixels));
     }
 
     /// Where an image's corner comes to lie: its middle is in the image.
@@ -655,6 +688,7 @@ impl TrainingImageOptions {
             ("least_visible", self.min_visibility),
             ("random_color_probability", self.random_color_probability),
             ("near_real_fraction", self.near_real_fraction),
+            ("tabletop_fraction", self.tabletop_fraction),
         ] {
             if !(0.0..=1.0).contains(&share) {
                 return wrong(field, "0 to 1", share.to_string());

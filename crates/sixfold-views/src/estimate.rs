@@ -44,6 +44,10 @@ pub struct ViewsOptions {
     pub close_side: usize,
     /// Align the outline there.
     pub outline: bool,
+    /// Where no region is given: proposals of an image that templates are compared with, the surest ones.
+    pub proposals: usize,
+    /// Of those, the ones most alike the object in which poses are looked for, beside one for each further instance.
+    pub places: usize,
     /// Seed of RANSAC.
     pub seed: u64,
 }
@@ -66,6 +70,8 @@ impl Default for ViewsOptions {
             close: 4,
             close_side: 224,
             outline: true,
+            proposals: 40,
+            places: 3,
             seed: 0,
         }
     }
@@ -84,6 +90,8 @@ impl ViewsOptions {
         }
         OptionError::unless_some("candidates", self.candidates)?;
         OptionError::unless_some("hypotheses", self.hypotheses)?;
+        OptionError::unless_some("proposals", self.proposals)?;
+        OptionError::unless_some("places", self.places)?;
         OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")
     }
 }
@@ -150,14 +158,36 @@ impl Views<'_> {
     /// # Errors
     /// [`ViewsError`].
     pub fn find(&self, image: &RgbImage, camera: &Camera, bbox: &Rect) -> Result<Option<Found>, ViewsError> {
-        let options = self.options;
-        let Some(part) = self.part(image, camera, bbox, options.side)? else { return Ok(None) };
+        let Some(part) = Part::new(self.extractor, image, camera, bbox, self.options.side)? else {
+            return Ok(None);
+        };
+        let ranked = self.ranked(&part);
+        let hypotheses = self.find_in(&part, &ranked, image, camera, bbox)?;
+        Ok(Some(Found { crop: part.crop, patch: part.patch, hypotheses, templates: ranked }))
+    }
+
+    /// The templates most alike a crop, best first: number and similarity.
+    pub(crate) fn ranked(&self, part: &Part) -> Vec<(usize, f32)> {
+        let reach = self.options.reach;
         let mut ranked: Vec<(usize, f32)> =
-            self.templates.par_iter().map(|t| similarity(t, &part.map, options.reach)).enumerate().collect();
+            self.templates.par_iter().map(|t| similarity(t, &part.map, reach)).enumerate().collect();
         ranked.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        ranked.truncate(options.candidates);
+        ranked.truncate(self.options.candidates);
+        ranked
+    }
+
+    /// The poses, best first, that a crop and the templates most alike it give.
+    pub(crate) fn find_in(
+        &self,
+        part: &Part,
+        ranked: &[(usize, f32)],
+        image: &RgbImage,
+        camera: &Camera,
+        bbox: &Rect,
+    ) -> Result<Vec<Hypothesis>, ViewsError> {
+        let options = self.options;
         let mut first: Vec<Hypothesis> =
-            ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], &part)).collect();
+            ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], part)).collect();
         first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in first {
@@ -165,7 +195,7 @@ impl Views<'_> {
                 kept.push(hypothesis);
             }
         }
-        let mut hypotheses = self.moved(kept, &part)?;
+        let mut hypotheses = self.moved(kept, part)?;
         for hypothesis in &mut hypotheses {
             hypothesis.camera_from_object = part.crop.to_camera(&hypothesis.camera_from_object);
         }
@@ -176,22 +206,7 @@ impl Views<'_> {
             Ok::<(), ViewsError>(())
         })?;
         hypotheses[..close].sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
-        Ok(Some(Found { crop: part.crop, patch: part.patch, hypotheses, templates: ranked }))
-    }
-
-    /// The crop about a box with what the networks see of it; `None` for a box that shows nothing.
-    fn part(
-        &self,
-        image: &RgbImage,
-        camera: &Camera,
-        bbox: &Rect,
-        side: usize,
-    ) -> Result<Option<Part>, ViewsError> {
-        let Some(crop) = Crop::of_box(camera, bbox, CROP_FACTOR, side) else { return Ok(None) };
-        let patch = crop.cut(image, camera, [0.5; 3]);
-        let input = input(&patch.data);
-        let maps = self.extractor.features(std::slice::from_ref(&input), side)?;
-        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map }))
+        Ok(hypotheses)
     }
 
     /// A pose refined in a crop about the whole object as the pose has it, of more pixels, and its outline aligned there.
@@ -209,7 +224,8 @@ impl Views<'_> {
             return Ok(hypothesis);
         }
         let side = self.options.close_side;
-        let Some(part) = self.part(image, camera, &whole, side)? else { return Ok(hypothesis) };
+        let part = Part::new(self.extractor, image, camera, &whole, side)?;
+        let Some(part) = part else { return Ok(hypothesis) };
         let start = Hypothesis {
             camera_from_object: part.crop.to_crop(&hypothesis.camera_from_object),
             ..hypothesis
@@ -223,7 +239,7 @@ impl Views<'_> {
     }
 
     /// Whether two poses are so near that refining both is no use.
-    fn same(&self, a: &Hypothesis, b: &Hypothesis) -> bool {
+    pub(crate) fn same(&self, a: &Hypothesis, b: &Hypothesis) -> bool {
         let (a, b) = (&a.camera_from_object, &b.camera_from_object);
         a.rotation_angle_to(b) < 0.17 && a.distance_to(b) < 0.05 * a.translation().norm()
     }
@@ -418,7 +434,7 @@ impl Views<'_> {
 }
 
 /// A crop with what the networks see of it.
-struct Part {
+pub(crate) struct Part {
     crop: Crop,
     patch: Patch,
     input: Vec<f32>,
@@ -426,6 +442,21 @@ struct Part {
 }
 
 impl Part {
+    /// The part of an image about a box in a crop of `side` pixels; `None` for a box that shows nothing.
+    pub(crate) fn new(
+        extractor: &Extractor,
+        image: &RgbImage,
+        camera: &Camera,
+        bbox: &Rect,
+        side: usize,
+    ) -> Result<Option<Part>, ViewsError> {
+        let Some(crop) = Crop::of_box(camera, bbox, CROP_FACTOR, side) else { return Ok(None) };
+        let patch = crop.cut(image, camera, [0.5; 3]);
+        let input = input(&patch.data);
+        let maps = extractor.features(std::slice::from_ref(&input), side)?;
+        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map }))
+    }
+
     fn target(&self) -> Target<'_> {
         Target { camera: &self.crop.camera, input: &self.input, map: &self.map }
     }

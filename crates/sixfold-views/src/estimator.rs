@@ -7,31 +7,34 @@ use burn::tensor::Device;
 use serde_json::{Map, json};
 use sixfold_align::outline::outline_mesh;
 use sixfold_estimator::{
-    EstimatorError, MinConfidence, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
+    EstimatorError, MinConfidence, Need, Needs, Object, ObjectDetector, PoseEstimate, PoseEstimator, PreparedObject, Query,
     downcast,
 };
 use sixfold_io::Fnv1a;
 use sixfold_mesh::Mesh;
 
 use crate::error::ViewsError;
-use crate::estimate::{Views, ViewsOptions};
+use crate::estimate::{Hypothesis, Views, ViewsOptions};
 use crate::features::Extractor;
 use crate::file;
 use crate::network::{ViewNetwork, shipped_hash};
 use crate::refiner::Refiner;
 use crate::refiner::network::RefinerNetwork;
+use crate::search::Places;
 use crate::templates::{Template, TemplateOptions, make_templates, view_mesh};
 
 const METHOD: &str = "views";
 /// Where an object's templates are kept in its folder.
 const FILE: &str = "views.bin";
 
-/// Poses of known objects from colour in given regions, without training for the object.
+/// Poses of known objects from colour, without training for the object, in given regions or where a detector of any object sees one.
 #[derive(Clone)]
 pub struct ViewsEstimator {
     extractor: Arc<Extractor>,
     /// For the features of the network within the program alone.
     refiner: Option<Arc<Refiner>>,
+    /// Says where any object could be, for queries without a region.
+    proposals: Option<Arc<dyn ObjectDetector>>,
     /// The hash of the network's weights, for templates that are kept.
     network: u64,
     /// How objects are rendered.
@@ -69,10 +72,17 @@ impl ViewsEstimator {
         ViewsEstimator {
             extractor: Arc::new(extractor),
             refiner: None,
+            proposals: None,
             network,
             templates: TemplateOptions::default(),
             options: ViewsOptions::default(),
         }
+    }
+
+    /// Looks for objects where `detector` sees any, if a query has no region. Which object it says is not asked.
+    #[must_use]
+    pub fn with_proposals(self, detector: Arc<dyn ObjectDetector>) -> ViewsEstimator {
+        ViewsEstimator { proposals: Some(detector), ..self }
     }
 
     /// What decides about the templates of a mesh.
@@ -142,7 +152,8 @@ impl PoseEstimator for ViewsEstimator {
     }
 
     fn needs(&self) -> Needs {
-        Needs { depth: Need::Unused, rgb: Need::Required, region: Need::Required, object: Need::Required }
+        let region = if self.proposals.is_some() { Need::Optional } else { Need::Required };
+        Needs { depth: Need::Unused, rgb: Need::Required, region, object: Need::Required }
     }
 
     /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 69 % lie above 0.4, 90 % of those within a fifth of the
@@ -178,11 +189,6 @@ impl PoseEstimator for ViewsEstimator {
         let object: &ViewsObject = downcast(object, METHOD)?;
         self.options.check().map_err(EstimatorError::method)?;
         let image = query.rgb(METHOD)?;
-        let region = query.region.ok_or(EstimatorError::Input {
-            what: "region that says where the object is",
-            method: METHOD,
-            advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
-        })?;
         let views = Views {
             extractor: &self.extractor,
             mesh: &object.view,
@@ -190,6 +196,31 @@ impl PoseEstimator for ViewsEstimator {
             templates: &object.templates,
             refiner: self.refiner.as_deref(),
             options: &self.options,
+        };
+        let estimate = |pose: &Hypothesis, score: f64| {
+            let confidence = pose.similarity.clamp(0.0, 1.0) * score;
+            let mut estimate = PoseEstimate::new(pose.camera_from_object, confidence);
+            estimate.details = Map::from_iter([
+                ("similarity".to_owned(), json!(pose.similarity)),
+                ("inliers".to_owned(), json!(pose.inliers)),
+            ]);
+            (confidence >= query.min_confidence).then_some(estimate)
+        };
+        let Some(region) = query.region else {
+            let proposals = self.proposals.as_deref().ok_or(EstimatorError::Input {
+                what: "region that says where the object is",
+                method: METHOD,
+                advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
+            })?;
+            let sizes = [self.options.proposals, self.options.side];
+            let kept: Arc<Places> = query.memo.get_or_default();
+            let places = kept.of_image(proposals, &self.extractor, image, query.camera, sizes)?;
+            let found = views.search(image, query.camera, &places, query.max_instances);
+            return Ok(found
+                .map_err(EstimatorError::method)?
+                .iter()
+                .filter_map(|h| estimate(h, 1.0))
+                .collect());
         };
         let found = views.find(image, query.camera, &region.bbox).map_err(EstimatorError::method)?;
         let Some(found) = found else {
@@ -199,16 +230,6 @@ impl PoseEstimator for ViewsEstimator {
             );
             return Err(EstimatorError::Region { source: source.into() });
         };
-        let Some(best) = found.hypotheses.first() else { return Ok(vec![]) };
-        let confidence = best.similarity.clamp(0.0, 1.0) * region.score;
-        if confidence < query.min_confidence {
-            return Ok(vec![]);
-        }
-        let mut estimate = PoseEstimate::new(best.camera_from_object, confidence);
-        estimate.details = Map::from_iter([
-            ("similarity".to_owned(), json!(best.similarity)),
-            ("inliers".to_owned(), json!(best.inliers)),
-        ]);
-        Ok(vec![estimate])
+        Ok(found.hypotheses.first().and_then(|h| estimate(h, region.score)).into_iter().collect())
     }
 }

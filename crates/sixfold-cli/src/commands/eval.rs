@@ -41,6 +41,9 @@ pub(crate) struct EvalArguments {
     /// With --detections: score from which on detections count for recall and false detections, 0 to 1
     #[arg(long, value_name = "SCORE", default_value = "0.4", value_parser = score)]
     pub min_score: f64,
+    /// With --detections: whatever objects are called counts for nothing, as for the proposals of a detector of any object
+    #[arg(long, requires = "detections", conflicts_with = "results")]
+    pub one_class: bool,
     /// With --detections: write the ground truth that they were scored with as a COCO file
     #[arg(long, value_name = "FILE.json", requires = "detections", conflicts_with = "results")]
     pub write_truth: Option<PathBuf>,
@@ -69,6 +72,9 @@ fn score(text: &str) -> Result<f64, String> {
     let score: f64 = text.parse().map_err(|error| format!("{error}"))?;
     if (0.0..=1.0).contains(&score) { Ok(score) } else { Err(format!("found {score}, expected 0 to 1")) }
 }
+
+/// What all objects are called where their names count for nothing.
+const ANY_OBJECT: u32 = 0;
 
 /// The delta of ITODD in the BOP Challenge, metres; of all others it is that of [`EvalOptions`].
 const ITODD: (&str, f64) = ("itodd", 0.005);
@@ -148,7 +154,7 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
 /// Box and mask AP of detections, in COCO's terms.
 fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     let path = a.detections.as_deref().ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
-    let read = dataset.detections(path, a.lenient)?;
+    let mut read = dataset.detections(path, a.lenient)?;
     let mut incomplete = false;
     for changed in &read.adjusted {
         let kept = matches!(changed.adjustment, Adjustment::Clipped | Adjustment::Scene);
@@ -159,7 +165,11 @@ fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     for image in excepted(dataset, a.except.as_deref())? {
         images.remove(&image);
     }
-    let truth = VisibleTruth::of_images(dataset, &images)?;
+    let mut truth = VisibleTruth::of_images(dataset, &images)?;
+    if a.one_class {
+        read.detections.iter_mut().for_each(|d| d.category_id = ANY_OBJECT);
+        truth.truth.annotations.iter_mut().for_each(|t| t.category_id = ANY_OBJECT);
+    }
     if !read.detections.is_empty()
         && !read.detections.iter().any(|d| images.contains(&(d.scene_id, d.image_id)))
     {

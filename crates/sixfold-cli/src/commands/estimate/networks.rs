@@ -44,6 +44,9 @@ struct ViewsArguments {
     /// Another network than that within the program
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
+    /// Another detector of any object than that within the program, which says where to look if no box is given
+    #[arg(long, value_name = "FILE.safetensors")]
+    proposals: Option<PathBuf>,
     /// Leave out the last step, which aligns the rendered mesh with the image
     #[arg(long)]
     no_refine: bool,
@@ -57,6 +60,10 @@ impl MethodArguments for ViewsArguments {
         };
         estimator.options.seed = common.seed;
         estimator.options.outline = !self.no_refine;
+        if let Some(file) = &self.proposals {
+            let detector = TrainedDetector::load(file).context("--proposals")?;
+            estimator = estimator.with_proposals(Arc::new(detector));
+        }
         Ok(Box::new(estimator))
     }
 }

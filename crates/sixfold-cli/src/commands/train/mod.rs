@@ -9,6 +9,7 @@ mod mttm;
 mod nol;
 mod options;
 mod pix2pose;
+mod proposals;
 mod refiner;
 #[cfg(test)]
 mod tests;
@@ -34,6 +35,7 @@ pub(crate) use self::dgcm::TrainDgcmArguments;
 pub(crate) use self::mttm::TrainMttmArguments;
 pub(crate) use self::nol::TrainNolArguments;
 pub(crate) use self::pix2pose::{TrainPix2PoseArguments, train_pix2pose};
+pub(crate) use self::proposals::TrainProposalsArguments;
 pub(crate) use self::refiner::TrainRefinerArguments;
 pub(crate) use self::views::TrainViewsArguments;
 use crate::arguments::Arguments;
@@ -84,6 +86,12 @@ pub(crate) enum TrainCommand {
                       Writes model.safetensors with its card; the one within the program was made like that."
     )]
     Refiner(Box<TrainRefinerArguments>),
+    /// Train the detector of any object in colour images, on procedural objects
+    #[command(
+        after_help = "Example:\n  sixfold train proposals --backgrounds photographs --out out/proposals\n\n\
+                      Interrupted, it resumes when the same command is given again."
+    )]
+    Proposals(Box<TrainProposalsArguments>),
 }
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
@@ -100,6 +108,9 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })
         }
         TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
+        TrainCommand::Proposals(of) => {
+            show(&a.json, &of.out, &proposals::train_proposals(of)?, || ())
+        }
         TrainCommand::Refiner(of) => show(&a.json, &of.out, &refiner::train_refiner(of)?, || ()),
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {

@@ -1,0 +1,95 @@
+//! Where no region is given: a detector of any object proposes boxes, the object's templates say which of them look like it, and
+//! poses are looked for there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features are a foundation model's).
+//!
+//! Proposals and their features belong to the image: they are computed once, however many objects are searched in it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rayon::prelude::*;
+use sixfold_align::outline::projected_box;
+use sixfold_estimator::{EstimatorError, ObjectDetector};
+use sixfold_geometry::{Camera, Rect, RgbImage};
+
+use crate::error::ViewsError;
+use crate::estimate::{Hypothesis, Part, Views};
+use crate::features::Extractor;
+
+/// Boxes of two poses that overlap more than this (intersection over union) are of one instance.
+const ONE_INSTANCE: f64 = 0.5;
+
+/// A box that could show an object, with what the networks see there.
+pub(crate) struct Place {
+    bbox: Rect,
+    part: Part,
+}
+
+/// The places of an image, once they are known.
+#[derive(Default)]
+pub(crate) struct Places(Mutex<Option<Arc<Vec<Place>>>>);
+
+impl Places {
+    /// Where a detector of any object sees one, the surest first, at most `most`; asked for once.
+    pub(crate) fn of_image(
+        &self,
+        detector: &dyn ObjectDetector,
+        extractor: &Extractor,
+        image: &RgbImage,
+        camera: &Camera,
+        [most, side]: [usize; 2],
+    ) -> Result<Arc<Vec<Place>>, EstimatorError> {
+        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(places) = kept.as_ref() {
+            return Ok(places.clone());
+        }
+        let mut detected = detector.detect(image)?;
+        detected.sort_by(|a, b| b.region.score.total_cmp(&a.region.score));
+        detected.truncate(most);
+        let place = |bbox: Rect| -> Result<Option<Place>, ViewsError> {
+            let part = Part::new(extractor, image, camera, &bbox, side)?;
+            Ok(part.map(|part| Place { bbox, part }))
+        };
+        let places: Result<Vec<Option<Place>>, ViewsError> =
+            detected.par_iter().map(|d| place(d.region.bbox)).collect();
+        let places = Arc::new(places.map_err(EstimatorError::method)?.into_iter().flatten().collect());
+        *kept = Some(Arc::clone(&places));
+        Ok(places)
+    }
+}
+
+impl Views<'_> {
+    /// The object's poses in the places that look like it, best first, at most `instances`, no two alike.
+    pub(crate) fn search(
+        &self,
+        image: &RgbImage,
+        camera: &Camera,
+        places: &[Place],
+        instances: usize,
+    ) -> Result<Vec<Hypothesis>, ViewsError> {
+        let mut ranked: Vec<_> = places.iter().map(|place| (place, self.ranked(&place.part))).collect();
+        let likeness = |templates: &[(usize, f32)]| templates.first().map_or(f32::NEG_INFINITY, |t| t.1);
+        ranked.sort_by(|a, b| likeness(&b.1).total_cmp(&likeness(&a.1)));
+        ranked.truncate(self.options.places.saturating_add(instances - 1));
+        let mut found = Vec::new();
+        for (place, templates) in &ranked {
+            let poses = self.find_in(&place.part, templates, image, camera, &place.bbox)?;
+            found.extend(poses.first().copied());
+        }
+        found.sort_by(|a: &Hypothesis, b| b.similarity.total_cmp(&a.similarity));
+        let mut kept: Vec<Hypothesis> = Vec::new();
+        for hypothesis in found {
+            if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
+                kept.push(hypothesis);
+            }
+        }
+        Ok(kept)
+    }
+
+    /// Whether two poses are of one instance: their boxes in the image overlap more than those of two can.
+    fn one(&self, camera: &Camera, a: &Hypothesis, b: &Hypothesis) -> bool {
+        let boxed = |h: &Hypothesis| projected_box(self.outline, camera, &h.camera_from_object);
+        match (boxed(a), boxed(b)) {
+            (Some(a), Some(b)) => a.iou(&b) > ONE_INSTANCE,
+            _ => self.same(a, b),
+        }
+    }
+}
