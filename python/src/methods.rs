@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use pyo3::prelude::*;
 use sixfold::align::DepthOptions;
+use sixfold::detect::detector::TrainedDetector;
 use sixfold::estimator::PoseEstimator;
 use sixfold::mttm::{MatchedBy, MttmEstimator, MttmOptions};
 use sixfold::pix2pose::estimator::Pix2PoseEstimator;
@@ -120,7 +121,9 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
             let mut estimator = read.map_err(|error| file_or_value(&error))?;
             estimator.options.seed = options.seed;
             estimator.options.outline = options.refine;
-            (Arc::new(estimator), vec![])
+            let proposals = interruptible(py, |_| TrainedDetector::proposals())?;
+            let proposals = proposals.map_err(|error| file_or_value(&error))?;
+            (Arc::new(estimator.with_proposals(Arc::new(proposals))), vec![])
         }
         _ => {
             let weights = weights.ok_or_else(|| {

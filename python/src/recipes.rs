@@ -1,4 +1,4 @@
-//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`, `train_refiner`: data in, a model file out. They report their
+//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`, `train_refiner`, `train_proposals`: data in, a model file out. They report their
 //! progress, stop after the step in which Ctrl-C comes, and resume when they are called again with the same arguments. Without
 //! an argument, or with None, they take the default of the recipe.
 
@@ -379,5 +379,44 @@ pub(crate) fn train_refiner<'py>(
     let seed = count("seed", seed, common.seed as usize)? as u64;
     recipe.options.common = common.with(self::steps(steps)?, learning_rate, seed);
     recipe.options.batch = count("batch", batch, recipe.options.batch)?;
+    summary(py, run(py, progress, checked(recipe)?, (), out)?)
+}
+
+/// Trains a detector of any object in colour images, on synthetic objects: the proposals of the method "views" without boxes.
+///
+/// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures and backgrounds,
+/// synthetic ones only if None; batch: images in a step; objects: synthetic objects to learn from; size: side of the training
+/// images in pixels.
+///
+/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+///
+/// >>> trained = train_proposals("out/proposals", steps=100)  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (out, *, steps=None, learning_rate=None, batch=None, objects=None, size=None, backgrounds=None, progress=None, seed=None))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn train_proposals<'py>(
+    py: Python<'py>,
+    out: PathBuf,
+    steps: Option<i64>,
+    learning_rate: Option<f64>,
+    batch: Option<i64>,
+    objects: Option<i64>,
+    size: Option<i64>,
+    backgrounds: Option<PathBuf>,
+    progress: Option<Py<PyAny>>,
+    seed: Option<i64>,
+) -> PyResult<Bound<'py, PyDict>> {
+    use sixfold::detect::proposals::ProposalsRecipe;
+    let mut recipe = ProposalsRecipe {
+        backgrounds,
+        command: "sixfold.train_proposals".to_owned(),
+        ..ProposalsRecipe::default()
+    };
+    let common = recipe.options.common.clone();
+    let seed = count("seed", seed, common.seed as usize)? as u64;
+    recipe.options.common = common.with(self::steps(steps)?, learning_rate, seed);
+    recipe.options.batch = count("batch", batch, recipe.options.batch)?;
+    recipe.objects = count("objects", objects, recipe.objects)?;
+    recipe.size = count("size", size, recipe.size)?;
     summary(py, run(py, progress, checked(recipe)?, (), out)?)
 }

@@ -25,6 +25,16 @@ impl TrainedDetector {
         Ok(TrainedDetector { model, options })
     }
 
+    /// The detector of any object that is within the program: proposals for objects that no detector was trained on.
+    ///
+    /// # Errors
+    /// [`ModelError`] if the program carries weights of another version than its own.
+    pub fn proposals() -> Result<TrainedDetector, ModelError> {
+        let model = DetectorModel::proposals()?;
+        let options = DetectOptions { masks: false, ..model.options() };
+        Ok(TrainedDetector { model, options })
+    }
+
     /// A detector with options of one's own.
     pub fn new(model: DetectorModel, options: DetectOptions) -> TrainedDetector {
         TrainedDetector { model, options }

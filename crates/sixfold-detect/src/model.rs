@@ -7,9 +7,13 @@ use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::RgbImage;
 use sixfold_nn::weights::{
-    ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown,
+    ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
+    write_card_markdown,
 };
 use std::path::{Path, PathBuf};
+
+/// The weights of the detector of any object; their card lies beside them.
+const PROPOSALS: &[u8] = include_bytes!("../weights/proposals.safetensors");
 
 /// Name of the compact detector in weight files.
 pub const COMPACT: &str = "detect-compact";
@@ -124,6 +128,21 @@ impl DetectorModel {
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let device = Device::flex();
         let (network, config, classes, usage, card) = read(path, &device)?;
+        Ok(DetectorModel { network: network.valid(), config, classes, usage, card, device })
+    }
+
+    /// The detector of any object that is within the program: one class, [`crate::proposals::ANY_OBJECT`].
+    ///
+    /// # Errors
+    /// [`ModelError`] if the program carries weights of another version than its own.
+    pub fn proposals() -> Result<Self, ModelError> {
+        let device = Device::flex();
+        let config = DetectorConfig::compact(1);
+        let name = Path::new("proposals.safetensors");
+        let (network, card) =
+            load_weights_from_bytes(config.init(0, &device), name, PROPOSALS, architecture(&config))?;
+        let classes = vec![ClassEntry { id: crate::proposals::ANY_OBJECT }];
+        let usage = serde_json::from_value(card.extra["use"].clone()).unwrap_or_default();
         Ok(DetectorModel { network: network.valid(), config, classes, usage, card, device })
     }
 

@@ -149,7 +149,9 @@ impl Recipe for ProposalsRecipe {
     fn check(&self) -> Result<(), OptionError> {
         let objects = (1..=100_000).contains(&self.objects);
         OptionError::unless(objects, "objects", self.objects, "1 to 100000")?;
-        if let Err(crate::samples::TrainingImageError::Option { field, found, expected }) = self.scenes().check() {
+        if let Err(crate::samples::TrainingImageError::Option { field, found, expected }) =
+            self.scenes().check()
+        {
             return Err(OptionError { field, found, expected });
         }
         self.options.check()
@@ -158,7 +160,8 @@ impl Recipe for ProposalsRecipe {
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
         // Every field by its name, so that a new one finds its place; the size is in the options of the samples.
         let ProposalsRecipe { options, objects, size: _, backgrounds, command: _ } = self;
-        let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
+        let backgrounds =
+            background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
         Fingerprint::of(options)?
             .merged(&Fingerprint::of(&serde_json::json!({ "samples": self.scenes() }))?)
             .with("objects", *objects as u64)
@@ -210,5 +213,95 @@ impl Recipe for ProposalsRecipe {
             .save(&session.model())
             .map_err(TrainError::method)?;
         Ok(Some(()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_option_and_every_background_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("a.png"), b"one").unwrap();
+        let of = |recipe: &ProposalsRecipe| recipe.inputs(&()).unwrap();
+        let differs = |change: &dyn Fn(&mut ProposalsRecipe), name: &str| {
+            let mut recipe = ProposalsRecipe::default();
+            change(&mut recipe);
+            let difference = of(&ProposalsRecipe::default()).difference(&of(&recipe)).unwrap();
+            assert!(difference.contains(&format!("{name} was")), "{difference}");
+        };
+        differs(&|r| r.options.common.steps = 3, "steps");
+        differs(&|r| r.options.common.seed = 3, "seed");
+        differs(&|r| r.options.batch = 3, "batch");
+        differs(&|r| r.objects = 3, "objects");
+        differs(&|r| r.size = 96, "samples.size");
+        differs(&|r| r.backgrounds = Some(folder.path().to_owned()), "backgrounds");
+        let command = "another".to_owned();
+        let same = ProposalsRecipe { command, ..ProposalsRecipe::default() };
+        assert_eq!(of(&same), of(&ProposalsRecipe::default()));
+    }
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let named = |change: &dyn Fn(&mut ProposalsRecipe)| {
+            let mut recipe = ProposalsRecipe::default();
+            change(&mut recipe);
+            recipe.check().unwrap_err().field
+        };
+        assert_eq!(ProposalsRecipe::default().check(), Ok(()));
+        assert_eq!(named(&|r| r.objects = 0), "objects");
+        assert_eq!(named(&|r| r.size = 100), "size");
+        assert_eq!(named(&|r| r.options.batch = 0), "batch");
+    }
+
+    #[test]
+    fn all_objects_of_a_training_image_are_of_one_class_and_within_their_boxes() {
+        let recipe = ProposalsRecipe { objects: 12, size: 160, ..ProposalsRecipe::default() };
+        let source = recipe.source().unwrap();
+        let mut objects = 0;
+        for number in 0..12 {
+            let image = source.sample(3, number);
+            assert_eq!(image, source.sample(3, number));
+            for (index, instance) in image.annotation.instances.iter().enumerate() {
+                assert_eq!(instance.class, 0);
+                let pixels = || (0..160 * 160).filter(|i| image.annotation.labels[*i] == index as u8 + 1);
+                let [x0, y0, x1, y1] = instance.corners.map(|c| c as usize);
+                assert!(pixels().all(|i| (x0..=x1).contains(&(i % 160)) && (y0..=y1).contains(&(i / 160))));
+                assert!(pixels().count() > 0);
+                objects += 1;
+            }
+        }
+        assert!(objects > 24, "{objects} objects in 12 images");
+    }
+
+    #[test]
+    fn the_detector_within_the_program_sees_objects_that_nobody_trained_on() {
+        use crate::detector::TrainedDetector;
+        use sixfold_estimator::ObjectDetector;
+        use sixfold_geometry::Rect;
+
+        let mut recipe = ProposalsRecipe { objects: 40, ..ProposalsRecipe::default() };
+        // Objects and images of another seed than the training's.
+        recipe.options.common.seed = 77;
+        let source = recipe.source().unwrap();
+        let detector = TrainedDetector::proposals().unwrap();
+        let (mut found, mut all) = (0, 0);
+        for number in 0..10 {
+            let image = source.sample(77, number);
+            let area = 320 * 320;
+            let rgb = sixfold_geometry::RgbImage::from_fn(320, 320, |x, y| {
+                std::array::from_fn(|c| (image.rgb[c * area + y * 320 + x] * 255.0).round() as u8)
+            });
+            let proposals = detector.detect(&rgb).unwrap();
+            assert!(proposals.iter().all(|p| p.object_id == ANY_OBJECT));
+            for instance in &image.annotation.instances {
+                let [x0, y0, x1, y1] = instance.corners.map(f64::from);
+                let truth = Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
+                found += usize::from(proposals.iter().any(|p| p.region.bbox.iou(&truth) > 0.5));
+                all += 1;
+            }
+        }
+        assert!(all > 30 && 10 * found > 7 * all, "{found} of {all}");
     }
 }

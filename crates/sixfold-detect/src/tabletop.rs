@@ -88,7 +88,8 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
         let index = random.random_range(0..meshes.len());
         let about_z = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), between(random, -3.1, 3.1));
         let standing = random.random::<f32>() < STANDING;
-        let turn = about_z * if standing { UnitQuaternion::identity() } else { random_rotation(random).rotation() };
+        let turn =
+            about_z * if standing { UnitQuaternion::identity() } else { random_rotation(random).rotation() };
         let turned = meshes[index].transformed(&Pose::new(turn, Vec3::zeros()));
         let (low, high) = turned.bounding_box();
         let size = high - low;
@@ -101,7 +102,8 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
             if below > 0.0 && !stacked {
                 continue;
             }
-            let shift = Vec3::new(at[0] - 0.5 * (low.x + high.x), at[1] - 0.5 * (low.y + high.y), below - low.z);
+            let shift =
+                Vec3::new(at[0] - 0.5 * (low.x + high.x), at[1] - 0.5 * (low.y + high.y), below - low.z);
             taken.push((at, radius, below + size.z));
             out.push((index, Pose::new(turn, shift)));
             break;
@@ -111,19 +113,26 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
 }
 
 /// Draws a photograph of `side` pixels of a table with some of `meshes`, which stand on z = 0 or lie about the origin.
-pub(crate) fn tabletop(meshes: &[&Mesh], textures: &Backgrounds, side: usize, random: &mut Random) -> Tabletop {
+pub(crate) fn tabletop(
+    meshes: &[&Mesh],
+    textures: &Backgrounds,
+    side: usize,
+    random: &mut Random,
+) -> Tabletop {
     let field = f64::from(uniform(random, FIELD));
     let focal = 0.5 * side as f64 / (0.5 * field).tan();
     let middle = 0.5 * (side as f64 - 1.0);
     let pixels = f64::from(uniform(random, PIXELS.map(f32::ln)).exp());
     let distance = focal * DIAMETER / pixels;
-    let camera = Camera { fx: focal, fy: focal, cx: middle, cy: middle, width: side, height: side, distortion: None };
+    let camera =
+        Camera { fx: focal, fy: focal, cx: middle, cy: middle, width: side, height: side, distortion: None };
     let camera_from_table = looking_down(distance, random);
     let reach = 0.45 * side as f64 * distance / focal;
     let placed = placed(meshes, reach, random);
     let half = [between(random, 0.7, 3.0) * reach, between(random, 0.7, 3.0) * reach];
     let turn = between(random, -0.8, 0.8);
-    let mut flat: Vec<Mesh> = sheet([0.0; 2], half, turn, 0.0, texture(textures, random)).into_iter().collect();
+    let mut flat: Vec<Mesh> =
+        sheet([0.0; 2], half, turn, 0.0, texture(textures, random)).into_iter().collect();
     for number in 0..random.random_range(0..=SHEETS) {
         let at = [between(random, -reach, reach), between(random, -reach, reach)];
         let size = [between(random, 0.04, 0.25), between(random, 0.04, 0.25)];
@@ -132,7 +141,10 @@ pub(crate) fn tabletop(meshes: &[&Mesh], textures: &Backgrounds, side: usize, ra
     }
     let mut objects: Vec<SceneObject<'_>> = placed
         .iter()
-        .map(|(index, pose)| SceneObject { mesh: meshes[*index], camera_from_object: camera_from_table * *pose })
+        .map(|(index, pose)| SceneObject {
+            mesh: meshes[*index],
+            camera_from_object: camera_from_table * *pose,
+        })
         .collect();
     let count = objects.len();
     objects.extend(flat.iter().map(|mesh| SceneObject { mesh, camera_from_object: camera_from_table }));

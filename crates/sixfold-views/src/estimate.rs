@@ -517,7 +517,7 @@ pub(crate) mod tests {
     }
 
     /// A body with an arm and a foot in three colours: no rotation maps it onto itself.
-    fn part() -> Mesh {
+    pub(crate) fn part() -> Mesh {
         Mesh::merged(&[
             cuboid([-0.06, -0.03, -0.03], [0.06, 0.03, 0.03], [200, 60, 40]),
             cuboid([0.02, 0.0, 0.03], [0.06, 0.03, 0.09], [40, 90, 190]),
@@ -526,15 +526,11 @@ pub(crate) mod tests {
         .unwrap()
     }
 
-    #[test]
-    fn a_part_is_found_in_other_light_than_its_templates_have() {
+    /// [`part`] in an image of 640x480 pixels, where it is, and its box.
+    pub(crate) fn photographed(camera: &Camera) -> (RgbImage, Pose, Rect) {
         let mesh = part();
-        let extractor = Extractor::shipped().unwrap();
-        let options = TemplateOptions { directions: 60, rotations: 12, ..TemplateOptions::default() };
-        let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &options).unwrap();
-        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
         let truth = Pose::new(UnitQuaternion::from_euler_angles(2.1, 0.5, 0.7), Vec3::new(0.15, -0.1, 0.9));
-        let mut frame = VisibilityBuffer::new(&camera);
+        let mut frame = VisibilityBuffer::new(camera);
         let objects = [SceneObject { mesh: &mesh, camera_from_object: truth }];
         frame.render(&objects, &RenderOptions::default());
         let lights = [
@@ -546,7 +542,17 @@ pub(crate) mod tests {
             [120 + noise, 110 + noise, 100]
         });
         let image = shade(&frame, &objects, &lights, &Material::default(), Some(&table));
-        let bbox = frame.bounding_box().unwrap();
+        (image, truth, frame.bounding_box().unwrap())
+    }
+
+    #[test]
+    fn a_part_is_found_in_other_light_than_its_templates_have() {
+        let mesh = part();
+        let extractor = Extractor::shipped().unwrap();
+        let options = TemplateOptions { directions: 60, rotations: 12, ..TemplateOptions::default() };
+        let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &options).unwrap();
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, truth, bbox) = photographed(&camera);
         let find = |outline: bool, bbox: &Rect| {
             let options = ViewsOptions { outline, ..ViewsOptions::default() };
             let views = Views {

@@ -7,8 +7,8 @@ use burn::tensor::Device;
 use serde_json::{Map, json};
 use sixfold_align::outline::outline_mesh;
 use sixfold_estimator::{
-    EstimatorError, MinConfidence, Need, Needs, Object, ObjectDetector, PoseEstimate, PoseEstimator, PreparedObject, Query,
-    downcast,
+    EstimatorError, MinConfidence, Need, Needs, Object, ObjectDetector, PoseEstimate, PoseEstimator,
+    PreparedObject, Query, downcast,
 };
 use sixfold_io::Fnv1a;
 use sixfold_mesh::Mesh;
@@ -231,5 +231,65 @@ impl PoseEstimator for ViewsEstimator {
             return Err(EstimatorError::Region { source: source.into() });
         };
         Ok(found.hypotheses.first().and_then(|h| estimate(h, region.score)).into_iter().collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::tests::{part, photographed};
+    use sixfold_estimator::{DetectedObject, Region};
+    use sixfold_geometry::{Camera, Rect, RgbImage};
+    use sixfold_mesh::ModelInfo;
+
+    /// Sees something in these boxes, and counts how often it is asked.
+    struct Somewhere(Vec<Rect>, std::sync::atomic::AtomicUsize);
+
+    impl ObjectDetector for Somewhere {
+        fn check_object(&self, _: u32) -> Result<(), EstimatorError> {
+            Ok(())
+        }
+
+        fn detect(&self, _: &RgbImage) -> Result<Vec<DetectedObject>, EstimatorError> {
+            self.1.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            let region = |bbox: &Rect| DetectedObject { object_id: 0, region: Region::of_box(*bbox) };
+            Ok(self.0.iter().map(region).collect())
+        }
+    }
+
+    #[test]
+    fn without_a_region_an_object_is_found_among_proposals_which_are_made_once() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, truth, bbox) = photographed(&camera);
+        let beside = Rect { x: 40.0, y: 300.0, ..bbox };
+        let above = Rect { x: 300.0, y: 20.0, ..bbox };
+        let detector = Arc::new(Somewhere(vec![beside, above, bbox], 0.into()));
+        let mut estimator = ViewsEstimator::shipped().unwrap();
+        estimator.templates = TemplateOptions { directions: 60, rotations: 12, ..TemplateOptions::default() };
+        // One place alone is looked at: the templates have to choose the right one.
+        estimator.options = ViewsOptions { places: 1, close: 1, ..ViewsOptions::default() };
+        assert_eq!(estimator.needs().region, Need::Required);
+        let mesh = part();
+        let info = ModelInfo::of_mesh(&mesh);
+        let object = Object::of_mesh("part", mesh, info);
+        let prepared = estimator.prepare(&object).unwrap();
+        let query = Query { rgb: Some(&image), ..Query::new(&camera) };
+        let error = estimator.estimate(prepared.as_ref(), &query).unwrap_err();
+        assert!(matches!(error, EstimatorError::Input { .. }), "{error}");
+
+        let estimator = estimator.with_proposals(detector.clone());
+        assert_eq!(estimator.needs().region, Need::Optional);
+        for _ in 0..2 {
+            let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
+            assert_eq!(found.len(), 1);
+            let pose = found[0].camera_from_object;
+            assert!(pose.distance_to(&truth) < 0.05, "{pose:?} instead of {truth:?}");
+        }
+        assert_eq!(detector.1.load(std::sync::atomic::Ordering::Relaxed), 1);
+        // As many instances as are asked for, each a place of its own.
+        let query = Query { rgb: Some(&image), max_instances: 3, ..Query::new(&camera) };
+        let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
+        assert!(!found.is_empty() && found.len() <= 3);
+        assert!(found[0].camera_from_object.distance_to(&truth) < 0.05);
     }
 }

@@ -961,3 +961,15 @@ def train_refiner(
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...
+def train_proposals(
+    out: Path,
+    *,
+    steps: int = 8000,
+    learning_rate: float = 0.002,
+    batch: int = 4,
+    objects: int = 400,
+    size: int = 320,
+    backgrounds: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...

@@ -105,6 +105,8 @@ rows! {
         "estimate --method pix2pose --weights pix2pose.safetensors --dataset tiny --targets targets.json --boxes gt --out results.csv";
     estimate_dataset_by_views: dataset, ["results.csv"], None,
         "estimate --method views --dataset tiny --targets targets.json --boxes gt --out results.csv";
+    estimate_dataset_by_views_alone: dataset, ["results.csv"], None,
+        "estimate --method views --dataset tiny --targets targets.json --out results.csv";
     detect_image: dataset_and_networks, ["out"], None,
         "detect --weights detector.safetensors --rgb tiny/test/000007/rgb/000004.png --threshold 0 --per-object 2 --out out";
     detect_dataset: dataset_and_networks, ["found.json", "pictures"], None,
@@ -115,6 +117,7 @@ rows! {
         "train detector --dataset tiny --ids 1 --size 96 --batch 2 --steps 3 --out out";
     train_views: dataset, ["out"], None, "train views --steps 3 --batch 1 --out out";
     train_refiner: dataset, ["out"], None, "train refiner --steps 3 --batch 1 --out out";
+    train_proposals: dataset, ["out"], None, "train proposals --steps 3 --batch 2 --objects 6 --size 96 --out out";
     train_nol: dataset, ["out"], None, "train nol --steps 2 --out out";
     train_mttm: dataset, ["out"], None, "train mttm --steps 2 --objects 16 --scenes 4 --anchors 4 --out out";
     train_dgcm: dataset, ["out"], None, "train dgcm --views 64 --steps 3 --pairs 2 --out out";

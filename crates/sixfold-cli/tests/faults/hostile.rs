@@ -95,6 +95,7 @@ fn good() -> BTreeMap<&'static str, Row> {
         ("train nol", of("train_nol")),
         ("train views", of("train_views")),
         ("train refiner", of("train_refiner")),
+        ("train proposals", of("train_proposals")),
         ("train mttm", of("train_mttm")),
         ("train dgcm", of("train_dgcm")),
         ("simulate-depth", of("simulate_depth")),

@@ -36,7 +36,7 @@ pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
 /// Poses from colour without training for the object.
 pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "views",
-    "rendered views of a mesh matched with a colour image, in boxes, no training",
+    "rendered views of a mesh matched with a colour image, in boxes or where any object seems to be, no training",
 );
 
 #[derive(Debug, Args)]
@@ -60,11 +60,11 @@ impl MethodArguments for ViewsArguments {
         };
         estimator.options.seed = common.seed;
         estimator.options.outline = !self.no_refine;
-        if let Some(file) = &self.proposals {
-            let detector = TrainedDetector::load(file).context("--proposals")?;
-            estimator = estimator.with_proposals(Arc::new(detector));
-        }
-        Ok(Box::new(estimator))
+        let proposals = match &self.proposals {
+            Some(file) => TrainedDetector::load(file).context("--proposals")?,
+            None => TrainedDetector::proposals().context("the detector within the program")?,
+        };
+        Ok(Box::new(estimator.with_proposals(Arc::new(proposals))))
     }
 }
 

@@ -108,9 +108,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })
         }
         TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
-        TrainCommand::Proposals(of) => {
-            show(&a.json, &of.out, &proposals::train_proposals(of)?, || ())
-        }
+        TrainCommand::Proposals(of) => show(&a.json, &of.out, &proposals::train_proposals(of)?, || ()),
         TrainCommand::Refiner(of) => show(&a.json, &of.out, &refiner::train_refiner(of)?, || ()),
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {

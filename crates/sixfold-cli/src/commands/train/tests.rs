@@ -80,6 +80,13 @@ fn without_options_the_command_line_asks_for_the_recipes_defaults() {
         }
         _ => panic!(),
     }
+    let command = command_line();
+    match parsed("proposals") {
+        TrainCommand::Proposals(a) => {
+            same(a.recipe(), sixfold_detect::proposals::ProposalsRecipe { command, ..Default::default() });
+        }
+        _ => panic!(),
+    }
 }
 
 #[test]
@@ -307,6 +314,18 @@ fn the_stub_of_python_shows_the_defaults_of_the_others() {
             ("learning_rate", d.common.learning_rate.to_string()),
             ("batch", d.batch.to_string()),
             ("seed", d.common.seed.to_string()),
+        ],
+    );
+    let d = sixfold_detect::proposals::ProposalsRecipe::default();
+    check(
+        "train_proposals",
+        vec![
+            ("steps", d.options.common.steps.to_string()),
+            ("learning_rate", d.options.common.learning_rate.to_string()),
+            ("batch", d.options.batch.to_string()),
+            ("objects", d.objects.to_string()),
+            ("size", d.size.to_string()),
+            ("seed", d.options.common.seed.to_string()),
         ],
     );
 }
