@@ -58,6 +58,13 @@ fn an_object_is_stored_with_templates_and_found() {
     assert_eq!(std::fs::read(dir.join("sixfold-objects/twin/templates.bin")).unwrap(), bytes);
     fails(dir, "object add thing part.ply --unit mm --templates", &["thing", "--replace"]);
     assert_eq!(std::fs::read(&file).unwrap(), bytes);
+    // Other sides for one search are kept beside, and leave the object's own templates as they are.
+    let around = format!("{DEPTH} --matcher points --object thing --templates around --json");
+    let found = sixfold(dir, &around).expect(0).json();
+    assert_near(&pose_of(&found["poses"][0]["camera_from_object"]), &case.truth);
+    let beside = std::fs::metadata(dir.join("sixfold-objects/thing/templates-around.bin")).unwrap();
+    assert!(beside.len() > 2 * bytes.len() as u64);
+    assert_eq!(std::fs::read(&file).unwrap(), bytes);
 }
 
 #[test]
