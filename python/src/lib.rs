@@ -118,6 +118,7 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(recipes::train_mttm, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_nol, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_views, module)?)?;
+    module.add_function(wrap_pyfunction!(recipes::train_refiner, module)?)?;
     module.add_function(wrap_pyfunction!(mttm::estimate_mttm, module)?)?;
     module.add_function(wrap_pyfunction!(made_up::made_up_mesh, module)?)?;
     module.add_function(wrap_pyfunction!(made_up::drop_objects, module)?)?;

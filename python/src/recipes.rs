@@ -1,4 +1,4 @@
-//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`: data in, a model file out. They report their
+//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`, `train_refiner`: data in, a model file out. They report their
 //! progress, stop after the step in which Ctrl-C comes, and resume when they are called again with the same arguments. Without
 //! an argument, or with None, they take the default of the recipe.
 
@@ -341,6 +341,40 @@ pub(crate) fn train_views<'py>(
     use sixfold::views::recipe::ViewsRecipe;
     let mut recipe =
         ViewsRecipe { backgrounds, command: "sixfold.train_views".to_owned(), ..ViewsRecipe::default() };
+    let common = recipe.options.common.clone();
+    let seed = count("seed", seed, common.seed as usize)? as u64;
+    recipe.options.common = common.with(self::steps(steps)?, learning_rate, seed);
+    recipe.options.batch = count("batch", batch, recipe.options.batch)?;
+    summary(py, run(py, progress, checked(recipe)?, (), out)?)
+}
+
+/// Trains the network that refines poses of any object in colour images, on synthetic objects.
+///
+/// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures, backgrounds and
+/// occluders, synthetic ones only if None; batch: objects in a step, of each four poses.
+///
+/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+///
+/// >>> trained = train_refiner("out/refiner", steps=100)  # doctest: +SKIP
+#[pyfunction]
+#[pyo3(signature = (out, *, steps=None, learning_rate=None, batch=None, backgrounds=None, progress=None, seed=None))]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn train_refiner<'py>(
+    py: Python<'py>,
+    out: PathBuf,
+    steps: Option<i64>,
+    learning_rate: Option<f64>,
+    batch: Option<i64>,
+    backgrounds: Option<PathBuf>,
+    progress: Option<Py<PyAny>>,
+    seed: Option<i64>,
+) -> PyResult<Bound<'py, PyDict>> {
+    use sixfold::views::refiner::recipe::RefinerRecipe;
+    let mut recipe = RefinerRecipe {
+        backgrounds,
+        command: "sixfold.train_refiner".to_owned(),
+        ..RefinerRecipe::default()
+    };
     let common = recipe.options.common.clone();
     let seed = count("seed", seed, common.seed as usize)? as u64;
     recipe.options.common = common.with(self::steps(steps)?, learning_rate, seed);

@@ -38,8 +38,8 @@ pub use normals::{NormalOptions, inpaint_depth, normals_from_depth};
 pub use option_error::OptionError;
 pub use plane::{Plane, PlaneOptions, dominant_plane, fit_plane};
 pub use pnp::{
-    PnpError, PnpOptions, PnpReport, PnpSolver, RefineOptions, RefineReport, epnp, p3p, pnp_ransac,
-    refine_pose,
+    PnpError, PnpOptions, PnpReport, PnpSolver, RefineOptions, RefineReport, Trust, epnp, p3p, pnp_ransac,
+    refine_pose, refine_trusted,
 };
 pub use pose::{Pose, PoseError};
 pub use solver::NormalEquations;

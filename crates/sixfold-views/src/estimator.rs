@@ -18,6 +18,8 @@ use crate::estimate::{Views, ViewsOptions};
 use crate::features::Extractor;
 use crate::file;
 use crate::network::{ViewNetwork, shipped_hash};
+use crate::refiner::Refiner;
+use crate::refiner::network::RefinerNetwork;
 use crate::templates::{Template, TemplateOptions, make_templates, view_mesh};
 
 const METHOD: &str = "views";
@@ -28,6 +30,8 @@ const FILE: &str = "views.bin";
 #[derive(Clone)]
 pub struct ViewsEstimator {
     extractor: Arc<Extractor>,
+    /// For the features of the network within the program alone.
+    refiner: Option<Arc<Refiner>>,
     /// The hash of the network's weights, for templates that are kept.
     network: u64,
     /// How objects are rendered.
@@ -42,10 +46,14 @@ impl ViewsEstimator {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<ViewsEstimator, ViewsError> {
-        Ok(ViewsEstimator::new(Extractor::shipped()?, shipped_hash()))
+        let device = Device::default();
+        let refiner = Refiner::new(RefinerNetwork::shipped(&device)?, device);
+        let estimator = ViewsEstimator::new(Extractor::shipped()?, shipped_hash());
+        Ok(ViewsEstimator { refiner: Some(Arc::new(refiner)), ..estimator })
     }
 
-    /// With a network that `sixfold train views` wrote.
+    /// With a network that `sixfold train views` wrote. The refiner within the program does not know its features: poses are refined
+    /// by their products alone.
     ///
     /// # Errors
     /// [`ViewsError::Weights`].
@@ -60,6 +68,7 @@ impl ViewsEstimator {
     fn new(extractor: Extractor, network: u64) -> ViewsEstimator {
         ViewsEstimator {
             extractor: Arc::new(extractor),
+            refiner: None,
             network,
             templates: TemplateOptions::default(),
             options: ViewsOptions::default(),
@@ -136,10 +145,10 @@ impl PoseEstimator for ViewsEstimator {
         Needs { depth: Need::Unused, rgb: Need::Required, region: Need::Required, object: Need::Required }
     }
 
-    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 71 % lie above 0.25, 92 % of those within a fifth of the
-    /// diameter among them; 85 % of them are within half of it, of all 67 % (`benches/views_confidence.py`).
+    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 69 % lie above 0.4, 90 % of those within a fifth of the
+    /// diameter among them; 94 % of them are within half of it, of all 74 % (`benches/views_confidence.py`).
     fn min_confidence(&self) -> MinConfidence {
-        MinConfidence { image: 0.25, dataset: 0.0 }
+        MinConfidence { image: 0.4, dataset: 0.0 }
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
@@ -179,6 +188,7 @@ impl PoseEstimator for ViewsEstimator {
             mesh: &object.view,
             outline: &object.outline,
             templates: &object.templates,
+            refiner: self.refiner.as_deref(),
             options: &self.options,
         };
         let found = views.find(image, query.camera, &region.bbox).map_err(EstimatorError::method)?;

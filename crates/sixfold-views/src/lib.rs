@@ -16,6 +16,7 @@ mod file;
 mod matching;
 pub mod network;
 pub mod recipe;
+pub mod refiner;
 mod samples;
 pub mod templates;
 pub mod training;

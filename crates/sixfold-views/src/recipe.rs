@@ -1,7 +1,7 @@
 //! A whole training: nothing but a seed in (better: photographs for textures and backgrounds too), a network for views out.
 //! Interrupted at any time, it is resumed.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use sixfold_data::background_files;
@@ -17,6 +17,24 @@ use crate::training::{ViewsTraining, ViewsTrainingOptions};
 
 /// Fraction of procedural textures between the photographs.
 const PROCEDURAL_FRACTION: f32 = 0.2;
+
+/// Textures, backgrounds and occluders of the training objects.
+pub(crate) fn textures(backgrounds: Option<&Path>) -> Result<Backgrounds, TrainError> {
+    let Some(folder) = backgrounds else { return Ok(Backgrounds::procedural()) };
+    let photographs = Backgrounds::from_folder(folder, &PhotographOptions::default());
+    Ok(photographs.map_err(TrainError::about("backgrounds"))?.with_procedural_fraction(PROCEDURAL_FRACTION))
+}
+
+/// What a model's card says of the training objects.
+pub(crate) fn described(textures: &Backgrounds) -> String {
+    let images = match textures.images() {
+        0 => "noise".to_owned(),
+        n => format!("{n} photographs and noise"),
+    };
+    format!(
+        "synthetic toys and household shapes with random colours, textures, backgrounds and occluders from {images}; no scanned object"
+    )
+}
 
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -67,21 +85,10 @@ impl Recipe for ViewsRecipe {
     ) -> Result<Prepared<ViewsTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
         let network = ViewNetwork::untrained(&device)?;
-        let textures = match &self.backgrounds {
-            Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())
-                .map_err(TrainError::about("backgrounds"))?
-                .with_procedural_fraction(PROCEDURAL_FRACTION),
-            None => Backgrounds::procedural(),
-        };
+        let textures = textures(self.backgrounds.as_deref())?;
         let mut card = ModelCard::new(ARCHITECTURE, "Views, features of known objects in colour images");
-        let images = match textures.images() {
-            0 => "noise".to_owned(),
-            n => format!("{n} photographs and noise"),
-        };
-        card.data = format!(
-            "synthetic toys and household shapes with random colours, textures, backgrounds and occluders from {images}; no scanned object; \
-             initial weights: XFeat (Potje et al. 2024, Apache-2.0)"
-        );
+        let weights = "initial weights: XFeat (Potje et al. 2024, Apache-2.0)";
+        card.data = format!("{}; {weights}", described(&textures));
         let options = self.options.clone();
         card.extra = serde_json::json!({ "training": options });
         Ok(Prepared { training: ViewsTraining::new(network, options, device), card, context: textures })

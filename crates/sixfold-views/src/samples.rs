@@ -24,7 +24,7 @@ pub const POINTS: usize = 96;
 /// Points of an object that are nearer to each other than this part of its diameter are not held apart.
 const SAME_POINT: f32 = 0.05;
 /// A point is seen where the surface in the photograph is at most this part of the diameter away from it.
-const SEEN: f32 = 0.02;
+pub(crate) const SEEN: f32 = 0.02;
 /// Fewer correspondences are no sample.
 const MIN_POINTS: usize = 12;
 
@@ -41,12 +41,12 @@ pub struct Sample {
     pub others: Vec<Vec<bool>>,
 }
 
-fn between(random: &mut Random, low: f64, high: f64) -> f64 {
+pub(crate) fn between(random: &mut Random, low: f64, high: f64) -> f64 {
     low + (high - low) * random.random::<f64>()
 }
 
 /// An object about the origin, in colours or without.
-fn object(textures: &Backgrounds, random: &mut Random) -> Option<Mesh> {
+pub(crate) fn object(textures: &Backgrounds, random: &mut Random) -> Option<Mesh> {
     let mesh = if random.random::<f32>() < 0.6 {
         randomly_colored(&toy(random).ok()?, random)
     } else {
@@ -106,19 +106,29 @@ fn lights(random: &mut Random) -> (Vec<Light>, Material) {
 }
 
 /// The object as a photograph shows it.
-struct Photograph {
-    patch: Patch,
-    crop: Crop,
-    pose: Pose,
-    coordinates: PointImage,
-    hidden: Coverage,
+pub(crate) struct Photograph {
+    pub(crate) patch: Patch,
+    pub(crate) crop: Crop,
+    /// In the crop's frame.
+    pub(crate) pose: Pose,
+    pub(crate) coordinates: PointImage,
+    pub(crate) hidden: Coverage,
 }
 
-fn photograph(
+/// Which box a photograph is cropped about.
+pub(crate) struct Framing {
+    /// The whole object's, not that of the part that is seen.
+    pub(crate) whole: bool,
+    /// How much smaller or larger than that box.
+    pub(crate) scale: [f64; 2],
+}
+
+pub(crate) fn photograph(
     mesh: &Mesh,
     pose: &Pose,
     textures: &Backgrounds,
     side: usize,
+    framing: &Framing,
     random: &mut Random,
 ) -> Option<Photograph> {
     let wide = wide_camera();
@@ -149,10 +159,14 @@ fn photograph(
         return None;
     }
     let [x0, y0, x1, y1] = corners.map(|v| v as f64);
-    let (w, h) = (x1 - x0 + 1.0, y1 - y0 + 1.0);
+    let seen = [x0, y0, x1 - x0 + 1.0, y1 - y0 + 1.0];
+    let [x0, y0, w, h] = if framing.whole { [x, y, w, h].map(f64::from) } else { seen };
     let jitter = |random: &mut Random| between(random, -0.07, 0.07) * w.max(h);
-    let bbox = Rect { x: x0 + jitter(random), y: y0 + jitter(random), width: w, height: h }
-        .scaled(between(random, 0.9, 1.15));
+    let bbox = Rect { x: x0 + jitter(random), y: y0 + jitter(random), width: w, height: h }.scaled(between(
+        random,
+        framing.scale[0],
+        framing.scale[1],
+    ));
     let crop = Crop::of_box(&wide, &bbox, CROP_FACTOR, side)?;
     let pose = crop.to_crop(pose);
     let mut frame = VisibilityBuffer::new(&crop.camera);
@@ -184,7 +198,7 @@ fn in_crop(cover: &Coverage, wide: &Camera, crop: &Crop) -> Coverage {
     })
 }
 
-fn distance(a: &[f32; 3], b: &[f32; 3]) -> f32 {
+pub(crate) fn distance(a: &[f32; 3], b: &[f32; 3]) -> f32 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f32>().sqrt()
 }
 
@@ -195,7 +209,8 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<S
     let rotation = random_rotation(random).rotation();
     let range = diameter * between(random, 4.0, 9.0);
     let shift = Vec3::new(between(random, -0.05, 0.05), between(random, -0.05, 0.05), 1.0) * range;
-    let photograph = photograph(&mesh, &Pose::new(rotation, shift), textures, side, random)?;
+    let framing = Framing { whole: false, scale: [0.9, 1.15] };
+    let photograph = photograph(&mesh, &Pose::new(rotation, shift), textures, side, &framing, random)?;
     // Most meshes of users have colours, some have not.
     let bare = (random.random::<f32>() < 0.15)
         .then(|| Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec()).ok())

@@ -951,3 +951,13 @@ def train_views(
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...
+def train_refiner(
+    out: Path,
+    *,
+    steps: int = 12000,
+    learning_rate: float = 0.001,
+    batch: int = 4,
+    backgrounds: Path | None = None,
+    progress: Progress | None = None,
+    seed: int = 0,
+) -> dict[str, Any]: ...

@@ -114,6 +114,7 @@ rows! {
     train_detector: dataset, ["out"], None,
         "train detector --dataset tiny --ids 1 --size 96 --batch 2 --steps 3 --out out";
     train_views: dataset, ["out"], None, "train views --steps 3 --batch 1 --out out";
+    train_refiner: dataset, ["out"], None, "train refiner --steps 3 --batch 1 --out out";
     train_nol: dataset, ["out"], None, "train nol --steps 2 --out out";
     train_mttm: dataset, ["out"], None, "train mttm --steps 2 --objects 16 --scenes 4 --anchors 4 --out out";
     train_dgcm: dataset, ["out"], None, "train dgcm --views 64 --steps 3 --pairs 2 --out out";

@@ -94,6 +94,7 @@ fn good() -> BTreeMap<&'static str, Row> {
         ("train detector", of("train_detector")),
         ("train nol", of("train_nol")),
         ("train views", of("train_views")),
+        ("train refiner", of("train_refiner")),
         ("train mttm", of("train_mttm")),
         ("train dgcm", of("train_dgcm")),
         ("simulate-depth", of("simulate_depth")),

@@ -17,7 +17,7 @@ use crate::{Camera, CameraError, Mat3, Pose, Vec2, Vec3};
 
 pub use ap3p::p3p;
 pub use epnp::epnp;
-pub use refine::{RefineOptions, RefineReport, refine_pose};
+pub use refine::{RefineOptions, RefineReport, Trust, refine_pose, refine_trusted};
 
 /// Why no pose could be found.
 #[derive(Debug, Error, Clone, PartialEq)]

@@ -82,7 +82,7 @@ pub fn refine_pose(
 pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -> RefineReport {
     let limit = options.threshold_px * options.threshold_px;
     let mut pose = *initial;
-    let mut equations = linearise(data, &pose, limit, |_| 1.0);
+    let mut equations = linearise(data, &pose, limit, |_, _| 1.0);
     let mut lambda = 1e-4;
     let mut iterations = 0;
     while iterations < options.max_iterations && equations.count >= 6 {
@@ -92,7 +92,7 @@ pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -
             if lambda > 1e6 { break } else { continue }
         };
         let next = pose * Pose::exp(&step);
-        let next_equations = linearise(data, &next, limit, |_| 1.0);
+        let next_equations = linearise(data, &next, limit, |_, _| 1.0);
         if next_equations.cost < equations.cost {
             let gain = equations.cost - next_equations.cost;
             let small = gain <= options.convergence * equations.cost;
@@ -129,7 +129,7 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
     let mut squares = Vec::with_capacity(data.points.len());
     for _ in 0..iterations {
         squares.clear();
-        linearise(data, &pose, window, |square| {
+        linearise(data, &pose, window, |_, square| {
             squares.push(square);
             0.0
         });
@@ -150,7 +150,7 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
             variance = (0.5 * sum / weights).max(1e-12 * window);
             share = (weights / squares.len() as f64).clamp(0.01, 0.999);
         }
-        let equations = linearise(data, &pose, window, |square| probability(square, variance, share));
+        let equations = linearise(data, &pose, window, |_, square| probability(square, variance, share));
         let Some(step) = equations.solve(1e-9) else { return *initial };
         pose = pose * Pose::exp(&step);
         if step.amax() < 1e-7 {
@@ -160,20 +160,72 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
     pose
 }
 
+/// How far an image point is trusted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Trust {
+    /// How far it may be off, pixels.
+    pub spread_px: f64,
+    /// How probably it is right at all, 0 to 1.
+    pub weight: f64,
+}
+
+/// Refines a pose over correspondences each of which says how far it is trusted: least squares of the errors over their spreads,
+/// under Cauchy's distribution, by reweighting (Holland and Welsch 1977).
+///
+/// # Errors
+/// As for [`refine_pose`]; [`PnpError::NoModel`] when what is trusted does not fix a pose.
+pub fn refine_trusted(
+    object_points: &[Vec3],
+    image_points: &[Vec2],
+    trust: &[Trust],
+    camera: &Camera,
+    initial: &Pose,
+) -> Result<Pose, PnpError> {
+    if trust.len() != image_points.len() {
+        return Err(PnpError::Lengths { object_points: trust.len(), image_points: image_points.len() });
+    }
+    let data = Prepared::new(object_points, image_points, camera)?;
+    if trust.iter().filter(|t| t.weight > LEAST_WEIGHT).count() < 3 {
+        return Err(PnpError::NoModel);
+    }
+    let mut pose = initial.with_translation(initial.transform_point(&data.centre));
+    for _ in 0..TRUSTED_STEPS {
+        let weight = |i: usize, square: f64| {
+            let Trust { spread_px, weight } = trust[i];
+            let variance = spread_px * spread_px;
+            weight / (variance + square)
+        };
+        let step = linearise(&data, &pose, f64::INFINITY, weight).solve(1e-6).ok_or(PnpError::NoModel)?;
+        pose = pose * Pose::exp(&step);
+        if !pose.translation().iter().all(|c| c.is_finite()) || pose.translation().z <= 0.0 {
+            return Err(PnpError::NoModel);
+        }
+        if step.amax() < 1e-8 {
+            break;
+        }
+    }
+    Ok(pose.with_translation(pose.transform_point(&-data.centre)))
+}
+
+/// Points of a smaller weight do not count.
+const LEAST_WEIGHT: f64 = 1e-6;
+/// Most steps of [`refine_trusted`].
+const TRUSTED_STEPS: usize = 20;
+
 /// The normal equations of the correspondences within the threshold; their cost counts all. The twist moves the object
 /// in its own frame, about its centroid, where rotation and translation are least coupled.
 fn linearise(
     data: &Prepared,
     pose: &Pose,
     limit: f64,
-    mut weight: impl FnMut(f64) -> f64,
+    mut weight: impl FnMut(usize, f64) -> f64,
 ) -> NormalEquations {
     let r: Mat3 = pose.rotation_matrix();
     let t = pose.translation();
     let (fx, fy) = (data.camera.fx, data.camera.fy);
     let mut sum = NormalEquations::default();
     let mut outside = 0usize;
-    for (x, m) in data.points.iter().zip(&data.rays) {
+    for (i, (x, m)) in data.points.iter().zip(&data.rays).enumerate() {
         let p = r * x + t;
         let inverse = 1.0 / p.z;
         let (a, b) = (p.x * inverse, p.y * inverse);
@@ -183,7 +235,7 @@ fn linearise(
             outside += 1;
             continue;
         }
-        let weight = weight(square);
+        let weight = weight(i, square);
         let (su, sv) = (fx * inverse, fy * inverse);
         // Rows of d(pixel)/d(point), turned into the object's frame.
         let gu = Vec3::new(

@@ -107,6 +107,28 @@ fn epnp_with_noise() {
 }
 
 #[test]
+fn a_refinement_follows_what_is_trusted() {
+    let case = case(5, 200, 0.0, 0.4, false);
+    let start = case.truth * Pose::exp(&Vector6::new(0.002, -0.001, 0.01, 0.05, -0.08, 0.04));
+    let refined = |of_wrong: Trust| {
+        let right = Trust { spread_px: 0.5, weight: 1.0 };
+        let trust: Vec<Trust> = (0..200).map(|i| if i < 80 { of_wrong } else { right }).collect();
+        let found = refine_trusted(&case.points, &case.pixels, &trust, &camera(), &start).unwrap();
+        found.rotation_angle_to(&case.truth)
+    };
+    // Forty per cent are wrong: not trusted, they pull at nothing; said to be rough, hardly; trusted like the others, some.
+    let none = refined(Trust { spread_px: 0.5, weight: 0.0 });
+    let rough = refined(Trust { spread_px: 20.0, weight: 1.0 });
+    let all = refined(Trust { spread_px: 0.5, weight: 1.0 });
+    assert!(none < 1e-6 && rough < 0.01 && rough < all, "{none} {rough} {all}");
+    let lost = vec![Trust { spread_px: 1.0, weight: 0.0 }; 200];
+    let found = refine_trusted(&case.points, &case.pixels, &lost, &camera(), &start);
+    assert_eq!(found, Err(PnpError::NoModel));
+    let found = refine_trusted(&case.points, &case.pixels, &lost[1..], &camera(), &start);
+    assert_eq!(found, Err(PnpError::Lengths { object_points: 199, image_points: 200 }));
+}
+
+#[test]
 fn refinement_ignores_what_is_beyond_the_threshold() {
     let case = case(5, 200, 0.0, 0.4, false);
     let start = case.truth * Pose::exp(&Vector6::new(0.0005, -0.0003, 0.003, 0.01, -0.02, 0.01));

@@ -9,6 +9,7 @@ mod mttm;
 mod nol;
 mod options;
 mod pix2pose;
+mod refiner;
 #[cfg(test)]
 mod tests;
 mod views;
@@ -33,6 +34,7 @@ pub(crate) use self::dgcm::TrainDgcmArguments;
 pub(crate) use self::mttm::TrainMttmArguments;
 pub(crate) use self::nol::TrainNolArguments;
 pub(crate) use self::pix2pose::{TrainPix2PoseArguments, train_pix2pose};
+pub(crate) use self::refiner::TrainRefinerArguments;
 pub(crate) use self::views::TrainViewsArguments;
 use crate::arguments::Arguments;
 
@@ -76,6 +78,12 @@ pub(crate) enum TrainCommand {
     #[command(after_help = "Example:\n  sixfold train views --backgrounds photographs --out out/views\n\n\
         Interrupted, it resumes when the same command is given again.")]
     Views(Box<TrainViewsArguments>),
+    /// Train the network that refines poses in colour images, of any object, on procedural objects
+    #[command(
+        after_help = "Example:\n  sixfold train refiner --backgrounds photographs --out out/refiner\n\n\
+                      Writes model.safetensors with its card; the one within the program was made like that."
+    )]
+    Refiner(Box<TrainRefinerArguments>),
 }
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
@@ -92,6 +100,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })
         }
         TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
+        TrainCommand::Refiner(of) => show(&a.json, &of.out, &refiner::train_refiner(of)?, || ()),
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {
             let summary = mttm::train_mttm(of)?;

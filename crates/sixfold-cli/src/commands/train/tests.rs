@@ -73,6 +73,13 @@ fn without_options_the_command_line_asks_for_the_recipes_defaults() {
         }
         _ => panic!(),
     }
+    let command = command_line();
+    match parsed("refiner") {
+        TrainCommand::Refiner(a) => {
+            same(a.recipe(), sixfold_views::refiner::recipe::RefinerRecipe { command, ..Default::default() });
+        }
+        _ => panic!(),
+    }
 }
 
 #[test]
@@ -285,6 +292,16 @@ fn the_stub_of_python_shows_the_defaults_of_the_others() {
     let d = sixfold_views::recipe::ViewsRecipe::default().options;
     check(
         "train_views",
+        vec![
+            ("steps", d.common.steps.to_string()),
+            ("learning_rate", d.common.learning_rate.to_string()),
+            ("batch", d.batch.to_string()),
+            ("seed", d.common.seed.to_string()),
+        ],
+    );
+    let d = sixfold_views::refiner::recipe::RefinerRecipe::default().options;
+    check(
+        "train_refiner",
         vec![
             ("steps", d.common.steps.to_string()),
             ("learning_rate", d.common.learning_rate.to_string()),

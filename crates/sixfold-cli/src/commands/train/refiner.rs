@@ -1,0 +1,69 @@
+//! `sixfold train refiner`: nothing but a seed in (better: photographs for textures too), a network that refines poses out.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+use sixfold_views::refiner::recipe::RefinerRecipe;
+
+use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
+
+fn default() -> RefinerRecipe {
+    RefinerRecipe::default()
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainRefinerArguments {
+    /// Folder of photographs (PNG, JPEG) for textures, backgrounds and occluders (default: procedural textures only)
+    #[arg(long, value_name = "DIR")]
+    pub backgrounds: Option<PathBuf>,
+    /// Training steps
+    #[arg(long, value_name = "N", default_value_t = default().options.common.steps)]
+    pub steps: u64,
+    /// Highest learning rate
+    #[arg(long, value_name = "RATE", default_value_t = default().options.common.learning_rate)]
+    pub learning_rate: f64,
+    /// Objects in a step; of each four poses
+    #[arg(long, value_name = "N", default_value_t = default().options.batch)]
+    pub batch: usize,
+    /// Seed of the samples
+    #[arg(long, default_value_t = default().options.common.seed)]
+    pub seed: u64,
+    /// Train no further: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Folder for the model and the training's checkpoints, log and curves
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+impl TrainRefinerArguments {
+    pub(super) fn recipe(&self) -> RefinerRecipe {
+        let mut options = default().options;
+        options.common.steps = self.steps;
+        options.common.learning_rate = self.learning_rate;
+        options.common.seed = self.seed;
+        options.batch = self.batch;
+        RefinerRecipe { backgrounds: self.backgrounds.clone(), options, command: command_line() }
+    }
+}
+
+/// Trains, or resumes a training, and writes the model.
+pub(super) fn train_refiner(a: &TrainRefinerArguments) -> Result<Summary<()>> {
+    let recipe = checked(a.recipe())?;
+    let shown = Shown {
+        preparing: "samples",
+        measuring: "model measured",
+        message: |record| {
+            format!(
+                "error {:.3} cells, displacement {:.3}, near {:.3}, here {:.3}, {:.1} objects/s",
+                loss(record, "error"),
+                loss(record, "displacement"),
+                loss(record, "near"),
+                loss(record, "here"),
+                record.samples_per_second
+            )
+        },
+    };
+    Ok(summary(train_in(&recipe, (), &a.out, a.export, shown)?, |()| ()))
+}

@@ -1,0 +1,141 @@
+//! The refiner's whole training: nothing but a seed in (better: photographs for textures and backgrounds too), a refiner for the
+//! features of the network within the program out. Interrupted at any time, it is resumed.
+
+use std::path::PathBuf;
+
+use burn::tensor::Device;
+use sixfold_data::background_files;
+use sixfold_nn::fingerprint::Fingerprint;
+use sixfold_nn::options::OptionError;
+use sixfold_nn::recipe::{Prepared, Recipe, Session};
+use sixfold_nn::train_error::TrainError;
+use sixfold_nn::weights::{ModelCard, save_weights, write_card_markdown};
+use sixfold_synth::augment::Backgrounds;
+
+use super::network::{ARCHITECTURE, RefinerNetwork};
+use super::training::{RefinerTraining, RefinerTrainingOptions, Source};
+use crate::features::Extractor;
+use crate::network::shipped_hash;
+use crate::recipe::{described, textures};
+
+/// How the network is trained.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RefinerRecipe {
+    /// Folder of photographs for textures, backgrounds and occluders; procedural textures only without.
+    pub backgrounds: Option<PathBuf>,
+    /// Steps, learning rate, seed, crops.
+    pub options: RefinerTrainingOptions,
+    /// What was asked for, for the model's card.
+    pub command: String,
+}
+
+impl Recipe for RefinerRecipe {
+    type Data = ();
+    type Samples = Source;
+    type Training = RefinerTraining;
+    type Context = Backgrounds;
+    type Report = ();
+
+    fn steps(&self) -> u64 {
+        self.options.common.steps
+    }
+
+    fn seed(&self) -> u64 {
+        self.options.common.seed
+    }
+
+    fn command(&self) -> &str {
+        &self.command
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        self.options.check()
+    }
+
+    fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
+        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        let RefinerRecipe { backgrounds, options, command: _ } = self;
+        let backgrounds =
+            background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
+        let features = format!("{:016x}", shipped_hash());
+        Fingerprint::of(options)?.with("features", features).with_files("backgrounds", &backgrounds)
+    }
+
+    fn prepare(
+        &self,
+        (): (),
+        _: &mut Session<'_>,
+    ) -> Result<Prepared<RefinerTraining, Backgrounds>, TrainError> {
+        let device = Device::flex().autodiff();
+        let network = RefinerNetwork::random(self.seed(), &device);
+        let textures = textures(self.backgrounds.as_deref())?;
+        let mut card = ModelCard::new(ARCHITECTURE, "Refiner of poses of known objects in colour images");
+        card.data = format!("{}; features: those of the views within the program", described(&textures));
+        let options = self.options.clone();
+        card.extra = serde_json::json!({ "training": options });
+        Ok(Prepared { training: RefinerTraining::new(network, options, device), card, context: textures })
+    }
+
+    fn samples(&self, textures: &mut Backgrounds, _: &mut Session<'_>) -> Result<Option<Source>, TrainError> {
+        let extractor = Extractor::shipped().map_err(TrainError::about("views"))?;
+        Ok(Some(Source { textures: textures.clone(), extractor }))
+    }
+
+    fn finish(
+        &self,
+        Prepared { training, card, .. }: Prepared<RefinerTraining, Backgrounds>,
+        session: &mut Session<'_>,
+    ) -> Result<Option<()>, TrainError> {
+        let path = session.model();
+        save_weights(&training.into_network(), &card, &path)?;
+        write_card_markdown(&card, &path.with_extension("md"))?;
+        Ok(Some(()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_option_and_every_background_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("a.png"), b"one").unwrap();
+        let of = |recipe: &RefinerRecipe| recipe.inputs(&()).unwrap();
+        let differs = |recipe: RefinerRecipe, name: &str| {
+            let difference = of(&RefinerRecipe::default()).difference(&of(&recipe)).unwrap();
+            assert!(difference.contains(&format!("{name} was")), "{difference}");
+        };
+        let with = |change: &dyn Fn(&mut RefinerTrainingOptions)| {
+            let mut recipe = RefinerRecipe::default();
+            change(&mut recipe.options);
+            recipe
+        };
+        differs(with(&|o| o.common.steps = 3), "steps");
+        differs(with(&|o| o.common.learning_rate = 0.5), "learning_rate");
+        differs(with(&|o| o.common.seed = 3), "seed");
+        differs(with(&|o| o.batch = 3), "batch");
+        differs(with(&|o| o.side = 96), "side");
+        let photographs =
+            RefinerRecipe { backgrounds: Some(folder.path().to_owned()), ..RefinerRecipe::default() };
+        differs(photographs.clone(), "backgrounds");
+        let before = of(&photographs);
+        std::fs::write(folder.path().join("a.png"), b"two").unwrap();
+        assert!(before.difference(&of(&photographs)).unwrap().starts_with("backgrounds was"));
+        let command = "another".to_owned();
+        assert_eq!(of(&RefinerRecipe { command, ..RefinerRecipe::default() }), of(&RefinerRecipe::default()));
+    }
+
+    #[test]
+    fn options_out_of_range_are_named() {
+        let named = |change: &dyn Fn(&mut RefinerTrainingOptions)| {
+            let mut options = RefinerTrainingOptions::default();
+            change(&mut options);
+            options.check().unwrap_err().field
+        };
+        assert_eq!(RefinerTrainingOptions::default().check(), Ok(()));
+        assert_eq!(named(&|o| o.side = 100), "side");
+        assert_eq!(named(&|o| o.batch = 0), "batch");
+        assert_eq!(named(&|o| o.common.steps = 0), "steps");
+    }
+}
