@@ -184,7 +184,9 @@ pub(crate) fn second_matching(
             let pose =
                 |e: &Entry| object.object_pose(&camera_from_view(&camera_from_roi, e.turn), e.template);
             let mut chosen: Vec<(usize, Entry)> = vec![];
-            for (_, entry) in learned.ranked(descriptor).into_iter().take(NEAREST * options.network_hypotheses) {
+            for (_, entry) in
+                learned.ranked(descriptor).into_iter().take(NEAREST * options.network_hypotheses)
+            {
                 if chosen.len() >= options.network_hypotheses {
                     break;
                 }

@@ -166,14 +166,10 @@ impl PoseEstimator for MttmEstimator {
         query: &Query<'_>,
     ) -> Result<Vec<PoseEstimate>, EstimatorError> {
         let object: &MttmObject = downcast(object, METHOD)?;
-        let templates = object.object.templates();
-        let from_all_sides = templates.source == Source::Mesh
-            && templates.options.coverage == ViewCoverage::Around
-            && !self.options.published;
         let options = MttmOptions {
             max_instances: query.max_instances,
             min_score: query.min_confidence,
-            ..if from_all_sides { self.options.from_all_sides() } else { self.options }
+            ..self.options.for_templates(object.object.templates())
         };
         options.check().map_err(EstimatorError::method)?;
         let regions = query.memo.get_or_default::<RegionCache>();

@@ -8,8 +8,7 @@
 use std::collections::VecDeque;
 
 use sixfold_geometry::{
-    Camera, DepthImage, Mask, Plane, PlaneOptions, PointCloud, Vec2, Vec3, dominant_plane,
-    stats::median,
+    Camera, DepthImage, Mask, Plane, PlaneOptions, PointCloud, Vec2, Vec3, dominant_plane, stats::median,
 };
 
 use crate::error::TemplateError;
@@ -28,8 +27,12 @@ const EDGE: (f64, f64) = (0.005, 0.015);
 /// pixels; chosen by hand, not swept.
 const RING: (f64, usize) = (0.25, 8);
 /// The plane: what holds at least this fraction of the ring; chosen by hand, not swept.
-const PLANE: PlaneOptions =
-    PlaneOptions { threshold: 0.01, iterations: 200, min_share: 0.35, max_angle: std::f64::consts::FRAC_PI_6 };
+const PLANE: PlaneOptions = PlaneOptions {
+    threshold: 0.01,
+    iterations: 200,
+    min_share: 0.35,
+    max_angle: std::f64::consts::FRAC_PI_6,
+};
 /// A pixel lies on the plane within this multiple of the median distance of the ring's, about three standard deviations of noise.
 const DEVIATIONS: f64 = 4.5;
 /// Bounds of that distance, metres; chosen by hand, not swept.

@@ -352,7 +352,11 @@ fn a_large_mask_gives_the_size_of_the_right_one() {
     frame.render(&[part, other], &RenderOptions::default());
     let truth = size(&frame.depth(), &mask);
     let right = check_mask(&depth, &camera, &mask).unwrap();
-    assert!((size(&depth, &right.mask) / truth - 1.0).abs() < 0.03, "{:.3}", size(&depth, &right.mask) / truth);
+    assert!(
+        (size(&depth, &right.mask) / truth - 1.0).abs() < 0.03,
+        "{:.3}",
+        size(&depth, &right.mask) / truth
+    );
     for pixels in [2, 4, 6] {
         let large = mask.grown(pixels);
         let checked = check_mask(&depth, &camera, &large).unwrap();

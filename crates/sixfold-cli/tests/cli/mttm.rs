@@ -106,14 +106,14 @@ fn templates_from_around_find_what_lies_upside_down() {
     let truth = on_table(0.02, 0.01, 0.5) * Pose::exp(&[0.0, 0.0, 0.11, 0.0, 0.0, 0.0].into());
     let truth = truth * Pose::exp(&[0.0, 0.0, 0.0, std::f64::consts::PI, 0.0, 0.0].into());
     write_depth(&dir.join("over.png"), &depth_of(&[(&part(), truth)]), DEPTH_SCALE).unwrap();
-    let search = "estimate --method mttm --depth over.png --camera camera.json --object part.ply --unit mm --json";
+    let search =
+        "estimate --method mttm --depth over.png --camera camera.json --object part.ply --unit mm --json";
     // With what the cache of each keeps, and whichever was searched with first.
     for _ in 0..2 {
         let above = sixfold(dir, search);
         assert!(above.code < 2, "{}", above.stderr);
-        let wrong = |pose: &serde_json::Value| {
-            pose_of(&pose["camera_from_object"]).rotation_angle_to(&truth) > 0.5
-        };
+        let wrong =
+            |pose: &serde_json::Value| pose_of(&pose["camera_from_object"]).rotation_angle_to(&truth) > 0.5;
         assert!(above.json()["poses"].as_array().unwrap().iter().all(wrong), "{}", above.stdout);
         let around = sixfold(dir, &format!("{search} --templates around")).expect(0).json();
         assert_near(&pose_of(&around["poses"][0]["camera_from_object"]), &truth);

@@ -33,7 +33,8 @@ pub(crate) struct LeftOut {
 fn checked(path: &Path, depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<(Mask, LeftOut)> {
     let file = path.display().to_string();
     let advice = || format!("{file}: too large a mask (--mask-as-is takes it as it is)");
-    let CheckedMask { mask, on_plane, beyond_edges } = check_mask(depth, camera, mask).with_context(advice)?;
+    let CheckedMask { mask, on_plane, beyond_edges } =
+        check_mask(depth, camera, mask).with_context(advice)?;
     if on_plane + beyond_edges >= WORTH_A_WARNING {
         eprintln!(
             "warning: {file}: left out {:.0} % of the mask on the plane around the object and {:.0} % beyond a depth edge; \
