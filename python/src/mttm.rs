@@ -181,8 +181,12 @@ fn checked(py: Python<'_>, views: Vec<View>) -> PyResult<Vec<View>> {
     })?;
     let mut views = vec![];
     for (number, (checked, view)) in checked.into_iter().enumerate() {
-        let checked = checked.map_err(|error| {
-            template_error(&format!("views[{number}] (check_masks=False takes masks as they are)"), &error)
+        let checked = checked.map_err(|error| match &error {
+            TemplateError::MaskTooLarge { .. } => {
+                let name = format!("views[{number}] (check_masks=False takes masks as they are)");
+                template_error(&name, &error)
+            }
+            _ => template_error("views", &error),
         })?;
         if checked.left_out() >= WORTH_A_WARNING {
             let text = format!(
