@@ -119,7 +119,8 @@ impl Searched {
 /// method: "ppf", point pair features on depth, no training; "mttm", templates in depth, no training; "pix2pose", object
 /// coordinates from colour by a trained network, in boxes; "views", rendered views of the mesh matched with the colours, in boxes,
 /// no training. weights: pix2pose's network (needed), or another one for mttm and views than that of the package. keep_plane (ppf, mttm): search points on the table plane too. matcher (mttm): "points", "network" or
-/// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. refine (pix2pose, views): align the
+/// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. templates (mttm): "above", what
+/// stands on a table, z axis up, or "around", anything in any orientation, slower (above unless given). refine (pix2pose, views): align the
 /// rendered outline with the image where there is a mesh; passes (pix2pose): max number of passes over an object (1 unless given); icp (pix2pose): align
 /// poses with the depth image. seed of everything random.
 ///
@@ -143,7 +144,7 @@ pub(crate) struct PyEstimator {
 #[pymethods]
 impl PyEstimator {
     #[new]
-    #[pyo3(signature = (method, *, weights=None, keep_plane=false, matcher="both", templates_only=false, refine=true, passes=None, icp=false, seed=0))]
+    #[pyo3(signature = (method, *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,
@@ -152,6 +153,7 @@ impl PyEstimator {
         keep_plane: bool,
         matcher: &str,
         templates_only: bool,
+        templates: Option<String>,
         refine: bool,
         passes: Option<i64>,
         icp: bool,
@@ -162,6 +164,7 @@ impl PyEstimator {
             keep_plane,
             matcher: matcher.to_owned(),
             templates_only,
+            templates,
             refine,
             passes: passes.map(|n| whole("passes", n, 1)).transpose()?,
             icp,

@@ -15,7 +15,7 @@ use sixfold::views::estimator::ViewsEstimator;
 
 use crate::arrays::bad;
 use crate::guard::interruptible;
-use crate::mttm::{matched_by, network};
+use crate::mttm::{coverage, matched_by, network};
 use crate::training::file_or_value;
 
 /// The methods' options as they were given.
@@ -24,6 +24,7 @@ pub(crate) struct Options {
     pub keep_plane: bool,
     pub matcher: String,
     pub templates_only: bool,
+    pub templates: Option<String>,
     pub refine: bool,
     pub passes: Option<usize>,
     pub icp: bool,
@@ -33,7 +34,7 @@ pub(crate) struct Options {
 /// Each method with its own options beside the seed.
 const METHODS: [(&str, &[&str]); 4] = [
     ("ppf", &["keep_plane"]),
-    ("mttm", &["keep_plane", "weights", "matcher", "templates_only"]),
+    ("mttm", &["keep_plane", "weights", "matcher", "templates_only", "templates"]),
     ("pix2pose", &["weights", "refine", "passes", "icp"]),
     ("views", &["weights", "refine"]),
 ];
@@ -49,6 +50,7 @@ impl Options {
             ("keep_plane", self.keep_plane.then(|| "True".to_owned())),
             ("matcher", (self.matcher != BOTH).then(|| self.matcher.clone())),
             ("templates_only", self.templates_only.then(|| "True".to_owned())),
+            ("templates", self.templates.clone()),
             ("refine", (!self.refine).then(|| "False".to_owned())),
             ("passes", self.passes.map(|p| p.to_string())),
             ("icp", self.icp.then(|| "True".to_owned())),
@@ -109,6 +111,7 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
                 options: MttmOptions { matched_by, ..MttmOptions::default() },
                 network,
                 templates_only: options.templates_only,
+                coverage: options.templates.as_deref().map(|c| coverage("templates", c)).transpose()?,
                 ..MttmEstimator::default()
             };
             (Arc::new(estimator), vec![])

@@ -10,6 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use sixfold::geometry::{Camera, DepthImage, Mask, Pose};
 use sixfold::mttm::mask::to_image;
+use sixfold::mttm::mask_check::{WORTH_A_WARNING, check_mask};
 use sixfold::mttm::model::{ModelError, MttmModel};
 use sixfold::mttm::{
     DepthView, KnownObject, MatchedBy, MttmOptions, ObjectTemplates, SIDE, Source, StoreError, TemplateError,
@@ -63,10 +64,7 @@ impl PyTemplates {
     #[staticmethod]
     #[pyo3(signature = (mesh, *, coverage="above"))]
     fn from_mesh(py: Python<'_>, mesh: &Bound<'_, PyMesh>, coverage: &str) -> PyResult<Self> {
-        let known = [ViewCoverage::Above, ViewCoverage::Around];
-        let coverage = known.into_iter().find(|c| c.name() == coverage).ok_or_else(|| {
-            bad("coverage", known.map(|c| format!("{:?}", c.name())).join(" or "), format!("{coverage:?}"))
-        })?;
+        let coverage = self::coverage("coverage", coverage)?;
         let options = TemplateOptions { coverage, ..TemplateOptions::default() };
         let mesh = mesh.get().mesh.clone();
         let made = interruptible(py, move |_| ObjectTemplates::from_mesh(&mesh, &options))?;
@@ -79,11 +77,18 @@ impl PyTemplates {
     /// metres, without lens distortion; mask (H, W) bool; pose (4, 4). Without poses every view has a frame of its own,
     /// parallel to its camera, the origin in the middle of what is seen, and poses found with it are that frame's.
     ///
-    /// Raises ValueError for no view, a mask of another size or with too little depth, an object smaller than 1.5 cm or
+    /// check_masks: leave out of the masks what depth shows to be something else, the table around the object and what lies beyond
+    /// depth edges; warns from 3 % of a mask on.
+    ///
+    /// Raises ValueError for no view, a mask of another size or with too little depth, one more than a third of which is something else, an object smaller than 1.5 cm or
     /// larger than 60 cm, poses for some views only.
     #[staticmethod]
-    fn from_depth(py: Python<'_>, views: Vec<Bound<'_, PyAny>>) -> PyResult<Self> {
-        let views = views.iter().enumerate().map(|(i, v)| view_of(i, v)).collect::<PyResult<Vec<_>>>()?;
+    #[pyo3(signature = (views, *, check_masks=true))]
+    fn from_depth(py: Python<'_>, views: Vec<Bound<'_, PyAny>>, check_masks: bool) -> PyResult<Self> {
+        let mut views = views.iter().enumerate().map(|(i, v)| view_of(i, v)).collect::<PyResult<Vec<_>>>()?;
+        if check_masks {
+            views = checked(py, views)?;
+        }
         let made = interruptible(py, move |_| {
             let borrowed: Vec<DepthView<'_>> = views
                 .iter()
@@ -168,6 +173,34 @@ impl PyTemplates {
     }
 }
 
+/// The views with what depth shows to be something else left out of their masks.
+fn checked(py: Python<'_>, views: Vec<View>) -> PyResult<Vec<View>> {
+    let checked = interruptible(py, move |_| {
+        let checked = views.into_iter().map(|view| (check_mask(&view.depth, &view.camera, &view.mask), view));
+        checked.collect::<Vec<_>>()
+    })?;
+    let mut views = vec![];
+    for (number, (checked, view)) in checked.into_iter().enumerate() {
+        let checked = checked.map_err(|error| match &error {
+            TemplateError::MaskTooLarge { .. } => {
+                let name = format!("views[{number}] (check_masks=False takes masks as they are)");
+                template_error(&name, &error)
+            }
+            _ => template_error("views", &error),
+        })?;
+        if checked.left_out() >= WORTH_A_WARNING {
+            let text = format!(
+                "views[{number}]: left out {:.0} % of the mask on the plane around the object and {:.0} % beyond a depth edge",
+                100.0 * checked.on_plane,
+                100.0 * checked.beyond_edges
+            );
+            py.import("warnings")?.call_method1("warn", (text,))?;
+        }
+        views.push(View { mask: checked.mask, ..view });
+    }
+    Ok(views)
+}
+
 fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
     let expected = "a tuple (depth, camera, mask) or (depth, camera, mask, camera_from_object)";
     let name = format!("views[{number}]");
@@ -187,6 +220,14 @@ fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
         _ => None,
     };
     Ok(View { depth, camera, mask, pose })
+}
+
+/// From which sides templates are rendered, by its name.
+pub(crate) fn coverage(argument: &str, name: &str) -> PyResult<ViewCoverage> {
+    let known = [ViewCoverage::Above, ViewCoverage::Around];
+    known.into_iter().find(|c| c.name() == name).ok_or_else(|| {
+        bad(argument, known.map(|c| format!("{:?}", c.name())).join(" or "), format!("{name:?}"))
+    })
 }
 
 /// Who matches regions with templates, as it is typed.
@@ -367,6 +408,7 @@ pub(crate) fn estimate_mttm(
         Err(_) => return Err(bad("model", "an Mttm, Templates or a Mesh", model.get_type().to_string())),
     };
     let options = MttmOptions { matched_by, max_instances, min_score, ..MttmOptions::default() };
+    let options = options.for_templates(known.templates());
     let size = scene.depth().size();
     let found = interruptible(py, move |_| estimate(&scene, &known, &options).0)?;
     found

@@ -132,6 +132,8 @@ def test_options_of_other_methods_are_refused(tmp_path):
         ("ppf", {"weights": "w.safetensors"}, "weights"),
         ("ppf", {"matcher": "points"}, "matcher"),
         ("ppf", {"templates_only": True}, "templates_only"),
+        ("ppf", {"templates": "around"}, "templates"),
+        ("mttm", {"templates": "below"}, "templates"),
         ("ppf", {"icp": True}, "icp"),
         ("mttm", {"refine": False}, "refine"),
         ("mttm", {"passes": 2}, "passes"),

@@ -125,6 +125,25 @@ def test_an_object_without_a_mesh(thing, scene):
     assert not sixfold.Mttm(known).has_mesh
 
 
+def grown(mask, pixels):
+    """The mask with all pixels at most so many columns and rows from it."""
+    padded = np.pad(mask, pixels)
+    shifts = range(2 * pixels + 1)
+    return np.any([padded[y:, x:][: mask.shape[0], : mask.shape[1]] for y in shifts for x in shifts], axis=0)
+
+
+def test_masks_are_held_against_depth(thing):
+    depth, camera, mask, _ = scene_of(thing, 0.6, (-0.02, 0.01))
+    right = sixfold.Templates.from_depth([(depth, camera, mask)], check_masks=False).diameter
+    with pytest.warns(UserWarning, match=r"views\[0\]: left out .* of the mask"):
+        trimmed = sixfold.Templates.from_depth([(depth, camera, grown(mask, 5))])
+    assert abs(trimmed.diameter / right - 1) < 0.04
+    with pytest.raises(ValueError, match=r"views\[0\] \(check_masks=False.*cut it closer"):
+        sixfold.Templates.from_depth([(depth, camera, grown(mask, 30))])
+    large = sixfold.Templates.from_depth([(depth, camera, grown(mask, 30))], check_masks=False)
+    assert large.diameter > 1.2 * right
+
+
 def test_wrong_use(thing, templates, scene, weights, tmp_path):
     depth, camera, mask, pose = scene
     lens = sixfold.Camera(525, 525, 320, 240, 640, 480, distortion=(0.1, 0, 0, 0))

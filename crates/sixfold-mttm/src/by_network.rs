@@ -23,12 +23,8 @@ use crate::published::{self, visible_centre};
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
-/// Where the descriptors of an object's templates are kept in its folder.
-const DESCRIPTORS_FILE: &str = "descriptors.bin";
 /// Regions of which pairs are compared: fewest and most. Chosen by hand; not swept.
 const LOOKED_AT: (usize, usize) = (64, 400);
-/// Hypotheses that the network adds to a region's; chosen by hand, not swept.
-const HYPOTHESES: usize = 2;
 /// Pairs that go through the network at a time; of no influence on the result.
 const AT_A_TIME: usize = 32;
 /// The minimum trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
@@ -74,7 +70,7 @@ impl MttmEstimator {
         notes: &mut Vec<String>,
     ) -> KnownObject {
         let Some(network) = &self.network else { return known };
-        match object.file(DESCRIPTORS_FILE) {
+        match object.file(&self.file_name("descriptors")) {
             None => known.with_network(network.clone()),
             Some(file) => {
                 let (known, note) = known.with_network_cached(network.clone(), &file);
@@ -188,8 +184,10 @@ pub(crate) fn second_matching(
             let pose =
                 |e: &Entry| object.object_pose(&camera_from_view(&camera_from_roi, e.turn), e.template);
             let mut chosen: Vec<(usize, Entry)> = vec![];
-            for (_, entry) in learned.ranked(descriptor).into_iter().take(NEAREST * HYPOTHESES) {
-                if chosen.len() >= HYPOTHESES {
+            for (_, entry) in
+                learned.ranked(descriptor).into_iter().take(NEAREST * options.network_hypotheses)
+            {
+                if chosen.len() >= options.network_hypotheses {
                     break;
                 }
                 let entry = object.matcher.entries()[entry];

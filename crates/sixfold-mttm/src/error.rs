@@ -46,6 +46,19 @@ pub enum TemplateError {
         /// Pixels needed.
         needed: usize,
     },
+    /// Much of the mask shows something else.
+    #[error(
+        "{:.0} % of the mask lies on the plane around it and {:.0} % beyond a depth edge, at most {:.0} % are left out: cut it closer to the object",
+        100.0 * on_plane, 100.0 * beyond_edges, 100.0 * most
+    )]
+    MaskTooLarge {
+        /// Fraction of its pixels with depth on the plane that surrounds it.
+        on_plane: f64,
+        /// Fraction beyond a depth edge, on surfaces that go on outside the mask.
+        beyond_edges: f64,
+        /// Fraction that may be left out.
+        most: f64,
+    },
     /// What the mask shows has a size that no tabletop object has.
     #[error(
         "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"

@@ -14,6 +14,7 @@ use crate::error::StoreError;
 use crate::estimate::{KnownObject, MttmEstimate, MttmOptions, Stages, search};
 use crate::regions::RegionCache;
 use crate::template::{ObjectTemplates, Source, TemplateOptions};
+use crate::views::ViewCoverage;
 
 const METHOD: &str = "mttm";
 /// Where an object's templates are kept in its folder.
@@ -30,6 +31,9 @@ pub struct MttmEstimator {
     pub options: MttmOptions,
     /// Which templates are rendered from a mesh, where its folder holds none yet.
     pub templates: TemplateOptions,
+    /// From which sides an object with a mesh is searched, whatever templates its folder holds; these are kept in files of their own.
+    /// `None`: those that it holds, or [`MttmEstimator::templates`].
+    pub coverage: Option<ViewCoverage>,
     /// The network (feature `network`); without one, points match alone.
     #[cfg(feature = "network")]
     pub network: Option<Arc<crate::model::MttmModel>>,
@@ -67,7 +71,16 @@ impl PreparedObject for MttmObject {
 }
 
 impl MttmEstimator {
-    /// The object's templates: those in its folder, or rendered from its mesh with [`MttmEstimator::templates`].
+    /// The name of a file derived from an object's templates.
+    pub(crate) fn file_name(&self, what: &str) -> String {
+        match self.coverage {
+            None => format!("{what}.bin"),
+            Some(coverage) => format!("{what}-{}.bin", coverage.name()),
+        }
+    }
+
+    /// The object's templates: those in its folder, or rendered from its mesh with [`MttmEstimator::templates`] and
+    /// [`MttmEstimator::coverage`].
     fn templates(&self, object: &Object, notes: &mut Vec<String>) -> Result<ObjectTemplates, EstimatorError> {
         let wrap = |source| EstimatorError::Object { object: object.name.clone(), source };
         let file = object.file(TEMPLATES_FILE);
@@ -80,13 +93,25 @@ impl MttmEstimator {
             })?;
             let only =
                 |source| StoreError::OnlyTemplates { object: object.name.clone(), source: Box::new(source) };
+            if let Some(coverage) = self.coverage {
+                notes.push(format!(
+                    "templates {} of {}: it is known from depth images alone, so it is found from their sides",
+                    coverage.name(),
+                    object.name
+                ));
+            }
             return ObjectTemplates::read(&file).map_err(|e| wrap(Box::new(only(e))));
         };
-        let Some(file) = file else {
-            return ObjectTemplates::from_mesh(mesh, &self.templates).map_err(|e| wrap(Box::new(e)));
+        let wanted =
+            TemplateOptions { coverage: self.coverage.unwrap_or(self.templates.coverage), ..self.templates };
+        let Some(file) = object.file(&self.file_name("templates")) else {
+            return ObjectTemplates::from_mesh(mesh, &wanted).map_err(|e| wrap(Box::new(e)));
         };
         // Templates that were asked for with other views stay as they are.
-        let options = ObjectTemplates::read(&file).map_or(self.templates, |kept| kept.options);
+        let options = match self.coverage {
+            None => ObjectTemplates::read(&file).map_or(wanted, |kept| kept.options),
+            Some(_) => wanted,
+        };
         let (templates, note) =
             ObjectTemplates::cached(&file, mesh, &options).map_err(|e| wrap(Box::new(e)))?;
         notes.extend(note.map(|n| format!("templates of {} not kept, or computed again: {n}", object.name)));
@@ -144,7 +169,7 @@ impl PoseEstimator for MttmEstimator {
         let options = MttmOptions {
             max_instances: query.max_instances,
             min_score: query.min_confidence,
-            ..self.options
+            ..self.options.for_templates(object.object.templates())
         };
         options.check().map_err(EstimatorError::method)?;
         let regions = query.memo.get_or_default::<RegionCache>();

@@ -27,6 +27,7 @@ pub mod learned;
 #[cfg(feature = "network")]
 pub mod loss;
 pub mod mask;
+pub mod mask_check;
 pub mod matching;
 #[cfg(feature = "network")]
 pub mod model;

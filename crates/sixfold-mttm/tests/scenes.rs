@@ -8,14 +8,15 @@ use sixfold_mttm::align::camera_from_view;
 use sixfold_mttm::judge::{Surface, judge};
 use sixfold_mttm::learned::Learned;
 use sixfold_mttm::mask::to_image;
+use sixfold_mttm::mask_check::check_mask;
 use sixfold_mttm::matching::{Entry, MatchOptions, Matcher};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::network::MAP;
 use sixfold_mttm::patch::Patch;
 use sixfold_mttm::roi::{Roi, UNKNOWN};
 use sixfold_mttm::{
-    DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateOptions,
-    estimate,
+    DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateError,
+    TemplateOptions, estimate,
 };
 use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
@@ -332,6 +333,39 @@ fn one_masked_view_is_enough_to_find_it_elsewhere() {
         assert!(t < 12.0 && r < 8.0, "{t:.1} mm, {r:.1} degrees");
         assert!(iou(best, &visible, &depth) > 0.5);
     }
+}
+
+#[test]
+fn a_large_mask_gives_the_size_of_the_right_one() {
+    // A box behind the part, so that a large mask takes in more than the table.
+    let (part, other) = (part(), cuboid([-0.05, -0.05, 0.0], [0.05, 0.05, 0.2]));
+    let objects = [(&part, on_table(-0.1, 0.05, 0.4)), (&other, on_table(-0.08, 0.2, 0.1))];
+    let (depth, mask) = look(&objects, 8);
+    let camera = camera();
+    let size = |depth: &DepthImage, mask: &Mask| {
+        let view = DepthView { depth, camera: &camera, mask, camera_from_object: None };
+        ObjectTemplates::from_depth(&[view], &TemplateOptions::default()).unwrap().diameter
+    };
+    // As a camera without noise sees it.
+    let mut frame = VisibilityBuffer::new(&camera);
+    let [part, other] = objects.map(|(mesh, camera_from_object)| SceneObject { mesh, camera_from_object });
+    frame.render(&[part, other], &RenderOptions::default());
+    let truth = size(&frame.depth(), &mask);
+    let right = check_mask(&depth, &camera, &mask).unwrap();
+    assert!(
+        (size(&depth, &right.mask) / truth - 1.0).abs() < 0.03,
+        "{:.3}",
+        size(&depth, &right.mask) / truth
+    );
+    for pixels in [2, 4, 6] {
+        let large = mask.grown(pixels);
+        let checked = check_mask(&depth, &camera, &large).unwrap();
+        let (before, after) = (size(&depth, &large) / truth, size(&depth, &checked.mask) / truth);
+        assert!((after - 1.0).abs() < 0.03 && before > 1.3, "{pixels}: {before:.3}, checked {after:.3}");
+        assert!(checked.on_plane > 0.05 && checked.beyond_edges > 0.005, "{pixels}");
+    }
+    let huge = check_mask(&depth, &camera, &mask.grown(20));
+    assert!(matches!(huge, Err(TemplateError::MaskTooLarge { .. })));
 }
 
 #[test]

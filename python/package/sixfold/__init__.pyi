@@ -373,12 +373,13 @@ class Estimator:
         keep_plane: bool = False,
         matcher: Literal["points", "network", "both"] = "both",
         templates_only: bool = False,
+        templates: Literal["above", "around"] | None = None,
         refine: bool = True,
         passes: int | None = None,
         icp: bool = False,
         seed: int = 0,
     ) -> Estimator:
-        """weights: pix2pose (needed), mttm, views; keep_plane: ppf, mttm; matcher, templates_only: mttm; refine: pix2pose, views;
+        """weights: pix2pose (needed), mttm, views; keep_plane: ppf, mttm; matcher, templates_only, templates: mttm; refine: pix2pose, views;
         others: pix2pose."""
     @property
     def name(self) -> str: ...
@@ -654,7 +655,7 @@ class Templates:
     @staticmethod
     def from_mesh(mesh: Mesh, *, coverage: Literal["above", "around"] = "above") -> Templates: ...
     @staticmethod
-    def from_depth(views: Sequence[View]) -> Templates: ...
+    def from_depth(views: Sequence[View], *, check_masks: bool = True) -> Templates: ...
     @staticmethod
     def load(path: Path) -> Templates: ...
     def save(self, path: Path) -> None: ...

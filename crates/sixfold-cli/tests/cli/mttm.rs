@@ -1,7 +1,7 @@
 //! `sixfold estimate --method mttm`, `sixfold object add --templates` and `--depth`.
 
 use sixfold_geometry::{Mask, Pose};
-use sixfold_io::{write_depth, write_mask};
+use sixfold_io::{read_mask, write_depth, write_mask};
 
 use crate::support::*;
 
@@ -58,6 +58,13 @@ fn an_object_is_stored_with_templates_and_found() {
     assert_eq!(std::fs::read(dir.join("sixfold-objects/twin/templates.bin")).unwrap(), bytes);
     fails(dir, "object add thing part.ply --unit mm --templates", &["thing", "--replace"]);
     assert_eq!(std::fs::read(&file).unwrap(), bytes);
+    // Other sides for one search are kept beside, and leave the object's own templates as they are.
+    let around = format!("{DEPTH} --matcher points --object thing --templates around --json");
+    let found = sixfold(dir, &around).expect(0).json();
+    assert_near(&pose_of(&found["poses"][0]["camera_from_object"]), &case.truth);
+    let beside = std::fs::metadata(dir.join("sixfold-objects/thing/templates-around.bin")).unwrap();
+    assert!(beside.len() > 2 * bytes.len() as u64);
+    assert_eq!(std::fs::read(&file).unwrap(), bytes);
 }
 
 #[test]
@@ -89,6 +96,62 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
     assert_near(&(there * here.inverse() * case.truth), &moved);
     // Only this method can look for it.
     fails(dir, "estimate --depth depth.png --camera camera.json --object seen", &["seen", "no mesh", "mttm"]);
+}
+
+#[test]
+fn templates_from_around_find_what_lies_upside_down() {
+    let case = OneImage::new();
+    let dir = case.path();
+    // On its tower, the bottom up.
+    let truth = on_table(0.02, 0.01, 0.5) * Pose::exp(&[0.0, 0.0, 0.11, 0.0, 0.0, 0.0].into());
+    let truth = truth * Pose::exp(&[0.0, 0.0, 0.0, std::f64::consts::PI, 0.0, 0.0].into());
+    write_depth(&dir.join("over.png"), &depth_of(&[(&part(), truth)]), DEPTH_SCALE).unwrap();
+    let search =
+        "estimate --method mttm --depth over.png --camera camera.json --object part.ply --unit mm --json";
+    // With what the cache of each keeps, and whichever was searched with first.
+    for _ in 0..2 {
+        let above = sixfold(dir, search);
+        assert!(above.code < 2, "{}", above.stderr);
+        let wrong =
+            |pose: &serde_json::Value| pose_of(&pose["camera_from_object"]).rotation_angle_to(&truth) > 0.5;
+        assert!(above.json()["poses"].as_array().unwrap().iter().all(wrong), "{}", above.stdout);
+        let around = sixfold(dir, &format!("{search} --templates around")).expect(0).json();
+        assert_near(&pose_of(&around["poses"][0]["camera_from_object"]), &truth);
+    }
+    fails(dir, &format!("{search} --templates below"), &["below", "--templates"]);
+}
+
+#[test]
+fn a_mask_cut_too_large_is_trimmed_or_refused() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_part_mask(&case);
+    let mask = read_mask(&dir.join("mask.png")).unwrap();
+    write_mask(&dir.join("large.png"), &mask.grown(3)).unwrap();
+    write_mask(&dir.join("huge.png"), &mask.grown(20)).unwrap();
+    let add = |name: &str, mask: &str| {
+        let input = format!("--depth depth.png --mask {mask} --camera camera.json --json");
+        sixfold(dir, &format!("object add {name} {input}"))
+    };
+    let diameter = |run: &Run| run.json()["diameter"].as_f64().unwrap();
+    let right = add("right", "mask.png").expect(0);
+    assert!(!right.stderr.contains("warning"), "{}", right.stderr);
+    let trimmed = add("trimmed", "large.png").expect(0);
+    assert!((diameter(&trimmed) / diameter(&right) - 1.0).abs() < 0.03, "{trimmed:?} {right:?}");
+    for words in ["large.png", "left out", "% of the mask", "--mask-as-is"] {
+        assert!(trimmed.stderr.contains(words), "{}", trimmed.stderr);
+    }
+    let out = &trimmed.json()["left_out"][0];
+    assert!(out["mask"] == "large.png" && out["on_plane"].as_f64().unwrap() > 0.1, "{out}");
+    // What is refused leaves nothing, and can be asked for all the same.
+    let refused = add("refused", "huge.png").expect(2);
+    for words in ["huge.png", "% of the mask", "plane", "cut it closer", "--mask-as-is"] {
+        assert!(refused.stderr.contains(words), "{}", refused.stderr);
+    }
+    fails(dir, "object show refused", &["refused"]);
+    let as_is = add("as-is", "huge.png --mask-as-is").expect(0);
+    assert!(diameter(&as_is) > 1.2 * diameter(&right), "{as_is:?}");
+    assert_eq!(as_is.json()["left_out"], serde_json::json!([]));
 }
 
 #[test]

@@ -12,6 +12,7 @@ use sixfold_ppf::PpfEstimator;
 
 use super::arguments::CommonArguments;
 use super::networks;
+use crate::commands::object::arguments::TemplateViews;
 
 /// What makes an estimator of options.
 type Build = fn(&ArgMatches, &CommonArguments) -> Result<Box<dyn PoseEstimator>>;
@@ -119,6 +120,10 @@ struct MttmArguments {
     /// Who matches regions with templates; with --preset published the network alone
     #[arg(long, value_enum, default_value = networks::DEFAULT_MATCHER, conflicts_with = "preset")]
     matcher: Matcher,
+    /// From which sides a mesh's templates are rendered; things that lie, or that lie on others, are found by those from around
+    /// (default: those that the object was added with, else above)
+    #[arg(long, value_enum, value_name = "VIEWS")]
+    templates: Option<TemplateViews>,
     /// Judge poses by the templates alone, as if there were no mesh
     #[arg(long)]
     templates_only: bool,
@@ -137,6 +142,7 @@ impl MethodArguments for MttmArguments {
         let estimator = MttmEstimator {
             depth: depth_options(self.keep_plane, common),
             options,
+            coverage: self.templates.map(TemplateViews::coverage),
             templates_only: self.templates_only,
             ..MttmEstimator::default()
         };

@@ -25,6 +25,15 @@ struct Listed {
     record: ObjectRecord,
 }
 
+/// An object known from depth images.
+#[derive(Serialize)]
+struct Added<'a> {
+    #[serde(flatten)]
+    listed: &'a Listed,
+    /// What its masks held besides, one for each; empty with --mask-as-is.
+    left_out: Vec<templates::LeftOut>,
+}
+
 pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
     let store = ObjectStore::new(&a.store);
     match &a.command {
@@ -44,12 +53,13 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
 
 /// Stores an object that is known from depth images.
 fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
-    let templates = templates::of_depth(&a.views)?;
+    let (templates, left_out) = templates::of_depth(&a.views)?;
     let record = ObjectRecord::of_views(&a.views.depth, templates.diameter);
     let new = NewObject { mesh: None, record: &record, replace: a.replace };
     store.add(&a.name, new, |object| keep(&templates, object.file(TEMPLATES_FILE)))?;
     let listed = Listed { name: a.name.clone(), record };
-    report(json, &listed, || {
+    let added = Added { listed: &listed, left_out };
+    report(json, &added, || {
         println!(
             "added {}: {} template(s), {:.1} mm across as seen",
             listed.name,

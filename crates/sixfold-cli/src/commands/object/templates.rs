@@ -3,9 +3,11 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
+use serde::Serialize;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
 use sixfold_io::{CameraFile, read_depth, read_mask};
+use sixfold_mttm::mask_check::{CheckedMask, WORTH_A_WARNING, check_mask};
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 
 use super::arguments::DepthViewArguments;
@@ -17,8 +19,35 @@ struct Read {
     pose: Option<Pose>,
 }
 
-/// The templates of an object in depth images.
-pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<ObjectTemplates> {
+/// What was left out of a mask, as fractions of its pixels with depth.
+#[derive(Debug, Serialize)]
+pub(crate) struct LeftOut {
+    mask: String,
+    /// On the plane around the object.
+    on_plane: f64,
+    /// Beyond a depth edge.
+    beyond_edges: f64,
+}
+
+/// A mask without what depth shows to be something else; warns where that is much.
+fn checked(path: &Path, depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<(Mask, LeftOut)> {
+    let file = path.display().to_string();
+    let advice = || format!("{file}: too large a mask (--mask-as-is takes it as it is)");
+    let CheckedMask { mask, on_plane, beyond_edges } =
+        check_mask(depth, camera, mask).with_context(advice)?;
+    if on_plane + beyond_edges >= WORTH_A_WARNING {
+        eprintln!(
+            "warning: {file}: left out {:.0} % of the mask on the plane around the object and {:.0} % beyond a depth edge; \
+             --mask-as-is takes it as it is",
+            100.0 * on_plane,
+            100.0 * beyond_edges
+        );
+    }
+    Ok((mask, LeftOut { mask: file, on_plane, beyond_edges }))
+}
+
+/// The templates of an object in depth images, and what was left out of its masks.
+pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<(ObjectTemplates, Vec<LeftOut>)> {
     let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
     let file = CameraFile::read(camera_path)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {
@@ -44,22 +73,30 @@ pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<ObjectTemplates> {
             a.depth.len()
         );
     }
-    let mut read = vec![];
+    let (mut read, mut left_out) = (vec![], vec![]);
     for (i, (depth_file, mask_file)) in a.depth.iter().zip(&a.masks).enumerate() {
         let depth = read_depth(depth_file, scale / 1000.0)?;
         let camera = file.for_image(depth.width(), depth.height(), camera_path)?;
         let depth = undistort_depth(&depth, &camera)?;
         let mask = read_mask(mask_file)?;
         camera.check_image(mask.width(), mask.height()).with_context(|| mask_file.display().to_string())?;
-        let pose = poses.as_ref().map(|p| p[i]);
-        read.push(Read { depth, camera: camera.without_distortion(), mask, pose });
+        let camera = camera.without_distortion();
+        let mask = if a.mask_as_is {
+            mask
+        } else {
+            let (mask, out) = checked(mask_file, &depth, &camera, &mask)?;
+            left_out.push(out);
+            mask
+        };
+        read.push(Read { depth, camera, mask, pose: poses.as_ref().map(|p| p[i]) });
     }
     let views: Vec<DepthView<'_>> = read
         .iter()
         .map(|r| DepthView { depth: &r.depth, camera: &r.camera, mask: &r.mask, camera_from_object: r.pose })
         .collect();
     let names: Vec<String> = a.depth.iter().map(|f| f.display().to_string()).collect();
-    ObjectTemplates::from_depth(&views, &TemplateOptions::default()).with_context(|| names.join(", "))
+    let templates = ObjectTemplates::from_depth(&views, &TemplateOptions::default());
+    Ok((templates.with_context(|| names.join(", "))?, left_out))
 }
 
 fn read_poses(path: &Path) -> Result<Vec<Pose>> {
