@@ -162,7 +162,11 @@ impl Views<'_> {
             return Ok(None);
         };
         let ranked = self.ranked(&part);
-        let hypotheses = self.find_in(&part, &ranked, image, camera, bbox)?;
+        let mut hypotheses = self.coarse(&part, &ranked)?;
+        let close = self.options.close.min(hypotheses.len());
+        let closer =
+            self.closer_all(hypotheses[..close].iter().map(|h| (*h, *bbox)).collect(), image, camera)?;
+        hypotheses.splice(..close, closer);
         Ok(Some(Found { crop: part.crop, patch: part.patch, hypotheses, templates: ranked }))
     }
 
@@ -177,14 +181,7 @@ impl Views<'_> {
     }
 
     /// The poses, best first, that a crop and the templates most alike it give.
-    pub(crate) fn find_in(
-        &self,
-        part: &Part,
-        ranked: &[(usize, f32)],
-        image: &RgbImage,
-        camera: &Camera,
-        bbox: &Rect,
-    ) -> Result<Vec<Hypothesis>, ViewsError> {
+    pub(crate) fn coarse(&self, part: &Part, ranked: &[(usize, f32)]) -> Result<Vec<Hypothesis>, ViewsError> {
         let options = self.options;
         let mut first: Vec<Hypothesis> =
             ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], part)).collect();
@@ -200,13 +197,21 @@ impl Views<'_> {
             hypothesis.camera_from_object = part.crop.to_camera(&hypothesis.camera_from_object);
         }
         hypotheses.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
-        let close = options.close.min(hypotheses.len());
-        hypotheses[..close].par_iter_mut().try_for_each(|hypothesis| {
-            *hypothesis = self.closer(*hypothesis, image, camera, bbox)?;
-            Ok::<(), ViewsError>(())
-        })?;
-        hypotheses[..close].sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
         Ok(hypotheses)
+    }
+
+    /// Poses with the boxes they were found in, each refined once more ([`Views::closer`]), best first.
+    pub(crate) fn closer_all(
+        &self,
+        poses: Vec<(Hypothesis, Rect)>,
+        image: &RgbImage,
+        camera: &Camera,
+    ) -> Result<Vec<Hypothesis>, ViewsError> {
+        let closer: Result<Vec<Hypothesis>, ViewsError> =
+            poses.into_par_iter().map(|(h, bbox)| self.closer(h, image, camera, &bbox)).collect();
+        let mut closer = closer?;
+        closer.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
+        Ok(closer)
     }
 
     /// A pose refined in a crop about the whole object as the pose has it, of more pixels, and its outline aligned there.
@@ -438,7 +443,7 @@ pub(crate) struct Part {
     crop: Crop,
     patch: Patch,
     input: Vec<f32>,
-    map: FeatureMap,
+    pub(crate) map: FeatureMap,
 }
 
 impl Part {

@@ -5,6 +5,9 @@ use sixfold_nn::xfeat::CHANNELS;
 use crate::features::FeatureMap;
 use crate::templates::Template;
 
+/// See [`quick_similarity`].
+const QUICK_STEP: usize = 4;
+
 /// The product of two features.
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     let (a, _) = a.as_chunks::<16>();
@@ -29,6 +32,16 @@ pub fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
         sum += best_near(template.feature(i), map, usize::from(*cell), reach).1;
     }
     sum / template.cells.len() as f32
+}
+
+/// The same by every [`QUICK_STEP`]th feature, looked for in the neighbouring cells alone: about twelve times as fast.
+pub fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (i, cell) in template.cells.iter().enumerate().step_by(QUICK_STEP) {
+        sum += best_near(template.feature(i), map, usize::from(*cell), 1).1;
+        count += 1.0;
+    }
+    if count > 0.0 { sum / count } else { 0.0 }
 }
 
 /// The cell within `reach` of `cell` whose feature is nearest, and the product.

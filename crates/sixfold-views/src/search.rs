@@ -13,6 +13,7 @@ use sixfold_geometry::{Camera, Rect, RgbImage};
 use crate::error::ViewsError;
 use crate::estimate::{Hypothesis, Part, Views};
 use crate::features::Extractor;
+use crate::matching::quick_similarity;
 
 /// Boxes of two poses that overlap more than this (intersection over union) are of one instance.
 const ONE_INSTANCE: f64 = 0.5;
@@ -65,16 +66,26 @@ impl Views<'_> {
         places: &[Place],
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let mut ranked: Vec<_> = places.iter().map(|place| (place, self.ranked(&place.part))).collect();
-        let likeness = |templates: &[(usize, f32)]| templates.first().map_or(f32::NEG_INFINITY, |t| t.1);
-        ranked.sort_by(|a, b| likeness(&b.1).total_cmp(&likeness(&a.1)));
-        ranked.truncate(self.options.places.saturating_add(instances - 1));
-        let mut found = Vec::new();
-        for (place, templates) in &ranked {
-            let poses = self.find_in(&place.part, templates, image, camera, &place.bbox)?;
-            found.extend(poses.first().copied());
+        let mut alike: Vec<(&Place, f32)> =
+            places.par_iter().map(|place| (place, self.likeness(&place.part))).collect();
+        alike.sort_by(|a, b| b.1.total_cmp(&a.1));
+        alike.truncate(self.options.places.saturating_add(instances - 1));
+        let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
+        for (number, (place, _)) in alike.iter().enumerate() {
+            let poses = self.coarse(&place.part, &self.ranked(&place.part))?;
+            pool.extend(poses.into_iter().map(|pose| (number, pose)));
         }
-        found.sort_by(|a: &Hypothesis, b| b.similarity.total_cmp(&a.similarity));
+        pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));
+        // The best of all, and where several instances are asked for, the best of each place.
+        let mut seen = vec![false; alike.len()];
+        let mut chosen = Vec::new();
+        for (number, pose) in pool {
+            let first = !std::mem::replace(&mut seen[number], true);
+            if chosen.len() < self.options.close || (first && instances > 1) {
+                chosen.push((pose, alike[number].0.bbox));
+            }
+        }
+        let found = self.closer_all(chosen, image, camera)?;
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in found {
             if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
@@ -82,6 +93,12 @@ impl Views<'_> {
             }
         }
         Ok(kept)
+    }
+
+    /// How alike a crop and the most similar template are, by some of its features: to choose the places that are worth more.
+    fn likeness(&self, part: &Part) -> f32 {
+        let of = |template| quick_similarity(template, &part.map);
+        self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 
     /// Whether two poses are of one instance: their boxes in the image overlap more than those of two can.
