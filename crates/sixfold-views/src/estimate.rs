@@ -70,8 +70,8 @@ impl Default for ViewsOptions {
             close: 4,
             close_side: 224,
             outline: true,
-            proposals: 40,
-            places: 3,
+            proposals: 100,
+            places: 4,
             seed: 0,
         }
     }
