@@ -32,7 +32,7 @@ pub struct MttmEstimator {
     /// Which templates are rendered from a mesh, where its folder holds none yet.
     pub templates: TemplateOptions,
     /// From which sides an object with a mesh is searched, whatever templates its folder holds; these are kept in files of their own.
-    /// `None`: those that it holds, or [`MttmEstimator::templates`].
+    /// `None`: those that it holds, or those that it draws.
     pub coverage: Option<ViewCoverage>,
     /// The network (feature `network`); without one, points match alone.
     #[cfg(feature = "network")]
