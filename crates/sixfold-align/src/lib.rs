@@ -5,6 +5,7 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod depth_icp;
+pub mod evidence;
 pub mod mesh;
 pub mod outline;
 pub mod prepared;
@@ -12,6 +13,7 @@ pub mod verification;
 pub mod verify;
 
 pub use depth_icp::{AlignedToDepth, align_to_depth};
+pub use evidence::{ColorEvidence, ColorGradients, DepthEvidence, Evidence, Witness};
 pub use mesh::{VerificationMesh, could_be_simplified, verification_mesh};
 pub use prepared::{DepthOptions, DepthRegion, PreparedDepth, PreparedDepthError};
 pub use verification::{VerificationOptions, VerificationScore, Verifier};

@@ -170,6 +170,11 @@ impl PreparedDepth {
         self.plane.get_or_init(find).as_ref()
     }
 
+    /// Points nearer to the plane than this are its own, metres.
+    pub fn plane_margin(&self) -> f64 {
+        self.options.plane.threshold
+    }
+
     /// Distance in pixels to the nearest depth edge or hole, at most 255.
     pub fn edge_distance(&self) -> &Image<u8> {
         self.edge_distance.get_or_init(|| edge_distances(&self.filled, &self.normals))

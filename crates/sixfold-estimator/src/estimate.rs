@@ -20,6 +20,9 @@ pub struct PoseEstimate {
     pub camera_from_object: Pose,
     /// What decides between estimates of one method, 0 to 1.
     pub confidence: f64,
+    /// The probability that the pose is right, where the method knows it: that no point of the object lies further than a tenth of
+    /// the diameter from where it is (MSSD).
+    pub probability: Option<f64>,
     /// What verification by rendering says, where there is depth.
     pub verification: Option<VerificationScore>,
     /// The object's visible pixels as numbers `y * width + x`, where the method segments.
@@ -38,6 +41,7 @@ impl PoseEstimate {
         PoseEstimate {
             camera_from_object,
             confidence,
+            probability: None,
             verification: None,
             mask: None,
             details: Map::new(),

@@ -10,9 +10,11 @@ use sixfold_geometry::{Camera, OptionError, RgbImage};
 use crate::error::EstimatorError;
 use crate::region::Region;
 
-/// What methods derive from a query once and use for every object that is searched in it, by type.
-#[derive(Default)]
-pub struct Memo(Mutex<HashMap<TypeId, Arc<dyn Any + Send + Sync>>>);
+/// What methods derive from a query once and use for every object that is searched in it, by type. A clone is the same memo.
+#[derive(Default, Clone)]
+pub struct Memo(Arc<Mutex<Kept>>);
+
+type Kept = HashMap<TypeId, Arc<dyn Any + Send + Sync>>;
 
 impl Memo {
     /// The value of this type, made when first asked for.
@@ -54,10 +56,27 @@ pub struct Query<'a> {
     pub memo: Memo,
     /// What [`Query::depth_region`] returns.
     #[doc(hidden)]
-    pub depth_region: OnceLock<Result<DepthRegion, PreparedDepthError>>,
+    pub depth_region: Arc<OnceLock<Result<DepthRegion, PreparedDepthError>>>,
 }
 
 impl<'a> Query<'a> {
+    /// The same question with other limits, as a method asks it that asks others: what depends on the image and the region is
+    /// computed once for all of them.
+    #[must_use]
+    pub fn passed_on(&self, max_instances: usize, min_confidence: f64) -> Query<'a> {
+        Query {
+            camera: self.camera,
+            rgb: self.rgb,
+            depth: self.depth,
+            region: self.region,
+            max_instances,
+            min_confidence,
+            diagnostics: self.diagnostics,
+            memo: self.memo.clone(),
+            depth_region: self.depth_region.clone(),
+        }
+    }
+
     /// Everything in the image of this camera, one instance, any confidence; add images and limits by the fields.
     pub fn new(camera: &'a Camera) -> Query<'a> {
         Query {
@@ -69,7 +88,7 @@ impl<'a> Query<'a> {
             min_confidence: 0.0,
             diagnostics: false,
             memo: Memo::default(),
-            depth_region: OnceLock::new(),
+            depth_region: Arc::default(),
         }
     }
 
