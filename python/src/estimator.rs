@@ -35,6 +35,10 @@ pub(crate) struct PyPoseEstimate {
     /// What decides between estimates of one method, 0 to 1.
     #[pyo3(get)]
     confidence: f64,
+    /// The probability that the pose is right (no point of the object further than a tenth of the diameter from where it is), where
+    /// the method knows it (auto); None otherwise.
+    #[pyo3(get)]
+    probability: Option<f64>,
     /// The object's visible pixels, (H, W) bool, where the method segments; None otherwise.
     #[pyo3(get)]
     mask: Option<Py<PyArray2<bool>>>,
@@ -63,6 +67,7 @@ fn to_python(py: Python<'_>, estimate: PoseEstimate, camera: &Camera) -> PyResul
     Ok(PyPoseEstimate {
         camera_from_object: arrays::from_pose(py, &estimate.camera_from_object)?.unbind(),
         confidence: estimate.confidence,
+        probability: estimate.probability,
         mask: estimate.mask.as_ref().map(image).transpose()?.map(Bound::unbind),
         details: details.unbind(),
         notes: estimate.notes,
@@ -118,7 +123,8 @@ impl Searched {
 ///
 /// method: "ppf", point pair features on depth, no training; "mttm", templates in depth, no training; "pix2pose", object
 /// coordinates from colour by a trained network, in boxes; "views", rendered views of the mesh matched with the colours, in boxes,
-/// no training. weights: pix2pose's network (needed), or another one for mttm and views than that of the package. keep_plane (ppf, mttm): search points on the table plane too. matcher (mttm): "points", "network" or
+/// no training; "auto", all methods that the images allow, one after the other until one is sure, each pose with its probability. weights: pix2pose's network (needed), or another one for mttm and views than that of the package; for auto those of pix2pose, which is else left out.
+/// budget (auto): seconds for an object after which no further method is asked; poses then depend on how fast the machine is. keep_plane (ppf, mttm, auto): search points on the table plane too. matcher (mttm): "points", "network" or
 /// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. templates (mttm): "above", what
 /// stands on a table, z axis up, or "around", anything in any orientation, slower (above unless given). refine (pix2pose, views): align the
 /// rendered outline with the image where there is a mesh; passes (pix2pose): max number of passes over an object (1 unless given); icp (pix2pose): align
@@ -144,7 +150,7 @@ pub(crate) struct PyEstimator {
 #[pymethods]
 impl PyEstimator {
     #[new]
-    #[pyo3(signature = (method, *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, seed=0))]
+    #[pyo3(signature = (method, *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, budget=None, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,
@@ -157,6 +163,7 @@ impl PyEstimator {
         refine: bool,
         passes: Option<i64>,
         icp: bool,
+        budget: Option<f64>,
         seed: i64,
     ) -> PyResult<Self> {
         let options = Options {
@@ -168,6 +175,7 @@ impl PyEstimator {
             refine,
             passes: passes.map(|n| whole("passes", n, 1)).transpose()?,
             icp,
+            budget,
             seed: self::seed(seed)?,
         };
         let (method, ids) = make(py, options.check(method)?, &options)?;
@@ -175,7 +183,7 @@ impl PyEstimator {
         Ok(PyEstimator { method, ids, record, searched: Arc::default() })
     }
 
-    /// The method: "ppf", "mttm", "pix2pose" or "views".
+    /// The method: "ppf", "mttm", "pix2pose", "views" or "auto".
     #[getter]
     fn name(&self) -> &'static str {
         self.method.name()
@@ -206,7 +214,7 @@ impl PyEstimator {
     /// then); id: which of the weights' objects it is, not needed where they know one. depth (H, W) metres; rgb (H, W, 3) uint8;
     /// images are without lens distortion, and what the method does not use is ignored (`needs`). box (4,) x, y, width,
     /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: max number of poses;
-    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0.25 for views, 0 for pix2pose). What is
+    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0.4 for views, 0 for pix2pose, 0.5 for auto). What is
     /// derived from an object is kept for the next call. The same input gives the same result at any number of threads. Ctrl-C
     /// is heard.
     ///

@@ -2,9 +2,11 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use pyo3::prelude::*;
 use sixfold::align::DepthOptions;
+use sixfold::auto::AutoMembers;
 use sixfold::detect::detector::TrainedDetector;
 use sixfold::estimator::PoseEstimator;
 use sixfold::mttm::{MatchedBy, MttmEstimator, MttmOptions};
@@ -28,15 +30,17 @@ pub(crate) struct Options {
     pub refine: bool,
     pub passes: Option<usize>,
     pub icp: bool,
+    pub budget: Option<f64>,
     pub seed: u64,
 }
 
 /// Each method with its own options beside the seed.
-const METHODS: [(&str, &[&str]); 4] = [
+const METHODS: [(&str, &[&str]); 5] = [
     ("ppf", &["keep_plane"]),
     ("mttm", &["keep_plane", "weights", "matcher", "templates_only", "templates"]),
     ("pix2pose", &["weights", "refine", "passes", "icp"]),
     ("views", &["weights", "refine"]),
+    ("auto", &["weights", "keep_plane", "budget"]),
 ];
 
 /// The default of `matcher`.
@@ -54,6 +58,7 @@ impl Options {
             ("refine", (!self.refine).then(|| "False".to_owned())),
             ("passes", self.passes.map(|p| p.to_string())),
             ("icp", self.icp.then(|| "True".to_owned())),
+            ("budget", self.budget.map(|b| b.to_string())),
         ];
         all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
     }
@@ -114,6 +119,24 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
                 coverage: options.templates.as_deref().map(|c| coverage("templates", c)).transpose()?,
                 ..MttmEstimator::default()
             };
+            (Arc::new(estimator), vec![])
+        }
+        "auto" => {
+            let budget = options.budget.map(|b| Duration::try_from_secs_f64(b).ok().filter(|b| !b.is_zero()));
+            let budget = match budget {
+                Some(None) => {
+                    let found = options.budget.map(|b| b.to_string()).unwrap_or_default();
+                    return Err(bad("budget", "seconds above 0", found));
+                }
+                given => given.flatten(),
+            };
+            let seed = options.seed;
+            let made = interruptible(py, move |_| {
+                let pix2pose = weights.as_deref().map(|weights| (weights, None));
+                AutoMembers { pix2pose, depth, seed, without_views: false }.estimator()
+            })?;
+            let mut estimator = made.map_err(|error| file_or_value(&error))?;
+            estimator.budget = budget;
             (Arc::new(estimator), vec![])
         }
         "views" => {

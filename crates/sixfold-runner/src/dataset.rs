@@ -20,6 +20,7 @@ use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
 
 use crate::error::{RunError, describe};
 use crate::inputs::Inputs;
+use crate::overruled::left_standing;
 use crate::record::{RunOptions, RunRecord};
 use crate::regions::RegionSource;
 
@@ -306,6 +307,9 @@ impl DatasetRun<'_> {
                 found.extend(estimates.into_iter().map(posed));
             }
         }
+        let standing = left_standing(&found.iter().map(|p| &p.estimate).collect::<Vec<_>>());
+        let mut stands = standing.into_iter();
+        found.retain(|_| stands.next().unwrap_or(true));
         Ok(found)
     }
 

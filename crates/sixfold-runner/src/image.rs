@@ -9,6 +9,8 @@ use serde_json::{Map, Value};
 use sixfold_align::{PreparedDepth, VerificationScore};
 use sixfold_estimator::{EstimatorError, Object, PoseEstimate, PoseEstimator, PreparedObject, Query};
 
+use crate::overruled::left_standing;
+
 /// A method and the image that it is asked about.
 pub struct ImageRun<'a> {
     /// The method.
@@ -49,6 +51,18 @@ impl ImageRun<'_> {
     }
 }
 
+/// Drops poses most of whose pixels belong to surer poses, of the same object or of another; only where methods say probabilities.
+/// How many were dropped.
+pub fn without_overruled(found: &mut [FoundObject]) -> usize {
+    let all: Vec<&PoseEstimate> = found.iter().flat_map(|f| &f.estimates).collect();
+    let standing = left_standing(&all);
+    let mut stands = standing.iter();
+    for object in found {
+        object.estimates.retain(|_| stands.next().copied().unwrap_or(true));
+    }
+    standing.iter().filter(|stands| !**stands).count()
+}
+
 /// What makes a search of a depth image hopeless or slow, a sentence each.
 pub fn depth_notes(depth: &PreparedDepth, estimator: &dyn PoseEstimator) -> Vec<String> {
     let mut notes = vec![];
@@ -73,6 +87,9 @@ pub struct FoundPose {
     pub camera_from_object: [[f64; 4]; 4],
     /// 0 to 1.
     pub confidence: f64,
+    /// That the pose is right, where the method knows it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub probability: Option<f64>,
     /// What verification by rendering says.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub verification: Option<VerificationScore>,
@@ -95,6 +112,7 @@ impl FoundPose {
             object: found.object.name().to_owned(),
             camera_from_object: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])),
             confidence: estimate.confidence,
+            probability: estimate.probability,
             verification: estimate.verification,
             details,
             elapsed: found.seconds,

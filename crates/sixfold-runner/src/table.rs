@@ -6,9 +6,11 @@ use crate::image::ImageReport;
 
 /// The poses of one image and what was not found, a line each.
 pub fn pose_table(report: &ImageReport) -> String {
+    let judged = report.poses.iter().any(|p| p.probability.is_some());
+    let certainty = if judged { "probability" } else { "confidence" };
     let mut text = format!(
-        "{:<24} {:>10} {:>8} {:>26} {:>8}\n",
-        "object", "confidence", "visible", "translation (m)", "seconds"
+        "{:<24} {:>11} {:>8} {:>26} {:>8}\n",
+        "object", certainty, "visible", "translation (m)", "seconds"
     );
     for pose in &report.poses {
         let t: Vec<String> = pose.camera_from_object[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();
@@ -16,9 +18,9 @@ pub fn pose_table(report: &ImageReport) -> String {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{:<24} {:>10.3} {visible:>8} {:>26} {:>8.2}",
+            "{:<24} {:>11.3} {visible:>8} {:>26} {:>8.2}",
             pose.object,
-            pose.confidence,
+            pose.probability.unwrap_or(pose.confidence),
             t.join(" "),
             pose.elapsed
         );

@@ -69,9 +69,9 @@ const OUTLINE: [usize; 2] = [2, 1];
 /// How much of a surface's own colour covers the image: of what is sure and of what is not.
 const TINT: [f32; 2] = [0.45, 0.2];
 
-/// The number that overlays show for an estimate, 0 to 1.
+/// The number that overlays show for an estimate, 0 to 1: its probability, or its confidence where the method knows none.
 pub fn certainty(estimate: &PoseEstimate) -> f64 {
-    estimate.confidence
+    estimate.probability.unwrap_or(estimate.confidence)
 }
 
 /// Where an object is seen.

@@ -3,6 +3,7 @@
 use std::fmt::Display;
 use std::num::NonZeroUsize;
 use std::ops::RangeInclusive;
+use std::time::Duration;
 
 use anyhow::{Result, bail};
 
@@ -20,6 +21,9 @@ pub fn in_range<T: PartialOrd + Display>(option: &str, value: T, range: RangeInc
 /// Most threads: more only cost memory.
 const MOST_THREADS: usize = 1024;
 
+/// Longest time on the command line, seconds.
+const MOST_SECONDS: f64 = 3600.0;
+
 /// Parses a number of threads.
 ///
 /// # Errors
@@ -35,6 +39,22 @@ pub fn threads(text: &str) -> Result<NonZeroUsize, String> {
 pub fn count<const MOST: usize>(text: &str) -> Result<NonZeroUsize, String> {
     let number = text.parse().ok().filter(|number: &NonZeroUsize| number.get() <= MOST);
     number.ok_or_else(|| format!("found {text}, expected a whole number from 1 to {MOST}"))
+}
+
+/// Parses a length of time: a number with s or ms behind it.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn duration(text: &str) -> Result<Duration, String> {
+    let seconds = match (text.strip_suffix("ms"), text.strip_suffix('s')) {
+        (Some(number), _) => number.trim().parse::<f64>().ok().map(|ms| ms / 1000.0),
+        (None, Some(number)) => number.trim().parse::<f64>().ok(),
+        (None, None) => None,
+    };
+    let seconds = seconds.filter(|s| *s > 0.0 && *s <= MOST_SECONDS);
+    seconds
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("found {text}, expected a time above 0, at most an hour, such as 1s or 500ms"))
 }
 
 /// Parses millimetres per unit of a depth image.

@@ -13,6 +13,8 @@ pub use sixfold_runner as runner;
 pub use sixfold_synth as synth;
 
 #[cfg(feature = "networks")]
+pub use sixfold_auto as auto;
+#[cfg(feature = "networks")]
 pub use sixfold_data as data;
 #[cfg(feature = "networks")]
 pub use sixfold_detect as detect;

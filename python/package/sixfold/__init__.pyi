@@ -356,6 +356,8 @@ class Estimate:
     @property
     def confidence(self) -> float: ...
     @property
+    def probability(self) -> float | None: ...
+    @property
     def mask(self) -> Bool | None: ...
     @property
     def details(self) -> dict[str, Any]: ...
@@ -367,7 +369,7 @@ class Estimator:
 
     def __new__(
         cls,
-        method: Literal["ppf", "mttm", "pix2pose", "views"],
+        method: Literal["ppf", "mttm", "pix2pose", "views", "auto"],
         *,
         weights: Path | None = None,
         keep_plane: bool = False,
@@ -377,9 +379,10 @@ class Estimator:
         refine: bool = True,
         passes: int | None = None,
         icp: bool = False,
+        budget: float | None = None,
         seed: int = 0,
     ) -> Estimator:
-        """weights: pix2pose (needed), mttm, views; keep_plane: ppf, mttm; matcher, templates_only, templates: mttm; refine: pix2pose, views;
+        """weights: pix2pose (needed), mttm, views, auto; keep_plane: ppf, mttm, auto; budget, seconds: auto; matcher, templates_only, templates: mttm; refine: pix2pose, views;
         others: pix2pose."""
     @property
     def name(self) -> str: ...

@@ -142,7 +142,8 @@ mod tests {
             .collect();
         let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
         let faces = sides.iter().flat_map(|s| [[s[0], s[1], s[2]], [s[0], s[2], s[3]]]).collect();
-        let colors = (0..8u8).map(|k| [40 + 25 * k, 230 - 25 * k, if k % 2 == 0 { 60 } else { 200 }]).collect();
+        let colors =
+            (0..8u8).map(|k| [40 + 25 * k, 230 - 25 * k, if k % 2 == 0 { 60 } else { 200 }]).collect();
         Mesh::new(vertices, faces).unwrap().with_colors(colors).unwrap()
     }
 

@@ -1,5 +1,6 @@
 //! `sixfold reproduce`: a method measured on a dataset as its paper does, with its ablations, one table from one command.
 
+mod auto;
 mod dgcm;
 mod kept;
 mod mttm;
@@ -21,6 +22,9 @@ pub(crate) struct ReproduceArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ReproduceCommand {
+    /// Do the probabilities of --method auto hold, and what of absent objects? Also fits them
+    #[command(after_help = auto::AFTER_HELP)]
+    Auto(Box<auto::ReproduceAutoArguments>),
     /// Recall and AR of Pix2Pose per object, what each part of the method is worth, and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
@@ -43,6 +47,7 @@ pub(crate) enum ReproduceCommand {
 
 pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
     match &a.command {
+        ReproduceCommand::Auto(arguments) => auto::run(arguments, &a.json),
         ReproduceCommand::Pix2pose(arguments) => pix2pose::run(arguments, &a.json),
         ReproduceCommand::Mttm(arguments) => mttm::run(arguments, &a.json),
         ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),

@@ -18,6 +18,7 @@ use super::methods::{METHODS, Method};
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
     sixfold estimate --method pix2pose --weights model.safetensors --rgb c.png --camera camera.json --object mug.ply --unit mm --box 210,140,90,120 --out out\n  \
+    sixfold estimate --method auto --depth d.png --rgb c.png --camera camera.json --object mug box can --out out\n  \
     sixfold estimate --method mttm --depth d.png --camera camera.json --object mug --out out\n  \
     sixfold estimate --dataset lmo --split test --out results.csv\n  \
     sixfold estimate --method pix2pose --weights model.safetensors --dataset lmo --boxes gt --out results.csv";
@@ -127,7 +128,7 @@ pub(crate) struct CommonArguments {
     #[arg(long, value_name = "DIR", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub overlays: Option<PathBuf>,
     /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image and 0.05 for a dataset with --method ppf, 0.45
-    /// and 0.05 with mttm, 0.4 and 0 with views, 0 with pix2pose)
+    /// and 0.05 with mttm, 0.4 and 0 with views, 0 with pix2pose; with auto the probability, 0.5 and 0)
     #[arg(long, value_name = "SCORE", value_parser = min_score)]
     pub min_score: Option<f64>,
     /// Seed of everything random

@@ -8,7 +8,7 @@ use sixfold_align::PreparedDepth;
 use sixfold_estimator::{Need, Object, PoseEstimator, Query};
 use sixfold_geometry::{Camera, DepthImage, RgbImage, undistort_depth, undistort_rgb};
 use sixfold_io::{CameraFile, read_depth, read_rgb};
-use sixfold_runner::{FoundObject, ImageRun, depth_notes};
+use sixfold_runner::{FoundObject, ImageRun, depth_notes, without_overruled};
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::found::SearchedImage;
@@ -40,6 +40,11 @@ impl Input {
         if needs.rgb == Need::Required && a.rgb.is_none() {
             bail!(
                 "--method {method} needs a colour image: give --rgb FILE (with --camera and --box) or --dataset DIR"
+            );
+        }
+        if a.depth.is_none() && a.rgb.is_none() {
+            bail!(
+                "--method {method} works on depth, colour or both: give --depth FILE, --rgb FILE (with --camera and --object) or --dataset DIR"
             );
         }
         if needs.depth == Need::Unused && a.depth.is_some() {
@@ -131,7 +136,11 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
         ..Query::new(&input.camera)
     };
     let image = ImageRun { estimator, query };
-    let found = search(common, &image, matches!(place, Where::Nowhere))?;
+    let mut found = search(common, &image, matches!(place, Where::Nowhere))?;
+    let overruled = without_overruled(&mut found);
+    if overruled > 0 {
+        eprintln!("note: {overruled} poses are left out: most of their pixels belong to surer ones");
+    }
     let searched = SearchedImage {
         camera: &input.camera,
         rgb: input.rgb.as_ref(),

@@ -88,6 +88,8 @@ pub(crate) static METHODS: &[Method] = &[
     networks::PIX2POSE,
     #[cfg(feature = "networks")]
     networks::VIEWS,
+    #[cfg(feature = "networks")]
+    networks::AUTO,
     Method::of::<MttmArguments>(
         "mttm",
         "templates in depth, from a mesh or from depth images of the object, no training",
@@ -172,6 +174,6 @@ impl Matcher {
 }
 
 /// How depth images are prepared by the options that methods on depth share.
-fn depth_options(keep_plane: bool, common: &CommonArguments) -> DepthOptions {
+pub(super) fn depth_options(keep_plane: bool, common: &CommonArguments) -> DepthOptions {
     DepthOptions { remove_plane: !keep_plane, seed: common.seed, ..DepthOptions::default() }
 }

@@ -4,9 +4,11 @@ use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
+use sixfold_auto::AutoMembers;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_estimator::{ObjectDetector, PoseEstimator, Region};
 use sixfold_geometry::RgbImage;
@@ -14,11 +16,11 @@ use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_pix2pose::estimator::Pix2PoseEstimator;
 use sixfold_runner::RegionSource;
-use sixfold_shell::ranges::count;
+use sixfold_shell::ranges::{self, count};
 use sixfold_views::estimator::ViewsEstimator;
 
 use super::arguments::CommonArguments;
-use super::methods::{Method, MethodArguments, PresetArguments};
+use super::methods::{Method, MethodArguments, PresetArguments, depth_options};
 
 /// Who matches with `--method mttm`, unless `--matcher` says so.
 pub(super) const DEFAULT_MATCHER: &str = "both";
@@ -38,6 +40,39 @@ pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "views",
     "rendered views of a mesh matched with a colour image, in boxes or where any object seems to be, no training",
 );
+
+/// All methods, judged together.
+pub(super) const AUTO: Method = Method::of::<AutoArguments>(
+    "auto",
+    "all methods that the images allow, one after the other until one is sure, each pose with the probability that it is right",
+);
+
+#[derive(Debug, Args)]
+struct AutoArguments {
+    /// Trained model that `sixfold train pix2pose` wrote; for mttm and views another network than that within the program
+    #[arg(long, value_name = "FILE.safetensors")]
+    weights: Option<PathBuf>,
+    /// Ask no further method once this has passed for an object, such as 1s or 500ms; the poses then depend on how fast the machine is
+    #[arg(long, value_name = "TIME", value_parser = ranges::duration)]
+    budget: Option<Duration>,
+    /// Match points on the table plane too
+    #[arg(long)]
+    keep_plane: bool,
+}
+
+impl MethodArguments for AutoArguments {
+    fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
+        let members = AutoMembers {
+            pix2pose: self.weights.as_deref().map(|weights| (weights, common.object_id)),
+            without_views: false,
+            depth: depth_options(self.keep_plane, common),
+            seed: common.seed,
+        };
+        let mut auto = members.estimator()?;
+        auto.budget = self.budget;
+        Ok(Box::new(auto))
+    }
+}
 
 #[derive(Debug, Args)]
 struct ViewsArguments {

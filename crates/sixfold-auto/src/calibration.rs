@@ -1,0 +1,166 @@
+//! The fitted models, one for each kind of image, and their file.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS};
+use crate::regression::{Fit, LogisticModel, fit};
+
+/// The version of the file's form.
+const VERSION: u32 = 1;
+
+/// Why a calibration cannot be used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CalibrationError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is no calibration.
+    #[error("{file}: {reason}; expected a file that `sixfold reproduce auto --fit FILE` wrote")]
+    Content {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// How numbers become probabilities.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    version: u32,
+    /// The names of the numbers, as this version knows them.
+    names: Vec<String>,
+    /// With depth alone.
+    depth: LogisticModel,
+    /// With colour alone.
+    color: LogisticModel,
+    /// With both.
+    both: LogisticModel,
+}
+
+impl Calibration {
+    /// That within the program.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Content`]; never for a program that passed its tests.
+    pub fn shipped() -> Result<Calibration, CalibrationError> {
+        Calibration::parse(include_str!("../calibration.json"), "calibration.json within the program")
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`CalibrationError`].
+    pub fn read(path: &Path) -> Result<Calibration, CalibrationError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
+        Calibration::parse(&text, &path.display().to_string())
+    }
+
+    fn parse(text: &str, file: &str) -> Result<Calibration, CalibrationError> {
+        let content = |reason: String| CalibrationError::Content { file: file.to_owned(), reason };
+        let read: Calibration = serde_json::from_str(text).map_err(|e| content(e.to_string()))?;
+        if read.version != VERSION {
+            return Err(content(format!("field version: found {}, expected {VERSION}", read.version)));
+        }
+        if read.names != NAMES {
+            return Err(content("field names: found other numbers than this version knows".to_owned()));
+        }
+        let models = [("depth", &read.depth), ("color", &read.color), ("both", &read.both)];
+        if let Some((name, _)) = models.into_iter().find(|(_, model)| !model.is_whole()) {
+            return Err(content(format!("field {name}: found lists of other lengths, or no finite numbers")));
+        }
+        Ok(read)
+    }
+
+    /// Fits the three models: `rows` and those of them that would be reported, for depth alone, colour alone and both. A list without
+    /// rows keeps the model that is within the program.
+    ///
+    /// # Errors
+    /// As [`Calibration::shipped`].
+    pub fn fitted(rows: [(&[Fit<'_>], &[Fit<'_>]); 3]) -> Result<Calibration, CalibrationError> {
+        let takes =
+            |ranges: &[std::ops::Range<usize>]| -> Vec<usize> { ranges.iter().cloned().flatten().collect() };
+        let takes = [
+            takes(&[OF_DEPTH, OF_OTHERS]),
+            takes(&[OF_COLOR, OF_OTHERS]),
+            takes(&[OF_DEPTH, OF_COLOR, OF_OTHERS]),
+        ];
+        let model =
+            |k: usize, kept: fn(Calibration) -> LogisticModel| -> Result<LogisticModel, CalibrationError> {
+                let (all, reported) = rows[k];
+                if all.is_empty() {
+                    Ok(kept(Calibration::shipped()?))
+                } else {
+                    Ok(fit(all, &takes[k]).scaled_to(reported))
+                }
+            };
+        let (depth, color, both) = (model(0, |c| c.depth)?, model(1, |c| c.color)?, model(2, |c| c.both)?);
+        Ok(Calibration { version: VERSION, names: NAMES.map(str::to_owned).to_vec(), depth, color, both })
+    }
+
+    /// The probability that a pose is right; 0 where nothing is known of it.
+    pub fn probability(&self, numbers: &Numbers) -> f64 {
+        let known = |mut range: std::ops::Range<usize>| range.any(|k| numbers[k].is_some());
+        match (known(OF_DEPTH), known(OF_COLOR)) {
+            (true, true) => self.both.probability(numbers),
+            (true, false) => self.depth.probability(numbers),
+            (false, true) => self.color.probability(numbers),
+            (false, false) => 0.0,
+        }
+    }
+
+    /// As a file has it.
+    pub fn to_text(&self) -> String {
+        // Numbers, lists and strings are always JSON.
+        serde_json::to_string_pretty(self).unwrap_or_default() + "\n"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_one_within_the_program_is_whole_and_broken_ones_are_named() {
+        let shipped = Calibration::shipped().unwrap();
+        let text = shipped.to_text();
+        assert_eq!(Calibration::parse(&text, "x").unwrap(), shipped);
+        let broken = |from: &str, to: &str| {
+            Calibration::parse(&text.replacen(from, to, 1), "x.json").unwrap_err().to_string()
+        };
+        assert!(broken("\"version\": 1", "\"version\": 9").contains("field version: found 9, expected 1"));
+        assert!(broken("\"pixels\"", "\"inches\"").contains("field names"));
+        assert!(broken("\"scaling\": [", "\"scaling\": [1,").contains("x.json"));
+        let none = Calibration::read(Path::new("/nowhere/calibration.json")).unwrap_err().to_string();
+        assert!(none.starts_with("/nowhere/calibration.json: "), "{none}");
+    }
+
+    #[test]
+    fn better_evidence_is_more_probable() {
+        let shipped = Calibration::shipped().unwrap();
+        let place = |name: &str| NAMES.iter().position(|n| *n == name).unwrap();
+        let with = |score: f64| {
+            let mut numbers: Numbers = [None; NAMES.len()];
+            for name in ["depth", "boundary", "normals", "visible", "total"] {
+                numbers[place(name)] = Some(score);
+            }
+            (numbers[place("pixels")], numbers[place("relief")]) = (Some(8.0), Some(0.6));
+            (numbers[place("pierced")], numbers[place("on_plane")]) = (Some(0.0), Some(0.0));
+            (numbers[place("gap_here")], numbers[place("gap_elsewhere")]) = (Some(0.4), Some(score - 0.5));
+            shipped.probability(&numbers)
+        };
+        assert!(with(0.95) > 0.8 && with(0.3) < 0.2, "{} {}", with(0.95), with(0.3));
+        assert_eq!(shipped.probability(&[None; NAMES.len()]), 0.0);
+    }
+}

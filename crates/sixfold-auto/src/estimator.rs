@@ -1,0 +1,302 @@
+//! The method that asks the others.
+
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde_json::{Map, Value, json};
+use sixfold_align::evidence::{Scene, Shape};
+use sixfold_align::{ColorGradients, DepthOptions, VerificationMesh, VerificationOptions};
+use sixfold_estimator::{
+    EstimatorError, MinConfidence, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
+    downcast,
+};
+use sixfold_geometry::Pose;
+use sixfold_mesh::Mesh;
+
+use crate::calibration::{Calibration, CalibrationError};
+use crate::hypotheses::{Hypothesis, Pool};
+use crate::numbers::NAMES;
+
+const METHOD: &str = "auto";
+/// Where the mesh that is rendered is kept; the file of template matching, which keeps the same.
+const MESH_FILE: &str = "verification-mesh.bin";
+/// Step at which a continuous symmetry is sampled, as a fraction of the diameter.
+const SYMMETRY_STEP: f64 = 0.05;
+/// Poses that a method is asked for beside the instances: what is second best says how sure the best is. Chosen by hand; not swept.
+const MORE: usize = 2;
+/// With a pose this probable for every instance no further method is asked; chosen by hand, not swept.
+const SURE: f64 = 0.9;
+/// Below this probability a pose is not reported by default.
+const REPORTED: f64 = 0.5;
+
+/// One method that asks others in turn, judges their poses together, and says how probable each is.
+#[derive(Clone)]
+pub struct AutoEstimator {
+    members: Vec<Arc<dyn PoseEstimator>>,
+    calibration: Arc<Calibration>,
+    /// How depth images are prepared, for all methods alike.
+    pub depth: DepthOptions,
+    /// Once this has passed for an object, no further method is asked; the first always is. With it results depend on how fast the
+    /// machine is.
+    pub budget: Option<Duration>,
+    /// Ask all methods, however sure the first are.
+    pub ask_all: bool,
+}
+
+impl AutoEstimator {
+    /// Asks `members` in this order, and judges by the calibration within the program.
+    ///
+    /// # Errors
+    /// [`CalibrationError`], never for a program that passed its tests.
+    pub fn new(members: Vec<Arc<dyn PoseEstimator>>) -> Result<AutoEstimator, CalibrationError> {
+        let calibration = Arc::new(Calibration::shipped()?);
+        Ok(AutoEstimator {
+            members,
+            calibration,
+            depth: DepthOptions::default(),
+            budget: None,
+            ask_all: false,
+        })
+    }
+
+    /// Judges by another calibration.
+    #[must_use]
+    pub fn with_calibration(self, calibration: Calibration) -> AutoEstimator {
+        AutoEstimator { calibration: Arc::new(calibration), ..self }
+    }
+
+    /// Everything that is known of an object in an image: all poses of all methods that were asked, the most probable first.
+    ///
+    /// # Errors
+    /// [`EstimatorError`], as that of the method that it comes from.
+    pub fn hypotheses(
+        &self,
+        object: &AutoObject,
+        query: &Query<'_>,
+    ) -> Result<Vec<Hypothesis>, EstimatorError> {
+        self.pool(object, query, |pool, _| Ok(pool.hypotheses))
+    }
+
+    /// Fills a pool and hands it on, with what was left out.
+    fn pool<T>(
+        &self,
+        object: &AutoObject,
+        query: &Query<'_>,
+        done: impl FnOnce(Pool<'_>, Vec<String>) -> Result<T, EstimatorError>,
+    ) -> Result<T, EstimatorError> {
+        let mut notes = vec![];
+        let color = query.rgb.filter(|image| image.size() == (query.camera.width, query.camera.height));
+        if query.rgb.is_some() && color.is_none() {
+            notes.push("the colour image has another size than the camera: colours are not used".to_owned());
+        }
+        let gradients = color.map(|image| {
+            let kept: Arc<OnceLock<ColorGradients>> = query.memo.get_or_default();
+            kept.get_or_init(|| ColorGradients::new(image));
+            (image, kept)
+        });
+        let color = gradients.as_ref().and_then(|(image, kept)| kept.get().map(|g| (*image, g)));
+        let mut pool = Pool {
+            scene: Scene { camera: query.camera, depth: query.depth.map(|d| d.as_ref()), color },
+            shape: Shape { mesh: &object.rendered, colored: &object.mesh, threshold: object.threshold },
+            diameter: object.diameter,
+            symmetries: &object.symmetries,
+            calibration: &self.calibration,
+            one_instance: query.max_instances == 1,
+            hypotheses: vec![],
+            asked: 0,
+        };
+        let start = Instant::now();
+        let asked = Query {
+            rgb: color.map(|c| c.0),
+            ..query.passed_on(query.max_instances.saturating_add(MORE), 0.0)
+        };
+        let mut possible = 0;
+        for (number, member) in self.members.iter().enumerate() {
+            if !can_answer(member.as_ref(), &asked) {
+                continue;
+            }
+            possible += 1;
+            let sure = pool.chosen(query.max_instances).iter().filter(|(h, _)| h.probability >= SURE).count();
+            let late = self.budget.is_some_and(|budget| start.elapsed() >= budget);
+            if pool.asked > 0 && (late || (!self.ask_all && sure >= query.max_instances)) {
+                break;
+            }
+            let prepared = match object.prepared(number, member.as_ref())? {
+                Ok(prepared) => prepared,
+                Err(lack) => {
+                    notes.push(lack);
+                    continue;
+                }
+            };
+            pool.add(member.as_ref(), member.estimate(prepared.as_ref().as_ref(), &asked)?);
+        }
+        if possible == 0 {
+            let names: Vec<&str> = self.members.iter().map(|m| m.name()).collect();
+            return Err(EstimatorError::Input {
+                what: "image that a method works on",
+                method: METHOD,
+                advice: if names.is_empty() {
+                    "no method is there to be asked"
+                } else {
+                    "give --depth FILE, or --rgb FILE"
+                },
+            });
+        }
+        if pool.asked == 0 {
+            return Err(EstimatorError::method(notes.join("; ")));
+        }
+        done(pool, notes)
+    }
+}
+
+/// Whether a query has what a method needs.
+fn can_answer(method: &dyn PoseEstimator, query: &Query<'_>) -> bool {
+    let needs = method.needs();
+    let has = |need: Need, there: bool| need != Need::Required || there;
+    has(needs.depth, query.depth.is_some())
+        && has(needs.rgb, query.rgb.is_some())
+        && has(needs.region, query.region.is_some())
+}
+
+/// An object as all methods know it.
+pub struct AutoObject {
+    object: Object,
+    mesh: Arc<Mesh>,
+    rendered: Mesh,
+    diameter: f64,
+    threshold: f64,
+    symmetries: Vec<Pose>,
+    members: Vec<Prepared>,
+    notes: Vec<String>,
+}
+
+/// An object as one method knows it; `Err` says why it cannot be asked.
+type Known = Result<Arc<Box<dyn PreparedObject>>, String>;
+/// The same, prepared when the method is first asked.
+type Prepared = Mutex<Option<Known>>;
+
+impl AutoObject {
+    /// The object as method number `number` knows it, or why it cannot be asked.
+    fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<Known, EstimatorError> {
+        let Some(place) = self.members.get(number) else {
+            return Err(EstimatorError::Foreign { method: METHOD });
+        };
+        let mut kept = place.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(kept) = kept.as_ref() {
+            return Ok(kept.clone());
+        }
+        let prepared = method
+            .prepare(&self.object)
+            .map(Arc::new)
+            .map_err(|error| format!("--method {} was not asked: {error}", method.name()));
+        *kept = Some(prepared.clone());
+        Ok(prepared)
+    }
+}
+
+impl PreparedObject for AutoObject {
+    fn name(&self) -> &str {
+        &self.object.name
+    }
+
+    fn mesh(&self) -> Option<&Mesh> {
+        Some(&self.mesh)
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
+    }
+}
+
+impl PoseEstimator for AutoEstimator {
+    fn name(&self) -> &'static str {
+        METHOD
+    }
+
+    /// A mesh, since poses are judged by rendering it, and one image at least.
+    fn needs(&self) -> Needs {
+        Needs { depth: Need::Optional, rgb: Need::Optional, region: Need::Optional, object: Need::Required }
+    }
+
+    fn depth_options(&self) -> DepthOptions {
+        self.depth
+    }
+
+    /// Probabilities need no other threshold for other images. In a dataset all that may be there is reported, and scores sort it.
+    fn min_confidence(&self) -> MinConfidence {
+        MinConfidence { image: REPORTED, dataset: 0.0 }
+    }
+
+    fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
+        let mesh = object.needed_mesh(METHOD)?.clone();
+        let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), &mesh);
+        let kept =
+            kept.map_err(|e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) })?;
+        let note = |n| format!("mesh of {} not kept, or simplified again: {n}", object.name);
+        let diameter = object.info.as_ref().map_or_else(|| mesh.diameter(), |info| info.diameter);
+        Ok(Box::new(AutoObject {
+            mesh,
+            rendered: kept.mesh,
+            diameter,
+            threshold: VerificationOptions::default().threshold_for(diameter),
+            symmetries: object.info.as_ref().map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
+            members: self.members.iter().map(|_| Prepared::default()).collect(),
+            notes: kept.note.map(note).into_iter().collect(),
+            object: object.clone(),
+        }))
+    }
+
+    fn estimate(
+        &self,
+        object: &dyn PreparedObject,
+        query: &Query<'_>,
+    ) -> Result<Vec<PoseEstimate>, EstimatorError> {
+        let object: &AutoObject = downcast(object, METHOD)?;
+        self.pool(object, query, |pool, notes| {
+            let chosen = pool.chosen(query.max_instances).into_iter();
+            let mut found: Vec<PoseEstimate> = chosen
+                .filter(|(h, _)| h.probability >= query.min_confidence)
+                .map(|(h, o)| reported(h, &o))
+                .collect();
+            if let Some(first) = found.first_mut() {
+                first.notes.extend(notes);
+            }
+            Ok(found)
+        })
+    }
+}
+
+/// A hypothesis as it is reported.
+fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
+    let evidence = &hypothesis.evidence;
+    let estimate = &hypothesis.estimate;
+    let sum: f64 = hypothesis.probability + others.iter().map(|h| h.probability).sum::<f64>();
+    let alternatives: Vec<Value> = others
+        .iter()
+        .map(|h| json!({ "camera_from_object": rows(&h.estimate.camera_from_object), "weight": h.probability / sum }))
+        .collect();
+    let numbers: Map<String, Value> = NAMES
+        .iter()
+        .zip(&hypothesis.numbers)
+        .filter_map(|(n, v)| Some(((*n).to_owned(), json!((*v)?))))
+        .collect();
+    PoseEstimate {
+        probability: Some(hypothesis.probability),
+        verification: evidence.depth.map(|d| d.score),
+        mask: Some(evidence.pixels.clone()),
+        details: Map::from_iter([
+            ("method".to_owned(), hypothesis.method.into()),
+            ("found_by".to_owned(), json!(hypothesis.found_by)),
+            ("alternatives".to_owned(), alternatives.into()),
+            ("evidence".to_owned(), numbers.into()),
+        ]),
+        diagnostics: estimate.diagnostics.clone(),
+        notes: estimate.notes.clone(),
+        ..PoseEstimate::new(estimate.camera_from_object, hypothesis.probability)
+    }
+}
+
+fn rows(pose: &Pose) -> [[f64; 4]; 4] {
+    let m = pose.to_matrix();
+    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+}

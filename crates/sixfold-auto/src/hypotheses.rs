@@ -1,0 +1,223 @@
+//! Poses of all methods in one pool: held against the image, joined where they are the same, compared with each other.
+
+use rayon::prelude::*;
+use sixfold_align::evidence::{Scene, Shape, Witness};
+use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
+use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
+use sixfold_geometry::{Pose, Vec3};
+
+use crate::calibration::Calibration;
+use crate::numbers::{Numbers, add_others, of_evidence, strength};
+
+/// Poses whose points lie apart by less than this fraction of the diameter are the same; of methods on colour alone, which err along
+/// the view axis. Chosen by hand; not swept.
+const SAME: f64 = 0.1;
+/// See [`SAME`].
+const SAME_BY_COLOR: f64 = 0.2;
+/// Poses that share more than this fraction of the smaller one's pixels are of one place; chosen by hand, not swept.
+const ONE_PLACE: f64 = 0.5;
+
+/// A pose with what is known of it.
+#[derive(Debug, Clone)]
+pub struct Hypothesis {
+    /// The method that found it.
+    pub method: &'static str,
+    /// All methods that found it.
+    pub found_by: Vec<&'static str>,
+    /// What that method said, and the pose as it stands now.
+    pub estimate: PoseEstimate,
+    /// What the image says.
+    pub evidence: Evidence,
+    /// The same and the other poses, as numbers.
+    pub numbers: Numbers,
+    /// That it is right.
+    pub probability: f64,
+    strength: f64,
+}
+
+/// What a pool of hypotheses knows of object and image.
+pub(crate) struct Pool<'a> {
+    pub scene: Scene<'a>,
+    pub shape: Shape<'a>,
+    pub diameter: f64,
+    pub symmetries: &'a [Pose],
+    pub calibration: &'a Calibration,
+    pub one_instance: bool,
+    pub hypotheses: Vec<Hypothesis>,
+    pub asked: usize,
+}
+
+impl Pool<'_> {
+    /// Takes in what a method found, and judges all anew.
+    pub fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
+        self.asked += 1;
+        let by_depth = method.needs().depth != Need::Unused;
+        let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
+        let options = VerificationOptions::default();
+        let judged: Vec<Option<Hypothesis>> = found
+            .into_par_iter()
+            .map_init(Witness::default, |witness, mut estimate| {
+                if !is_before_camera(&estimate.camera_from_object, diameter) {
+                    return None;
+                }
+                let mut evidence = witness.ask(scene, shape, &estimate.camera_from_object, &options);
+                if !by_depth
+                    && let Some(moved) = moved_to_depth(scene, shape, diameter, &estimate.camera_from_object)
+                {
+                    let after = witness.ask(scene, shape, &moved, &options);
+                    if ranking(&after) > ranking(&evidence) {
+                        (estimate.camera_from_object, evidence) = (moved, after);
+                    }
+                }
+                let similarity = estimate.details.get("similarity").and_then(serde_json::Value::as_f64);
+                let name = method.name();
+                Some(Hypothesis {
+                    method: name,
+                    found_by: vec![name],
+                    numbers: of_evidence(&evidence, similarity),
+                    strength: strength(&evidence, similarity),
+                    estimate,
+                    evidence,
+                    probability: 0.0,
+                })
+            })
+            .collect();
+        for hypothesis in judged.into_iter().flatten() {
+            self.join(hypothesis);
+        }
+        self.compare();
+    }
+
+    /// Adds a hypothesis, or joins it with the same one.
+    fn join(&mut self, new: Hypothesis) {
+        let same = |h: &&mut Hypothesis| {
+            let limit = if h.evidence.depth.is_some() { SAME } else { SAME_BY_COLOR };
+            distance(
+                &h.estimate.camera_from_object,
+                &new.estimate.camera_from_object,
+                self.symmetries,
+                &self.shape,
+            ) < limit * self.diameter
+        };
+        let Some(place) = self.hypotheses.iter_mut().find(same) else {
+            self.hypotheses.push(new);
+            return;
+        };
+        let mut found_by = std::mem::take(&mut place.found_by);
+        found_by.extend(new.found_by.iter().filter(|m| !place.found_by.contains(m)));
+        found_by.sort_unstable();
+        found_by.dedup();
+        if new.strength > place.strength {
+            *place = new;
+        }
+        place.found_by = found_by;
+    }
+
+    /// Compares every hypothesis with the others, and computes probabilities; the most probable first.
+    fn compare(&mut self) {
+        let others: Vec<(f64, f64)> = self
+            .hypotheses
+            .iter()
+            .enumerate()
+            .map(|(i, h)| {
+                let (mut here, mut elsewhere) = (0.0f64, 0.0f64);
+                for (_, other) in self.hypotheses.iter().enumerate().filter(|(k, _)| *k != i) {
+                    let best = if one_place(h, other) { &mut here } else { &mut elsewhere };
+                    *best = best.max(other.strength);
+                }
+                (h.strength - here, h.strength - elsewhere)
+            })
+            .collect();
+        for (h, (here, elsewhere)) in self.hypotheses.iter_mut().zip(others) {
+            let agreement = (self.asked > 1).then(|| (h.found_by.len() - 1) as f64);
+            add_others(&mut h.numbers, agreement, here, self.one_instance.then_some(elsewhere));
+            h.probability = self.calibration.probability(&h.numbers);
+        }
+        self.hypotheses.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+    }
+
+    /// The most probable hypotheses, one at a place, at most `most`, each with the others at its place that are not much less probable.
+    pub fn chosen(&self, most: usize) -> Vec<(&Hypothesis, Vec<&Hypothesis>)> {
+        let mut chosen: Vec<(&Hypothesis, Vec<&Hypothesis>)> = vec![];
+        for hypothesis in &self.hypotheses {
+            if let Some((best, others)) = chosen.iter_mut().find(|(best, _)| one_place(best, hypothesis)) {
+                if hypothesis.probability > ALTERNATIVE * best.probability {
+                    others.push(hypothesis);
+                }
+            } else if chosen.len() < most {
+                chosen.push((hypothesis, vec![]));
+            }
+        }
+        chosen
+    }
+}
+
+/// Another pose at the same place is said if it is at least this probable beside the best; chosen by hand, not swept.
+const ALTERNATIVE: f64 = 0.25;
+
+/// An object whose centre is nearer than this many diameters lies against the lens; chosen by hand, not swept.
+const AGAINST_LENS: f64 = 0.5;
+
+fn is_before_camera(pose: &Pose, diameter: f64) -> bool {
+    pose.translation().iter().all(|v| v.is_finite()) && pose.translation().z > AGAINST_LENS * diameter
+}
+
+fn ranking(evidence: &Evidence) -> f64 {
+    evidence.depth.map_or(0.0, |d| d.score.ranking())
+}
+
+/// A pose from colour where the measured surface has it.
+fn moved_to_depth(scene: &Scene<'_>, shape: &Shape<'_>, diameter: f64, pose: &Pose) -> Option<Pose> {
+    let image = scene.depth?;
+    let aligned = align_to_depth(image, shape.mesh, diameter, pose, &|_, _| true).ok()?;
+    Some(refine(&mut Verifier::default(), image, shape.mesh, &aligned.camera_from_object, shape.threshold))
+}
+
+/// The largest distance between a corner of the object's box at both poses, under the symmetry for which it is smallest, metres.
+fn distance(a: &Pose, b: &Pose, symmetries: &[Pose], shape: &Shape<'_>) -> f64 {
+    let (low, high) = shape.mesh.bounding_box();
+    let corners: [Vec3; 8] =
+        std::array::from_fn(|k| Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] }));
+    let at = |symmetry: &Pose| {
+        let off = |c: &Vec3| (a.transform_point(&symmetry.transform_point(c)) - b.transform_point(c)).norm();
+        corners.iter().map(off).fold(0.0, f64::max)
+    };
+    let none = at(&Pose::identity());
+    symmetries.iter().map(at).fold(none, f64::min)
+}
+
+/// Whether two poses are of one place in the image.
+fn one_place(a: &Hypothesis, b: &Hypothesis) -> bool {
+    let (a, b) = (&a.evidence.pixels, &b.evidence.pixels);
+    shared(a, b) as f64 > ONE_PLACE * a.len().min(b.len()) as f64
+}
+
+/// How many numbers two ascending lists share.
+fn shared(a: &[u32], b: &[u32]) -> usize {
+    let (mut i, mut k, mut count) = (0, 0, 0);
+    while i < a.len() && k < b.len() {
+        match a[i].cmp(&b[k]) {
+            std::cmp::Ordering::Less => i += 1,
+            std::cmp::Ordering::Greater => k += 1,
+            std::cmp::Ordering::Equal => (i, k, count) = (i + 1, k + 1, count + 1),
+        }
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shared_pixels_are_counted() {
+        assert_eq!(shared(&[1, 3, 5, 9], &[2, 3, 9, 10]), 2);
+        assert_eq!(shared(&[], &[1]), 0);
+    }
+
+    #[test]
+    fn what_lies_against_the_lens_is_no_pose() {
+        let at = |z| is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, z)), 0.2);
+        assert_eq!([at(-1.0), at(0.05), at(0.5), at(f64::NAN)], [false, false, true, false]);
+    }
+}

@@ -1,0 +1,20 @@
+//! One method that asks the others, holds their poses against the image together, and says how probable each is.
+//!
+//! [`AutoEstimator`] is given other methods behind [`PoseEstimator`](sixfold_estimator::PoseEstimator). Their poses compete in one
+//! pool: each is rendered and held against depth, normals, outline, edges and colours ([`sixfold_align::evidence`]), and a
+//! [`Calibration`] turns these numbers into a probability. What is asked, and in which order, is the caller's choice; [`AutoMembers`] puts together
+//! all that there is.
+
+mod calibration;
+mod estimator;
+mod hypotheses;
+mod members;
+mod numbers;
+mod regression;
+
+pub use calibration::{Calibration, CalibrationError};
+pub use estimator::{AutoEstimator, AutoObject};
+pub use hypotheses::Hypothesis;
+pub use members::AutoMembers;
+pub use numbers::{NAMES, Numbers};
+pub use regression::{Fit, LogisticModel, fit};

@@ -1,0 +1,62 @@
+//! The methods that are asked, put together: all that the program has.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use sixfold_align::DepthOptions;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_estimator::{EstimatorError, PoseEstimator};
+use sixfold_mttm::model::MttmModel;
+use sixfold_mttm::{MttmEstimator, MttmOptions};
+use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+use sixfold_ppf::PpfEstimator;
+use sixfold_views::estimator::ViewsEstimator;
+
+use crate::estimator::AutoEstimator;
+
+/// What may be left out, or comes in, when all methods are put together.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct AutoMembers<'a> {
+    /// A trained model of Pix2Pose, and which of its objects is meant where an object does not say.
+    pub pix2pose: Option<(&'a Path, Option<u32>)>,
+    /// Leave out the views in colour.
+    pub without_views: bool,
+    /// How depth images are prepared.
+    pub depth: DepthOptions,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+impl AutoMembers<'_> {
+    /// The method that asks them: point pair features, templates, Pix2Pose where there is a model, views.
+    ///
+    /// # Errors
+    /// [`EstimatorError::Method`] where the file of Pix2Pose is no such model, or a network within the program cannot be read, which a
+    /// program that passed its tests never says.
+    pub fn estimator(&self) -> Result<AutoEstimator, EstimatorError> {
+        let network = MttmModel::shipped().map_err(EstimatorError::method)?;
+        let ppf = PpfEstimator { depth: self.depth, ..PpfEstimator::default() };
+        let mttm = MttmEstimator {
+            depth: self.depth,
+            options: MttmOptions::default(),
+            network: Some(Arc::new(network)),
+            ..MttmEstimator::default()
+        };
+        let mut members: Vec<Arc<dyn PoseEstimator>> = vec![Arc::new(ppf), Arc::new(mttm)];
+        if let Some((weights, object_id)) = self.pix2pose {
+            let mut trained = Pix2PoseEstimator::load(weights).map_err(EstimatorError::method)?;
+            trained.options.estimate.seed = self.seed;
+            trained.object_id = object_id;
+            members.push(Arc::new(trained));
+        }
+        if !self.without_views {
+            let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;
+            views.options.seed = self.seed;
+            let proposals = TrainedDetector::proposals().map_err(EstimatorError::method)?;
+            members.push(Arc::new(views.with_proposals(Arc::new(proposals))));
+        }
+        let mut auto = AutoEstimator::new(members).map_err(EstimatorError::method)?;
+        auto.depth = self.depth;
+        Ok(auto)
+    }
+}

@@ -1,0 +1,96 @@
+//! What is known of a pose, as the numbers that its probability is computed from.
+
+use sixfold_align::Evidence;
+
+/// How many numbers there are.
+const COUNT: usize = 17;
+
+/// Their names, in order.
+pub const NAMES: [&str; COUNT] = [
+    "depth",
+    "boundary",
+    "normals",
+    "visible",
+    "total",
+    "pixels",
+    "pierced",
+    "relief",
+    "on_plane",
+    "edges",
+    "chance",
+    "correlation",
+    "tint",
+    "similarity",
+    "agreement",
+    "gap_here",
+    "gap_elsewhere",
+];
+
+/// Whether more of each speaks for a pose: a fit that says otherwise has learned how its scenes were made.
+pub(crate) const SPEAKS_FOR: [bool; COUNT] = [
+    true, true, true, true, true, true, false, true, false, true, false, true, false, true, true, true, true,
+];
+/// Those that come of the depth image.
+pub(crate) const OF_DEPTH: std::ops::Range<usize> = 0..9;
+/// Those that come of the colour image.
+pub(crate) const OF_COLOR: std::ops::Range<usize> = 9..14;
+/// Those that come of the other poses.
+pub(crate) const OF_OTHERS: std::ops::Range<usize> = 14..17;
+
+/// The numbers of a pose, in the order of [`NAMES`]; `None` where one is not known.
+pub type Numbers = [Option<f64>; COUNT];
+
+/// A gap to other poses above this says no more; chosen by hand, not swept.
+const MAX_GAP: f64 = 0.4;
+/// A tint further off than this says no more: lamps and cameras colour images too. Chosen by hand; not swept.
+const MAX_TINT: f64 = 0.15;
+
+/// What the image says, without the other poses. `similarity` is what a method on colour says of its pose.
+pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>) -> Numbers {
+    let mut numbers = [None; COUNT];
+    if let Some(depth) = &evidence.depth {
+        let score = &depth.score;
+        let rendered = score.rendered.max(1) as f64;
+        let values = [
+            score.depth,
+            score.boundary,
+            score.normals,
+            score.visible_fraction().sqrt(),
+            score.total.sqrt(),
+            (1.0 + score.inliers as f64).ln(),
+            score.pierced as f64 / rendered,
+            depth.relief.sqrt(),
+            depth.on_plane,
+        ];
+        for (place, value) in numbers[OF_DEPTH].iter_mut().zip(values) {
+            *place = Some(value);
+        }
+    }
+    if let Some(color) = &evidence.color {
+        let values = [
+            Some(color.edges),
+            Some(color.chance),
+            Some(color.correlation),
+            color.tint.map(|t| t.min(MAX_TINT)),
+        ];
+        numbers[OF_COLOR.start..OF_COLOR.start + values.len()].copy_from_slice(&values);
+        numbers[OF_COLOR.end - 1] = similarity;
+    }
+    numbers
+}
+
+/// What one number says of a pose before the others are known: the ranking of verification, else edges and similarity.
+pub(crate) fn strength(evidence: &Evidence, similarity: Option<f64>) -> f64 {
+    match (&evidence.depth, &evidence.color) {
+        (Some(depth), _) => depth.score.ranking(),
+        (None, Some(color)) => 0.5 * (color.edges - color.chance) + similarity.unwrap_or(0.0),
+        (None, None) => 0.0,
+    }
+}
+
+/// Adds what the other poses say: how many other methods agree, and by how much this one is stronger than the strongest other at the
+/// same place and elsewhere.
+pub(crate) fn add_others(numbers: &mut Numbers, agreement: Option<f64>, here: f64, elsewhere: Option<f64>) {
+    let gap = |value: f64| value.clamp(-MAX_GAP, MAX_GAP);
+    numbers[OF_OTHERS].copy_from_slice(&[agreement, Some(gap(here)), elsewhere.map(gap)]);
+}

@@ -1,0 +1,183 @@
+//! What came of all searches, in numbers.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::{Given, Search};
+
+/// Bins of the reliability diagram.
+const BINS: usize = 10;
+/// Poses of at least this probability are reported.
+const REPORTED: f64 = 0.5;
+
+/// One bin of a reliability diagram.
+#[derive(Debug, Clone, Copy, Default, Serialize, PartialEq)]
+pub(super) struct Bin {
+    /// Poses in it.
+    pub poses: usize,
+    /// Their mean probability.
+    pub probability: f64,
+    /// The fraction of them that is right.
+    pub right: f64,
+}
+
+/// What came of the searches with the same images.
+#[derive(Debug, Serialize)]
+pub(super) struct Row {
+    pub given: Given,
+    /// Objects searched in images that show them.
+    pub present: usize,
+    /// Of those, the fraction whose best pose is right.
+    pub found: f64,
+    /// Of the right ones, the fraction of at least [`REPORTED`].
+    pub kept: f64,
+    /// Of the poses of at least [`REPORTED`], the fraction that is right.
+    pub precision: f64,
+    /// Objects searched in images that do not show them.
+    pub absent: usize,
+    /// Of those, the fraction that is reported all the same.
+    pub accepted: f64,
+    /// Expected calibration error of the best poses (Naeini et al. 2015, ten bins).
+    pub expected_error: f64,
+    /// Area under the ROC curve of the best poses.
+    pub auc: f64,
+    /// Seconds a search took on average.
+    pub seconds: f64,
+    pub bins: Vec<Bin>,
+}
+
+/// All rows.
+#[derive(Debug, Serialize)]
+pub(super) struct Whole {
+    pub rows: Vec<Row>,
+}
+
+impl Whole {
+    pub fn of(searches: &[Search]) -> Whole {
+        Whole { rows: Given::ALL.into_iter().filter_map(|given| row(given, searches)).collect() }
+    }
+}
+
+fn row(given: Given, searches: &[Search]) -> Option<Row> {
+    let of: Vec<&Search> = searches.iter().filter(|s| s.given == given).collect();
+    if of.is_empty() {
+        return None;
+    }
+    let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+    // The best pose of each search: its probability and whether it is right.
+    let best: Vec<(bool, f64, bool)> =
+        of.iter().filter_map(|s| s.poses.first().map(|p| (s.present, p.probability, p.right))).collect();
+    let present = of.iter().filter(|s| s.present).count();
+    let absent = of.len() - present;
+    let right = best.iter().filter(|(_, _, right)| *right).count();
+    let reported = best.iter().filter(|(_, p, _)| *p >= REPORTED);
+    let reported_right = reported.clone().filter(|(_, _, right)| *right).count();
+    let accepted = reported.clone().filter(|(there, _, _)| !there).count();
+    let mut bins = vec![Bin::default(); BINS];
+    for (_, p, right) in &best {
+        let bin = &mut bins[((p * BINS as f64) as usize).min(BINS - 1)];
+        bin.poses += 1;
+        bin.probability += p;
+        bin.right += f64::from(u8::from(*right));
+    }
+    for bin in bins.iter_mut().filter(|b| b.poses > 0) {
+        bin.probability /= bin.poses as f64;
+        bin.right /= bin.poses as f64;
+    }
+    let error = |b: &Bin| share(b.poses, best.len()) * (b.probability - b.right).abs();
+    Some(Row {
+        given,
+        present,
+        found: share(right, present),
+        kept: share(reported_right, right),
+        precision: share(reported_right, reported.count()),
+        absent,
+        accepted: share(accepted, absent),
+        expected_error: bins.iter().map(error).sum(),
+        auc: auc(&best),
+        seconds: of.iter().map(|s| s.seconds).sum::<f64>() / of.len() as f64,
+        bins,
+    })
+}
+
+/// The probability that a right pose has a higher probability than a wrong one.
+fn auc(best: &[(bool, f64, bool)]) -> f64 {
+    let (mut wins, mut pairs) = (0.0, 0.0);
+    for (_, p, _) in best.iter().filter(|b| b.2) {
+        for (_, q, _) in best.iter().filter(|b| !b.2) {
+            pairs += 1.0;
+            wins += if p > q {
+                1.0
+            } else if p == q {
+                0.5
+            } else {
+                0.0
+            };
+        }
+    }
+    if pairs == 0.0 { 0.5 } else { wins / pairs }
+}
+
+/// The rows as a page.
+pub(super) fn markdown(whole: &Whole) -> String {
+    let mut out = "| given | objects in the image | best pose right | of these at least 0.5 | right of those at least 0.5 | \
+                   objects not in the image | of these at least 0.5 | expected calibration error | AUC | s a search |\n\
+                   |---|---|---|---|---|---|---|---|---|---|\n"
+        .to_owned();
+    for r in &whole.rows {
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            out,
+            "| {} | {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.3} | {:.2} |",
+            r.given.name(),
+            r.present,
+            r.found,
+            r.kept,
+            r.precision,
+            r.absent,
+            r.accepted,
+            r.expected_error,
+            r.auc,
+            r.seconds
+        );
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Pose1;
+    use super::*;
+
+    fn search(present: bool, probability: f64, right: bool) -> Search {
+        let numbers = [None; sixfold_auto::NAMES.len()];
+        let poses = vec![Pose1 { method: "ppf".into(), numbers, probability, right }];
+        Search { object: "a".into(), given: Given::Depth, present, poses, seconds: 2.0 }
+    }
+
+    #[test]
+    fn a_row_counts_what_is_kept_and_what_is_accepted() {
+        let mut searches = vec![
+            search(true, 0.95, true),
+            search(true, 0.95, true),
+            search(true, 0.35, true),
+            search(true, 0.65, false),
+            search(false, 0.75, false),
+            search(false, 0.05, false),
+        ];
+        searches.push(Search { poses: vec![], ..search(true, 0.0, false) });
+        let whole = Whole::of(&searches);
+        let r = &whole.rows[0];
+        assert_eq!((whole.rows.len(), r.present, r.absent), (1, 5, 2));
+        assert_eq!((r.found, r.kept, r.accepted), (0.6, 2.0 / 3.0, 0.5));
+        assert_eq!(r.precision, 0.5);
+        // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
+        let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
+        assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
+        // Of nine pairs of a right and a wrong pose seven are in order.
+        assert!((r.auc - 7.0 / 9.0).abs() < 1e-9);
+        assert_eq!(r.seconds, 2.0);
+        assert!(markdown(&whole).contains("| depth | 5 | 0.600 | 0.667 | 0.500 | 2 | 0.500 |"));
+    }
+}
