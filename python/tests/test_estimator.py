@@ -73,6 +73,22 @@ def test_mttm_is_estimate_mttm(frame):
     assert found[0].details["template"] == expected[0].template and found[0].details["verified_by"] == "mesh"
 
 
+def test_auto_says_how_probable_a_pose_is(frame):
+    mesh, camera, _, depth, truth = frame
+    auto = sixfold.Estimator("auto")
+    assert auto.needs == {"depth": "optional", "rgb": "optional", "region": "optional", "object": "required"}
+    [found] = auto.find(mesh, camera, depth)
+    assert np.linalg.norm(found.camera_from_object[:3, 3] - truth[:3, 3]) < 0.01
+    assert 0.5 <= found.probability <= 1 and found.confidence == found.probability
+    assert found.details["found_by"] and found.details["evidence"]["visible"] > 0.3
+    assert found.mask.shape == depth.shape and found.mask.any()
+    # Nothing is there that looks like it.
+    assert auto.find(mesh, camera, np.full_like(depth, 0.9)) == []
+    assert sixfold.Estimator("ppf").find(mesh, camera, depth)[0].probability is None
+    with pytest.raises(ValueError, match="auto"):
+        auto.find(mesh, camera)
+
+
 def test_pix2pose_is_pix2pose(frame, box, weights):
     mesh, camera, rgb, depth, _ = frame
     network = sixfold.Pix2Pose.load(weights, camera=camera)
@@ -142,6 +158,10 @@ def test_options_of_other_methods_are_refused(tmp_path):
         ("pix2pose", {}, "weights"),
         ("pix2pose", {"weights": "w.safetensors", "keep_plane": True}, "keep_plane"),
         ("pix2pose", {"weights": "w.safetensors", "passes": 0}, "passes"),
+        ("auto", {"icp": True}, "icp"),
+        ("ppf", {"budget": 1.0}, "budget"),
+        ("auto", {"budget": 0.0}, "budget"),
+        ("auto", {"budget": float("nan")}, "budget"),
         ("ppf", {"seed": -1}, "seed"),
     ]:
         with pytest.raises(ValueError, match=f"^{name}: expected .*, found "):

@@ -160,7 +160,7 @@ mod tests {
             (numbers[place("gap_here")], numbers[place("gap_elsewhere")]) = (Some(0.4), Some(score - 0.5));
             shipped.probability(&numbers)
         };
-        assert!(with(0.95) > 0.8 && with(0.3) < 0.2, "{} {}", with(0.95), with(0.3));
+        assert!(with(1.0) > 0.8 && with(0.3) < 0.2, "{} {}", with(1.0), with(0.3));
         assert_eq!(shipped.probability(&[None; NAMES.len()]), 0.0);
     }
 }

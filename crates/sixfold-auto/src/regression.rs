@@ -199,8 +199,19 @@ mod tests {
         // What is not known counts as the mean.
         let unknown = model.probability(&[None; crate::NAMES.len()]);
         let mut mean: Numbers = [None; crate::NAMES.len()];
-        (mean[3], mean[5]) = (Some(model.means[0]), Some(model.means[1]));
+        for (k, value) in model.takes.iter().zip(&model.means) {
+            mean[*k] = Some(*value);
+        }
         assert_eq!(unknown, model.probability(&mean));
+    }
+
+    #[test]
+    fn what_speaks_the_wrong_way_is_left_out() {
+        // Number 3 speaks for a pose; where it seems to speak against, it is not taken.
+        let turned: Vec<(Numbers, bool)> = drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
+        let model = fit(&rows(&turned), &[3, 5]);
+        assert!(!model.takes.contains(&3), "{model:?}");
+        assert!(model.is_whole());
     }
 
     #[test]

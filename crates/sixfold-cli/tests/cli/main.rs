@@ -1,5 +1,7 @@
 //! The program as a user runs it: the real binary, in a temporary folder, on inputs made by the tests themselves.
 
+#[cfg(feature = "networks")]
+mod auto;
 mod bad_input;
 mod dataset;
 #[cfg(feature = "networks")]

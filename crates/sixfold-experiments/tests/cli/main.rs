@@ -1,5 +1,6 @@
 //! The program as a user runs it: the real binary, in a temporary folder, on inputs made by the tests themselves.
 
+mod auto;
 mod dgcm;
 mod grasp;
 #[path = "../support/made.rs"]

@@ -1,0 +1,67 @@
+//! `sixfold estimate --method auto`.
+
+use serde_json::Value;
+use sixfold_mesh::{PlyFormat, Unit, write_ply};
+
+use crate::support::*;
+
+const DEPTH: &str = "estimate --method auto --depth depth.png --camera camera.json --unit mm";
+
+#[test]
+fn says_how_probable_a_pose_is_and_what_is_not_there() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_other_part(dir);
+    let run = sixfold(dir, &format!("{DEPTH} --object part.ply other.ply --json --out out")).expect(0).json();
+    let poses = run["poses"].as_array().unwrap();
+    assert_eq!(poses.len(), 1, "{poses:?}");
+    assert_near(&pose_of(&poses[0]["camera_from_object"]), &case.truth);
+    let probability = poses[0]["probability"].as_f64().unwrap();
+    assert!((0.5..=1.0).contains(&probability), "{probability}");
+    assert_eq!(poses[0]["confidence"].as_f64(), Some(probability));
+    assert!(poses[0]["evidence"]["visible"].as_f64().unwrap() > 0.5, "{}", poses[0]);
+    assert!(!poses[0]["found_by"].as_array().unwrap().is_empty());
+    assert_eq!(run["not_found"], serde_json::json!(["other"]));
+    assert!(dir.join("out/overlay.png").is_file());
+
+    let table = sixfold(dir, &format!("{DEPTH} --object part.ply")).expect(0).stdout;
+    assert!(table.starts_with("object") && table.contains(" probability "), "{table}");
+    // Methods that know no probability say none.
+    let table = sixfold(dir, &format!("{} ", OneImage::ARGUMENTS)).expect(0).stdout;
+    assert!(table.contains(" confidence ") && !table.contains("probability"), "{table}");
+    // What is not there is nothing found.
+    sixfold(dir, &format!("{DEPTH} --object other.ply")).expect(1);
+}
+
+fn write_other_part(dir: &std::path::Path) {
+    write_ply(dir.join("other.ply"), &other_part(), Unit::Millimetre, PlyFormat::BinaryLittleEndian).unwrap();
+}
+
+#[test]
+fn the_same_on_any_number_of_threads() {
+    let case = OneImage::new();
+    let at = |more: &str| -> Value {
+        let run =
+            sixfold(case.path(), &format!("{DEPTH} --rgb rgb.png --object part.ply --json {more}")).expect(0);
+        let mut json = run.json();
+        assert!(json["poses"][0].as_object_mut().unwrap().remove("seconds").is_some());
+        json
+    };
+    assert_eq!(at("--threads 1"), at("--threads 2"));
+}
+
+#[test]
+fn wrong_options_are_named() {
+    let case = OneImage::new();
+    let dir = case.path();
+    fails(dir, &format!("{DEPTH} --object part.ply --budget 0s"), &["--budget", "found 0s", "500ms"]);
+    fails(dir, &format!("{DEPTH} --object part.ply --budget soon"), &["--budget", "soon"]);
+    fails(dir, &format!("{DEPTH} --object part.ply --icp"), &["--icp", "--method auto", "--method pix2pose"]);
+    fails(dir, &format!("{DEPTH} --object part.ply --weights none.safetensors"), &["none.safetensors"]);
+    fails(
+        dir,
+        "estimate --method auto --camera camera.json --object part.ply --unit mm",
+        &["--depth", "--rgb"],
+    );
+    sixfold(dir, &format!("{DEPTH} --object part.ply --budget 1ms")).expect(0);
+}

@@ -1,0 +1,38 @@
+//! `sixfold reproduce auto`.
+
+use crate::support::*;
+
+#[test]
+fn probabilities_are_fitted_checked_and_kept() {
+    let tiny = Tiny::new(true);
+    let dir = tiny.path();
+    let fit =
+        "reproduce auto --dataset tiny --given depth --without-views --fit fitted.json --out fit --json";
+    let fitted = sixfold(dir, fit).expect(0).json();
+    let row = &fitted["rows"][0];
+    assert_eq!((fitted["rows"].as_array().unwrap().len(), &row["given"]), (1, &"depth".into()));
+    assert!(row["present"].as_u64().unwrap() > 1 && row["found"].as_f64().unwrap() > 0.6, "{row}");
+    let poses: u64 = row["bins"].as_array().unwrap().iter().map(|b| b["poses"].as_u64().unwrap()).sum();
+    assert!(poses >= row["present"].as_u64().unwrap() / 2, "{row}");
+    for file in ["table.md", "reproduce.json", "reliability.png"] {
+        assert!(dir.join("fit").join(file).is_file(), "{file}");
+    }
+    // Kept images are not searched again: the same times.
+    assert_eq!(sixfold(dir, fit).expect(0).json(), fitted);
+
+    // By the fitted file, with an object that no image shows.
+    let mesh = tiny.file("models/obj_000001.ply");
+    std::fs::copy(mesh, dir.join("stranger.ply")).unwrap();
+    let check =
+        "reproduce auto --dataset tiny --given depth --without-views --strangers stranger.ply --unit mm";
+    let checked =
+        sixfold(dir, &format!("{check} --calibration fitted.json --out check --json")).expect(0).json();
+    assert!(checked["rows"][0]["absent"].as_u64().unwrap() > 0, "{checked}");
+    assert_eq!(checked["rows"][0]["present"], row["present"]);
+
+    fails(dir, &format!("{check} --calibration none.json --out x"), &["none.json"]);
+    std::fs::write(dir.join("broken.json"), "{}").unwrap();
+    fails(dir, &format!("{check} --calibration broken.json --out y"), &["broken.json", "--fit"]);
+    fails(dir, &check.replace(" --unit mm", " --out z"), &["--unit"]);
+    fails(dir, &fit.replace("--given depth", "--given depth --seed 5"), &["fit", "other inputs", "seed"]);
+}
