@@ -82,7 +82,13 @@ impl LogisticModel {
 /// they speak for a pose, are left out one by one, the worst first. Rows weigh alike; the same rows in the same order give the same
 /// model.
 pub fn fit(rows: &[Fit<'_>], takes: &[usize]) -> LogisticModel {
-    let mut takes = takes.to_vec();
+    // What is the same for all says nothing.
+    let varies = |k: &usize| {
+        let mut known = rows.iter().filter_map(|r| r.numbers[*k]);
+        let first = known.next();
+        known.any(|v| Some(v) != first)
+    };
+    let mut takes: Vec<usize> = takes.iter().copied().filter(varies).collect();
     loop {
         let model = fit_all(rows, &takes);
         let wrong = |k: &usize| if SPEAKS_FOR[takes[*k]] { -model.weights[*k] } else { model.weights[*k] };
