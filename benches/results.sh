@@ -16,7 +16,7 @@
 # Needs bash, python3, paths without spaces, and about 30 minutes of one core.
 set -euo pipefail
 
-PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose views detector grasp experience nol)
+PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose views auto detector grasp experience nol)
 # Asked for by name only: chapter 6 in small, about eight minutes more.
 MORE=(dgcm)
 
@@ -327,6 +327,15 @@ part_clutter() {
     done
     freeze clutter 11 poses_ppf=clutter-ppf.csv scores_ppf=clutter-ppf.json poses_above=clutter-above.csv scores_above=clutter-above.json \
         poses_around=clutter-around.csv scores_around=clutter-around.json
+}
+
+# Probabilities: simulated scenes that were not fitted to, with absent objects, and the sample images.
+part_auto() {
+    local scenes=OUT/auto-scenes
+    typed "sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 16 --views 1 --sensor xtion --seed 202 --no-masks --out $scenes"
+    typed "sixfold reproduce auto --dataset $scenes --absent 6 --disturb --given depth --out OUT/auto-depth --json OUT/auto-depth.json"
+    typed "sixfold reproduce auto --dataset data/demo --given depth both --out OUT/auto-demo --json OUT/auto-demo.json"
+    freeze auto 202 simulated=auto-depth.json samples=auto-demo.json
 }
 
 # Poses from colour in ground-truth boxes and in a detector's.

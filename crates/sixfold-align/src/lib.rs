@@ -13,7 +13,7 @@ pub mod verification;
 pub mod verify;
 
 pub use depth_icp::{AlignedToDepth, align_to_depth};
-pub use evidence::{ColorEvidence, ColorGradients, DepthEvidence, Evidence, Witness};
+pub use evidence::{ColorEvidence, ColorGradients, DepthEvidence, Evidence, EvidenceCollector};
 pub use mesh::{VerificationMesh, could_be_simplified, verification_mesh};
 pub use prepared::{DepthOptions, DepthRegion, PreparedDepth, PreparedDepthError};
 pub use verification::{VerificationOptions, VerificationScore, Verifier};

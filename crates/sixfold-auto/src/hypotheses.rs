@@ -1,7 +1,7 @@
 //! Poses of all methods in one pool: held against the image, joined where they are the same, compared with each other.
 
 use rayon::prelude::*;
-use sixfold_align::evidence::{Scene, Shape, Witness};
+use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
 use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
 use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
 use sixfold_geometry::{Pose, Vec3};
@@ -56,15 +56,15 @@ impl Pool<'_> {
         let options = VerificationOptions::default();
         let judged: Vec<Option<Hypothesis>> = found
             .into_par_iter()
-            .map_init(Witness::default, |witness, mut estimate| {
+            .map_init(EvidenceCollector::default, |collector, mut estimate| {
                 if !is_before_camera(&estimate.camera_from_object, diameter) {
                     return None;
                 }
-                let mut evidence = witness.ask(scene, shape, &estimate.camera_from_object, &options);
+                let mut evidence = collector.collect(scene, shape, &estimate.camera_from_object, &options);
                 if !by_depth
                     && let Some(moved) = moved_to_depth(scene, shape, diameter, &estimate.camera_from_object)
                 {
-                    let after = witness.ask(scene, shape, &moved, &options);
+                    let after = collector.collect(scene, shape, &moved, &options);
                     if ranking(&after) > ranking(&evidence) {
                         (estimate.camera_from_object, evidence) = (moved, after);
                     }

@@ -17,7 +17,7 @@ pub const NAMES: [&str; COUNT] = [
     "relief",
     "on_plane",
     "edges",
-    "chance",
+    "background_edges",
     "correlation",
     "tint",
     "similarity",
@@ -69,7 +69,7 @@ pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>) -> Numbe
     if let Some(color) = &evidence.color {
         let values = [
             Some(color.edges),
-            Some(color.chance),
+            Some(color.background_edges),
             Some(color.correlation),
             color.tint.map(|t| t.min(MAX_TINT)),
         ];
@@ -83,7 +83,7 @@ pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>) -> Numbe
 pub(crate) fn strength(evidence: &Evidence, similarity: Option<f64>) -> f64 {
     match (&evidence.depth, &evidence.color) {
         (Some(depth), _) => depth.score.ranking(),
-        (None, Some(color)) => 0.5 * (color.edges - color.chance) + similarity.unwrap_or(0.0),
+        (None, Some(color)) => 0.5 * (color.edges - color.background_edges) + similarity.unwrap_or(0.0),
         (None, None) => 0.0,
     }
 }

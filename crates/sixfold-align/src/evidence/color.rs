@@ -13,8 +13,8 @@ use crate::prepared::PreparedDepth;
 pub struct ColorEvidence {
     /// How much of the outline lies on edges that run along it, 0 to 1.
     pub edges: f64,
-    /// The same beside the outline, within and without: what clutter and texture give by chance.
-    pub chance: f64,
+    /// The same beside the outline, inside and outside the object: what clutter and texture give without an outline.
+    pub background_edges: f64,
     /// Correlation of the rendered colours with those of the image over all channels, -1 to 1; 0 where either hardly varies.
     pub correlation: f64,
     /// How far the mean colours lie apart, brightness aside (chromaticity, 0 to about 1); `None` for a mesh without colours.
@@ -78,7 +78,7 @@ impl ColorGradients {
 }
 
 /// The image that a pose is held against.
-pub(super) struct Seen<'a> {
+pub(super) struct ColorImage<'a> {
     pub camera: &'a Camera,
     pub image: &'a RgbImage,
     pub gradients: &'a ColorGradients,
@@ -86,7 +86,11 @@ pub(super) struct Seen<'a> {
 }
 
 /// What the image says, and the pixels that the object covers; `None` where it covers too few.
-pub(super) fn ask(seen: &Seen<'_>, shape: &Shape<'_>, pose: &Pose) -> Option<(ColorEvidence, Vec<u32>)> {
+pub(super) fn evidence_of(
+    seen: &ColorImage<'_>,
+    shape: &Shape<'_>,
+    pose: &Pose,
+) -> Option<(ColorEvidence, Vec<u32>)> {
     let camera = seen.camera;
     let bbox = projected_box(shape.mesh, camera, pose)?;
     let whole = Rect { x: 0.0, y: 0.0, width: camera.width as f64, height: camera.height as f64 };
@@ -108,7 +112,7 @@ pub(super) fn ask(seen: &Seen<'_>, shape: &Shape<'_>, pose: &Pose) -> Option<(Co
     };
     let mut covered = vec![];
     let mut pairs: Vec<(usize, usize)> = vec![];
-    let (mut edges, mut chance, mut outline, mut beside) = (0.0, 0.0, 0usize, 0usize);
+    let (mut edges, mut background_edges, mut outline, mut beside) = (0.0, 0.0, 0usize, 0usize);
     for y in 0..height {
         for x in 0..width {
             if inverse[y * width + x] <= 0.0 {
@@ -133,7 +137,7 @@ pub(super) fn ask(seen: &Seen<'_>, shape: &Shape<'_>, pose: &Pose) -> Option<(Co
             for off in BESIDE {
                 let (px, py) = (px + f64::from(off) * normal[0], py + f64::from(off) * normal[1]);
                 if let Some(edge) = seen.gradients.edge(px, py, normal, REACH) {
-                    chance += edge;
+                    background_edges += edge;
                     beside += 1;
                 }
             }
@@ -146,13 +150,13 @@ pub(super) fn ask(seen: &Seen<'_>, shape: &Shape<'_>, pose: &Pose) -> Option<(Co
     let colors = |image: &RgbImage, dx: usize, dy: usize| -> Vec<[f64; 3]> {
         pairs.iter().map(|&(x, y)| image[(x + dx, y + dy)].map(|c| f64::from(c) / 255.0)).collect()
     };
-    let (drawn, there) = (colors(&rendered, 0, 0), colors(seen.image, x0, y0));
+    let (rendered_colors, image_colors) = (colors(&rendered, 0, 0), colors(seen.image, x0, y0));
     let has_colors = shape.colored.colors().is_some() || shape.colored.texture().is_some();
     let evidence = ColorEvidence {
         edges: edges / outline.max(1) as f64,
-        chance: chance / beside.max(1) as f64,
-        correlation: correlation(&drawn, &there),
-        tint: has_colors.then(|| tint(&drawn, &there)),
+        background_edges: background_edges / beside.max(1) as f64,
+        correlation: correlation(&rendered_colors, &image_colors),
+        tint: has_colors.then(|| tint(&rendered_colors, &image_colors)),
     };
     Some((evidence, covered))
 }

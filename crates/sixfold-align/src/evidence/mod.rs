@@ -55,13 +55,13 @@ pub struct Shape<'a> {
 
 /// Holds poses of objects against images; keeps its buffers.
 #[derive(Debug, Default)]
-pub struct Witness {
+pub struct EvidenceCollector {
     verifier: Verifier,
 }
 
-impl Witness {
+impl EvidenceCollector {
     /// What an image says of an object's pose.
-    pub fn ask(
+    pub fn collect(
         &mut self,
         scene: &Scene<'_>,
         shape: &Shape<'_>,
@@ -75,8 +75,8 @@ impl Witness {
             DepthEvidence { score, relief: relief(image, &pixels), on_plane: on_plane(image, &pixels) }
         });
         let color = scene.color.and_then(|(image, gradients)| {
-            let seen = color::Seen { camera: scene.camera, image, gradients, depth: scene.depth };
-            let (evidence, covered) = color::ask(&seen, shape, pose)?;
+            let seen = color::ColorImage { camera: scene.camera, image, gradients, depth: scene.depth };
+            let (evidence, covered) = color::evidence_of(&seen, shape, pose)?;
             if scene.depth.is_none() {
                 pixels = covered;
             }
@@ -177,7 +177,7 @@ mod tests {
         let gradients = ColorGradients::new(&rgb);
         let scene = Scene { camera: &camera, depth: Some(&prepared), color: Some((&rgb, &gradients)) };
         let shape = Shape { mesh: &mesh, colored: &mesh, threshold: 0.008 };
-        Witness::default().ask(&scene, &shape, pose, &VerificationOptions::default())
+        EvidenceCollector::default().collect(&scene, &shape, pose, &VerificationOptions::default())
     }
 
     #[test]
@@ -185,7 +185,7 @@ mod tests {
         let right = asked(&pose());
         let (depth, color) = (right.depth.unwrap(), right.color.unwrap());
         assert!(depth.score.total > 0.8, "{depth:?}");
-        assert!(color.edges > color.chance + 0.4, "{color:?}");
+        assert!(color.edges > color.background_edges + 0.4, "{color:?}");
         assert!(color.correlation > 0.9, "{color:?}");
         assert!(color.tint.unwrap() < 0.02, "{color:?}");
         assert_eq!(right.pixels.len(), depth.score.inliers);
@@ -209,7 +209,8 @@ mod tests {
         let prepared = PreparedDepth::new(&depth, &camera, &options).unwrap();
         let scene = Scene { camera: &camera, depth: Some(&prepared), color: None };
         let shape = Shape { mesh: &mesh, colored: &mesh, threshold: 0.008 };
-        let flat = Witness::default().ask(&scene, &shape, &facing, &VerificationOptions::default());
+        let flat =
+            EvidenceCollector::default().collect(&scene, &shape, &facing, &VerificationOptions::default());
         assert!(flat.depth.unwrap().relief < 0.1, "{:?}", flat.depth);
         assert_eq!(flat.color, None);
     }

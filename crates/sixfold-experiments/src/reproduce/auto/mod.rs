@@ -117,13 +117,13 @@ struct Search {
     /// Whether the image shows it.
     present: bool,
     /// All poses that came up, the most probable first.
-    poses: Vec<Pose1>,
+    poses: Vec<FoundPose>,
     seconds: f64,
 }
 
 /// A pose that came up.
 #[derive(Debug, Serialize, Deserialize)]
-struct Pose1 {
+struct FoundPose {
     method: String,
     numbers: Numbers,
     probability: f64,
@@ -342,7 +342,7 @@ fn search<'k>(
         };
         let poses = found
             .iter()
-            .map(|h| Pose1 {
+            .map(|h| FoundPose {
                 method: h.method.to_owned(),
                 numbers: h.numbers,
                 probability: h.probability,

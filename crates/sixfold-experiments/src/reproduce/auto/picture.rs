@@ -30,7 +30,7 @@ pub(super) fn reliability(whole: &Whole) -> RgbImage {
 fn diagram(canvas: &mut Canvas, left: f64, row: &Row) {
     let bottom = TOP + SIDE;
     let at = |x: f64, y: f64| (left + SIDE * x, bottom - SIDE * y);
-    let title = format!("{}: expected error {:.3}", row.given.name(), row.expected_error);
+    let title = format!("{}: error {:.3}", row.given.name(), row.expected_error);
     canvas.text(left, TOP - 28.0, SIZE, &title, INK);
     for tick in 0..=4 {
         let v = f64::from(tick) / 4.0;

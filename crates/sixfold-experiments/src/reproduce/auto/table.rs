@@ -147,12 +147,12 @@ pub(super) fn markdown(whole: &Whole) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Pose1;
+    use super::super::FoundPose;
     use super::*;
 
     fn search(present: bool, probability: f64, right: bool) -> Search {
         let numbers = [None; sixfold_auto::NAMES.len()];
-        let poses = vec![Pose1 { method: "ppf".into(), numbers, probability, right }];
+        let poses = vec![FoundPose { method: "ppf".into(), numbers, probability, right }];
         Search { object: "a".into(), given: Given::Depth, present, poses, seconds: 2.0 }
     }
 
