@@ -5,6 +5,7 @@ use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
 use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
 use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
 use sixfold_geometry::{Pose, Vec3};
+use sixfold_mesh::Mesh;
 
 use crate::calibration::Calibration;
 use crate::numbers::{Numbers, add_others, of_evidence, strength};
@@ -57,7 +58,7 @@ impl Pool<'_> {
         let judged: Vec<Option<Hypothesis>> = found
             .into_par_iter()
             .map_init(EvidenceCollector::default, |collector, mut estimate| {
-                if !is_before_camera(&estimate.camera_from_object, diameter) {
+                if !is_before_camera(&estimate.camera_from_object, shape.mesh, diameter) {
                     return None;
                 }
                 let mut evidence = collector.collect(scene, shape, &estimate.camera_from_object, &options);
@@ -158,8 +159,11 @@ const ALTERNATIVE: f64 = 0.25;
 /// An object whose centre is nearer than this many diameters lies against the lens; chosen by hand, not swept.
 const AGAINST_LENS: f64 = 0.5;
 
-fn is_before_camera(pose: &Pose, diameter: f64) -> bool {
-    pose.translation().iter().all(|v| v.is_finite()) && pose.translation().z > AGAINST_LENS * diameter
+/// The object's frame may lie anywhere: what counts is the centre of its box.
+fn is_before_camera(pose: &Pose, mesh: &Mesh, diameter: f64) -> bool {
+    let (low, high) = mesh.bounding_box();
+    let centre = pose.transform_point(&(0.5 * (low + high)));
+    centre.iter().all(|v| v.is_finite()) && centre.z > AGAINST_LENS * diameter
 }
 
 fn ranking(evidence: &Evidence) -> f64 {
@@ -217,7 +221,13 @@ mod tests {
 
     #[test]
     fn what_lies_against_the_lens_is_no_pose() {
-        let at = |z| is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, z)), 0.2);
+        let mesh = |z: f64| {
+            let vertices = vec![Vec3::new(0.0, 0.0, z), Vec3::new(0.2, 0.0, z), Vec3::new(0.0, 0.1, z)];
+            Mesh::new(vertices, vec![[0, 1, 2]]).unwrap()
+        };
+        let at = |z| is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, z)), &mesh(0.0), 0.2);
         assert_eq!([at(-1.0), at(0.05), at(0.5), at(f64::NAN)], [false, false, true, false]);
+        // A scan whose frame lies a metre behind it.
+        assert!(is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, -0.5)), &mesh(1.0), 0.2));
     }
 }
