@@ -74,6 +74,22 @@ impl std::fmt::Display for Paper {
     }
 }
 
+/// What is printed on a sheet, metres from its top left corner.
+pub(crate) struct Print {
+    /// Black rectangles: left, top, width, height.
+    pub black: Vec<[f64; 4]>,
+    /// The line below the ruler.
+    pub text: Text,
+}
+
+/// A line of text.
+pub(crate) struct Text {
+    pub left: f64,
+    pub baseline: f64,
+    pub height: f64,
+    pub text: String,
+}
+
 /// A corner of a tag, on the board and in an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Corner {
@@ -199,9 +215,8 @@ impl Board {
         0.008
     }
 
-    /// Black rectangles of the sheet: left, top, width, height in metres from the sheet's top left corner, and texts with their
-    /// lower left corner and height.
-    pub(crate) fn print(&self) -> (Vec<[f64; 4]>, Vec<(f64, f64, f64, String)>) {
+    /// What is printed.
+    pub(crate) fn print(&self) -> Print {
         let (width, height) = self.paper.size();
         let (columns, rows, first) = self.paper.tags();
         let (middle_x, middle_y) = (0.5 * width, 0.5 * height - self.middle_below_sheets());
@@ -245,7 +260,8 @@ impl Board {
             "Sixfold board {}. Print at 100 %. This ruler has to measure 100 mm; else give its length: --ruler MM",
             self.paper
         );
-        (black, vec![(ruler_x - 0.025, height - 0.0085, 0.0022, text)])
+        let text = Text { left: ruler_x - 0.025, baseline: height - 0.0085, height: 0.0022, text };
+        Print { black, text }
     }
 
     /// The sheet as a PDF file of one page, in its true size.
@@ -266,14 +282,13 @@ impl Board {
                 }
             }
         };
-        let (black, texts) = self.print();
+        let Print { black, text } = self.print();
         black.into_iter().for_each(&mut fill);
-        for (x, y, size, text) in texts {
-            // Half as wide as Helvetica's letters are high, as in the PDF.
-            let dot = size / 12.0;
-            for (column, row) in text_dots(&text) {
-                fill([x + dot * column as f64, y - size + dot * row as f64, dot, dot]);
-            }
+        // About as wide as Helvetica in the PDF.
+        let dot = text.height / 12.0;
+        for (column, row) in text_dots(&text.text) {
+            let (x, y) = (text.left + dot * column as f64, text.baseline - text.height + dot * row as f64);
+            fill([x, y, dot, dot]);
         }
         image
     }
@@ -288,7 +303,7 @@ mod tests {
         for paper in Paper::ALL {
             let board = Board::new(paper);
             let (width, height) = paper.size();
-            let (black, _) = board.print();
+            let black = board.print().black;
             let margin = 0.005;
             for [x, y, w, h] in black {
                 assert!(

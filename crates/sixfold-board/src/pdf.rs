@@ -2,27 +2,24 @@
 
 use std::fmt::Write;
 
+use crate::board::{Print, Text};
+
 /// Points in a metre.
 const POINTS: f64 = 72.0 / 0.0254;
 
-/// A page of a size in metres. Rectangles: left, top, width, height from the page's top left corner, metres; texts: left and
-/// baseline from there, height, what they say.
-pub(crate) fn page(
-    (width, height): (f64, f64),
-    (black, texts): &(Vec<[f64; 4]>, Vec<(f64, f64, f64, String)>),
-) -> Vec<u8> {
+/// A page of a size in metres.
+pub(crate) fn page((width, height): (f64, f64), print: &Print) -> Vec<u8> {
     let mut drawing = String::from("0 g\n");
-    for [x, y, w, h] in black {
+    for [x, y, w, h] in &print.black {
         let (left, bottom) = (POINTS * x, POINTS * (height - y - h));
         // Writing to a string does not fail.
         let _ = writeln!(drawing, "{left:.4} {bottom:.4} {:.4} {:.4} re", POINTS * w, POINTS * h);
     }
     drawing.push_str("f\n");
-    for (x, y, size, text) in texts {
-        let escaped = text.replace('\\', "\\\\").replace('(', "\\(").replace(')', "\\)");
-        let (left, bottom, points) = (POINTS * x, POINTS * (height - y), POINTS * size / 0.72);
-        let _ = writeln!(drawing, "BT /F1 {points:.3} Tf {left:.3} {bottom:.3} Td ({escaped}) Tj ET");
-    }
+    let Text { left, baseline, height: size, text } = &print.text;
+    let escaped = text.replace('\\', "\\\\").replace('(', "\\(").replace(')', "\\)");
+    let (left, bottom, points) = (POINTS * left, POINTS * (height - baseline), POINTS * size / 0.72);
+    let _ = writeln!(drawing, "BT /F1 {points:.3} Tf {left:.3} {bottom:.3} Td ({escaped}) Tj ET");
     let (w, h) = (POINTS * width, POINTS * height);
     let objects = [
         "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>".to_owned(),
@@ -56,8 +53,8 @@ mod tests {
 
     #[test]
     fn the_table_points_to_the_objects() {
-        let file =
-            page((0.21, 0.297), &(vec![[0.0, 0.0, 0.0254, 0.0254]], vec![(0.0, 0.1, 0.003, "a (b)".into())]));
+        let text = Text { left: 0.0, baseline: 0.1, height: 0.003, text: "a (b)".into() };
+        let file = page((0.21, 0.297), &Print { black: vec![[0.0, 0.0, 0.0254, 0.0254]], text });
         let text = String::from_utf8(file).unwrap();
         assert!(text.contains("0.0000 769.8898 72.0000 72.0000 re"), "{text}");
         assert!(text.contains("(a \\(b\\)) Tj"));

@@ -21,7 +21,7 @@ pub(crate) fn convex_hull(points: &mut Vec<(i32, i32)>) -> Vec<Vec2> {
     let turn = |a: (i32, i32), b: (i32, i32), c: (i32, i32)| {
         i64::from(b.0 - a.0) * i64::from(c.1 - a.1) - i64::from(b.1 - a.1) * i64::from(c.0 - a.0)
     };
-    let mut half = |points: &mut dyn Iterator<Item = (i32, i32)>| {
+    let half = |points: &mut dyn Iterator<Item = (i32, i32)>| {
         let mut hull: Vec<(i32, i32)> = vec![];
         for p in points {
             while hull.len() >= 2 && turn(hull[hull.len() - 2], hull[hull.len() - 1], p) <= 0 {

@@ -1,7 +1,7 @@
 //! Simulated photographs of a board, with exact truth: for tests and for trying a camera before it is bought.
 
-use rand::{Rng, RngExt};
-use sixfold_geometry::random::stream;
+use rayon::prelude::*;
+use sixfold_geometry::random::{normal, stream};
 use sixfold_geometry::{Camera, Image, Pose, RgbImage, Vec2, Vec3};
 
 use crate::board::Board;
@@ -38,7 +38,7 @@ pub fn photograph(
 ) -> RgbImage {
     let board_from_camera = camera_from_board.inverse();
     let origin = board_from_camera.translation();
-    let sharp = Image::from_fn(camera.width, camera.height, |x, y| {
+    let pixel = |x: usize, y: usize| {
         let mut sum = 0.0;
         for i in 0..SAMPLES * SAMPLES {
             let within = |k: usize| (k as f64 + 0.5) / SAMPLES as f64 - 0.5;
@@ -48,11 +48,16 @@ pub fn photograph(
         let (low, high) = conditions.light;
         let light = low + (high - low) * x as f64 / camera.width as f64;
         sum / (SAMPLES * SAMPLES) as f64 * light
-    });
+    };
+    let rows: Vec<Vec<f64>> = (0..camera.height)
+        .into_par_iter()
+        .map(|y| (0..camera.width).map(|x| pixel(x, y)).collect())
+        .collect();
+    let sharp = Image::from_fn(camera.width, camera.height, |x, y| rows[y][x]);
     let blurred = blurred(&sharp, conditions.blur);
     let mut rng = stream(seed, 0);
     blurred.map(|level| {
-        let noisy = level + conditions.noise * gaussian(&mut rng);
+        let noisy = level + conditions.noise * f64::from(normal(&mut rng));
         [noisy.round().clamp(0.0, 255.0) as u8; 3]
     })
 }
@@ -82,11 +87,6 @@ fn reflectance(
         Some(false) => 0.1,
         None => 0.4,
     }
-}
-
-fn gaussian(rng: &mut impl Rng) -> f64 {
-    let (u, v): (f64, f64) = (rng.random(), rng.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 fn blurred(image: &Image<f64>, deviation: f64) -> Image<f64> {

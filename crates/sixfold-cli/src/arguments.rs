@@ -8,6 +8,8 @@ use sixfold_shell::meshes::MeshArguments;
 use sixfold_shell::PixelLimit;
 
 use crate::commands::NETWORKS;
+use crate::commands::board::BoardArguments;
+use crate::commands::calibrate::CalibrateArguments;
 use crate::commands::completions::CompletionsArguments;
 use crate::commands::demo::arguments::DemoArguments;
 use crate::commands::detect_arguments::DetectArguments;
@@ -97,6 +99,14 @@ pub(crate) enum Command {
     /// Keep objects under a name: add, list, show, remove
     #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
     Object(ObjectArguments),
+    /// Write a board of AprilTags to print: an object stands on it while it is photographed
+    #[command(after_help = "Example:\n  sixfold board --paper a4 --out board.pdf")]
+    Board(BoardArguments),
+    /// Find the camera, and its pose in every photograph, from photographs of the printed board
+    #[command(after_help = "Examples:\n  \
+        sixfold calibrate photographs --out out/calibration\n  \
+        sixfold calibrate photographs --camera out/calibration/camera.json --out out/poses")]
+    Calibrate(CalibrateArguments),
     /// Print shell completions
     #[command(
         after_help = "Example:\n  sixfold completions bash > ~/.local/share/bash-completion/completions/sixfold"

@@ -41,6 +41,8 @@ fn main() -> ExitCode {
         Command::Train(a) => commands::train::run(a),
         Command::Reproduce(_) => commands::experiments::run(),
         Command::Object(a) => commands::object::run(a),
+        Command::Board(a) => commands::board::run(a),
+        Command::Calibrate(a) => commands::calibrate::run(a),
         Command::Completions(a) => commands::completions::run(a, Arguments::command()),
     })
 }

@@ -81,7 +81,13 @@ impl<'a> ImageFile<'a> {
         &self,
         bytes: &'b [u8],
     ) -> Result<(impl ImageDecoder + use<'b>, ImageFormat), ImageFileError> {
-        let format = image::guess_format(bytes).map_err(|_| self.error("neither PNG nor JPEG"))?;
+        let format = image::guess_format(bytes).map_err(|_| {
+            self.error(if is_heif(bytes) {
+                "a HEIF (HEIC) file, expected PNG or JPEG: export it as JPEG, or let the phone take JPEG (\"most compatible\")"
+            } else {
+                "neither PNG nor JPEG"
+            })
+        })?;
         if !matches!(format, ImageFormat::Png | ImageFormat::Jpeg) {
             return Err(self.error(format!("{format:?} is not supported, expected PNG or JPEG")));
         }
@@ -211,6 +217,14 @@ pub(crate) fn png_of_depth(depth: &DepthImage, metres_per_unit: f64) -> Option<D
     let data: Vec<u16> = depth.as_slice().iter().map(|&z| unit(z)).collect();
     image::ImageBuffer::<image::Luma<u16>, _>::from_raw(depth.width() as u32, depth.height() as u32, data)
         .map(DynamicImage::from)
+}
+
+/// Whether a file is one of the family that phones write by default (ISO/IEC 23008-12).
+fn is_heif(bytes: &[u8]) -> bool {
+    let brand = bytes.get(8..12).filter(|_| bytes.get(4..8) == Some(b"ftyp".as_slice()));
+    brand.is_some_and(|brand| {
+        [b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1"].iter().any(|b| *b == brand)
+    })
 }
 
 #[cfg(test)]

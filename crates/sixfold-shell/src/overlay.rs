@@ -231,7 +231,8 @@ fn axes(image: &mut RgbImage, camera: &Camera, mesh: &Mesh, camera_from_object: 
 }
 
 /// A line of two pixels' width.
-pub(crate) fn line(image: &mut RgbImage, a: [f64; 2], b: [f64; 2], color: [u8; 3]) {
+/// A line between two pixels; what lies outside the image is left out.
+pub fn line(image: &mut RgbImage, a: [f64; 2], b: [f64; 2], color: [u8; 3]) {
     let steps = (b[0] - a[0]).abs().max((b[1] - a[1]).abs()).ceil().clamp(1.0, 4000.0);
     for i in 0..=steps as usize {
         let t = i as f64 / steps;

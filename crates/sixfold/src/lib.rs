@@ -2,6 +2,7 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub use sixfold_align as align;
+pub use sixfold_board as board;
 pub use sixfold_bop as bop;
 pub use sixfold_estimator as estimator;
 pub use sixfold_geometry as geometry;

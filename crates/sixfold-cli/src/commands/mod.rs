@@ -1,5 +1,7 @@
 //! One file per command.
 
+pub(crate) mod board;
+pub(crate) mod calibrate;
 pub(crate) mod completions;
 pub(crate) mod demo;
 #[cfg(feature = "networks")]

@@ -3,6 +3,7 @@
 #[cfg(feature = "networks")]
 mod auto;
 mod bad_input;
+mod calibrate;
 mod dataset;
 #[cfg(feature = "networks")]
 mod detect;
