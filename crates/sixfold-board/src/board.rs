@@ -168,7 +168,7 @@ impl Board {
         Some(corners.map(|(x, y)| Vec3::new(x, y, 0.0) * self.scale))
     }
 
-    /// The corners of found tags that are on this board.
+    /// The corners of found tags that are on this board. A tag that was found twice is left out: nobody knows which is the board's.
     pub fn corners(&self, tags: &[Tag]) -> Vec<Corner> {
         let of_tag = |tag: &Tag| {
             let places = self.tag_corners(tag.id)?;
@@ -182,7 +182,8 @@ impl Board {
             };
             Some(std::array::from_fn::<_, 4, _>(corner))
         };
-        tags.iter().filter_map(of_tag).flatten().collect()
+        let once = |tag: &&Tag| tags.iter().filter(|other| other.id == tag.id).count() == 1;
+        tags.iter().filter(once).filter_map(of_tag).flatten().collect()
     }
 
     /// How bright the sheet is at a place of the board's frame, metres; `None` off the sheet. The ruler and its text are left out.

@@ -34,7 +34,7 @@ impl Tag {
 /// What an image shows of tags.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Detections {
-    /// The tags, by number. One that is seen twice is left out: it is not known which is the board's.
+    /// The tags, by number, then from left to right. A number may be seen several times.
     pub tags: Vec<Tag>,
     /// How many tags are seen in a mirror.
     pub mirrored: usize,
@@ -55,8 +55,6 @@ pub fn detect_tags(image: &RgbImage) -> Detections {
         }
     }
     found.tags.sort_by(|a, b| a.id.cmp(&b.id).then(a.corners[0].x.total_cmp(&b.corners[0].x)));
-    let ids: Vec<usize> = found.tags.iter().map(|t| t.id).collect();
-    found.tags.retain(|t| ids.iter().filter(|id| **id == t.id).count() == 1);
     found
 }
 
