@@ -20,7 +20,7 @@ pub struct Tag {
     pub id: usize,
     /// Corners of its black square in pixels: top left, top right, bottom right, bottom left of the upright tag.
     pub corners: [Vec2; 4],
-    /// Width of its edges, pixels: 1 to 3 in a sharp image.
+    /// Width of its two widest edges, pixels: brightness changes from black to white over so many, 1 to 3 in a sharp image.
     pub edge_width: f64,
 }
 
@@ -63,20 +63,20 @@ fn read_tag(grey: &Image<u8>, points: &mut Vec<(i32, i32)>) -> Option<Option<Tag
     let quad = around(&convex_hull(points))?;
     // Cheap first: most dark regions are no tags.
     read_cells(grey, &quad, 0.2)?;
-    let (quad, edge_width) = refined(grey, &quad)?;
-    let cells = read_cells(grey, &quad, 0.4)?;
+    let (quad, slope) = refined(grey, &quad)?;
+    let (cells, contrast) = read_cells(grey, &quad, 0.4)?;
     match decode(&cells) {
         Some((id, rotation)) => {
             let corners = std::array::from_fn(|i| quad[(i + rotation) % 4]);
-            Some(Some(Tag { id, corners, edge_width }))
+            Some(Some(Tag { id, corners, edge_width: contrast / slope }))
         }
         None => decode(&mirrored(&cells)).map(|_| None),
     }
 }
 
 /// The cells inside a quadrangle; `None` where its border is not dark and its surroundings bright, by `clear` of the contrast
-/// between the two.
-fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<Cells> {
+/// between the two. With them the contrast, grey levels.
+fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<(Cells, f64)> {
     let side = SIDE as f64;
     let square = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)].map(|(x, y)| Vec2::new(x, y));
     let pairs: Vec<(Vec2, Vec2)> = square.into_iter().zip(*quad).collect();
@@ -116,7 +116,7 @@ fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<Cells> {
             *cell = level > 0.5 * (bright.at(u, v) + dark.at(u, v));
         }
     }
-    Some(cells)
+    Some((cells, contrast))
 }
 
 /// Mean brightness in the middle of a cell, with the cell's centre.

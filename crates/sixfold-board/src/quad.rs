@@ -99,13 +99,13 @@ pub(crate) fn brightness(image: &Image<u8>, p: &Vec2) -> Option<f64> {
     Some(upper * (1.0 - v) + lower * v)
 }
 
-/// A line along an edge from bright (outside) to dark: a point, a direction, and the width of the edge in pixels.
+/// A line along an edge from bright (outside) to dark: a point, a direction, and how steep the edge is, grey levels a pixel.
 fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> Option<(Vec2, Vec2, f64)> {
     let length = (to - from).norm();
     let samples = (length.round() as usize).clamp(12, 160);
     let steps = (reach / 0.25).round() as i32;
     let mut points = vec![];
-    let mut widths = vec![];
+    let mut slopes = vec![];
     for k in 0..samples {
         // Not near the corners, which are rounded.
         let along = 0.12 + 0.76 * (k as f64 + 0.5) / samples as f64;
@@ -122,15 +122,14 @@ fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> O
                 steepest = steepest.max(gradient);
             }
         }
-        let ends = (profile(reach + 1.0), profile(-reach - 1.0));
-        if let (true, (Some(white), Some(black))) = (steepest > 4.0, ends) {
+        if steepest > 4.0 {
             points.push(base + outside * (moment / sum));
-            widths.push((white - black).max(0.0) / steepest);
+            slopes.push(steepest);
         }
     }
     let (point, along) = fitted_line(&points, samples / 2)?;
-    widths.sort_by(f64::total_cmp);
-    Some((point, along, widths[widths.len() / 2]))
+    slopes.sort_by(f64::total_cmp);
+    Some((point, along, slopes[slopes.len() / 2]))
 }
 
 /// The line through at least `least` points; those that lie off it are left out.
@@ -161,14 +160,14 @@ fn fitted_line(points: &[Vec2], least: usize) -> Option<(Vec2, Vec2)> {
     line
 }
 
-/// The corners where lines along the quadrangle's edges meet, and the width of the edges in pixels; `None` where there are no
-/// edges from bright outside to dark inside.
+/// The corners where lines along the quadrangle's edges meet, and how steep the two flattest edges are, grey levels a pixel: motion
+/// blurs the edges across it only. `None` where there are no edges from bright outside to dark inside.
 pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
     let mut quad = *quad;
-    let mut width = 0.0;
+    let mut slope = 0.0;
     for pass in 0..3 {
         let mut lines = vec![];
-        let mut widths = vec![];
+        let mut slopes = vec![];
         for i in 0..4 {
             let (from, to) = (quad[i], quad[(i + 1) % 4]);
             let along = (to - from).try_normalize(1e-9)?;
@@ -177,9 +176,9 @@ pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
             let side = (to - from).norm();
             let reach =
                 if pass == 0 { (0.06 * side).clamp(2.0, 10.0) } else { (0.04 * side).clamp(2.0, 5.0) };
-            let (point, direction, edge_width) = edge(image, from, to, outside, reach)?;
+            let (point, direction, steepness) = edge(image, from, to, outside, reach)?;
             lines.push((point, direction));
-            widths.push(edge_width);
+            slopes.push(steepness);
         }
         let mut next = quad;
         for i in 0..4 {
@@ -192,10 +191,10 @@ pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
             }
         }
         quad = next;
-        widths.sort_by(f64::total_cmp);
-        width = 0.5 * (widths[1] + widths[2]);
+        slopes.sort_by(f64::total_cmp);
+        slope = 0.5 * (slopes[0] + slopes[1]);
     }
-    is_tag_shaped(&quad).then_some((quad, width))
+    is_tag_shaped(&quad).then_some((quad, slope))
 }
 
 #[cfg(test)]

@@ -134,6 +134,16 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
         matches!(refused, Err(BoardError::Blurred { .. } | BoardError::TooFewTags { .. })),
         "{refused:?}"
     );
+    // So does one of a camera that moved by 13 pixels.
+    let moved = RgbImage::from_fn(960, 720, |x, y| {
+        let sum: usize = (0..13).map(|i| usize::from(good[((x + i).min(959), y)][0])).sum();
+        [(sum / 13) as u8; 3]
+    });
+    let refused = board_pose(&corners(&moved), &camera());
+    assert!(
+        matches!(refused, Err(BoardError::Blurred { .. } | BoardError::TooFewTags { .. })),
+        "{refused:?}"
+    );
     // All from one side: nothing tells the focal length.
     let frontal: Vec<Vec<Corner>> = (0..5)
         .map(|i| {
