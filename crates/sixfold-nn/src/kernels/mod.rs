@@ -14,7 +14,7 @@ mod upsample;
 pub use gather::{Places, SampledPixel, gather_backward, gather_forward, neighbours};
 pub use lstm::{lstm_backward, lstm_forward};
 pub use shared::{Activation, ConvSpec};
-pub use upsample::{upsample_2x, upsample_2x_backward};
+pub use upsample::{Upsampling, upsample_2x, upsample_2x_backward};
 
 use dense::{dense_backward, dense_forward};
 use depthwise::{depthwise_backward, depthwise_forward};
