@@ -5,10 +5,12 @@
     cargo build --release -p sixfold-nn --example backbone_outputs
     python crates/sixfold-nn/checks/salient_vs_onnxruntime.py target/release/examples/backbone_outputs u2netp.onnx full.safetensors IMAGE...
 
-Images may end in `:x,y,width,height` for a crop. The map with weights in full precision differs by at most 1e-4 anywhere; with the
-shipped ones, in half precision, the differences are printed, and how many pixels of the mask above 0.5 change. The exit status is 1 otherwise.
-"""
+Images may end in `:x,y,width,height` for a crop. The map with weights in full precision differs anywhere by at most 1e-4, or by twice what
+onnxruntime itself differs by with its optimisations off: where the map is steep, the order of the sums already counts. With the shipped
+weights, in half precision, the differences are printed, and the share of the mask's pixels (above 0.5) that change.
+`--scores FILE.json` before the images adds them to a file for `convert_u2netp.py --scores`. The exit status is 1 otherwise."""
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -30,7 +32,8 @@ def prepared(name):
         x, y, width, height = map(int, crop.split(","))
         image = image.crop((x, y, x + width, y + height))
     x = np.asarray(image.resize((320, 320), Image.BILINEAR), dtype=np.float64)
-    return ((x / x.max() - MEAN) / DEVIATION).transpose(2, 0, 1)[None].astype(np.float32)
+    # safetensors writes the memory as it lies.
+    return np.ascontiguousarray(((x / x.max() - MEAN) / DEVIATION).transpose(2, 0, 1)[None], dtype=np.float32)
 
 
 def ours(program, weights, x, folder):
@@ -39,23 +42,42 @@ def ours(program, weights, x, folder):
     return load_file(folder / "out.safetensors")["salience"]
 
 
+def session(source, level):
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = level
+    found = onnxruntime.InferenceSession(source, options)
+    return lambda x: found.run(None, {found.get_inputs()[0].name: x})[0]
+
+
 def main():
     if len(sys.argv) < 5:
         sys.exit(__doc__)
     program, source, full, *images = sys.argv[1:]
-    session = onnxruntime.InferenceSession(source)
-    good = True
-    print("| image | largest, mean difference, f32 | largest, mean difference, f16 | pixels of the mask changed |\n|---|---|---|---|")
+    scores = Path(images[1]) if images[0] == "--scores" else None
+    images = images[2:] if scores else images
+    levels = onnxruntime.GraphOptimizationLevel
+    optimised, plain = session(source, levels.ORT_ENABLE_ALL), session(source, levels.ORT_DISABLE_ALL)
+    good, worst = True, np.zeros(5)
+    print("| image | f32: largest, mean difference | f16: largest, mean difference | mask changed | onnxruntime without optimisation |")
+    print("|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name in images:
             x = prepared(name)
-            expected = session.run(None, {session.get_inputs()[0].name: x})[0]
+            expected = optimised(x)
             exact, half = (ours(program, w, x, Path(folder)) for w in (full, "shipped"))
+            own = np.abs(plain(x) - expected).max()
             d, h = np.abs(exact - expected), np.abs(half - expected)
             changed = ((half > 0.5) != (expected > 0.5)).mean()
-            print(f"| {Path(name).parent.name}/{Path(name).name} | {d.max():.1e}, {d.mean():.1e} | {h.max():.1e}, {h.mean():.1e} | {changed:.3%} |")
-            good &= bool(d.max() <= BOUND)
-    print("good" if good else f"TOO LARGE: at most {BOUND:.0e}")
+            label = "/".join(Path(name).parts[-2:])
+            print(f"| {label} | {d.max():.1e}, {d.mean():.1e} | {h.max():.1e}, {h.mean():.1e} | {changed:.3%} | {own:.1e} |")
+            good &= bool(d.max() <= max(BOUND, 2 * own))
+            worst = np.maximum(worst, [d.max(), d.mean(), h.max(), h.mean(), changed])
+    if scores:
+        names = ["f32, largest", "f32, mean", "largest", "mean", "share of the mask's pixels"]
+        found = {f"difference from onnxruntime, {n}, worst of {len(images)} images": float(v) for n, v in zip(names, worst)}
+        known = json.loads(scores.read_text()) if scores.exists() else {}
+        scores.write_text(json.dumps(known | {k: v for k, v in found.items() if "f32" not in k}, indent=2))
+    print("good" if good else f"TOO LARGE: at most {BOUND:.0e}, or twice onnxruntime's own")
     sys.exit(0 if good else 1)
 
 

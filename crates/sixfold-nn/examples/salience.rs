@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let score = iou(&seen.mask(0.5), &truth);
         println!("| {name} | {score:.3} | {:.3} |", seen.highest);
-        scores.insert(format!("IoU, {name}"), score);
+        scores.insert(format!("intersection over union, {name}"), score);
         if best.is_infinite() {
             for _ in 0..5 {
                 let start = Instant::now();
@@ -61,7 +61,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let mean = scores.values().sum::<f64>() / scores.len() as f64;
     println!("| mean of {} | {mean:.3} | |\n\none image: {best:.3} s", scores.len());
-    scores.insert("IoU, mean".to_owned(), mean);
+    scores.insert("intersection over union, mean".to_owned(), mean);
+    scores.values_mut().for_each(|score| *score = (*score * 1e4).round() / 1e4);
     if let Some(path) = scores_file {
         fs::write(path, serde_json::to_string_pretty(&scores)?)?;
     }
