@@ -70,9 +70,8 @@ pub(super) fn refine(
                 let ratio = r * r / (scale * scale);
                 let weight = 1.0 / (1.0 + ratio).powi(2);
                 cost += ratio / (1.0 + ratio);
-                let tilt = |w: &Vec3| {
-                    w.cross(&(moved - axis.point)) - rotation.transform_direction(&w.cross(&arm))
-                };
+                let tilt =
+                    |w: &Vec3| w.cross(&(moved - axis.point)) - rotation.transform_direction(&w.cross(&arm));
                 let j = Vector4::new(
                     gradient.dot(&tilt(&u)),
                     gradient.dot(&tilt(&v)),

