@@ -291,6 +291,19 @@ fn known_solids_under_any_pose() {
     }
 }
 
+/// Twelve sides are nearly round, and twelve all the same; an oval cup too is nearly round, and keeps half a turn.
+#[test]
+fn nearly_round() {
+    let all = found(&prism(&regular(12, 0.04), 0.07, 0.8), 0.0);
+    compare("twelve sides", &sure(&all), &[Truth::Order(12, Vec3::z())], &Vec3::zeros(), EXACT);
+    assert!(all.iter().any(|s| s.order.is_none() && s.by_shape == Verdict::Likely), "{all:#?}");
+    let round = bottle();
+    let oval = round.vertices().iter().map(|v| Vec3::new(v.x * 1.08, v.y, v.z)).collect();
+    let all = found(&Mesh::new(oval, round.faces().to_vec()).unwrap(), 0.0);
+    compare("oval bottle", &sure(&all), &[Truth::Order(2, Vec3::z())], &Vec3::zeros(), EXACT);
+    assert!(all.iter().any(|s| s.order.is_none() && s.by_shape == Verdict::Likely), "{all:#?}");
+}
+
 #[test]
 fn a_ball_has_three_axes() {
     let pose = any_pose(&mut stream(3, 0));

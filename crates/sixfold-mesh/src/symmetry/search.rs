@@ -26,6 +26,10 @@ const ANGLE_TOLERANCE: f64 = 0.06;
 /// Half turns across a continuous axis among which the one is looked for that keeps the colours.
 const FLIPS: usize = 36;
 
+/// Colours differ, or the surface is off, by at most this fraction where some rotations about an axis are listed beside all:
+/// fewer angles always fit a little better.
+const CLEARER: f64 = 0.5;
+
 /// One order of one axis, with its evidence.
 #[derive(Debug, Clone, Copy)]
 struct Tested {
@@ -52,8 +56,9 @@ impl<'a> Search<'a> {
     pub fn run(mut self) -> Vec<FoundSymmetry> {
         for axis in candidates(self.body) {
             self.test(&axis);
-            if let Some(axis) = self.continuous(Verdict::Sure).first().copied() {
-                self.finish_round(&axis);
+            let round = self.found.iter().find(|t| t.order.is_none() && t.verdict == Verdict::Sure).copied();
+            if let Some(round) = round {
+                self.finish_round(&round);
                 return self.report();
             }
         }
@@ -63,17 +68,10 @@ impl<'a> Search<'a> {
         self.report()
     }
 
-    /// The continuous axes with at least this verdict.
-    fn continuous(&self, verdict: Verdict) -> Vec<Axis> {
-        let at_least = |t: &&Tested| t.order.is_none() && t.verdict >= verdict;
-        self.found.iter().filter(at_least).map(|t| t.axis).collect()
-    }
-
     /// A body with a sure continuous axis is as round about all axes, or has half turns across the axis, or neither.
-    fn finish_round(&mut self, axis: &Axis) {
-        let round = self.found.iter().find(|t| t.order.is_none()).copied();
-        self.found.clear();
-        self.found.extend(round);
+    fn finish_round(&mut self, round: &Tested) {
+        let axis = &round.axis;
+        self.found = vec![*round];
         let across = axis.direction.cross(&Vec3::ith(axis.direction.iamin(), 1.0)).normalize();
         let across = Axis { direction: across, point: self.body.centre };
         if let Some(second) = self.tested(&across, None).filter(|t| t.verdict == Verdict::Sure) {
@@ -203,27 +201,24 @@ impl<'a> Search<'a> {
         self.found = (0..all.len()).filter(|i| !is_repeated(*i)).map(|i| all[i]).collect();
     }
 
-    /// About an axis that may be continuous every half turn across it is as likely as the others: one is enough. Of a body that
-    /// may be a ball three axes are.
+    /// About an axis that may be continuous stays a discrete symmetry that fits clearly better: a prism of twelve sides has its
+    /// own. Of the half turns across it every one is otherwise as likely as the others, and one is enough. Of a body that may be
+    /// a ball three axes are.
     fn leave_out_what_follows(&mut self) {
-        let round = self.continuous(Verdict::Likely);
-        if round.is_empty() {
-            return;
+        let round: Vec<Tested> = self.found.iter().filter(|t| t.order.is_none()).copied().collect();
+        let Some(best) = round.iter().map(|t| t.deviation.p95).reduce(f64::min) else { return };
+        let is_clear = |t: &Tested| t.verdict == Verdict::Sure && t.deviation.p95 <= CLEARER * best;
+        let any_clear = self.found.iter().any(|t| t.order == Some(2) && is_clear(t));
+        let across = |t: &Tested| t.order == Some(2) && round[0].axis.angle_to(&t.axis) > 1.0;
+        let mut flip: Vec<Tested> = self.found.iter().filter(|t| across(t)).copied().collect();
+        flip.sort_by(|a, b| a.deviation.p95.total_cmp(&b.deviation.p95));
+        flip.truncate(usize::from(round.len() == 1 && !any_clear));
+        for t in &mut flip {
+            t.verdict = t.verdict.min(Verdict::Likely);
         }
-        let is_one_axis = round.len() == 1;
-        let (mut flips, mut axes) = (0, 0);
-        let any_sure = self.found.iter().any(|t| t.order == Some(2) && t.verdict == Verdict::Sure);
-        self.found.retain(|t| match (t.order, t.verdict) {
-            (_, Verdict::Sure) => true,
-            (None, _) => {
-                axes += 1;
-                axes <= 3
-            }
-            (Some(_), _) => {
-                flips += 1;
-                is_one_axis && !any_sure && flips == 1
-            }
-        });
+        self.found.retain(|t| t.order.is_some() && is_clear(t));
+        self.found.extend(round.into_iter().take(3));
+        self.found.extend(flip);
     }
 
     /// What was found, with its colours and what these allow.
@@ -232,25 +227,32 @@ impl<'a> Search<'a> {
         for tested in &self.found {
             let whole = self.with_color(tested);
             report.push(whole);
-            if whole.by_shape_and_color == whole.by_shape {
-                continue;
-            }
-            let of_axis = |t: &&Tested| t.axis.angle_to(&tested.axis) < SAME_AXIS && t.order != tested.order;
-            let parts = (2..=MAX_ORDER).rev().filter(|n| match tested.order {
-                None => true,
-                Some(order) => *n < order && order.is_multiple_of(*n),
-            });
-            let part = parts
-                .filter_map(|order| self.tested(&tested.axis, Some(order)))
-                .map(|t| self.with_color(&t))
-                .find(|s| s.by_shape_and_color > whole.by_shape_and_color);
-            // It may be listed for its shape.
-            let listed = |s: &FoundSymmetry| self.found.iter().filter(of_axis).any(|t| t.order == s.order);
-            report.extend(part.filter(|s| !listed(s)));
+            report.extend(self.part_by_color(tested, &whole));
         }
         let key = |s: &FoundSymmetry| (s.order.map_or(0, |n| MAX_ORDER + 1 - n), s.by_shape != Verdict::Sure);
         report.sort_by_key(key);
         report
+    }
+
+    /// The largest order below that of an axis which keeps the colours clearly better, unless it is listed for its shape.
+    fn part_by_color(&self, tested: &Tested, whole: &FoundSymmetry) -> Option<FoundSymmetry> {
+        let whole_color = whole.color.filter(|_| whole.by_shape_and_color < whole.by_shape)?;
+        let is_part = |n: &u32| tested.order.is_none_or(|order| n < &order && order.is_multiple_of(*n));
+        let is_clearer = |order: &u32| {
+            let color = self.body.color_difference(&tested.axis, &angles_of_order(*order));
+            color.is_some_and(|c| {
+                c.p95 <= CLEARER * whole_color.p95 && color_verdict(&c) > whole.by_shape_and_color
+            })
+        };
+        let order = (2..=MAX_ORDER).rev().filter(is_part).find(is_clearer)?;
+        let is_listed = |t: &Tested| t.order == Some(order) && t.axis.angle_to(&tested.axis) < SAME_AXIS;
+        if self.found.iter().any(is_listed) {
+            return None;
+        }
+        let part = Tested { order: Some(order), ..*tested };
+        let deviation = self.body.deviation(&part.axis, &angles_of_order(order), usize::MAX);
+        let verdict = shape_verdict(&deviation, self.body.diameter, self.body.noise);
+        Some(self.with_color(&Tested { deviation, verdict, ..part }))
     }
 
     fn with_color(&self, t: &Tested) -> FoundSymmetry {

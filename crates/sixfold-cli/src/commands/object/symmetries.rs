@@ -20,6 +20,8 @@ use crate::commands::render::portrait;
 
 /// Height of the line of text over each image, pixels.
 const CAPTION: usize = 26;
+/// Image pixels of a glyph's pixel.
+const TEXT: f64 = 4.0 / 3.0;
 /// Images in a row.
 const COLUMNS: usize = 4;
 /// The fraction of a full turn by which the image of a continuous symmetry is rotated.
@@ -124,8 +126,15 @@ pub(crate) fn add_to(info: &mut ModelInfo, mesh: &Mesh, a: &AddArguments) -> Res
     Ok(if found.is_empty() { none() } else { found.iter().map(line).collect() })
 }
 
+/// A number with some digits, without the sign of a zero.
+fn rounded(number: f64, digits: usize) -> String {
+    let text = format!("{number:.digits$}");
+    let is_zero = text.bytes().all(|b| b"-0.".contains(&b));
+    if is_zero { text.trim_start_matches('-').to_owned() } else { text }
+}
+
 fn in_words(s: &FoundSymmetry) -> String {
-    let [x, y, z] = <[f64; 3]>::from(s.axis).map(|c| format!("{:.3}", c + 0.0));
+    let [x, y, z] = <[f64; 3]>::from(s.axis).map(|c| rounded(c, 3));
     let about = format!("about ({x}, {y}, {z})");
     match s.order {
         None => format!("any rotation {about}"),
@@ -148,8 +157,9 @@ fn table(name: &str, diameter: f64, found: &[FoundSymmetry]) {
         "order", "axis", "point, mm", "95 %, mm (%)", "max, mm (%)", "colours", "by shape"
     );
     for s in found {
-        let numbers =
-            |v: [f64; 3], digits: usize, width: usize| v.map(|c| format!("{c:>width$.digits$}")).join(" ");
+        let numbers = |v: [f64; 3], digits: usize, width: usize| {
+            v.map(|c| format!("{:>width$}", rounded(c, digits))).join(" ")
+        };
         let length = |l: f64| format!("{:.2} ({:.1})", 1e3 * l, 100.0 * l / s.diameter);
         println!(
             "{:>5}  {}  {}  {:>14}  {:>14}  {:>7}  {:<8}  {}",
@@ -173,12 +183,9 @@ fn picture(mesh: &Mesh, found: &[FoundSymmetry]) -> RgbImage {
         let turn = first.or_else(|| s.continuous().map(|c| c.rotation(SOME_TURN * TAU)));
         let rotated = mesh.transformed(&turn.unwrap_or_else(Pose::identity));
         let degrees = 360.0 * s.order.map_or(SOME_TURN, |n| 1.0 / f64::from(n));
-        let [x, y, z] = <[f64; 3]>::from(s.axis).map(|c| format!("{c:.2}"));
-        let caption = format!(
-            "{degrees:.0} degrees about {x} {y} {z}: {}, {}",
-            s.by_shape.name(),
-            s.by_shape_and_color.name()
-        );
+        let [x, y, z] = <[f64; 3]>::from(s.axis).map(|c| rounded(c, 2));
+        let colors = s.color.map_or(String::new(), |_| format!(", colours {}", s.by_shape_and_color.name()));
+        let caption = format!("{degrees:.0} degrees about {x} {y} {z}: shape {}{colors}", s.by_shape.name());
         images.push((caption, portrait(&rotated)));
     }
     let side = images[0].1.width();
@@ -188,7 +195,7 @@ fn picture(mesh: &Mesh, found: &[FoundSymmetry]) -> RgbImage {
     let corner = |i: usize| (i % columns * side, i / columns * (side + CAPTION));
     for (i, (caption, _)) in images.iter().enumerate() {
         let (left, top) = corner(i);
-        canvas.text(left as f64 + 8.0, top as f64 + 8.0, 1.5, caption, INK);
+        canvas.text(left as f64 + 8.0, top as f64 + 8.0, TEXT, caption, INK);
     }
     let sheet = canvas.finish();
     Image::from_fn(sheet.width(), sheet.height(), |x, y| {
