@@ -6,7 +6,8 @@
 //! its mirror image.
 //!
 //! Candidates by moments: after Martinet et al. 2006; proposals that are verified on the surface: after Mitra et al. 2006. What
-//! counts as a symmetry: Hodan et al. 2018, section 2.3, whose bound is the wider of the two here.
+//! counts as a symmetry: Hodan et al. 2020 (BOP), who bound the Hausdorff distance and leave out what the texture resolves; their
+//! bound is the wider of the two here.
 
 mod axis;
 mod body;
@@ -27,8 +28,8 @@ const SURE_P95: f64 = 0.01;
 const SURE_MAX: f64 = 0.04;
 /// A likely symmetry: 95 of 100 points. LM-O's egg box and glue, which its `models_info.json` calls symmetric, reach 0.02.
 const LIKELY_P95: f64 = 0.03;
-/// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2018, section 2.3, of which every object
-/// was then looked at; their 15 mm for small objects would take any object of 5 cm for symmetric.
+/// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2020, within which every object was
+/// then looked at; their 15 mm for small objects would take any object of 5 cm for symmetric.
 const LIKELY_MAX: f64 = 0.1;
 /// What expected noise adds, in standard deviations and as squares. Both the moved point and the surface have it, but the nearest
 /// point is taken: boxes with independent noise on their vertices reach 1.7 and 3.3 (`noise_of_a_millimetre` in the tests).

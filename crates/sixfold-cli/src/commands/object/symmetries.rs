@@ -148,7 +148,7 @@ fn evidence_in_words(s: &FoundSymmetry) -> String {
 }
 
 fn table(name: &str, diameter: f64, found: &[FoundSymmetry]) {
-    println!("{name}: diameter {:.1} mm, {} symmetries", 1e3 * diameter, found.len());
+    println!("{name}: diameter {:.1} mm, symmetries: {}", 1e3 * diameter, found.len());
     if found.is_empty() {
         return;
     }
