@@ -437,6 +437,9 @@ fn options_out_of_range_are_refused() {
     let refused = |options: SymmetryOptions| find_symmetries(&ball(), &options).unwrap_err().to_string();
     let noise = refused(SymmetryOptions { noise: f64::NAN, ..SymmetryOptions::default() });
     assert_eq!(noise, "option noise: found NaN, expected 0 to 0.02 m");
+    // Of a ball of 10 cm.
+    let noise = refused(SymmetryOptions { noise: 0.003, ..SymmetryOptions::default() });
+    assert_eq!(noise, "option noise: found 0.003, expected at most a fiftieth of the object's diameter");
     assert!(refused(SymmetryOptions { samples: 3, ..SymmetryOptions::default() }).contains("samples"));
 }
 

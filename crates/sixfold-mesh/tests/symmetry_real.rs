@@ -1,21 +1,14 @@
 //! Symmetries of scanned and reconstructed objects, where they are at hand (`SIXFOLD_DATA`, or `../shared/data` beside the
 //! workspace). What is expected was seen in the pictures of `sixfold object symmetries --out`.
 
-use std::path::{Path, PathBuf};
+mod support;
+
+use std::path::Path;
 
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{FoundSymmetry, ModelsInfo, SymmetryOptions, Unit, Verdict, find_symmetries, read_mesh};
 
-fn data() -> Option<PathBuf> {
-    let folder = std::env::var_os("SIXFOLD_DATA")
-        .map(PathBuf::from)
-        .unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")));
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("skipped: no shared data");
-    None
-}
+use support::data;
 
 fn find(path: &Path, unit: Unit, noise: f64) -> Vec<FoundSymmetry> {
     let mesh = read_mesh(path, unit).unwrap_or_else(|error| panic!("{error}"));

@@ -39,8 +39,9 @@ const NOISE_MAX: f64 = 4.0;
 const SURE_COLOR: f64 = 0.1;
 /// Colours may be the same: gloss of one lamp is part of the texture of a scanned plate, which reaches 0.12.
 const LIKELY_COLOR: f64 = 0.2;
-/// Maximum noise that may be expected, metres.
+/// Maximum noise that may be expected, metres, and as a fraction of the diameter: with more of it anything would be symmetric.
 const MAX_NOISE: f64 = 0.02;
+const MAX_RELATIVE_NOISE: f64 = 0.02;
 
 /// What to expect of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -157,7 +158,7 @@ impl FoundSymmetry {
 /// continuous axes. The same mesh and options give the same symmetries.
 ///
 /// # Errors
-/// [`OptionError`] for options out of their range.
+/// [`OptionError`] for options out of their range, also for noise above a fiftieth of the object's diameter.
 pub fn find_symmetries(mesh: &Mesh, options: &SymmetryOptions) -> Result<Vec<FoundSymmetry>, OptionError> {
     options.check()?;
     let body = body::Body::new(mesh, options);
@@ -165,6 +166,8 @@ pub fn find_symmetries(mesh: &Mesh, options: &SymmetryOptions) -> Result<Vec<Fou
     if !(body.diameter > 1e-9) {
         return Ok(vec![]);
     }
+    let expected = "at most a fiftieth of the object's diameter";
+    OptionError::unless_within("noise", options.noise, ..=MAX_RELATIVE_NOISE * body.diameter, expected)?;
     Ok(search::Search::new(&body).run())
 }
 

@@ -56,16 +56,25 @@ impl<'a> Search<'a> {
     pub fn run(mut self) -> Vec<FoundSymmetry> {
         for axis in candidates(self.body) {
             self.test(&axis);
-            let round = self.found.iter().find(|t| t.order.is_none() && t.verdict == Verdict::Sure).copied();
-            if let Some(round) = round {
-                self.finish_round(&round);
-                return self.report();
+            if self.round().is_some() {
+                break;
             }
         }
-        self.complete_group();
-        self.leave_out_repetitions();
-        self.leave_out_what_follows();
+        if self.round().is_none() {
+            self.complete_group();
+        }
+        if let Some(round) = self.round() {
+            self.finish_round(&round);
+        } else {
+            self.leave_out_repetitions();
+            self.leave_out_what_follows();
+        }
         self.report()
+    }
+
+    /// A sure continuous axis.
+    fn round(&self) -> Option<Tested> {
+        self.found.iter().find(|t| t.order.is_none() && t.verdict == Verdict::Sure).copied()
     }
 
     /// A body with a sure continuous axis is as round about all axes, or has half turns across the axis, or neither.
@@ -252,7 +261,7 @@ impl<'a> Search<'a> {
         let part = Tested { order: Some(order), ..*tested };
         let deviation = self.body.deviation(&part.axis, &angles_of_order(order), usize::MAX);
         let verdict = shape_verdict(&deviation, self.body.diameter, self.body.noise);
-        Some(self.with_color(&Tested { deviation, verdict, ..part }))
+        (verdict > Verdict::None).then(|| self.with_color(&Tested { deviation, verdict, ..part }))
     }
 
     fn with_color(&self, t: &Tested) -> FoundSymmetry {
