@@ -55,7 +55,8 @@ def test_symmetries_are_found(bumpy, box):
     assert poses.shape == (3, 4, 4) and box.with_symmetries(poses).symmetries.shape == (4, 4, 4)
     for pose in poses:
         moved = box.transformed(pose).vertices
-        assert np.allclose(sorted(map(tuple, moved.round(5))), sorted(map(tuple, box.vertices.round(5))), atol=1e-4)
+        # Every corner comes to lie on a corner.
+        assert np.abs(moved[:, None] - box.vertices[None]).max(axis=2).min(axis=1).max() < 1e-4
     assert not [s for s in sixfold.find_symmetries(bumpy, noise=0.0005) if s["by_shape"] == "sure"]
     with pytest.raises(ValueError, match="noise"):
         sixfold.find_symmetries(box, noise=1.0)
