@@ -86,6 +86,7 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<pix2pose::Pix2Pose>()?;
     module.add_class::<pix2pose::Pix2PosePose>()?;
     module.add_function(wrap_pyfunction!(mesh::_mesh_of, module)?)?;
+    module.add_function(wrap_pyfunction!(mesh::find_symmetries, module)?)?;
     module.add_function(wrap_pyfunction!(camera::undistort_rgb, module)?)?;
     module.add_function(wrap_pyfunction!(camera::undistort_depth, module)?)?;
     module.add_function(wrap_pyfunction!(camera::pose_exp, module)?)?;

@@ -9,7 +9,10 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use sixfold::bop::ModelPoints;
 use sixfold::geometry::{Pose, Vec3};
-use sixfold::mesh::{ContinuousSymmetry, Mesh, MeshOptions, ModelInfo, PlyFormat, Unit, UnitError};
+use sixfold::mesh::{
+    ContinuousSymmetry, FoundSymmetry, Mesh, MeshOptions, ModelInfo, PlyFormat, SymmetryOptions, Unit,
+    UnitError,
+};
 
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::guard::{free, interruptible, mesh_file_error};
@@ -412,4 +415,45 @@ impl PyMesh {
 #[pyfunction]
 pub(crate) fn _mesh_of<'py>(py: Python<'py>, parts: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
     py.get_type::<PyMesh>().call((), Some(parts))
+}
+
+/// One symmetry that was found.
+fn found_symmetry<'py>(py: Python<'py>, s: &FoundSymmetry) -> PyResult<Bound<'py, PyDict>> {
+    let entry = PyDict::new(py);
+    entry.set_item("axis", arrays::from_vector3(py, &s.axis))?;
+    entry.set_item("point", arrays::from_vector3(py, &s.point))?;
+    entry.set_item("order", s.order)?;
+    entry.set_item("deviation_p95", s.deviation.p95)?;
+    entry.set_item("deviation_max", s.deviation.max)?;
+    entry.set_item("color_difference_mean", s.color.map(|c| c.mean))?;
+    entry.set_item("color_difference_p95", s.color.map(|c| c.p95))?;
+    entry.set_item("by_shape", s.by_shape.name())?;
+    entry.set_item("by_shape_and_color", s.by_shape_and_color.name())?;
+    entry.set_item("poses", arrays::from_poses(py, &s.poses())?)?;
+    Ok(entry)
+}
+
+/// The rotations that map a mesh onto itself, at least likely by its shape, continuous ones first. `noise`: standard deviation of
+/// the surface in metres, 0.001 for a mesh from photographs.
+///
+/// A dict each: axis (3,) and a point (3,) of it; order (rotations by multiples of a full turn over it, None: any); deviation_p95
+/// and deviation_max of the rotated surface from itself, metres; color_difference_mean and _p95, 0 to 1, None without colours;
+/// by_shape and by_shape_and_color "sure", "likely" or "none"; poses (order - 1, 4, 4).
+///
+/// >>> slab = Mesh([[0, 0, 0], [0.06, 0, 0], [0.06, 0.04, 0], [0, 0.04, 0]], [[0, 1, 2], [0, 2, 3]])
+/// >>> [s["order"] for s in find_symmetries(slab) if s["by_shape"] == "sure"]
+/// [2, 2, 2]
+#[pyfunction]
+#[pyo3(signature = (mesh, *, noise=0.0, seed=0))]
+pub(crate) fn find_symmetries<'py>(
+    py: Python<'py>,
+    mesh: &Bound<'py, PyMesh>,
+    noise: f64,
+    seed: i64,
+) -> PyResult<Vec<Bound<'py, PyDict>>> {
+    let options = SymmetryOptions { noise, seed: self::seed(seed)?, ..SymmetryOptions::default() };
+    let mesh = mesh.get().mesh.clone();
+    let found = free(py, || sixfold::mesh::find_symmetries(&mesh, &options))?
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    found.iter().map(|s| found_symmetry(py, s)).collect()
 }

@@ -45,6 +45,23 @@ def test_files(tmp_path, box):
     assert sixfold.Mesh.load(tmp_path / "box_mm.ply", unit="m", check_size=False).diameter > 100
 
 
+def test_symmetries_are_found(bumpy, box):
+    found = sixfold.find_symmetries(box)
+    assert [s["order"] for s in found] == [2, 2, 2] and {s["by_shape"] for s in found} == {"sure"}
+    axes = np.abs([s["axis"] for s in found])
+    assert np.allclose(np.sort(axes, axis=1), [[0, 0, 1]] * 3, atol=1e-3)
+    assert np.allclose(axes.sum(axis=0), 1, atol=1e-3) and found[0]["color_difference_p95"] is None
+    poses = np.concatenate([s["poses"] for s in found])
+    assert poses.shape == (3, 4, 4) and box.with_symmetries(poses).symmetries.shape == (4, 4, 4)
+    for pose in poses:
+        moved = box.transformed(pose).vertices
+        # Every corner comes to lie on a corner.
+        assert np.abs(moved[:, None] - box.vertices[None]).max(axis=2).min(axis=1).max() < 1e-4
+    assert not [s for s in sixfold.find_symmetries(bumpy, noise=0.0005) if s["by_shape"] == "sure"]
+    with pytest.raises(ValueError, match="noise"):
+        sixfold.find_symmetries(box, noise=1.0)
+
+
 def test_shapes(bumpy, box):
     coarse = bumpy.simplify(500)
     assert len(coarse.faces) <= 500 and abs(coarse.diameter - bumpy.diameter) < 0.002

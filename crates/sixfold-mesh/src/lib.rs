@@ -31,7 +31,9 @@ mod ply_write;
 mod sample;
 mod simplify;
 mod stl;
+mod surface;
 mod surfels;
+mod symmetry;
 mod unit;
 mod xyz;
 
@@ -49,5 +51,8 @@ pub use ply_write::{PlyFormat, ply_bytes, ply_files, write_ply};
 pub use sample::SurfaceSamples;
 pub use simplify::simplify;
 pub use stl::parse_stl;
+pub use symmetry::{
+    ColorDifference, Deviation, FoundSymmetry, SymmetryOptions, Verdict, find_symmetries, sure_symmetries,
+};
 pub use unit::{Unit, UnitError};
 pub use xyz::parse_xyz;

@@ -57,7 +57,7 @@ impl ModelInfo {
     /// The step that BOP's evaluation uses in [`ModelInfo::symmetry_poses`].
     pub const BOP_MAX_STEP: f64 = 0.01;
 
-    /// Diameter and bounding box of a mesh, without symmetries (nobody can tell those from a shape alone).
+    /// Diameter and bounding box of a mesh, without symmetries ([`crate::find_symmetries`] proposes them).
     pub fn of_mesh(mesh: &Mesh) -> Self {
         let (low, high) = mesh.bounding_box();
         ModelInfo {

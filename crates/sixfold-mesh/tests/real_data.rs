@@ -1,21 +1,14 @@
 //! The readers and measures on real models, where they are at hand (`SIXFOLD_DATA`, or `../shared/data`
 //! beside the workspace).
 
+mod support;
+
 use std::path::PathBuf;
 use std::time::Instant;
 
 use sixfold_mesh::{Mesh, ModelsInfo, Unit, read_mesh, simplify};
 
-fn data() -> Option<PathBuf> {
-    let folder = std::env::var_os("SIXFOLD_DATA")
-        .map(PathBuf::from)
-        .unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")));
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("skipped: no shared data");
-    None
-}
+use support::data;
 
 fn files(folder: PathBuf, ending: &str) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = std::fs::read_dir(&folder)

@@ -1,5 +1,8 @@
 //! `sixfold object`, `sixfold render`, `sixfold completions` and the help.
 
+use sixfold_geometry::Vec3;
+use sixfold_mesh::{Mesh, PlyFormat, Unit, write_ply};
+
 use crate::support::*;
 
 #[test]
@@ -65,6 +68,92 @@ fn symmetries_come_from_models_info() {
     let json = sixfold(tiny.path(), &format!("{add} --model-id 2 --json")).expect(0).json();
     assert_eq!(json["symmetries_discrete"][0][0][0], -1.0);
     fails(tiny.path(), &format!("{add} --model-id 9 --replace"), &["models_info.json", "9"]);
+}
+
+/// A box in the file `box.ply`, one of its sides red.
+fn write_box(dir: &std::path::Path) {
+    let corner = |i: u32| Vec3::new(0.03, 0.04, 0.055).component_mul(&sign(i));
+    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let vertices = quads.as_flattened().iter().map(|i| corner(*i)).collect();
+    let faces = (0..6).flat_map(|q| [[4 * q, 4 * q + 1, 4 * q + 2], [4 * q, 4 * q + 2, 4 * q + 3]]);
+    let colors = (0..24).map(|v| if v < 4 { [200, 20, 20] } else { [200; 3] }).collect();
+    let mesh = Mesh::new(vertices, faces.collect()).unwrap().with_colors(colors).unwrap();
+    write_ply(dir.join("box.ply"), &mesh, Unit::Millimetre, PlyFormat::Ascii).unwrap();
+}
+
+/// The signs of a corner of a box.
+fn sign(i: u32) -> Vec3 {
+    Vec3::from([0, 1, 2].map(|k| if i >> k & 1 == 1 { 1.0 } else { -1.0 }))
+}
+
+#[test]
+fn symmetries_are_found_shown_and_stored() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_box(dir);
+    let find = "object symmetries box.ply --unit mm";
+    let json = sixfold(dir, &format!("{find} --json --out box.png")).expect(0).json();
+    let found = json.as_array().unwrap();
+    assert_eq!(found.len(), 3, "{json:#}");
+    assert!(found.iter().all(|s| s["order"] == 2 && s["by_shape"] == "sure"));
+    // The red side lies below: half turns about z keep it there.
+    let kept: Vec<_> = found.iter().filter(|s| s["by_shape_and_color"] == "sure").collect();
+    assert!(kept.len() == 1 && kept[0]["axis"][2].as_f64().unwrap() > 0.999, "{json:#}");
+    assert_eq!(kept[0]["poses"][0][2][2].as_f64().unwrap().round(), 1.0);
+    let sheet = image::open(dir.join("box.png")).unwrap().to_rgb8();
+    assert_eq!(sheet.width() % 4, 0);
+    // Four images: as it is, and after each half turn; each shows the object.
+    for i in 0..4 {
+        let tile =
+            image::imageops::crop_imm(&sheet, i * sheet.width() / 4, 40, sheet.width() / 4, 440).to_image();
+        assert!(tile.pixels().filter(|p| p.0 != [255; 3]).count() > 5_000);
+    }
+    let table = sixfold(dir, find).expect(0).stdout;
+    assert!(table.contains("symmetries: 3") && table.contains("by shape and colour"), "{table}");
+
+    let count = |add: &str| {
+        let json = sixfold(dir, &format!("object add {add} --replace --json")).expect(0).json();
+        let length = |field: &str| json[field].as_array().unwrap().len();
+        (length("symmetries_discrete"), length("symmetries_continuous"))
+    };
+    assert_eq!(count("box box.ply --unit mm --find-symmetries"), (1, 0));
+    assert_eq!(count("box box.ply --unit mm --find-symmetries shape"), (3, 0));
+    assert_eq!(count("box box.ply --unit mm"), (0, 0));
+    let said = sixfold(dir, "object add box box.ply --unit mm --replace --find-symmetries").expect(0).stdout;
+    assert!(said.contains("stored: order 2 about (0.000, 0.000, 1.000)"), "{said}");
+    assert_eq!(said.matches("not stored, colours differ").count(), 2, "{said}");
+    // By its name, as stored.
+    assert_eq!(sixfold(dir, "object symmetries box --json").expect(0).json().as_array().unwrap().len(), 3);
+
+    // What has none.
+    assert_eq!(
+        sixfold(dir, "object symmetries part.ply --unit mm --json").expect(1).json(),
+        serde_json::json!([])
+    );
+    let said = sixfold(dir, "object add part part.ply --unit mm --find-symmetries").expect(0).stdout;
+    assert!(said.contains("no symmetry found"), "{said}");
+}
+
+#[test]
+fn symmetries_are_not_found_twice() {
+    let tiny = Tiny::new(false);
+    let dir = tiny.path();
+    write_box(dir);
+    fails(dir, "object symmetries box.ply", &["--unit"]);
+    fails(dir, "object symmetries box.ply --unit mm --noise 50", &["--noise", "50", "0 to 0.02 m"]);
+    fails(dir, "object add box box.ply --unit mm --find-symmetries --turns-about z", &["--turns-about"]);
+    fails(dir, "object add box box.ply --unit mm --noise 1", &["--find-symmetries"]);
+    // An entry that gives symmetries decides alone; one that gives none leaves room.
+    let info = tiny.file("models/models_info.json");
+    let add = "object add box box.ply --unit mm --find-symmetries shape --model-id 2 --models-info \
+               tiny/models/models_info.json --replace";
+    let json = sixfold(dir, &format!("{add} --json")).expect(0).json();
+    assert_eq!(json["symmetries_discrete"].as_array().unwrap().len(), 3);
+    let mut json: serde_json::Value = serde_json::from_slice(&std::fs::read(&info).unwrap()).unwrap();
+    json["2"]["symmetries_discrete"] =
+        serde_json::json!([[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]);
+    std::fs::write(&info, json.to_string()).unwrap();
+    fails(dir, add, &["--find-symmetries", "--models-info", "leave out one"]);
 }
 
 #[test]

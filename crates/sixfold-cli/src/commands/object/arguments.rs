@@ -8,6 +8,8 @@ use sixfold_mttm::ViewCoverage;
 use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges;
 
+use super::symmetries::{Evidence, SymmetriesArguments};
+
 #[derive(Debug, Args)]
 pub(crate) struct ObjectArguments {
     /// Folder of stored objects
@@ -38,6 +40,11 @@ pub(crate) enum ObjectCommand {
         #[arg(long, value_name = "FILE.png")]
         picture: Option<PathBuf>,
     },
+    /// Find the rotations that map an object onto itself, with evidence of shape and colours
+    #[command(after_help = "Examples:\n  \
+        sixfold object symmetries bottle.ply --unit mm --out symmetries.png\n  \
+        sixfold object symmetries can --noise 1 --json")]
+    Symmetries(SymmetriesArguments),
     /// Remove one object
     #[command(after_help = "Example:\n  sixfold object remove mug")]
     Remove {
@@ -71,6 +78,13 @@ pub(crate) struct AddArguments {
     /// The object may turn freely about this axis of its own frame: x, y or z
     #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
     pub turns_about: Option<Axis>,
+    /// Find the mesh's symmetries (`sixfold object symmetries`) and store those that are sure, by shape and colours or by shape
+    #[arg(long, value_enum, value_name = "BY", num_args = 0..=1, default_missing_value = "colors",
+        conflicts_with_all = ["turns_about", "depth"])]
+    pub find_symmetries: Option<Evidence>,
+    /// Noise of the mesh's surface, standard deviation in millimetres, for --find-symmetries
+    #[arg(long, value_name = "MM", default_value_t = 0.0, requires = "find_symmetries")]
+    pub noise: f64,
     /// Replace an object of the same name
     #[arg(long)]
     pub replace: bool,

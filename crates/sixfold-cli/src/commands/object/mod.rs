@@ -1,6 +1,7 @@
-//! `sixfold object add|list|show|remove`.
+//! `sixfold object add|list|show|symmetries|remove`.
 
 pub(crate) mod arguments;
+mod symmetries;
 mod templates;
 
 use std::path::Path;
@@ -43,6 +44,7 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
         },
         ObjectCommand::List => list(&store, &a.store, &a.json),
         ObjectCommand::Show { name, picture } => show(&store, name, picture.as_deref(), &a.json),
+        ObjectCommand::Symmetries(symmetries) => symmetries::run(symmetries, &a.store, &a.json),
         ObjectCommand::Remove { name } => {
             store.remove(name)?;
             report(&a.json, &serde_json::json!({ "removed": name }), || println!("removed {name}"))?;
@@ -74,7 +76,9 @@ fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Res
 fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArguments) -> Result<Outcome> {
     let unit = a.unit.as_ref().ok_or_else(|| anyhow!("--unit UNIT is missing"))?;
     let loaded = read_mesh(mesh, *unit)?;
-    let record = ObjectRecord::of_mesh(mesh, *unit, &loaded, &info(a, &loaded)?);
+    let mut info = info(a, &loaded)?;
+    let symmetries = symmetries::add_to(&mut info, &loaded, a)?;
+    let record = ObjectRecord::of_mesh(mesh, *unit, &loaded, &info);
     let new = NewObject { mesh: Some(&loaded), record: &record, replace: a.replace };
     let mut views = None;
     store.add(&a.name, new, |object| {
@@ -99,6 +103,7 @@ fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArgum
         if let Some((views, turns)) = views {
             println!("{views} views with {turns} turns each");
         }
+        symmetries.iter().for_each(|line| println!("  {line}"));
     })?;
     Ok(Outcome::Found)
 }
