@@ -1,6 +1,6 @@
 //! The printed sheet.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Image, RgbImage, Vec2, Vec3};
 use sixfold_plot::text_dots;
 
@@ -17,7 +17,7 @@ const GAP: f64 = 0.012;
 pub(crate) const RULER: f64 = 0.1;
 
 /// A size of paper.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Paper {
     /// 210 x 297 mm: 5 x 7 tags, numbers 0 to 34.
@@ -187,7 +187,7 @@ impl Board {
     }
 
     /// How bright the sheet is at a place of the board's frame, metres; `None` off the sheet. The ruler and its text are left out.
-    pub(crate) fn is_white(&self, x: f64, y: f64) -> Option<bool> {
+    pub fn is_white(&self, x: f64, y: f64) -> Option<bool> {
         let (x, y) = (x / self.scale, y / self.scale);
         let (width, height) = self.paper.size();
         let below = self.middle_below_sheets();
@@ -209,6 +209,14 @@ impl Board {
             return Some(false);
         }
         Some(family::cells(first + row as usize * columns + column as usize)[i - 1][j - 1])
+    }
+
+    /// The sheet in the board's frame: its left and lowest, and its right and highest coordinates, metres.
+    pub fn extent(&self) -> [Vec2; 2] {
+        let (width, height) = self.paper.size();
+        let centre = Vec2::new(0.0, -self.middle_below_sheets());
+        let half = Vec2::new(0.5 * width, 0.5 * height);
+        [(centre - half) * self.scale, (centre + half) * self.scale]
     }
 
     /// How far the middle of the tags is above the middle of the sheet, metres: the ruler is below the tags.

@@ -1,0 +1,158 @@
+//! Why an object cannot be learnt from photographs.
+
+use std::path::PathBuf;
+
+use sixfold_board::BoardError;
+use sixfold_estimator::StoreError;
+use sixfold_io::ImageFileError;
+use thiserror::Error;
+
+/// Why an object cannot be learnt from photographs.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum TeachError {
+    /// Too few photographs.
+    #[error(
+        "found {found} photographs that can be used, expected at least {least}: take 8 to 40 from all sides, the board in sight\
+         {reasons}"
+    )]
+    TooFewPhotographs {
+        /// How many can be used.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+        /// Why the others cannot; empty or `; FILE: REASON; ...`.
+        reasons: String,
+    },
+    /// All photographs are from one side.
+    #[error(
+        "all photographs are taken from within {degrees:.0} degrees: walk around the object, expected at least {least:.0} degrees \
+         between two of them"
+    )]
+    OneSide {
+        /// The largest angle between two of them.
+        degrees: f64,
+        /// What is needed.
+        least: f64,
+    },
+    /// No photograph shows the board.
+    #[error(
+        "no photograph shows a board of `sixfold board`{reasons}: lay the object on the printed board, or give poses"
+    )]
+    NoBoard {
+        /// Why; empty or `; FILE: REASON; ...`.
+        reasons: String,
+    },
+    /// The camera cannot be found.
+    #[error(
+        "the camera cannot be found from these photographs{reasons}; calibrate it with `sixfold calibrate` and give --camera"
+    )]
+    Camera {
+        /// Why.
+        source: BoardError,
+        /// Of the photographs; empty or `; FILE: REASON; ...`.
+        reasons: String,
+    },
+    /// The camera given is that of another size of image.
+    #[error(
+        "photographs have {width}x{height} pixels, the camera file is for {camera_width}x{camera_height}"
+    )]
+    CameraSize {
+        /// Of the photographs.
+        width: usize,
+        /// Of the photographs.
+        height: usize,
+        /// Of the camera.
+        camera_width: usize,
+        /// Of the camera.
+        camera_height: usize,
+    },
+    /// Nothing stands on the board.
+    #[error(
+        "no object was found that all photographs agree on: expected one object on the board, opaque, in the same place in every \
+         photograph{hint}"
+    )]
+    NoObject {
+        /// More to try; empty or a sentence.
+        hint: String,
+    },
+    /// Several objects.
+    #[error(
+        "found {found} objects on the board, the second {percent:.0} % as large as the first: leave one, or give masks"
+    )]
+    SeveralObjects {
+        /// How many.
+        found: usize,
+        /// Size of the second against the first, percent.
+        percent: f64,
+    },
+    /// Masks of photographs contradict each other.
+    #[error(
+        "the masks of {contradicting} of {all} photographs contradict the others: transparent and mirroring objects cannot be taught \
+         from photographs, nor what moved between them; correct the masks, or give a mesh"
+    )]
+    Contradicting {
+        /// How many.
+        contradicting: usize,
+        /// Of how many.
+        all: usize,
+    },
+    /// A mask or pose for a photograph that is not there.
+    #[error("photograph {index}: there are {photographs}, numbered from 0")]
+    NoPhotograph {
+        /// What was asked for.
+        index: usize,
+        /// How many there are.
+        photographs: usize,
+    },
+    /// A mask of another size than its photograph.
+    #[error(
+        "mask of {name}: found {width}x{height} pixels, the photograph has {photograph_width}x{photograph_height}"
+    )]
+    MaskSize {
+        /// The photograph.
+        name: String,
+        /// Of the mask.
+        width: usize,
+        /// Of the mask.
+        height: usize,
+        /// Of the photograph.
+        photograph_width: usize,
+        /// Of the photograph.
+        photograph_height: usize,
+    },
+    /// A step before one that it needs.
+    #[error("{missing} first")]
+    Order {
+        /// What has to be done.
+        missing: &'static str,
+    },
+    /// Interrupted.
+    #[error("interrupted; what was finished is kept")]
+    Stopped,
+    /// The network that sees masks.
+    #[error("cannot find masks")]
+    Masks(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// An image cannot be read or written.
+    #[error(transparent)]
+    Image(#[from] ImageFileError),
+    /// A file of the folder is not what it should be.
+    #[error("{}: {what}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// The system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The object cannot be stored.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}

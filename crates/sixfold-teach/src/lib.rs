@@ -1,0 +1,38 @@
+//! A new object from photographs: it stands on a printed board of tags and is photographed from all sides.
+//!
+//! [`locate`] finds camera and poses from the board, [`segment`] the object in every photograph (what stands out, what hides the
+//! print of the board, and what all photographs agree on), [`reconstruct`] a closed, coloured mesh: the visual hull, cut where
+//! photographs or measured depth show it to be hollow. [`Teaching`] keeps all steps in a folder, so that each can be looked at,
+//! corrected and resumed, and stores the object for all methods. [`simulation`] takes such photographs with exact truth.
+//!
+//! The world's frame is the board's: origin in the middle of the tags, z out of the sheet; metres. The object's frame has its
+//! origin in the middle of the mesh's box and the same axes.
+
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+mod distance;
+mod error;
+mod fusion;
+mod grid;
+mod hull;
+mod located;
+mod paint;
+mod pictures;
+mod record;
+mod reduce;
+mod shape;
+mod silhouette;
+pub mod simulation;
+mod stereo;
+mod surface;
+mod teaching;
+mod view;
+pub use error::TeachError;
+pub use located::{Located, SeenTags, locate};
+pub use record::{Stored, export_bop, photographs_of};
+pub use shape::{
+    Capture, FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Progress, Segmentation, Shape, ShapeOptions, reconstruct,
+    segment,
+};
+pub use silhouette::{SalientSegmenter, Segmenter};
+pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching};
+pub use view::{PosedPhotograph, Volume};

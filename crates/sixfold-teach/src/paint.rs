@@ -1,0 +1,105 @@
+//! The colours of a mesh from the photographs, and how much of it none of them shows.
+
+use rayon::prelude::*;
+use sixfold_geometry::Vec3;
+use sixfold_mesh::Mesh;
+use sixfold_render::render_depth;
+
+use crate::view::{View, bilinear_rgb};
+
+/// How far a vertex may lie behind the rendered surface and still be seen, metres.
+const BEHIND: f64 = 0.003;
+/// Cosine of the flattest angle at which a surface is seen.
+const FLATTEST: f64 = 0.2;
+
+/// Vertex colours, and the fraction of the surface that no photograph shows.
+pub(crate) struct Painted {
+    pub colors: Vec<[u8; 3]>,
+    pub unseen: f64,
+}
+
+pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
+    let depths: Vec<_> =
+        views.par_iter().map(|v| render_depth(mesh, &v.camera_from_world, &v.camera)).collect();
+    let normals = mesh.vertex_normals();
+    let colors: Vec<Option<[u8; 3]>> = (0..mesh.vertices().len())
+        .into_par_iter()
+        .map(|i| {
+            let (point, normal) = (&mesh.vertices()[i], &normals[i]);
+            let mut seen = vec![];
+            for (view, depth) in views.iter().zip(&depths) {
+                let cosine = (view.eye - point).normalize().dot(normal);
+                let Some((pixel, z)) = view.project(point) else { continue };
+                let front = f64::from(depth[(pixel.x.round() as usize, pixel.y.round() as usize)]);
+                if cosine > FLATTEST && front > 0.0 && z < front + BEHIND {
+                    seen.push((cosine * cosine, bilinear_rgb(&view.image, pixel.x, pixel.y)));
+                }
+            }
+            middle_color(&seen)
+        })
+        .collect();
+    let unseen = unseen_fraction(mesh, &colors);
+    Painted { colors: filled(mesh, colors), unseen }
+}
+
+/// For each channel the weighted median: highlights move with the light, and a wrong photograph is one of several.
+fn middle_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
+    let total: f64 = seen.iter().map(|s| s.0).sum();
+    if seen.is_empty() {
+        return None;
+    }
+    Some(std::array::from_fn(|c| {
+        let mut values: Vec<(f64, f64)> = seen.iter().map(|(weight, color)| (color[c], *weight)).collect();
+        values.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut sum = 0.0;
+        let middle = values.iter().find(|(_, weight)| {
+            sum += weight;
+            sum >= 0.5 * total
+        });
+        middle.or(values.last()).map_or(0, |(value, _)| value.round() as u8)
+    }))
+}
+
+fn unseen_fraction(mesh: &Mesh, colors: &[Option<[u8; 3]>]) -> f64 {
+    let (mut unseen, mut all) = (0.0, 0.0);
+    for (number, face) in mesh.faces().iter().enumerate() {
+        let [a, b, c] = mesh.triangle(number);
+        let area = (b - a).cross(&(c - a)).norm();
+        let missing = face.iter().filter(|i| colors[**i as usize].is_none()).count();
+        unseen += area * missing as f64 / 3.0;
+        all += area;
+    }
+    if all > 0.0 { unseen / all } else { 1.0 }
+}
+
+/// Vertices without a colour take that of their neighbours, from the border inwards.
+fn filled(mesh: &Mesh, mut colors: Vec<Option<[u8; 3]>>) -> Vec<[u8; 3]> {
+    let mut around: Vec<Vec<u32>> = vec![vec![]; mesh.vertices().len()];
+    for [a, b, c] in mesh.faces() {
+        for (i, j) in [(a, b), (b, c), (c, a)] {
+            around[*i as usize].push(*j);
+            around[*j as usize].push(*i);
+        }
+    }
+    loop {
+        let found: Vec<(usize, [u8; 3])> = (0..colors.len())
+            .filter(|i| colors[*i].is_none())
+            .filter_map(|i| {
+                let known: Vec<[u8; 3]> = around[i].iter().filter_map(|j| colors[*j as usize]).collect();
+                let mean = |c: usize| known.iter().map(|k| u32::from(k[c])).sum::<u32>() / known.len() as u32;
+                (!known.is_empty()).then(|| (i, std::array::from_fn(|c| mean(c) as u8)))
+            })
+            .collect();
+        if found.is_empty() {
+            break;
+        }
+        found.into_iter().for_each(|(i, color)| colors[i] = Some(color));
+    }
+    colors.into_iter().map(|c| c.unwrap_or([128; 3])).collect()
+}
+
+/// The centre of a mesh's box.
+pub(crate) fn centre(mesh: &Mesh) -> Vec3 {
+    let (low, high) = mesh.bounding_box();
+    (low + high) * 0.5
+}

@@ -1,0 +1,70 @@
+//! A picture to look at: every photograph with the outline of its mask and of the mesh.
+
+use sixfold_geometry::{Image, Mask, RgbImage};
+use sixfold_render::render_depth;
+
+use crate::error::TeachError;
+use crate::teaching::Teaching;
+
+/// Width of a photograph in the picture, pixels.
+const WIDTH: usize = 400;
+/// Photographs in a row.
+const COLUMNS: usize = 4;
+/// Most photographs that are shown.
+const MOST: usize = 40;
+const MASK: [u8; 3] = [255, 200, 0];
+const MESH: [u8; 3] = [0, 220, 255];
+
+impl Teaching {
+    /// The photographs that are used, cut to the object and its surroundings: the border of the mask in yellow, the outline of the
+    /// mesh in blue.
+    ///
+    /// # Errors
+    /// [`TeachError`].
+    pub fn picture(&self) -> Result<RgbImage, TeachError> {
+        let mesh = self.mesh()?;
+        let posed = self.posed()?;
+        let mut tiles = vec![];
+        for (_, image, camera, pose, mask) in posed.iter().take(MOST) {
+            let pinhole = camera.without_distortion();
+            let image = sixfold_geometry::undistort_rgb(image, camera).unwrap_or_else(|_| image.clone());
+            let outline = render_depth(&mesh, pose, &pinhole).map(|d| *d > 0.0);
+            tiles.push(tile(&image, mask, &outline));
+        }
+        let height = tiles.iter().map(Image::height).max().unwrap_or(1);
+        let rows = tiles.len().div_ceil(COLUMNS).max(1);
+        let mut picture = Image::filled(WIDTH * COLUMNS.min(tiles.len().max(1)), height * rows, [30; 3]);
+        for (i, tile) in tiles.iter().enumerate() {
+            let (x0, y0) = (WIDTH * (i % COLUMNS), height * (i / COLUMNS));
+            for y in 0..tile.height() {
+                for x in 0..tile.width() {
+                    picture[(x0 + x, y0 + y)] = tile[(x, y)];
+                }
+            }
+        }
+        Ok(picture)
+    }
+}
+
+fn tile(image: &RgbImage, mask: &Mask, outline: &Mask) -> RgbImage {
+    let [x0, y0, x1, y1] = outline.bounding_box().unwrap_or([0, 0, image.width(), image.height()]);
+    let margin = (x1 - x0).max(y1 - y0) / 5 + 8;
+    let side = (x1 - x0).max(y1 - y0) + 2 * margin;
+    let left = ((x0 + x1) / 2).saturating_sub(side / 2);
+    let top = ((y0 + y1) / 2).saturating_sub(side / 2);
+    let scale = side as f64 / WIDTH as f64;
+    let at = |x: usize, y: usize| {
+        let (u, v) = (left + (x as f64 * scale) as usize, top + (y as f64 * scale) as usize);
+        (u < image.width() && v < image.height()).then_some((u, v))
+    };
+    let border = |mask: &Mask, x: usize, y: usize| {
+        let inside = |x: usize, y: usize| at(x, y).is_some_and(|p| mask[p]);
+        inside(x, y) != inside(x + 1, y) || inside(x, y) != inside(x, y + 1)
+    };
+    Image::from_fn(WIDTH, WIDTH, |x, y| match at(x, y) {
+        _ if border(outline, x, y) => MESH,
+        _ if border(mask, x, y) => MASK,
+        Some(p) => image[p],
+        None => [30; 3],
+    })
+}

@@ -1,0 +1,184 @@
+//! What is kept of a taught object: its mesh with symmetries, and its photographs with poses and masks, in the object's folder.
+//!
+//! `photographs/photographs.json` has the form that `sixfold synthesize --photographs` takes: mesh, unit, and for each photograph its
+//! image, camera, pose (BOP's, millimetres) and mask.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use sixfold_bop::{GroundTruth, NewImage, SceneWriter, write_camera};
+use sixfold_estimator::{NewObject, Object, ObjectRecord, ObjectStore};
+use sixfold_geometry::{Camera, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
+use sixfold_io::{limits, read_mask, read_regular_text, read_rgb, write_atomically, write_mask, write_rgb};
+use sixfold_mesh::{
+    FoundSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, SymmetryOptions, Unit, find_symmetries, ply_files,
+    sure_symmetries,
+};
+
+use crate::error::TeachError;
+use crate::teaching::Teaching;
+
+/// Folder of the photographs in an object's folder.
+const PHOTOGRAPHS: &str = "photographs";
+/// Noise of a surface made from photographs, standard deviation as a fraction of the diameter.
+const NOISE: f64 = 0.004;
+
+/// What was stored.
+#[derive(Debug, Clone)]
+pub struct Stored {
+    /// Its record.
+    pub record: ObjectRecord,
+    /// Symmetries that were looked at, with evidence; the sure ones are stored.
+    pub symmetries: Vec<FoundSymmetry>,
+    /// How many photographs are kept.
+    pub photographs: usize,
+}
+
+#[derive(Serialize, Deserialize)]
+#[allow(non_snake_case)]
+struct Entry {
+    image: String,
+    camera: String,
+    cam_R_m2c: [f64; 9],
+    cam_t_m2c: [f64; 3],
+    mask: Option<String>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct PhotographFile {
+    mesh: String,
+    unit: String,
+    photographs: Vec<Entry>,
+}
+
+type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+impl Teaching {
+    /// Stores the object under a name. `derive` makes what methods derive from it, as in [`ObjectStore::add`].
+    ///
+    /// # Errors
+    /// [`TeachError::Order`] before the mesh is made, [`TeachError::Store`].
+    pub fn store(
+        &self,
+        store: &ObjectStore,
+        name: &str,
+        replace: bool,
+        derive: impl FnOnce(&Object) -> Result<(), Failure>,
+    ) -> Result<Stored, TeachError> {
+        let mesh = self.mesh()?;
+        let mut info = ModelInfo::of_mesh(&mesh);
+        let options = SymmetryOptions { noise: NOISE * info.diameter, ..SymmetryOptions::default() };
+        let symmetries = find_symmetries(&mesh, &options).unwrap_or_default();
+        (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&symmetries, true);
+        let source = self.folder().join("mesh.ply");
+        let record = ObjectRecord::of_mesh(&source, Unit::Metre, &mesh, &info);
+        let posed = self.posed()?;
+        let new = NewObject { mesh: Some(&mesh), record: &record, replace };
+        store.add(name, new, |object| {
+            if let Some(folder) = object.file(PHOTOGRAPHS) {
+                write_photographs(&folder, &posed)?;
+            }
+            derive(object)
+        })?;
+        Ok(Stored { record, symmetries, photographs: posed.len() })
+    }
+}
+
+pub(crate) type Posed = (String, RgbImage, Camera, Pose, sixfold_geometry::Mask);
+
+fn write_photographs(folder: &Path, posed: &[Posed]) -> Result<(), Failure> {
+    std::fs::create_dir_all(folder)?;
+    let mut photographs = vec![];
+    for (number, (_, image, camera, pose, mask)) in posed.iter().enumerate() {
+        let file = format!("{number:06}.png");
+        let mask_file = format!("{number:06}_mask.png");
+        write_rgb(&folder.join(&file), image)?;
+        write_mask(&folder.join(&mask_file), mask)?;
+        let (rotation, t) = (pose.rotation_matrix(), pose.translation() * 1000.0);
+        photographs.push(Entry {
+            image: file,
+            camera: "camera.json".to_owned(),
+            cam_R_m2c: std::array::from_fn(|i| rotation[(i / 3, i % 3)]),
+            cam_t_m2c: [t.x, t.y, t.z],
+            mask: Some(mask_file),
+        });
+        if number == 0 {
+            write_atomically(&folder.join("camera.json"), serde_json::to_string_pretty(camera)?.as_bytes())?;
+        }
+    }
+    let file = PhotographFile { mesh: "../mesh.ply".to_owned(), unit: "m".to_owned(), photographs };
+    let text = serde_json::to_string_pretty(&file)?;
+    Ok(write_atomically(&folder.join("photographs.json"), text.as_bytes())?)
+}
+
+/// The file that names a stored object's photographs; `None` where it has none.
+pub fn photographs_of(object: &Object) -> Option<PathBuf> {
+    object.file(PHOTOGRAPHS).map(|folder| folder.join("photographs.json")).filter(|file| file.is_file())
+}
+
+/// Writes a stored object as a BOP dataset: its model with `models_info.json` as object `id`, and, where it has photographs, these
+/// with poses and masks as scene 1 of split `train_real`. Returns the number of images.
+///
+/// # Errors
+/// [`TeachError::File`] where a file of the object is not what it should be or the dataset cannot be written.
+pub fn export_bop(object: &Object, id: u32, dataset: &Path) -> Result<usize, TeachError> {
+    let failed = |what: String| TeachError::File { path: dataset.to_owned(), what };
+    let mesh = object.needed_mesh("ppf").map_err(|e| failed(e.to_string()))?;
+    let info = object.info.clone().unwrap_or_else(|| ModelInfo::of_mesh(mesh));
+    write_model(mesh, info, id, dataset).map_err(|e| failed(e.to_string()))?;
+    let Some(file) = photographs_of(object) else { return Ok(0) };
+    let wrong = |what: String| TeachError::File { path: file.clone(), what };
+    let text = read_regular_text(&file, limits::SMALL_TEXT).map_err(|e| wrong(e.to_string()))?;
+    let list: PhotographFile = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let mut scene = SceneWriter::new(dataset, "train_real", 1);
+    for (number, entry) in list.photographs.iter().enumerate() {
+        let raw = read_rgb(&folder.join(&entry.image))?;
+        let path = folder.join(&entry.camera);
+        let text = read_regular_text(&path, limits::SMALL_TEXT).map_err(|e| wrong(e.to_string()))?;
+        let camera: Camera =
+            serde_json::from_str(&text).map_err(|e| TeachError::File { path, what: e.to_string() })?;
+        let rgb = undistort_rgb(&raw, &camera).map_err(|e| wrong(e.to_string()))?;
+        let camera = camera.without_distortion();
+        let mask = match &entry.mask {
+            Some(mask) => Some(read_mask(&folder.join(mask))?),
+            None => None,
+        };
+        let pose =
+            Pose::from_parts(&Mat3::from_row_slice(&entry.cam_R_m2c), Vec3::from(entry.cam_t_m2c) * 1e-3)
+                .map_err(|e| wrong(format!("field photographs[{number}].cam_R_m2c: {e}")))?;
+        let truth = [GroundTruth::new(id, pose)];
+        let masks = mask.map(|m| vec![m]);
+        let image = NewImage {
+            rgb: Some(&rgb),
+            ground_truth: &truth,
+            masks: masks.as_deref(),
+            masks_visible: masks.as_deref(),
+            ..NewImage::new(number as u32, &camera)
+        };
+        scene.add(&image).map_err(|e| failed(e.to_string()))?;
+        if number == 0 {
+            write_camera(dataset, &camera, 1e-3).map_err(|e| failed(e.to_string()))?;
+        }
+    }
+    scene.finish().map_err(|e| failed(e.to_string()))?;
+    Ok(list.photographs.len())
+}
+
+fn write_model(mesh: &Mesh, info: ModelInfo, id: u32, dataset: &Path) -> Result<(), Failure> {
+    let folder = dataset.join("models");
+    std::fs::create_dir_all(&folder)?;
+    for (file, bytes) in ply_files(
+        &folder.join(format!("obj_{id:06}.ply")),
+        mesh,
+        Unit::Millimetre,
+        PlyFormat::BinaryLittleEndian,
+    )? {
+        write_atomically(&file, &bytes)?;
+    }
+    ModelsInfo([(id, info)].into_iter().collect()).write(folder.join("models_info.json"))?;
+    let targets = json!([]);
+    write_atomically(&dataset.join("test_targets_bop19.json"), targets.to_string().as_bytes())?;
+    Ok(())
+}

@@ -1,0 +1,49 @@
+//! Photographs of many megapixels, made smaller before they are worked on.
+
+use std::sync::Arc;
+
+use sixfold_geometry::{Camera, Image, Mask, Vec2};
+
+use crate::view::{PosedPhotograph, reduced};
+
+/// The photograph with at most `side` pixels along its longer side.
+pub(crate) fn reduced_photograph(photograph: PosedPhotograph, side: usize) -> PosedPhotograph {
+    let (width, height) = photograph.image.size();
+    let longest = width.max(height);
+    if longest <= side {
+        return photograph;
+    }
+    let scale = longest as f64 / side as f64;
+    let size = ((width as f64 / scale).round() as usize, (height as f64 / scale).round() as usize);
+    let camera = photograph.camera.resize(size.0, size.1);
+    let (sx, sy) = (width as f64 / size.0 as f64, height as f64 / size.1 as f64);
+    let source = |x: f64, y: f64| Vec2::new((x + 0.5) * sx - 0.5, (y + 0.5) * sy - 0.5);
+    let nearest = |x: usize, y: usize| {
+        let p = source(x as f64, y as f64);
+        ((p.x.round() as usize).min(width - 1), (p.y.round() as usize).min(height - 1))
+    };
+    let depth = photograph.depth.map(|d| Arc::new(Image::from_fn(size.0, size.1, |x, y| d[nearest(x, y)])));
+    let mask = photograph.mask.map(|m| Arc::new(Image::from_fn(size.0, size.1, |x, y| m[nearest(x, y)])));
+    let image = Arc::new(reduced(&photograph.image, size, sx, &source));
+    PosedPhotograph { image, depth, mask, camera, ..photograph }
+}
+
+/// A mask of the whole photograph in the pixels of the reduced one.
+pub(crate) fn reduced_mask(mask: &Mask, photograph: &PosedPhotograph) -> Mask {
+    of_size(mask, photograph.image.size())
+}
+
+/// A mask of the reduced photograph in the pixels of the camera that took it.
+pub(crate) fn enlarged_mask(mask: &Mask, photograph: &PosedPhotograph, camera: Option<&Camera>) -> Mask {
+    let size = camera.map_or(photograph.image.size(), |c| (c.width, c.height));
+    of_size(mask, size)
+}
+
+fn of_size(mask: &Mask, (width, height): (usize, usize)) -> Mask {
+    if mask.size() == (width, height) {
+        return mask.clone();
+    }
+    let (sx, sy) = (mask.width() as f64 / width as f64, mask.height() as f64 / height as f64);
+    let at = |x: usize, s: f64, most: usize| ((((x as f64 + 0.5) * s).floor()) as usize).min(most - 1);
+    Image::from_fn(width, height, |x, y| mask[(at(x, sx, mask.width()), at(y, sy, mask.height()))])
+}

@@ -1,0 +1,476 @@
+//! Masks, and a mesh, of what all photographs show.
+
+use rayon::prelude::*;
+use sixfold_board::Board;
+use sixfold_geometry::{DepthImage, Image, Mask, Pose, Vec3};
+use sixfold_mesh::{Mesh, simplify};
+use sixfold_render::{Culling, RenderOptions, SceneObject, VisibilityBuffer};
+
+use crate::error::TeachError;
+use crate::fusion::carved;
+use crate::grid::Grid;
+use crate::hull::{Outlined, hull};
+use crate::paint::{centre, painted};
+use crate::silhouette::{Cues, Segmenter, consensus, masks};
+use crate::stereo::{Reach, StereoOptions, depths};
+use crate::surface::surface;
+use crate::view::{PosedPhotograph, View, Volume};
+
+/// Fewest photographs a shape is made from.
+pub const FEWEST_PHOTOGRAPHS: usize = 4;
+/// The same with measured depth.
+pub const FEWEST_WITH_DEPTH: usize = 1;
+/// Two photographs have to be this far apart, seen from the object, degrees.
+const APART: f64 = 50.0;
+/// A second part this large (fraction of the first) is a second object.
+const SECOND: f64 = 0.2;
+/// Parts whose boxes are this near are of one object, metres.
+const TOGETHER: f64 = 0.015;
+/// Overlap of a mask with what all others say, below which it contradicts them.
+const SAME: f64 = 0.7;
+/// How high above the board an object reaches at most, as a fraction of the sheet's longer side.
+const HEIGHT: f64 = 1.0;
+/// What touches the board within this height belongs to the table: flat shadows, the sheet's own thickness; metres.
+const TABLE: f64 = 0.0005;
+
+/// How far before and behind the hull depth is searched, metres.
+const BEYOND: f32 = 0.003;
+
+/// How finely is worked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ShapeOptions {
+    /// Pixels along the longer side of a view, when the object is looked for.
+    pub coarse_side: usize,
+    /// The same, when its shape is made.
+    pub fine_side: usize,
+    /// Voxels along the longest side of the space that is searched.
+    pub coarse_cells: usize,
+    /// Voxels along the longest side of the object.
+    pub fine_cells: usize,
+    /// The same, when photographs are compared with each other.
+    pub stereo_side: usize,
+    /// Hollows are cut out where photographs show them.
+    pub stereo: bool,
+    /// Most faces of the mesh.
+    pub faces: usize,
+}
+
+impl Default for ShapeOptions {
+    fn default() -> Self {
+        ShapeOptions {
+            coarse_side: 320,
+            fine_side: 512,
+            coarse_cells: 96,
+            fine_cells: 160,
+            stereo_side: 288,
+            stereo: true,
+            faces: 20_000,
+        }
+    }
+}
+
+/// Photographs of one object that stands still in the world.
+#[derive(Debug, Clone)]
+pub struct Capture {
+    /// The photographs.
+    pub photographs: Vec<PosedPhotograph>,
+    /// The board it stands on; the world is then the board's frame.
+    pub board: Option<Board>,
+    /// Where the object is searched for.
+    pub volume: Volume,
+}
+
+impl Capture {
+    /// An object on a board.
+    pub fn on_board(photographs: Vec<PosedPhotograph>, board: Board) -> Capture {
+        let [low, high] = board.extent();
+        let height = HEIGHT * (high - low).max();
+        let volume = Volume { low: Vec3::new(low.x, low.y, 0.0), high: Vec3::new(high.x, high.y, height) };
+        Capture { photographs, board: Some(board), volume }
+    }
+
+    fn floor(&self) -> Option<f64> {
+        self.board.as_ref().map(|_| TABLE)
+    }
+}
+
+/// Called between steps with what is done, 0 to 1; `false` stops.
+pub type Progress<'a> = &'a mut dyn FnMut(&'static str, f64) -> bool;
+
+pub(crate) fn step(progress: &mut Progress<'_>, what: &'static str, done: f64) -> Result<(), TeachError> {
+    if progress(what, done) { Ok(()) } else { Err(TeachError::Stopped) }
+}
+
+/// Where the photographs show the object.
+#[derive(Debug, Clone)]
+pub struct Segmentation {
+    /// The space that holds it.
+    pub volume: Volume,
+    /// For each photograph its mask, in the pixels of the whole photograph without lens distortion; `None` where it was not used.
+    pub masks: Vec<Option<Mask>>,
+    /// Photographs that are not used, and why.
+    pub left_out: Vec<(usize, String)>,
+}
+
+/// A mesh made from photographs.
+#[derive(Debug, Clone)]
+pub struct Shape {
+    /// Closed, coloured, in metres; its frame has its origin in the middle of the mesh's box and the axes of the world.
+    pub mesh: Mesh,
+    /// Takes points of the object's frame to the world.
+    pub world_from_object: Pose,
+    /// Fraction of the surface that no photograph shows.
+    pub unseen: f64,
+    /// Fraction of the surface's pixels of all photographs whose depth was measured or found by comparison.
+    pub with_depth: f64,
+}
+
+/// The views of those photographs that show a volume, with their numbers.
+fn views_of(capture: &Capture, volume: &Volume, side: usize, used: &[usize]) -> Vec<(usize, View)> {
+    let view = |i: &usize| View::new(&capture.photographs[*i], volume, side).map(|view| (*i, view));
+    used.par_iter().filter_map(view).collect()
+}
+
+/// Finds the object in the photographs of a capture.
+///
+/// # Errors
+/// [`TeachError`].
+pub fn segment(
+    capture: &Capture,
+    segmenter: &dyn Segmenter,
+    options: &ShapeOptions,
+    mut progress: Progress<'_>,
+) -> Result<Segmentation, TeachError> {
+    check_photographs(capture)?;
+    let all: Vec<usize> = (0..capture.photographs.len()).collect();
+    let volume = rough_volume(capture, &all, segmenter, options, &mut progress)?;
+    // Once more in views of the object alone, with what is around it.
+    let around = volume.scaled(1.3).within(&capture.volume);
+    let views = views_of(capture, &around, options.fine_side, &all);
+    let views = with_cues(views, capture, segmenter, &mut progress, "masks")?;
+    let odds: Vec<(View, Image<f32>)> = views.iter().map(|(_, v, c)| (v.clone(), c.sum())).collect();
+    let shape = consensus(&odds, &around, options.coarse_cells, capture.floor());
+    let shape = only_largest(&shape).ok_or_else(no_object)?;
+    let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
+    let views: Vec<(View, Cues)> = views.into_iter().map(|(_, v, c)| (v, c)).collect();
+    let found = masks(&views, &shape);
+    let (kept, left_out) = consistent(&views, found, &numbers, &around, capture, options)?;
+    let mut whole = vec![None; capture.photographs.len()];
+    for (number, view, mask) in &kept {
+        whole[*number] = Some(in_photograph(&capture.photographs[*number], view, mask));
+    }
+    Ok(Segmentation { volume: around, masks: whole, left_out })
+}
+
+fn no_object() -> TeachError {
+    TeachError::NoObject { hint: String::new() }
+}
+
+fn check_photographs(capture: &Capture) -> Result<(), TeachError> {
+    let found = capture.photographs.len();
+    let with_depth = capture.photographs.iter().any(|p| p.depth.is_some());
+    let least = if with_depth { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
+    if found < least {
+        return Err(TeachError::TooFewPhotographs { found, least, reasons: String::new() });
+    }
+    if with_depth {
+        return Ok(());
+    }
+    let centre = capture.volume.centre();
+    let towards: Vec<Vec3> = capture
+        .photographs
+        .iter()
+        .map(|p| (p.camera_from_world.inverse().translation() - centre).normalize())
+        .collect();
+    let angle = |a: &Vec3, b: &Vec3| a.dot(b).clamp(-1.0, 1.0).acos().to_degrees();
+    let largest = towards.iter().flat_map(|a| towards.iter().map(move |b| angle(a, b))).fold(0.0, f64::max);
+    if largest < APART {
+        return Err(TeachError::OneSide { degrees: largest, least: APART });
+    }
+    Ok(())
+}
+
+type Seen = (usize, View, Cues);
+
+fn with_cues(
+    views: Vec<(usize, View)>,
+    capture: &Capture,
+    segmenter: &dyn Segmenter,
+    progress: &mut Progress<'_>,
+    what: &'static str,
+) -> Result<Vec<Seen>, TeachError> {
+    let all = views.len();
+    let mut seen = vec![];
+    for (done, (number, view)) in views.into_iter().enumerate() {
+        step(progress, what, done as f64 / all as f64)?;
+        let cues = Cues::new(&view, capture.board.as_ref(), segmenter).map_err(TeachError::Masks)?;
+        seen.push((number, view, cues));
+    }
+    Ok(seen)
+}
+
+/// The box around the object.
+fn rough_volume(
+    capture: &Capture,
+    all: &[usize],
+    segmenter: &dyn Segmenter,
+    options: &ShapeOptions,
+    progress: &mut Progress<'_>,
+) -> Result<Volume, TeachError> {
+    let views = views_of(capture, &capture.volume, options.coarse_side, all);
+    let least = if capture.photographs.iter().any(|p| p.depth.is_some()) { 1 } else { FEWEST_PHOTOGRAPHS };
+    if views.len() < least {
+        return Err(TeachError::TooFewPhotographs { found: views.len(), least, reasons: String::new() });
+    }
+    let views = with_cues(views, capture, segmenter, progress, "looking for the object")?;
+    let odds: Vec<(View, Image<f32>)> = views.into_iter().map(|(_, v, c)| (v, c.sum())).collect();
+    let shape = consensus(&odds, &capture.volume, options.coarse_cells, capture.floor());
+    let parts = objects(&shape);
+    let Some(first) = parts.first() else { return Err(no_object()) };
+    if let Some(second) = parts.get(1) {
+        let fraction = second.len() as f64 / first.len() as f64;
+        if fraction > SECOND {
+            let found = parts.iter().filter(|p| p.len() as f64 > SECOND * first.len() as f64).count();
+            return Err(TeachError::SeveralObjects { found, percent: 100.0 * fraction });
+        }
+    }
+    let found = shape.volume_of(first).grown(2.0 * shape.step);
+    Ok(found.within(&capture.volume))
+}
+
+/// Parts of a rough shape that lie apart, largest first: parts of one object may hang together by too little to be seen.
+fn objects(shape: &Grid) -> Vec<Vec<usize>> {
+    let mut objects: Vec<(Volume, Vec<usize>)> = vec![];
+    for part in shape.components() {
+        let mut volume = shape.volume_of(&part).grown(0.5 * TOGETHER);
+        let mut part = part;
+        let mut apart = vec![];
+        for (other, voxels) in objects {
+            let common = volume.within(&other).size();
+            if common.min() > 0.0 {
+                part.extend(voxels);
+                volume = Volume { low: volume.low.inf(&other.low), high: volume.high.sup(&other.high) };
+            } else {
+                apart.push((other, voxels));
+            }
+        }
+        apart.push((volume, part));
+        objects = apart;
+    }
+    let mut parts: Vec<Vec<usize>> = objects.into_iter().map(|(_, part)| part).collect();
+    parts.sort_by_key(|p| std::cmp::Reverse(p.len()));
+    parts
+}
+
+/// The field with everything but its largest object outside.
+fn only_largest(shape: &Grid) -> Option<Grid> {
+    let parts = objects(shape);
+    let first = parts.first()?;
+    let mut only = shape.clone();
+    only.values.iter_mut().for_each(|v| *v = v.max(0.05));
+    first.iter().for_each(|i| only.values[*i] = shape.values[*i]);
+    Some(only)
+}
+
+type Kept = Vec<(usize, View, Mask)>;
+
+/// Leaves out the photographs whose mask contradicts the others'.
+fn consistent(
+    views: &[(View, Cues)],
+    found: Vec<Mask>,
+    numbers: &[usize],
+    volume: &Volume,
+    capture: &Capture,
+    options: &ShapeOptions,
+) -> Result<(Kept, Vec<(usize, String)>), TeachError> {
+    let mut left_out = vec![];
+    let given = |i: usize| views[i].0.mask.is_some();
+    let mut used: Vec<usize> = (0..views.len()).filter(|i| found[*i].as_slice().contains(&true)).collect();
+    for i in (0..views.len()).filter(|i| !used.contains(i)) {
+        left_out.push((numbers[i], "the object is not in sight".to_owned()));
+    }
+    // The shape of what is left decides again, as the first one is cut by a wrong mask too.
+    for _ in 0..3 {
+        let outlined: Vec<Outlined<'_>> =
+            used.iter().map(|i| Outlined::new(&views[*i].0, &found[*i])).collect();
+        let shape = hull(&outlined, volume, options.coarse_cells, capture.floor());
+        let overlap = |i: &usize| iou(&crate::silhouette::covered(&views[*i].0, &shape), &found[*i]);
+        let overlaps: Vec<f64> = used.par_iter().map(overlap).collect();
+        let worst = (0..used.len())
+            .filter(|k| overlaps[*k] < SAME && !given(used[*k]))
+            .min_by(|a, b| overlaps[*a].total_cmp(&overlaps[*b]));
+        let Some(worst) = worst else { break };
+        let bad = overlaps.iter().filter(|o| **o < SAME).count();
+        if 2 * bad > used.len() {
+            // Which one is wrong cannot be told: leave out those that cut most, one after the other.
+            let cutting = cutting_most(views, &found, &used).unwrap_or(worst);
+            let number = numbers[used.remove(cutting)];
+            left_out.push((number, "its mask cuts away what the others show".to_owned()));
+        } else {
+            let number = numbers[used.remove(worst)];
+            left_out.push((number, "its mask contradicts the others: moved, or hidden?".to_owned()));
+        }
+    }
+    let all = views.len();
+    if 3 * left_out.len() > all.max(3) {
+        return Err(TeachError::Contradicting { contradicting: left_out.len(), all });
+    }
+    left_out.sort();
+    let kept = used.into_iter().map(|i| (numbers[i], views[i].0.clone(), found[i].clone())).collect();
+    Ok((kept, left_out))
+}
+
+/// The view whose mask is smallest against its box in the image: it cuts the hull most.
+fn cutting_most(views: &[(View, Cues)], found: &[Mask], used: &[usize]) -> Option<usize> {
+    let fraction = |k: usize| {
+        let mask = &found[used[k]];
+        let inside = mask.as_slice().iter().filter(|m| **m).count();
+        inside as f64 / views[used[k]].0.image.as_slice().len() as f64
+    };
+    (0..used.len()).min_by(|a, b| fraction(*a).total_cmp(&fraction(*b)))
+}
+
+fn iou(a: &Mask, b: &Mask) -> f64 {
+    let pairs = || a.as_slice().iter().zip(b.as_slice());
+    let both = pairs().filter(|(a, b)| **a && **b).count();
+    let either = pairs().filter(|(a, b)| **a || **b).count();
+    if either == 0 { 0.0 } else { both as f64 / either as f64 }
+}
+
+/// A view's mask in the pixels of the photograph without its distortion.
+fn in_photograph(photograph: &PosedPhotograph, view: &View, mask: &Mask) -> Mask {
+    let (c, v) = (&photograph.camera, &view.camera);
+    Image::from_fn(c.width, c.height, |x, y| {
+        let along = |p: f64, from: (f64, f64), to: (f64, f64), length: usize| {
+            let q = ((p - from.1) / from.0 * to.0 + to.1).round();
+            (q >= 0.0 && q < length as f64).then_some(q as usize)
+        };
+        let u = along(x as f64, (c.fx, c.cx), (v.fx, v.cx), v.width);
+        let w = along(y as f64, (c.fy, c.cy), (v.fy, v.cy), v.height);
+        matches!((u, w), (Some(u), Some(w)) if mask[(u, w)])
+    })
+}
+
+/// The same the other way.
+fn in_view(view: &View, photograph: &PosedPhotograph, mask: &Mask) -> Mask {
+    let (c, v) = (&photograph.camera, &view.camera);
+    Image::from_fn(v.width, v.height, |x, y| {
+        let u = ((x as f64 - v.cx) / v.fx * c.fx + c.cx).round();
+        let w = ((y as f64 - v.cy) / v.fy * c.fy + c.cy).round();
+        u >= 0.0 && w >= 0.0 && mask.get(u as usize, w as usize).copied().unwrap_or(false)
+    })
+}
+
+/// Makes a mesh of the object from photographs and masks.
+///
+/// # Errors
+/// [`TeachError`].
+pub fn reconstruct(
+    capture: &Capture,
+    found: &Segmentation,
+    options: &ShapeOptions,
+    mut progress: Progress<'_>,
+) -> Result<Shape, TeachError> {
+    let used: Vec<usize> = (0..found.masks.len()).filter(|i| found.masks[*i].is_some()).collect();
+    step(&mut progress, "shape", 0.0)?;
+    let numbered = views_of(capture, &found.volume, options.fine_side, &used);
+    let masks: Vec<Mask> = numbered
+        .iter()
+        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
+        .collect();
+    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let outlined: Vec<Outlined<'_>> = views.iter().zip(&masks).map(|(v, m)| Outlined::new(v, m)).collect();
+    let rough = hull(&outlined, &found.volume, options.coarse_cells, capture.floor());
+    let parts = rough.components();
+    let first = parts.first().ok_or_else(no_object)?;
+    let volume = rough.volume_of(first).grown(2.0 * rough.step);
+    step(&mut progress, "shape", 0.2)?;
+    let fine = hull(&outlined, &volume, options.fine_cells, capture.floor());
+    let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
+        Some(known) => {
+            step(&mut progress, "shape", 0.6)?;
+            (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.least), known.fraction)
+        }
+        None => (fine, 0.0),
+    };
+    let mesh = surface(&fine.smoothed(0.8)).ok_or_else(no_object)?;
+    step(&mut progress, "shape", 0.8)?;
+    let mesh = simplify(&mesh, options.faces);
+    let paint = painted(&mesh, &views);
+    let origin = centre(&mesh);
+    let world_from_object = Pose::from_translation(origin);
+    let mesh = mesh.transformed(&world_from_object.inverse());
+    let mesh = mesh.clone().with_colors(paint.colors).unwrap_or(mesh);
+    step(&mut progress, "shape", 1.0)?;
+    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth })
+}
+
+/// Depth of views, measured or found by comparison.
+struct KnownDepth {
+    views: Vec<View>,
+    depths: Vec<DepthImage>,
+    /// How many views have to agree that a place is empty.
+    least: f32,
+    /// Fraction of the masks' pixels that have it.
+    fraction: f64,
+}
+
+fn depth_of(
+    capture: &Capture,
+    used: &[usize],
+    volume: &Volume,
+    hull: &Grid,
+    found: &Segmentation,
+    options: &ShapeOptions,
+) -> Option<KnownDepth> {
+    let measured = used.iter().all(|i| capture.photographs[*i].depth.is_some());
+    if !measured && !options.stereo {
+        return None;
+    }
+    let side = if measured { options.fine_side } else { options.stereo_side };
+    let numbered = views_of(capture, volume, side, used);
+    let masks: Vec<Mask> = numbered
+        .iter()
+        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
+        .collect();
+    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let all: Vec<DepthImage> = if measured {
+        views.iter().filter_map(|v| v.depth.clone()).collect()
+    } else {
+        let mesh = surface(hull)?;
+        let reaches: Vec<Reach> = views.par_iter().map(|view| reach(&mesh, view)).collect();
+        depths(&views, &reaches, &StereoOptions::default())
+    };
+    // What is beside the object is no depth of it.
+    let depths: Vec<DepthImage> = all
+        .iter()
+        .zip(&masks)
+        .map(|(depth, mask)| {
+            Image::from_fn(
+                depth.width(),
+                depth.height(),
+                |x, y| if mask[(x, y)] { depth[(x, y)] } else { 0.0 },
+            )
+        })
+        .collect();
+    let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
+    let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
+    let least = if measured { 1.0 } else { 3.0 };
+    Some(KnownDepth { views, depths, least, fraction: known as f64 / pixels.max(1) as f64 })
+}
+
+/// Where the pixels of a view look into a closed mesh and first out of it again, and a little more.
+fn reach(mesh: &Mesh, view: &View) -> Reach {
+    let depth_of = |mesh: &Mesh| {
+        let mut buffer = VisibilityBuffer::new(&view.camera);
+        let object = SceneObject { mesh, camera_from_object: view.camera_from_world };
+        buffer.render(&[object], &RenderOptions { culling: Culling::Back, ..RenderOptions::default() });
+        buffer.depth()
+    };
+    let front = depth_of(mesh).map(|d| d - BEYOND * f32::from(*d > 0.0));
+    let negated = mesh.faces().iter().map(|[a, b, c]| [*a, *c, *b]).collect();
+    let back = Mesh::new(mesh.vertices().to_vec(), negated);
+    let back =
+        back.map_or_else(|_| front.clone(), |back| depth_of(&back)).map(|d| d + BEYOND * f32::from(*d > 0.0));
+    Reach { front, back }
+}
