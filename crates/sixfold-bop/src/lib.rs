@@ -34,12 +34,12 @@ pub use coco_truth::{DetectionScores, FoundAtHalf, VisibleTruth, found_at_half, 
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{
-    Placement, VsdError, VsdOptions, add, adi, mspd, mssd, projection_error, rotation_error,
+    Placement, VsdError, VsdOptions, add, add_s, adi, mspd, mssd, projection_error, rotation_error,
     translation_error, vsd,
 };
 pub use evaluate::{
-    Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, Progress, RecallCurves,
-    evaluate, evaluate_detection,
+    Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, RecallCurves, evaluate,
+    evaluate_detection,
 };
 pub use plot::{draw_recall_curves, write_recall_curves};
 pub use points::ModelPoints;

@@ -19,6 +19,7 @@ mod option_error;
 mod plane;
 mod pnp;
 mod pose;
+mod progress;
 pub mod random;
 mod solver;
 pub mod stats;
@@ -42,8 +43,9 @@ pub use pnp::{
     refine_pose, refine_trusted,
 };
 pub use pose::{Pose, PoseError};
+pub use progress::Progress;
 pub use solver::NormalEquations;
-pub use undistort::{undistort_depth, undistort_rgb};
+pub use undistort::{undistort_box, undistort_depth, undistort_rgb};
 
 /// The linear algebra types in this crate's public signatures.
 pub use nalgebra;

@@ -29,6 +29,7 @@ mod surface;
 pub mod synthesis;
 pub mod training;
 pub mod view_grid;
+mod view_split;
 mod window;
 
 pub use error::NolError;
@@ -36,4 +37,5 @@ pub use features::SourceFeatures;
 pub use maps::Maps;
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;
+pub use view_split::{ViewSplit, ViewSplitError, WrittenViews};
 pub use window::object_window;

@@ -298,6 +298,21 @@ fn note_files(list: &Path, names: &[String]) -> std::io::Result<()> {
     file.write_all(format!("{gap}{}\n", names.join("\n")).as_bytes())
 }
 
+/// Copies the files of a folder, those in folders within it excepted.
+///
+/// # Errors
+/// When one cannot be read or written.
+pub fn copy_files(from: &Path, to: &Path) -> Result<()> {
+    std::fs::create_dir_all(to).with_context(|| format!("folder {}", to.display()))?;
+    for entry in std::fs::read_dir(from).with_context(|| format!("folder {}", from.display()))? {
+        let path = entry?.path();
+        if let Some(name) = path.file_name().filter(|_| path.is_file()) {
+            std::fs::copy(&path, to.join(name)).with_context(|| format!("cannot copy {}", path.display()))?;
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -5,6 +5,7 @@
 #[macro_use]
 pub mod screen;
 
+pub mod board;
 pub mod folder;
 pub mod found;
 pub mod frames;
@@ -20,6 +21,7 @@ pub mod progress;
 pub mod ranges;
 #[cfg(feature = "physics")]
 pub mod scenes;
+pub mod sheets;
 #[cfg(feature = "networks")]
 pub mod training;
 
