@@ -73,7 +73,7 @@ impl TrainedDetector {
     }
 
     /// Detections of a score below `threshold` are left out.
-    pub fn with_threshold(self, threshold: f32) -> TrainedDetector {
+    pub(crate) fn with_threshold(self, threshold: f32) -> TrainedDetector {
         TrainedDetector { options: DetectOptions { threshold, ..self.options }, ..self }
     }
 }
