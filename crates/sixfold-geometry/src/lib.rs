@@ -5,6 +5,7 @@
 //! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod camera;
 mod cloud;
