@@ -6,7 +6,8 @@ mod batch;
 mod pool;
 mod preview;
 
-pub use anchor::{Anchor, AnchorOptions, SeenPatch};
+pub use anchor::{Anchor, AnchorOptions};
 pub use batch::{Augmentation, Batch, PairBatchOptions};
-pub use pool::{Arrangement, DepthPoolOptions, Pool};
-pub use preview::preview;
+pub(crate) use pool::Arrangement;
+pub use pool::{DepthPoolOptions, Pool};
+pub(crate) use preview::preview;

@@ -16,7 +16,7 @@ use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, 
 use super::anchor::{Anchor, AnchorOptions, anchor, without_object};
 
 /// Objects on the table z = 0: numbers of meshes with their poses (world from object).
-pub type Arrangement = Vec<(usize, Pose)>;
+pub(crate) type Arrangement = Vec<(usize, Pose)>;
 
 /// How scenes are seen.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -41,7 +41,7 @@ pub struct DepthPoolOptions {
 
 impl DepthPoolOptions {
     /// For patches of `side` pixels.
-    pub fn for_side(side: usize) -> Self {
+    pub(crate) fn for_side(side: usize) -> Self {
         DepthPoolOptions {
             views: 5,
             distance: (0.55, 1.3),
@@ -100,7 +100,7 @@ impl Pool {
     }
 
     /// Regions with an object.
-    pub fn with_object(&self) -> &[Anchor] {
+    pub(crate) fn with_object(&self) -> &[Anchor] {
         &self.with_object
     }
 
