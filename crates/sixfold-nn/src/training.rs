@@ -125,7 +125,7 @@ pub fn fit<T: Training>(
 ///
 /// # Errors
 /// [`TrainError`]; the last checkpoints stay.
-pub fn fit_on<T: Training>(
+pub(crate) fn fit_on<T: Training>(
     inputs: &Fingerprint,
     training: &mut T,
     samples: &T::Samples,

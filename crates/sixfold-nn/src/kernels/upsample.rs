@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 /// Every pixel becomes 2x2 pixels. `x` holds planes of `height x width`.
-pub fn upsample_2x(x: &[f32], [height, width]: [usize; 2]) -> Vec<f32> {
+pub(crate) fn upsample_2x(x: &[f32], [height, width]: [usize; 2]) -> Vec<f32> {
     let mut out = vec![0.0; x.len() * 4];
     out.par_chunks_mut(4 * height * width).zip(x.par_chunks(height * width)).with_min_len(16).for_each(
         |(out, x)| {
@@ -20,7 +20,7 @@ pub fn upsample_2x(x: &[f32], [height, width]: [usize; 2]) -> Vec<f32> {
 }
 
 /// Gradient of [`upsample_2x`]: sums of 2x2 pixels. `height` and `width` are those of the small image.
-pub fn upsample_2x_backward(dy: &[f32], [height, width]: [usize; 2]) -> Vec<f32> {
+pub(crate) fn upsample_2x_backward(dy: &[f32], [height, width]: [usize; 2]) -> Vec<f32> {
     let mut out = vec![0.0; dy.len() / 4];
     out.par_chunks_mut(height * width).zip(dy.par_chunks(4 * height * width)).with_min_len(16).for_each(
         |(out, dy)| {
