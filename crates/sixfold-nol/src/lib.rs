@@ -6,9 +6,10 @@
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod agreement;
-pub mod coordinates;
+mod coordinates;
 mod error;
 mod features;
 pub mod loss;
@@ -38,4 +39,3 @@ pub use maps::Maps;
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;
 pub use view_split::{ViewSplit, ViewSplitError, WrittenViews};
-pub use window::object_window;

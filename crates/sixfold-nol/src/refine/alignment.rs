@@ -69,7 +69,7 @@ const AGAIN: usize = 1;
 impl RefinementState<'_, '_> {
     /// Makes the poses better: in one arrangement if all objects stood still by their given poses; otherwise every source by
     /// itself, and then in the places where objects stood in some of the images by these better poses.
-    pub fn refine(&mut self) -> Standing {
+    pub(crate) fn refine(&mut self) -> Standing {
         let given: Vec<Pose> = self.working.iter().map(|w| w.given).collect();
         let pairs: Vec<[usize; 2]> = self.sources.iter().map(|s| [s.image, s.object]).collect();
         let each: Vec<Vec<usize>> = (0..self.objects.len()).map(|object| vec![object]).collect();

@@ -21,5 +21,5 @@ pub(crate) mod tests;
 pub(crate) use appearance::{Common, Light, Shown, look};
 pub use gauss_newton::{PosedSource, refine_poses, refine_scene};
 pub use options::{PoseRefinementOptions, Refinement, SceneKind, SourceReport};
-pub use published::{PublishedRuleOptions, published_rule};
+pub use published::PublishedRuleOptions;
 pub use published_rule_poses::published_rule_poses;
