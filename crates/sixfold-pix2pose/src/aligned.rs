@@ -137,7 +137,7 @@ const SYMMETRY_STEP: f64 = 0.1;
 ///
 /// # Errors
 /// As [`estimate`], for objects that the model does not know.
-pub fn measure_corrections(
+pub(crate) fn measure_corrections(
     model: &Pix2PoseModel,
     photographs: &[PosedImage],
     objects: &BTreeMap<u32, (Mesh, ModelInfo)>,
