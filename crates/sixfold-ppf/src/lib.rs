@@ -6,11 +6,12 @@
 //! judged by rendering ([`mod@sixfold_align::verify`]); [`estimate()`] puts it together.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod clustering;
 pub mod estimate;
 mod estimator;
-pub mod model;
+mod model;
 mod model_file;
 pub mod voting;
 
