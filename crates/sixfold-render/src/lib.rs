@@ -7,6 +7,7 @@
 //! between rounded corners. One thread or many: same bytes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod outputs;
 mod portrait;
@@ -21,4 +22,4 @@ pub use portrait::{portrait, portrait_camera, portrait_pose};
 pub use raster::{Canvas, Culling, RenderOptions, SceneObject, VisibilityBuffer, render_depth};
 pub use sensor::{DepthSensor, Draws, simulate_depth};
 pub use shade::{Light, Material, shade};
-pub use table::{DepthOnTable, depth_on_table, plane_mesh, support_plane};
+pub use table::{DepthOnTable, depth_on_table, support_plane};

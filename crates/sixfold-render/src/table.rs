@@ -81,7 +81,7 @@ pub fn support_plane(objects: &[SceneObject<'_>]) -> Option<Plane> {
 }
 
 /// A square of the plane as a mesh in the camera frame, `size` metres wide, centred where the camera's axis meets it.
-pub fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
+pub(crate) fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
     let ray = camera.unproject(&Vec2::new(camera.width as f64 / 2.0, camera.height as f64 / 2.0), 1.0);
     let along = plane.normal.dot(&ray);
     let centre = if along.abs() > 1e-6 { ray * (plane.offset / along) } else { plane.normal * plane.offset };
