@@ -152,7 +152,7 @@ impl DatasetFolder {
     ///
     /// # Errors
     /// When it is there and holds something else: images that are there already belong to it.
-    pub fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
+    pub(crate) fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
         match std::fs::read(file) {
             Ok(there) if there == bytes => Ok(()),
             Ok(_) => bail!(

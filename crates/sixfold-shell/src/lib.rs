@@ -1,6 +1,8 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
 //! arguments, stores and scenes that both take.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 // First: its macros take the place of the standard ones in all that follows.
 #[macro_use]
 pub mod screen;
@@ -11,7 +13,7 @@ pub mod found;
 pub mod frames;
 pub mod grasp;
 pub mod idle;
-pub mod labels;
+mod labels;
 pub mod meshes;
 pub mod objects;
 pub mod output;

@@ -14,7 +14,8 @@ use sixfold_io::CameraFile;
 
 use crate::output::pose_rows;
 
-pub use self::photographs::{Photograph, leave_out_other_sizes, photograph_files, read_photographs};
+use self::photographs::leave_out_other_sizes;
+pub use self::photographs::{Photograph, photograph_files, read_photographs};
 
 /// The camera and all photographs, as `photographs.json` lists them.
 #[derive(Serialize)]

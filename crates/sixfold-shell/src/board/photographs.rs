@@ -105,7 +105,7 @@ fn photograph(file: &Path) -> Photograph {
 ///
 /// # Errors
 /// When none shows a tag.
-pub fn leave_out_other_sizes(photographs: &mut [Photograph]) -> Result<(usize, usize)> {
+pub(crate) fn leave_out_other_sizes(photographs: &mut [Photograph]) -> Result<(usize, usize)> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for photograph in photographs.iter().filter(|p| !p.tags.is_empty()) {
         *counts.entry(photograph.size).or_default() += 1;
