@@ -15,9 +15,9 @@ use super::solids::Builder;
 use super::sweep::Sweep;
 
 /// Range of a toy's diameter, metres.
-pub const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);
+pub(crate) const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);
 /// The second largest side of a toy's box is at least this, metres.
-pub const TOY_MIN_SIDE: f64 = 0.03;
+pub(crate) const TOY_MIN_SIDE: f64 = 0.03;
 /// Maximum number of solids in a toy.
 const MOST: usize = 8;
 
