@@ -8,20 +8,26 @@
 //! ([`estimate`]). The network ([`network`]) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects ([`training`]).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
-pub mod crop;
+mod crop;
 mod error;
-pub mod estimate;
+mod estimate;
 pub mod estimator;
-pub mod features;
+mod features;
 mod file;
 mod matching;
-pub mod network;
+mod network;
 pub mod recipe;
 pub mod refiner;
 mod samples;
 mod search;
-pub mod templates;
-pub mod training;
+mod templates;
+mod training;
 
 pub use error::ViewsError;
+pub use estimate::ViewsOptions;
+pub use features::{Extractor, FeatureMap};
+pub use network::ViewNetwork;
+pub use templates::TemplateOptions;
+pub use training::{Batch, ViewsTraining, ViewsTrainingOptions};
