@@ -1,6 +1,8 @@
 //! Does a pose agree with an image? A depth image prepared once for every method, verification by rendering, ICP of a rendered
 //! mesh against measured depth, and the outline of a mesh aligned with a colour image. How hypotheses arise is not known here.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 // `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
