@@ -2,7 +2,6 @@
 //! mesh against measured depth, and the outline of a mesh aligned with a colour image. How hypotheses arise is not known here.
 
 #![warn(unreachable_pub, unnameable_types)]
-
 // `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 

@@ -1,10 +1,10 @@
 //! Feature maps, logits and gradients of a backbone with given PyTorch weights, for `checks/backbones_vs_pytorch.py`.
 //!
-//! `backbone_outputs resnet50|densenet121|efficientnet-lite0|xfeat WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
+//! `backbone_outputs resnet50|densenet121|efficientnet-lite0|xfeat|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
 //! (`batch x 3 x height x width`) and `factor` (of the last map's shape), the output the maps (`map0` ..) and the `logits`; of a
 //! training step the `loss` (mean of last map times factor, plus mean of the squared logits), every parameter's gradient and
 //! every running statistic's new value. EfficientNet-Lite0, whose normalisation is folded, gives its seven maps alone. XFeat
-//! takes pairs of features as `factor`.
+//! takes pairs of features as `factor`. U2-Net-p (also for `checks/salient_vs_onnxruntime.py`) gives `salience`.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -17,6 +17,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sixfold_nn::densenet::DenseNet121Config;
 use sixfold_nn::lite0::Lite0Config;
 use sixfold_nn::resnet::ResNet50Config;
+use sixfold_nn::salient::SalientNetwork;
 use sixfold_nn::xfeat::XFeat;
 
 type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
@@ -25,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [network, weights, input, output] = arguments.as_slice() else {
         return Err(
-            "expected resnet50|densenet121|efficientnet-lite0|xfeat WEIGHTS INPUT.safetensors OUTPUT.safetensors"
+            "expected resnet50|densenet121|efficientnet-lite0|xfeat|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors"
                 .into(),
         );
     };
@@ -74,8 +75,21 @@ fn main() -> Result<(), Box<dyn Error>> {
             let fine = network.fine_matches(pairs.reshape([count, 128]));
             keep(&mut outputs, "fine_matches".to_owned(), fine)?;
         }
+        "u2netp" => {
+            let device = Device::default();
+            let network = match weights.as_str() {
+                "shipped" => SalientNetwork::shipped(&device)?,
+                file => SalientNetwork::load(Path::new(file), &device)?,
+            };
+            let [x, _] = data;
+            keep(
+                &mut outputs,
+                "salience".to_owned(),
+                network.layers().forward(Tensor::from_data(x, &device)),
+            )?;
+        }
         other => {
-            let names = "resnet50, densenet121, efficientnet-lite0 or xfeat";
+            let names = "resnet50, densenet121, efficientnet-lite0, xfeat or u2netp";
             return Err(format!("expected {names}, found {other}").into());
         }
     }

@@ -5,7 +5,8 @@
 //! matrix products over patches instead, and one pass for bias and activation.
 
 use crate::kernels::{
-    Activation, ConvShape, ConvSpec, conv_backward, conv_forward, upsample_2x, upsample_2x_backward,
+    Activation, ConvShape, ConvSpec, Upsampling, conv_backward, conv_forward, upsample_2x,
+    upsample_2x_backward,
 };
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
@@ -38,10 +39,10 @@ pub trait SixfoldOps: Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 
     /// Every pixel becomes 2x2 pixels.
-    fn sixfold_upsample(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn sixfold_upsample(x: FloatTensor<Self>, kind: Upsampling) -> FloatTensor<Self>;
 
-    /// Sums of 2x2 pixels.
-    fn sixfold_upsample_backward(dy: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// The gradient with respect to the small image.
+    fn sixfold_upsample_backward(dy: FloatTensor<Self>, kind: Upsampling) -> FloatTensor<Self>;
 }
 
 fn contiguous(tensor: FlexTensor) -> FlexTensor {
@@ -99,17 +100,17 @@ impl SixfoldOps for Flex {
         )
     }
 
-    fn sixfold_upsample(x: FloatTensor<Self>) -> FloatTensor<Self> {
+    fn sixfold_upsample(x: FloatTensor<Self>, kind: Upsampling) -> FloatTensor<Self> {
         let x = contiguous(x);
         let s = x.shape();
-        tensor(upsample_2x(values(&x), [s[2], s[3]]), [s[0], s[1], 2 * s[2], 2 * s[3]])
+        tensor(upsample_2x(values(&x), [s[2], s[3]], kind), [s[0], s[1], 2 * s[2], 2 * s[3]])
     }
 
-    fn sixfold_upsample_backward(dy: FloatTensor<Self>) -> FloatTensor<Self> {
+    fn sixfold_upsample_backward(dy: FloatTensor<Self>, kind: Upsampling) -> FloatTensor<Self> {
         let dy = contiguous(dy);
         let s = dy.shape();
         let small = [s[2] / 2, s[3] / 2];
-        tensor(upsample_2x_backward(values(&dy), small), [s[0], s[1], small[0], small[1]])
+        tensor(upsample_2x_backward(values(&dy), small, kind), [s[0], s[1], small[0], small[1]])
     }
 }
 
@@ -137,13 +138,13 @@ impl<B: SixfoldOps> Backward<B, 3> for ConvBackward {
 struct UpsampleBackward;
 
 impl<B: SixfoldOps> Backward<B, 1> for UpsampleBackward {
-    type State = ();
+    type State = Upsampling;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         let [node] = ops.parents;
         let dy = grads.consume::<B>(&ops.node);
         if let Some(node) = node {
-            grads.register::<B>(node.id, B::sixfold_upsample_backward(dy));
+            grads.register::<B>(node.id, B::sixfold_upsample_backward(dy, ops.state));
         }
     }
 }
@@ -177,15 +178,15 @@ impl<B: SixfoldOps, C: CheckpointStrategy> SixfoldOps for Autodiff<B, C> {
         unreachable!("second derivatives of convolutions are not needed and not implemented")
     }
 
-    fn sixfold_upsample(x: FloatTensor<Self>) -> FloatTensor<Self> {
+    fn sixfold_upsample(x: FloatTensor<Self>, kind: Upsampling) -> FloatTensor<Self> {
         let nodes = [x.node()];
         match UpsampleBackward.prepare::<C>(nodes).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => prep.finish((), B::sixfold_upsample(x.primitive().clone())),
-            OpsKind::UnTracked(prep) => prep.finish(B::sixfold_upsample(x.primitive().clone())),
+            OpsKind::Tracked(prep) => prep.finish(kind, B::sixfold_upsample(x.primitive().clone(), kind)),
+            OpsKind::UnTracked(prep) => prep.finish(B::sixfold_upsample(x.primitive().clone(), kind)),
         }
     }
 
-    fn sixfold_upsample_backward(_: FloatTensor<Self>) -> FloatTensor<Self> {
+    fn sixfold_upsample_backward(_: FloatTensor<Self>, _: Upsampling) -> FloatTensor<Self> {
         unreachable!("second derivatives of upsampling are not needed and not implemented")
     }
 }
@@ -218,7 +219,13 @@ pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) ->
 
 /// Doubles an image by repeating pixels: `batch x channels x height x width` to twice the rows and columns.
 pub fn upsample(x: Tensor<4>) -> Tensor<4> {
-    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch()))
+    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Repeated))
+}
+
+/// Doubles an image bilinearly, as PyTorch's `interpolate` without aligned corners: `batch x channels x height x width` to twice
+/// the rows and columns.
+pub fn doubled(x: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Bilinear))
 }
 
 /// Channels become pixels: `batch x (factor * factor * c) x h x w` to `batch x c x (factor * h) x (factor * w)` (Shi et al. 2016).

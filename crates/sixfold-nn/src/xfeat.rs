@@ -7,8 +7,9 @@
 use std::path::Path;
 
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData, activation};
+use burn::tensor::{Device, Tensor, activation};
 
+use crate::enlarge::enlarged;
 use crate::kernels::Activation;
 use crate::layers::{Conv, ConvConfig, Padding};
 use crate::pretrained::{PretrainedError, PretrainedFile};
@@ -258,34 +259,10 @@ fn run(layers: &[Conv], x: Tensor<4>) -> Tensor<4> {
     layers.iter().fold(x, |x, layer| layer.forward(x))
 }
 
-/// Bilinear enlargement by a whole factor, as PyTorch's `interpolate` without aligned corners.
-fn enlarged(x: Tensor<4>, factor: usize) -> Tensor<4> {
-    let [batch, channels, height, width] = x.dims();
-    let device = x.device();
-    let rows = Tensor::<2>::from_data(weights(height, factor), &device).unsqueeze::<3>();
-    let columns = Tensor::<2>::from_data(weights(width, factor), &device).transpose().unsqueeze::<3>();
-    let flat = x.reshape([batch * channels, height, width]);
-    let count = batch * channels;
-    let flat = rows.repeat_dim(0, count).matmul(flat).matmul(columns.repeat_dim(0, count));
-    flat.reshape([batch, channels, factor * height, factor * width])
-}
-
-/// What each of `side` values counts in each of `factor * side` values.
-fn weights(side: usize, factor: usize) -> TensorData {
-    let mut weights = vec![0.0f32; factor * side * side];
-    for (i, row) in weights.chunks_exact_mut(side).enumerate() {
-        let at = ((i as f32 + 0.5) / factor as f32 - 0.5).max(0.0);
-        let first = (at as usize).min(side - 1);
-        let part = at - first as f32;
-        row[first] += 1.0 - part;
-        row[(first + 1).min(side - 1)] += part;
-    }
-    TensorData::new(weights, [factor * side, side])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::TensorData;
 
     /// What PyTorch 2.13 gives with the package's weights for the image below: channel, row, column, value.
     const FEATURES: [(usize, usize, usize, f32); 5] =
@@ -324,13 +301,5 @@ mod tests {
         check(seen.features, &FEATURES, 0.02);
         check(seen.reliability, &RELIABILITY, 0.001);
         check(network.keypoints(image), &KEYPOINTS, 0.01);
-    }
-
-    #[test]
-    fn enlarging_keeps_a_ramp_and_a_constant() {
-        let device = Device::default();
-        let x = Tensor::<4>::from_data(TensorData::new(vec![1.0f32, 3.0, 1.0, 3.0], [1, 1, 2, 2]), &device);
-        let y: Vec<f32> = enlarged(x, 2).try_into_vec_as().unwrap();
-        assert_eq!(y, [1.0, 1.5, 2.5, 3.0].repeat(4));
     }
 }

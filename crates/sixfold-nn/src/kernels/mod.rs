@@ -15,6 +15,7 @@ pub use gather::{Places, SampledPixel, neighbours};
 pub(crate) use gather::{gather_backward, gather_forward};
 pub(crate) use lstm::{lstm_backward, lstm_forward};
 pub use shared::{Activation, ConvSpec};
+pub use upsample::Upsampling;
 pub(crate) use upsample::{upsample_2x, upsample_2x_backward};
 
 use dense::{dense_backward, dense_forward};
