@@ -117,6 +117,8 @@ def unused():
             owner = name if parts[0] == "src" else f"{name}/{parts[0]}"
             words.setdefault(owner, set()).update(re.findall(r"\w+", file.read_text()))
     for name, folder in crates():
+        if not (folder / "src" / "lib.rs").exists():
+            continue
         others = set().union(*(w for owner, w in words.items() if owner != name))
         for file in sorted((folder / "src").rglob("*.rs")):
             text = file.read_text()
