@@ -6,8 +6,6 @@ use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
 use sixfold_shell::pictures::Pictures;
 
-use sixfold_shell::folder::OutputFolder;
-
 use super::arguments::DemoArguments;
 use super::colour::Colour;
 use super::samples::Known;
@@ -16,11 +14,10 @@ use crate::commands::without_networks::MESSAGE;
 /// No poses, and why; an error where weights were given.
 pub(super) fn run(
     a: &DemoArguments,
-    _out: &mut OutputFolder,
+    _out: &mut Pictures,
     _dataset: &BopDataset,
     _targets: &[Target],
     _known: &BTreeMap<u32, Known>,
-    _drawer: &mut Pictures,
 ) -> Result<Colour> {
     if a.weights.is_some() || a.detector.is_some() {
         bail!("--weights and --detector: {MESSAGE}");
