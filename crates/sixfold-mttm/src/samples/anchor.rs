@@ -35,7 +35,7 @@ pub struct AnchorOptions {
 
 impl AnchorOptions {
     /// For patches of `side` pixels.
-    pub(crate) fn for_side(side: usize) -> Self {
+    pub fn for_side(side: usize) -> Self {
         AnchorOptions { side, border: side * 3 / 14, tilt: 0.22, turn: 0.22, positives: 2 }
     }
 

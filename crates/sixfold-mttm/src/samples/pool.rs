@@ -41,7 +41,7 @@ pub struct DepthPoolOptions {
 
 impl DepthPoolOptions {
     /// For patches of `side` pixels.
-    pub(crate) fn for_side(side: usize) -> Self {
+    pub fn for_side(side: usize) -> Self {
         DepthPoolOptions {
             views: 5,
             distance: (0.55, 1.3),
