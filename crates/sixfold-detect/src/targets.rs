@@ -26,7 +26,7 @@ pub struct Instance {
 pub struct Annotation {
     /// Columns and rows.
     pub size: [usize; 2],
-    /// For every pixel 0 for background, the object's number from 1, or [`IGNORED`].
+    /// For every pixel 0 for background, the object's number from 1, or `IGNORED`.
     pub labels: Vec<u8>,
     /// The objects; at most 254.
     pub instances: Vec<Instance>,

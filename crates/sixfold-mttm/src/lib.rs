@@ -1,10 +1,10 @@
 //! Objects never trained on, found in depth images by their templates: what chapter 5 of the dissertation is about.
 //!
-//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh ([`from_mesh`])
-//! or cut out of real depth images ([`from_depth`]). Adding an object is all there is to do: nothing is trained.
+//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh (`from_mesh`)
+//! or cut out of real depth images (`from_depth`). Adding an object is all there is to do: nothing is trained.
 //! In a scene, patches around sampled pixels ([`roi`]) are matched with all templates ([`matching`]), the best ones get
 //! masks ([`mask`]), masks of one object are merged, matched again without their background, and the nearest
-//! templates become poses by their geometry ([`align`]); [`mod@estimate`] puts it together, and [`judge`] says how well a pose
+//! templates become poses by their geometry ([`align`]); [`estimate()`] puts it together, and [`judge`] says how well a pose
 //! agrees with the image when there is no mesh.
 //!
 //! Without the feature `network` (default) there is matching point by point only, and nothing of Burn is compiled.

@@ -62,7 +62,7 @@ impl CheckedMask {
 /// Leaves out of a mask what depth shows to be something else. Depth in metres, without lens distortion.
 ///
 /// # Errors
-/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than [`MAX_LEFT_OUT`] would be left out.
+/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than `MAX_LEFT_OUT` would be left out.
 pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<CheckedMask, TemplateError> {
     camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;

@@ -39,7 +39,7 @@ impl DiscriminatorConfig {
     }
 }
 
-/// The discriminator, made by [`DiscriminatorConfig`].
+/// The discriminator, made by `DiscriminatorConfig`.
 #[derive(Module, Debug)]
 pub struct Discriminator {
     stages: Vec<Stage>,

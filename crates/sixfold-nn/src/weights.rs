@@ -32,7 +32,7 @@ const MAX_HEADER: u64 = 32 << 20;
 pub struct ModelCard {
     /// Name of the network's architecture. Loading asks for it.
     pub architecture: String,
-    /// Version of the file's layout, see [`FORMAT_VERSION`]. [`save_weights`] fills it in.
+    /// Version of the file's layout, see `FORMAT_VERSION`. [`save_weights`] fills it in.
     pub format_version: u32,
     /// One line for people.
     pub title: String,

@@ -59,7 +59,7 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
     Ok(notes)
 }
 
-/// As [`choose_images`], by the distance of the poses: [`choose_by_pose`] with the dissertation's numbers for images in which nothing
+/// As [`choose_images`], by the distance of the poses: `choose_by_pose` with the dissertation's numbers for images in which nothing
 /// hides the objects.
 pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
     let poses: Vec<Pose> = object.images.iter().map(|i| *i.posed.camera_from_object()).collect();

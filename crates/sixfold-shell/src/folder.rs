@@ -132,7 +132,7 @@ impl DatasetFolder {
     /// Writes the models with their `models_info.json`.
     ///
     /// # Errors
-    /// As [`DatasetFolder::write_once`].
+    /// As `DatasetFolder::write_once`.
     pub fn write_models<'a>(
         &self,
         models: impl Iterator<Item = (u32, &'a Mesh, &'a ModelInfo)>,

@@ -38,7 +38,7 @@ pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Po
     None
 }
 
-/// As [`settle`], with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
+/// As `settle`, with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
 /// it rolled.
 pub fn settle_at_centre(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     let rest = settle(parts, world_from_object)?;

@@ -3,9 +3,9 @@
 //!
 //! Without a region, a detector of any object proposes some, and the templates choose among them (`search`).
 //!
-//! A region is cut out as a camera sees it that looks at its middle ([`crop`]). Its features ([`features`]) are compared with those of all
-//! [`templates`]; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
-//! ([`estimate`]). The network ([`network`]) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects ([`training`]).
+//! A region is cut out as a camera sees it that looks at its middle (`crop`). Its features (`features`) are compared with those of all
+//! `templates`; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
+//! (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects (`training`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

@@ -66,7 +66,7 @@ impl ViewNetwork {
         load_weights(ViewNetwork::untrained(device)?, path, ARCHITECTURE)
     }
 
-    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs that [`input`] makes, `batch x 3 x side
+    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs that `input` makes, `batch x 3 x side
     /// x side`; sides are multiples of 32 pixels.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let grey = x.clone().narrow(1, 0, 1);

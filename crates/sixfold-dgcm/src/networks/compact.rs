@@ -72,7 +72,7 @@ impl CompactConfig {
     }
 }
 
-/// The compact network, made by [`CompactConfig`].
+/// The compact network, made by `CompactConfig`.
 #[derive(Module, Debug)]
 pub struct Compact {
     geometry: Vec<Conv>,

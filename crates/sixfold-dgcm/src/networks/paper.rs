@@ -103,7 +103,7 @@ impl PaperConfig {
     }
 }
 
-/// The dissertation's network, made by [`PaperConfig`].
+/// The dissertation's network, made by `PaperConfig`.
 #[derive(Module, Debug)]
 pub struct Paper {
     backbone: ResNet50,

@@ -21,7 +21,7 @@ pub(crate) const TOY_MIN_SIDE: f64 = 0.03;
 /// Maximum number of solids in a toy.
 const MOST: usize = 8;
 
-/// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in [`TOY_DIAMETER`] (each
+/// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in `TOY_DIAMETER` (each
 /// as likely as any other). Its solids overlap, so parts of their surfaces lie inside.
 ///
 /// # Errors
