@@ -19,9 +19,6 @@ use crate::bop::json_to_python;
 use crate::guard::{Leave, Stop, Tell, dataset_error, os_error, reporting, results_error};
 use crate::training::file_or_value;
 
-/// Detections this sure are passed on, as `sixfold estimate` does: a pose's own confidence sorts them further.
-const MIN_DETECTION: f32 = 0.1;
-
 /// A method, a dataset, and where the results go.
 pub(crate) struct Run {
     pub method: Arc<dyn PoseEstimator>,
@@ -132,7 +129,7 @@ impl Run {
         if let Some(weights) = &self.detector {
             let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
             let detector = TrainedDetector::load(weights).map_err(|error| file_or_value(&error))?;
-            let detector = Box::new(detector.with_threshold(MIN_DETECTION));
+            let detector = Box::new(detector.for_dataset());
             return Ok((RegionSource::of_detector(detector, ids).map_err(run_error)?, vec![]));
         }
         match self.boxes.as_deref() {

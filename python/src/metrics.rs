@@ -395,9 +395,14 @@ fn bop19<'py>(
         EvalOptions { compute_vsd: vsd, visib_gt_min, models: models_of(models)?, ..EvalOptions::default() };
     options.check().map_err(eval_error)?;
     let targets = dataset.targets(targets.as_deref()).map_err(dataset_error)?;
-    let scores =
-        interruptible(py, move |stop| evaluate(&dataset, &estimates, &targets, &options, &|_| stop.check()))?
-            .map_err(eval_error)?;
+    let scores = interruptible(py, move |stop| {
+        let progress = |_, _| {
+            stop.check();
+            true
+        };
+        evaluate(&dataset, &estimates, &targets, &options, &progress)
+    })?
+    .map_err(eval_error)?;
     if let Some(path) = curves {
         free(py, || write_recall_curves(&path, &scores))?.map_err(image_error)?;
     }

@@ -211,8 +211,8 @@ pub(crate) fn refine_poses(
                     photograph,
                 })
                 .collect();
-            refine_scene(&sources, &meshes, &options, |done| {
-                tell.tell(done);
+            refine_scene(&sources, &meshes, &options, &|done, total| {
+                tell.tell(done as f64 / total as f64);
                 !stop.flag().load(Ordering::Relaxed)
             })
         },

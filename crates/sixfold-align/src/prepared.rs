@@ -171,7 +171,7 @@ impl PreparedDepth {
     }
 
     /// Points nearer to the plane than this are its own, metres.
-    pub fn plane_margin(&self) -> f64 {
+    pub(crate) fn plane_margin(&self) -> f64 {
         self.options.plane.threshold
     }
 

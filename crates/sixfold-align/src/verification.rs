@@ -262,7 +262,7 @@ impl Verifier {
     }
 
     /// About `count` of the points that would be seen at a pose, evenly over the image.
-    pub fn visible_points(
+    pub(crate) fn visible_points(
         &mut self,
         image: &PreparedDepth,
         mesh: &Mesh,

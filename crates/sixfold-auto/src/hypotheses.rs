@@ -50,7 +50,7 @@ pub(crate) struct Pool<'a> {
 
 impl Pool<'_> {
     /// Takes in what a method found, and judges all anew.
-    pub fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
+    pub(crate) fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
         self.asked += 1;
         let by_depth = method.needs().depth != Need::Unused;
         let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
@@ -138,7 +138,7 @@ impl Pool<'_> {
     }
 
     /// The most probable hypotheses, one at a place, at most `most`, each with the others at its place that are not much less probable.
-    pub fn chosen(&self, most: usize) -> Vec<(&Hypothesis, Vec<&Hypothesis>)> {
+    pub(crate) fn chosen(&self, most: usize) -> Vec<(&Hypothesis, Vec<&Hypothesis>)> {
         let mut chosen: Vec<(&Hypothesis, Vec<&Hypothesis>)> = vec![];
         for hypothesis in &self.hypotheses {
             if let Some((best, others)) = chosen.iter_mut().find(|(best, _)| one_place(best, hypothesis)) {

@@ -5,6 +5,8 @@
 //! [`Calibration`] turns these numbers into a probability. What is asked, and in which order, is the caller's choice; [`AutoMembers`] puts together
 //! all that there is.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 mod calibration;
 mod estimator;
 mod hypotheses;

@@ -68,7 +68,7 @@ impl LogisticModel {
 
     /// The same with the scaling under which the probabilities of `rows` hold best.
     #[must_use]
-    pub fn scaled_to(self, rows: &[Fit<'_>]) -> LogisticModel {
+    pub(crate) fn scaled_to(self, rows: &[Fit<'_>]) -> LogisticModel {
         let z: Vec<[f64; 2]> = rows.iter().map(|r| [self.raw(r.numbers), 1.0]).collect();
         let right: Vec<bool> = rows.iter().map(|r| r.right).collect();
         // About a scaling of one: few rows change little.

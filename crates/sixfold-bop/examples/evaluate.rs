@@ -15,7 +15,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let dataset = BopDataset::open(Path::new(dataset), "test")?;
     let estimates = read_results(Path::new(results))?;
     let targets = dataset.targets(None)?;
-    let found = evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &|_| {})?;
+    let found = evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &())?;
     println!("{}", serde_json::to_string_pretty(&found)?);
     if let Some(path) = rest.first() {
         write_recall_curves(Path::new(path), &found)?;

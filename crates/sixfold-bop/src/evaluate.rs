@@ -7,10 +7,11 @@
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Serialize;
-use sixfold_geometry::{Camera, DepthImage, Pose};
+use sixfold_geometry::{Camera, DepthImage, Pose, Progress};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use thiserror::Error;
@@ -77,9 +78,24 @@ pub enum EvalError {
     /// A depth image does not fit (cannot happen with images that passed the size check).
     #[error(transparent)]
     Vsd(#[from] VsdError),
+    /// Whoever received the progress asked to stop.
+    #[error("the evaluation was stopped")]
+    Stopped,
 }
 
+/// The delta of ITODD in the BOP Challenge, metres; of all others it is the default.
+const ITODD: (&str, f64) = ("itodd", 0.005);
+
 impl EvalOptions {
+    /// Those of the BOP Challenge for the dataset in a folder, which is known by its name.
+    pub fn for_dataset(folder: &Path) -> EvalOptions {
+        let mut options = EvalOptions::default();
+        if folder.file_name().is_some_and(|name| name.eq_ignore_ascii_case(ITODD.0)) {
+            options.vsd.delta = ITODD.1;
+        }
+        options
+    }
+
     /// Tests every field.
     ///
     /// # Errors
@@ -101,15 +117,6 @@ impl EvalOptions {
         let steps = self.curve_steps;
         test((1..=10_000).contains(&steps), "curve_steps", steps as f64, "from 1 to 10000")
     }
-}
-
-/// How far an evaluation is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Progress {
-    /// Images finished.
-    pub done: usize,
-    /// Images in all.
-    pub total: usize,
 }
 
 /// Recall against threshold.
@@ -543,17 +550,17 @@ fn average_time(estimates: &[Estimate]) -> Result<f64, String> {
 /// Scores estimates on a dataset.
 ///
 /// `targets` as from [`BopDataset::targets`]; those of whole images are spelled out from the ground truth. `progress`
-/// is called after every image, from any thread. The result is the same at any number of threads.
+/// receives every image. The result is the same at any number of threads.
 ///
 /// # Errors
 /// [`EvalError`] when an option is out of range or a file of the dataset is broken. What is merely not there (depth,
-/// a model) leaves scores empty, with reasons.
+/// a model) leaves scores empty, with reasons. [`EvalError::Stopped`] where `progress` says so.
 pub fn evaluate(
     dataset: &BopDataset,
     estimates: &[Estimate],
     targets: &[Target],
     options: &EvalOptions,
-    progress: &(dyn Fn(Progress) + Sync),
+    progress: &dyn Progress,
 ) -> Result<Evaluation, EvalError> {
     options.check()?;
     let targets = dataset.object_targets(targets)?;
@@ -600,8 +607,7 @@ pub fn evaluate(
                 scored.push((task, errors));
             }
             let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-            progress(Progress { done: finished, total: images.len() });
-            Ok(scored)
+            if progress.report(finished, images.len()) { Ok(scored) } else { Err(EvalError::Stopped) }
         })
         .collect::<Result<_, _>>()?;
     let scored: Vec<Scored<'_, '_>> = scored.into_iter().flatten().collect();

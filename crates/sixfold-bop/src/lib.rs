@@ -4,6 +4,7 @@
 //! file to scores: [`BopDataset::open`], [`read_results`], [`BopDataset::targets`], [`evaluate`].
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod coco;
 mod coco_rows;
@@ -34,12 +35,12 @@ pub use coco_truth::{DetectionScores, FoundAtHalf, VisibleTruth, found_at_half, 
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{
-    Placement, VsdError, VsdOptions, add, adi, mspd, mssd, projection_error, rotation_error,
+    Placement, VsdError, VsdOptions, add, add_s, adi, mspd, mssd, projection_error, rotation_error,
     translation_error, vsd,
 };
 pub use evaluate::{
-    Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, Progress, RecallCurves,
-    evaluate, evaluate_detection,
+    Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, RecallCurves, evaluate,
+    evaluate_detection,
 };
 pub use plot::{draw_recall_curves, write_recall_curves};
 pub use points::ModelPoints;
@@ -52,9 +53,7 @@ pub use scene_files::{
     GroundTruth, GroundTruthInfo, ImageCamera, Target, TargetObject, parse_scene_camera, parse_scene_gt,
     parse_scene_gt_info, parse_targets,
 };
-pub use score::{
-    area_under_accuracy, average_precision, fractions_05_to_50, greedy_matches, pixels_5_to_50, recall_below,
-};
+pub use score::{area_under_accuracy, average_precision, recall_below};
 pub use table::{detection_score_table, score_table};
 pub use visibility::{ObjectVisibility, VISIBILITY_DELTA, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

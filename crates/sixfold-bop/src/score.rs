@@ -5,12 +5,12 @@
 use std::cmp::Ordering;
 
 /// The thresholds .05, .10 ... .50 as `start + i * step`, bit for bit those of the BOP Challenge.
-pub fn fractions_05_to_50() -> Vec<f64> {
+pub(crate) fn fractions_05_to_50() -> Vec<f64> {
     (0..10).map(|i| 0.05 + f64::from(i) * 0.05).collect()
 }
 
 /// The thresholds 5, 10 ... 50 pixels of MSPD.
-pub fn pixels_5_to_50() -> Vec<f64> {
+pub(crate) fn pixels_5_to_50() -> Vec<f64> {
     (1..=10).map(|i| f64::from(5 * i)).collect()
 }
 
@@ -23,7 +23,7 @@ pub(crate) fn by_falling_score<T>(items: &mut [T], score: impl Fn(&T) -> f64) {
 /// valid ground truth with the smallest error below `threshold`.
 ///
 /// `errors[estimate][ground truth]`, estimates sorted by falling score. Returns the ground truth of each estimate.
-pub fn greedy_matches(errors: &[Vec<f64>], valid: &[bool], threshold: f64) -> Vec<Option<usize>> {
+pub(crate) fn greedy_matches(errors: &[Vec<f64>], valid: &[bool], threshold: f64) -> Vec<Option<usize>> {
     let mut taken = vec![false; valid.len()];
     let mut matches = Vec::with_capacity(errors.len());
     for row in errors {

@@ -18,7 +18,7 @@ fn lmo_published_results_score_as_the_official_toolkit_says() {
     let dataset = BopDataset::open(&dir, "test").unwrap();
     let estimates = read_results(&dir.join("published/cnos-fastsam-megapose_lmo-test.csv")).unwrap();
     let targets = dataset.targets(None).unwrap();
-    let found = evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &|_| {}).unwrap();
+    let found = evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &()).unwrap();
     let text = std::fs::read_to_string(dir.join("published/expected_scores.json")).unwrap();
     let expected: serde_json::Value = serde_json::from_str(&text).unwrap();
     let close = |name: &str, found: Option<f64>, expected: &serde_json::Value| {
@@ -64,7 +64,7 @@ fn lmo_ground_truth_scores_exactly_one() {
     let estimates = read_results(&path).unwrap();
     let targets = dataset.targets(None).unwrap();
     let options = EvalOptions::default();
-    let found = evaluate(&dataset, &estimates, &targets, &options, &|_| {}).unwrap();
+    let found = evaluate(&dataset, &estimates, &targets, &options, &()).unwrap();
     assert_eq!((found.ar_mssd, found.ar_mspd), (Some(1.0), Some(1.0)));
     // The published matrices are not quite rotations, the estimates are read back from the same numbers: no error at all.
     assert_eq!((found.add_auc, found.add_s_auc), (Some(1.0), Some(1.0)));
@@ -75,7 +75,7 @@ fn lmo_ground_truth_scores_exactly_one() {
 
     // The one frame with depth: VSD and AR exist and are one as well, whatever hides the objects.
     let frame: Vec<Target> = targets.iter().copied().filter(|t| t.im_id == 3).collect();
-    let found = evaluate(&dataset, &estimates, &frame, &options, &|_| {}).unwrap();
+    let found = evaluate(&dataset, &estimates, &frame, &options, &()).unwrap();
     assert_eq!((found.ar, found.ar_vsd), (Some(1.0), Some(1.0)), "{:?}", found.reasons);
 
     // And an estimate five centimetres off scores less in every respect.
@@ -84,7 +84,7 @@ fn lmo_ground_truth_scores_exactly_one() {
         let t = estimate.camera_from_object.translation() + Vec3::new(0.05, 0.0, 0.0);
         estimate.camera_from_object = estimate.camera_from_object.with_translation(t);
     }
-    let worse = evaluate(&dataset, &off, &frame, &options, &|_| {}).unwrap();
+    let worse = evaluate(&dataset, &off, &frame, &options, &()).unwrap();
     assert!(worse.ar_vsd < Some(0.6) && worse.ar_mssd < Some(0.5) && worse.ar_mspd < Some(0.6), "{worse:?}");
     assert_eq!(worse.add_s_recall["mean"], Some(0.0));
 }
@@ -121,7 +121,7 @@ fn the_scores_do_not_depend_on_the_number_of_threads() {
     targets.truncate(60);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let run = || evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &|_| {}).unwrap();
+        let run = || evaluate(&dataset, &estimates, &targets, &EvalOptions::default(), &()).unwrap();
         serde_json::to_string(&pool.install(run)).unwrap()
     };
     assert_eq!(run(1), run(3));
@@ -135,7 +135,7 @@ fn hope_as_a_bare_scene_folder_has_no_depth_and_says_so() {
     assert!(targets.len() >= 3 * 15);
     let camera = dataset.scene(0).unwrap().camera(0).unwrap();
     assert_eq!((camera.width, camera.height), (1920, 1080));
-    let found = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &|_| {}).unwrap();
+    let found = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &()).unwrap();
     assert_eq!((found.ar, found.ar_mssd), (None, Some(0.0)));
     assert_eq!(found.add_s_recall["2"], Some(0.0));
     assert!(

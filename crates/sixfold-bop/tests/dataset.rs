@@ -122,7 +122,7 @@ fn truth_as_estimates(dataset: &BopDataset) -> Vec<Estimate> {
 
 fn score(dataset: &BopDataset, estimates: &[Estimate]) -> sixfold_bop::Evaluation {
     let targets = dataset.targets(None).unwrap();
-    evaluate(dataset, estimates, &targets, &EvalOptions::default(), &|_| {}).unwrap()
+    evaluate(dataset, estimates, &targets, &EvalOptions::default(), &()).unwrap()
 }
 
 #[test]
@@ -223,7 +223,7 @@ fn missing_parts_leave_scores_empty_with_reasons() {
     let object = Some(TargetObject { obj_id: 1, inst_count: 1 });
     let one = [Target { scene_id: 2, im_id: 3, object }];
     let found =
-        evaluate(&dataset, &truth_as_estimates(&dataset), &one, &EvalOptions::default(), &|_| {}).unwrap();
+        evaluate(&dataset, &truth_as_estimates(&dataset), &one, &EvalOptions::default(), &()).unwrap();
     assert_eq!(found.ar, Some(1.0));
 }
 
@@ -277,7 +277,7 @@ fn broken_datasets_are_named() {
     std::fs::write(file("depth/000003.png"), &png[..png.len() / 2]).unwrap();
     assert!(message(scene.depth(3)).contains("depth/000003.png: im_id 3: not a readable image"));
     let targets = dataset.targets(None).unwrap();
-    let result = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &|_| {});
+    let result = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &());
     assert!(message(result).contains("000003.png"));
 
     let gt = std::fs::read_to_string(file("scene_gt.json")).unwrap();
@@ -291,7 +291,7 @@ fn broken_datasets_are_named() {
     std::fs::remove_file(file("scene_gt_info.json")).unwrap();
     std::fs::remove_file(file("scene_gt.json")).unwrap();
     assert!(!dataset.scene(2).unwrap().has_ground_truth());
-    let result = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &|_| {});
+    let result = evaluate(&dataset, &[], &targets, &EvalOptions::default(), &());
     assert!(message(result).contains("scene_gt.json: the ground truth is missing"));
     std::fs::write(root.join("camera.json"), r#"{"width": 0, "height": 480}"#).unwrap();
     assert!(message(BopDataset::open(root, "test")).contains("field width: found 0"));
@@ -314,8 +314,8 @@ fn broken_datasets_are_named() {
 fn options_out_of_range_are_refused() {
     let (_dir, dataset) = written();
     let bad = EvalOptions { max_symmetry_step: 0.0, ..EvalOptions::default() };
-    assert!(message(evaluate(&dataset, &[], &[], &bad, &|_| {})).contains("max_symmetry_step"));
-    let found = evaluate(&dataset, &[], &[], &EvalOptions::default(), &|_| {}).unwrap();
+    assert!(message(evaluate(&dataset, &[], &[], &bad, &())).contains("max_symmetry_step"));
+    let found = evaluate(&dataset, &[], &[], &EvalOptions::default(), &()).unwrap();
     assert_eq!(found.ar_mssd, None);
     assert!(found.reasons["ar_mssd"].contains("no pose to be found"), "{:?}", found.reasons);
 }

@@ -3,6 +3,8 @@
 //!
 //! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] draws poses, [`color_patch`] images.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 mod backgrounds;
 mod colors;
 mod contents;

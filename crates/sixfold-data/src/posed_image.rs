@@ -103,7 +103,7 @@ impl PosedImage {
     }
 
     /// The same, knowing which part of the object's silhouette is visible, 0 to 1.
-    pub fn with_visible_fraction(self, fraction: f64) -> Self {
+    pub(crate) fn with_visible_fraction(self, fraction: f64) -> Self {
         PosedImage { visible_fraction: Some(fraction), ..self }
     }
 

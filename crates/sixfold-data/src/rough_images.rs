@@ -90,11 +90,11 @@ pub(crate) struct Disturber {
 }
 
 impl Disturber {
-    pub fn new(options: &RoughImageOptions<'_>) -> Self {
+    pub(crate) fn new(options: &RoughImageOptions<'_>) -> Self {
         Disturber { random: ChaCha8Rng::seed_from_u64(options.seed), reach: options.disturb }
     }
 
-    pub fn disturb(&mut self, pose: &Pose) -> Pose {
+    pub(crate) fn disturb(&mut self, pose: &Pose) -> Pose {
         let Some([shift, rotation]) = self.reach else { return *pose };
         let mut draw = |reach: f64| reach * (2.0 * self.random.random::<f64>() - 1.0);
         let moved = Vec3::new(draw(shift), draw(shift), draw(shift));

@@ -8,6 +8,11 @@ use sixfold_geometry::RgbImage;
 use crate::detect::DetectOptions;
 use crate::model::{DetectorModel, ModelError};
 
+/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
+const MIN_SCORE: f32 = 0.4;
+/// In datasets, detections this sure are passed on: a pose's own confidence sorts them further.
+const MIN_DETECTION: f32 = 0.1;
+
 /// A trained detector with what is asked of it.
 pub struct TrainedDetector {
     model: DetectorModel,
@@ -50,8 +55,25 @@ impl TrainedDetector {
         &self.options
     }
 
+    /// A detector that says where a method looks in the images of a dataset.
+    pub fn for_dataset(self) -> TrainedDetector {
+        self.with_threshold(MIN_DETECTION)
+    }
+
+    /// Where it sees the object that was asked for best, if at all.
+    ///
+    /// # Errors
+    /// When the network fails on the image.
+    pub fn best(self, image: &RgbImage, object_id: u32) -> Result<Option<Region>, EstimatorError> {
+        let threshold = self.options.threshold.min(MIN_SCORE);
+        let found = self.with_threshold(threshold).detect(image)?;
+        let found = found.into_iter().filter(|d| d.object_id == object_id);
+        let best = found.max_by(|a, b| a.region.score.total_cmp(&b.region.score));
+        Ok(best.map(|d| d.region))
+    }
+
     /// Detections of a score below `threshold` are left out.
-    pub fn with_threshold(self, threshold: f32) -> TrainedDetector {
+    pub(crate) fn with_threshold(self, threshold: f32) -> TrainedDetector {
         TrainedDetector { options: DetectOptions { threshold, ..self.options }, ..self }
     }
 }

@@ -3,15 +3,18 @@
 //! The short way: [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod detect;
 pub mod detector;
-pub mod loss;
+mod loss;
 pub mod model;
 pub mod network;
 pub mod proposals;
 pub mod recipe;
 pub mod samples;
 mod tabletop;
-pub mod targets;
+mod targets;
 pub mod training;
+
+pub use targets::{Annotation, Instance};

@@ -11,7 +11,7 @@ use sixfold_geometry::stats::sigmoid;
 
 /// Weights of the terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LossWeights {
+pub(crate) struct LossWeights {
     /// Of scores.
     pub scores: f32,
     /// Of boxes.
@@ -28,7 +28,7 @@ impl Default for LossWeights {
 
 /// Raw output of one image: planes row by row, level after level.
 #[derive(Debug, Clone, Copy)]
-pub struct RawOutput<'a> {
+pub(crate) struct RawOutput<'a> {
     /// Logits of every level.
     pub scores: &'a [Vec<f32>],
     /// Sides, coefficients, bias of every level.
@@ -41,7 +41,7 @@ pub struct RawOutput<'a> {
 
 /// What an image adds to the loss, and the gradients in the shapes of the output.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LossValue {
+pub(crate) struct LossValue {
     /// Before its weight.
     pub scores: f64,
     /// Before its weight.
@@ -113,7 +113,7 @@ fn generalised_overlap(found: [f32; 4], truth: [f32; 4]) -> (f32, f32, [f32; 4])
 ///
 /// # Panics
 /// If the output does not fit the targets.
-pub fn loss(
+pub(crate) fn loss(
     raw: &RawOutput<'_>,
     targets: &Targets,
     config: &DetectorConfig,

@@ -18,7 +18,7 @@ const PROPOSALS: &[u8] = include_bytes!("../weights/proposals.safetensors");
 /// Name of the compact detector in weight files.
 pub const COMPACT: &str = "detect-compact";
 /// Name of the detector on ResNet-50 in weight files.
-pub const RETINANET: &str = "detect-retinanet";
+pub(crate) const RETINANET: &str = "detect-retinanet";
 
 /// What a detector knows of a class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

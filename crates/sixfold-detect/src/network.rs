@@ -16,9 +16,9 @@ use sixfold_nn::ops::upsample;
 use sixfold_nn::resnet::{ResNet50, ResNet50Config};
 
 /// Pixels between the locations of the finest level.
-pub const FINEST_STRIDE: usize = 8;
+pub(crate) const FINEST_STRIDE: usize = 8;
 /// Pixels per pixel of the mask prototypes along a side.
-pub const MASK_STRIDE: usize = 4;
+pub(crate) const MASK_STRIDE: usize = 4;
 /// Score of every class everywhere before training (Lin et al. 2017, section 3.3).
 const PRIOR: f32 = 0.01;
 
@@ -84,7 +84,7 @@ impl DetectorConfig {
     }
 
     /// Channels beside the scores: four sides, the mask's coefficients, and its bias.
-    pub fn regression_channels(&self) -> usize {
+    pub(crate) fn regression_channels(&self) -> usize {
         4 + self.prototypes + 1
     }
 

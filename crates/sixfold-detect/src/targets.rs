@@ -10,7 +10,7 @@ const MAX_LOCATIONS: usize = 9;
 /// Locations of an object whose mask is learnt.
 const MASK_LOCATIONS: usize = 3;
 /// Pixel label of what is neither background nor to be learnt.
-pub const IGNORED: u8 = 255;
+pub(crate) const IGNORED: u8 = 255;
 
 /// An object in a training image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,7 +26,7 @@ pub struct Instance {
 pub struct Annotation {
     /// Columns and rows.
     pub size: [usize; 2],
-    /// For every pixel 0 for background, the object's number from 1, or [`IGNORED`].
+    /// For every pixel 0 for background, the object's number from 1, or `IGNORED`.
     pub labels: Vec<u8>,
     /// The objects; at most 254.
     pub instances: Vec<Instance>,
@@ -34,7 +34,7 @@ pub struct Annotation {
 
 /// A location that stands for an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Positive {
+pub(crate) struct Positive {
     /// Level of the pyramid.
     pub level: usize,
     /// Number of the location on its level, row by row.
@@ -45,7 +45,7 @@ pub struct Positive {
 
 /// An object's mask at the resolution of the prototypes, about its box.
 #[derive(Debug, Clone, PartialEq)]
-pub struct MaskTarget {
+pub(crate) struct MaskTarget {
     /// First column and row.
     pub corner: [usize; 2],
     /// Columns and rows.
@@ -56,7 +56,7 @@ pub struct MaskTarget {
 
 /// Targets of one image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Targets {
+pub(crate) struct Targets {
     /// Columns and rows of every level.
     pub grids: Vec<[usize; 2]>,
     /// Locations that stand for objects.
@@ -86,7 +86,7 @@ fn centre(location: usize, stride: usize) -> usize {
 
 impl Targets {
     /// Targets of an image whose sides are multiples of [`DetectorConfig::alignment`].
-    pub fn new(annotation: &Annotation, config: &DetectorConfig) -> Targets {
+    pub(crate) fn new(annotation: &Annotation, config: &DetectorConfig) -> Targets {
         let [width, height] = annotation.size;
         let count = annotation.instances.len();
         let mut sums = vec![[0.0f64; 3]; count];

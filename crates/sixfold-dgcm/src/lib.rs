@@ -8,13 +8,18 @@
 //! Metres and radians, in the camera's frame unless a name says otherwise.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod learner;
-pub mod loss;
+mod loss;
 pub mod model;
-pub mod networks;
+mod networks;
 pub mod outcome;
 pub mod recipe;
-pub mod samples;
-pub mod training;
+mod samples;
+mod training;
 pub mod transfer;
+
+pub use networks::{Compact, Encoded, Network, Paper};
+pub use samples::{GraspPoolOptions, Pair, PairOptions, Pool, View};
+pub use training::{Batch, DgcmTraining, DgcmTrainingOptions};

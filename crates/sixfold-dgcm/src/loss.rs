@@ -3,13 +3,13 @@
 use burn::tensor::Tensor;
 
 /// Negative pairs are pushed apart up to this distance (equation 6.2).
-pub const MARGIN: f64 = 10.0;
+pub(crate) const MARGIN: f64 = 10.0;
 /// Weight of pixels on the object (equation 6.3).
 const OBJECT_WEIGHT: f64 = 3.0;
 
 /// The contrastive loss of equation 6.2 for features (`pairs x 256`) whose first `positives` rows are positive pairs, and
 /// the mean distances of positive and of negative pairs.
-pub fn metric_loss(
+pub(crate) fn metric_loss(
     input: &Tensor<2>,
     experience: &Tensor<2>,
     positives: usize,
@@ -34,7 +34,7 @@ pub fn metric_loss(
 
 /// Equation 6.2 for all pairs of a first and a second view of the batch that show different families: the same images say
 /// that much more. `different` (`pairs x pairs`) holds 1 for such pairs.
-pub fn cross_loss(input: &Tensor<2>, experience: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
+pub(crate) fn cross_loss(input: &Tensor<2>, experience: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
     let of_input = input.clone().square().sum_dim(1);
     let of_experience = experience.clone().square().sum_dim(1).transpose();
     let product = input.clone().matmul(experience.clone().transpose());
@@ -45,7 +45,11 @@ pub fn cross_loss(input: &Tensor<2>, experience: &Tensor<2>, different: Tensor<2
 
 /// The masked L1 loss of equation 6.3 for coordinates (`batch x 3 x side x side`) where `mask` (`batch x 1 x side x side`)
 /// is 1 on the object, and the mean absolute error of one coordinate there.
-pub fn coordinate_loss(output: Tensor<4>, target: Tensor<4>, mask: Tensor<4>) -> (Tensor<1>, Tensor<1>) {
+pub(crate) fn coordinate_loss(
+    output: Tensor<4>,
+    target: Tensor<4>,
+    mask: Tensor<4>,
+) -> (Tensor<1>, Tensor<1>) {
     let [batch, _, height, width] = output.dims();
     // Sum over the three coordinates: `batch x 1 x side x side`.
     let error = (output - target).abs().sum_dim(1);

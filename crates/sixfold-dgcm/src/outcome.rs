@@ -136,7 +136,12 @@ impl OutcomeModel {
     }
 
     /// The probability that a grasp holds, 0 to 1.
-    pub fn success_probability(&self, description: &GraspDescription, share: f64, transferred: bool) -> f64 {
+    pub(crate) fn success_probability(
+        &self,
+        description: &GraspDescription,
+        share: f64,
+        transferred: bool,
+    ) -> f64 {
         sigmoid(self.weights.dot(&numbers(description, share, transferred)))
     }
 }

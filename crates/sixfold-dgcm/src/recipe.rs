@@ -1,7 +1,6 @@
 //! A whole training: nothing but a seed in, a network for grasps from experience out. Interrupted at any time, it is resumed.
 
 use std::path::PathBuf;
-use std::sync::Mutex;
 
 use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
@@ -193,13 +192,7 @@ impl Recipe for DgcmRecipe {
         session: &mut Session<'_>,
     ) -> Result<Option<Pool>, TrainError> {
         session.note(&format!("making {} views", self.views));
-        let events = Mutex::new(&mut *session.events);
-        let pool = Pool::new(pool, |done| {
-            if let Ok(mut events) = events.lock() {
-                events(TrainingEvent::Preparing(done, self.views));
-            }
-        });
-        Ok(Some(pool))
+        Ok(Pool::new(pool, &session.progress(TrainingEvent::Preparing)))
     }
 
     fn finish(

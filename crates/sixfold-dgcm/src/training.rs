@@ -277,7 +277,7 @@ mod tests {
 
     #[test]
     fn on_one_batch_both_losses_fall() {
-        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, |_| ());
+        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, &()).unwrap();
         let device = Device::flex().autodiff();
         let options = DgcmTrainingOptions { pairs: 2, negatives: 1, ..DgcmTrainingOptions::default() };
         let network = Network::Compact(CompactConfig.init(3, &device));
@@ -292,7 +292,7 @@ mod tests {
 
     #[test]
     fn it_goes_on_where_it_stopped() {
-        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, |_| ());
+        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, &()).unwrap();
         let device = Device::flex().autodiff();
         let default = DgcmTrainingOptions::default();
         let common = TrainingOptions { steps: 16, warm_up: 2, ..default.common.clone() };

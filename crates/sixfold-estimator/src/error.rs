@@ -4,7 +4,7 @@ use sixfold_align::PreparedDepthError;
 use thiserror::Error;
 
 /// What any error of a method is wrapped in.
-pub type Source = Box<dyn std::error::Error + Send + Sync>;
+pub(crate) type Source = Box<dyn std::error::Error + Send + Sync>;
 
 /// Why a method cannot prepare an object or answer a query.
 #[derive(Debug, Error)]

@@ -5,6 +5,8 @@
 //! Objects come from mesh files or from an [`ObjectStore`], a folder of named objects. What methods derive from an object
 //! (descriptions, templates) is kept in its folder there, or for a mesh file in a [`Cache`].
 
+#![warn(unreachable_pub, unnameable_types)]
+
 mod cache;
 mod detector;
 mod error;

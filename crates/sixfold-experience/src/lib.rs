@@ -8,6 +8,7 @@
 //! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
 //! memory, asks the store only for what has changed, and finds the nearest exactly.
 
+#![warn(unreachable_pub, unnameable_types)]
 // `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 

@@ -72,7 +72,7 @@ impl Raw {
     ///
     /// # Errors
     /// [`StoreError::Field`].
-    pub fn understand(self, id: i64, copies: Vec<Copy>) -> Result<Experience, StoreError> {
+    pub(crate) fn understand(self, id: i64, copies: Vec<Copy>) -> Result<Experience, StoreError> {
         let wrong = |field, expected, found: String| StoreError::Field { id, field, expected, found };
         let side = usize::try_from(self.side)
             .ok()

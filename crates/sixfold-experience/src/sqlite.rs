@@ -159,7 +159,7 @@ impl SqliteStore {
     ///
     /// # Errors
     /// [`StoreError`] where nothing can be read.
-    pub fn open_damaged(path: &Path) -> Result<SqliteStore, StoreError> {
+    pub(crate) fn open_damaged(path: &Path) -> Result<SqliteStore, StoreError> {
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         Self::connect_as(path, path, OpenFlags::SQLITE_OPEN_READ_ONLY, REPAIRS)
             .and_then(checked)

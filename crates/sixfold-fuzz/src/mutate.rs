@@ -60,7 +60,7 @@ pub fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
 }
 
 /// The bytes with the right checksum behind every chunk of a PNG: the same for images.
-pub fn with_png_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
+pub(crate) fn with_png_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
     let mut at = 8;
     while let Some(head) = bytes.get(at..at + 4) {
         let length = u32::from_be_bytes([head[0], head[1], head[2], head[3]]) as usize;

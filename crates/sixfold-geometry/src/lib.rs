@@ -5,6 +5,7 @@
 //! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod camera;
 mod cloud;
@@ -19,6 +20,7 @@ mod option_error;
 mod plane;
 mod pnp;
 mod pose;
+mod progress;
 pub mod random;
 mod solver;
 pub mod stats;
@@ -42,8 +44,9 @@ pub use pnp::{
     refine_pose, refine_trusted,
 };
 pub use pose::{Pose, PoseError};
+pub use progress::Progress;
 pub use solver::NormalEquations;
-pub use undistort::{undistort_depth, undistort_rgb};
+pub use undistort::{undistort_box, undistort_depth, undistort_rgb};
 
 /// The linear algebra types in this crate's public signatures.
 pub use nalgebra;

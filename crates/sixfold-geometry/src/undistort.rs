@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use crate::{Camera, CameraError, DepthImage, Image, RgbImage, Vec2};
+use crate::{Camera, CameraError, DepthImage, Image, Rect, RgbImage, Vec2};
 
 /// The depth image a pinhole camera with the same intrinsics would have measured: the nearest raw pixel, because a mean
 /// over a depth edge is a point that does not exist. Missing where the raw image shows nothing.
@@ -41,6 +41,25 @@ pub fn undistort_rgb(raw: &RgbImage, camera: &Camera) -> Result<RgbImage, Camera
             (top * (1.0 - fy) + bottom * fy).round() as u8
         })
     })
+}
+
+/// The box that holds what a box of the raw image shows, in the pinhole image: found from its border and inside, 25 points.
+pub fn undistort_box(region: &Rect, lens: &Camera) -> Rect {
+    if lens.distortion.is_none() {
+        return *region;
+    }
+    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    for (u, v) in (0..=4).flat_map(|u| (0..=4).map(move |v| (u, v))) {
+        let along = |i: i32, start: f64, size: f64| start + 0.25 * f64::from(i) * size;
+        let at = Vec2::new(along(u, region.x, region.width), along(v, region.y, region.height));
+        if let Some(at) = lens.undistort_point(&at) {
+            (low, high) = (low.inf(&at), high.sup(&at));
+        }
+    }
+    if low.x > high.x {
+        return *region;
+    }
+    Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y }
 }
 
 fn resample<T: Clone + Send + Sync>(

@@ -15,9 +15,10 @@ use sixfold_geometry::random::stream;
 use sixfold_geometry::{KdTree, Pose, Vec3};
 use thiserror::Error;
 
+use crate::completion::assume_walls;
 use crate::{
     AntipodalQuality, CollisionScene, CompletedObject, CompletionOptions, Grasp, GraspView, Gripper,
-    assume_walls, complete_by_mirrors, gripper_pose,
+    complete_by_mirrors, gripper_pose,
 };
 
 /// An option out of range.
@@ -183,7 +184,7 @@ pub(crate) struct Planner<'a> {
 }
 
 impl<'a> Planner<'a> {
-    pub fn new(
+    pub(crate) fn new(
         view: &GraspView,
         gripper: &'a Gripper,
         object: CompletedObject,
@@ -312,7 +313,7 @@ impl<'a> Planner<'a> {
     }
 
     /// The grasp at about this pose: moved along x so that the object is midway between the pads, tested and judged.
-    pub fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
+    pub(crate) fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
         if self.scene.hit(self.gripper, pose, opening).is_some() {
             return None;
         }
@@ -343,7 +344,7 @@ impl<'a> Planner<'a> {
     }
 
     /// Points between the pads, in the gripper's frame: index and point.
-    pub fn between(&self, pose: &Pose, opening: f64) -> Vec<(usize, Vec3)> {
+    pub(crate) fn between(&self, pose: &Pose, opening: f64) -> Vec<(usize, Vec3)> {
         let rotation = pose.rotation_matrix().transpose();
         let origin = pose.translation();
         let (half_opening, half_width) = (0.5 * opening, 0.5 * self.gripper.finger_width);
@@ -364,7 +365,7 @@ impl<'a> Planner<'a> {
     }
 
     /// How far the points between the pads reach along x, without the two outermost on each side.
-    pub fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
+    pub(crate) fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
         if between.len() < 8 {
             return None;
         }

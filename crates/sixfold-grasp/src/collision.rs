@@ -45,7 +45,7 @@ impl CollisionScene {
 
     /// With the object this thick behind every seen point, metres: nobody saw that the palm could be there. Fingers may, for
     /// they have to reach round the object.
-    pub fn with_thickness(mut self, seen: &[Vec3], thickness: f64) -> CollisionScene {
+    pub(crate) fn with_thickness(mut self, seen: &[Vec3], thickness: f64) -> CollisionScene {
         let steps = (thickness / Self::STEP).floor() as usize;
         let behind = |p: &Vec3, k: usize| p + p.normalize() * (k as f64 * Self::STEP);
         let points =

@@ -167,7 +167,7 @@ fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
 /// whose sides the camera looks over (a banana, a pair of scissors). Their normals are level and look outwards. Points that
 /// contradict the image or lie where a point is known are left out, so a second call adds nothing. Does nothing without a
 /// table.
-pub fn assume_walls(view: &GraspView, object: &mut CompletedObject, options: &CompletionOptions) {
+pub(crate) fn assume_walls(view: &GraspView, object: &mut CompletedObject, options: &CompletionOptions) {
     let Some(table) = view.table else { return };
     let cell = view.step.max(1e-4);
     let any = if table.normal.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };

@@ -17,6 +17,7 @@
 //! ```
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod antipodal;
 mod cluster;
@@ -34,7 +35,7 @@ mod view;
 pub use antipodal::{AntipodalOptions, OptionsError, antipodal_grasps};
 pub use cluster::{ClusterOptions, GraspCluster, cluster_grasps};
 pub use collision::{CollisionScene, Hit};
-pub use completion::{CompletedObject, CompletionOptions, assume_walls, complete_by_mirrors};
+pub use completion::{CompletedObject, CompletionOptions, complete_by_mirrors};
 pub use describe::GraspDescription;
 pub use draw::{DrawnGrasp, draw_grasps};
 pub use fit::GraspFitter;

@@ -2,6 +2,8 @@
 //!
 //! Images are decoded without trusting their headers; depth comes out in metres. What knows datasets stands above.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 mod camera_file;
 mod error;
 mod files;

@@ -232,7 +232,7 @@ pub(crate) struct Parts {
 
 impl Parts {
     /// The checked mesh. Normals are made unit; one without a direction is computed from the faces.
-    pub fn into_mesh(self, file: &str) -> Result<Mesh, MeshFileError> {
+    pub(crate) fn into_mesh(self, file: &str) -> Result<Mesh, MeshFileError> {
         let in_file = |source| MeshFileError::Mesh { file: file.to_owned(), source };
         let mut mesh = Mesh::new(self.vertices, self.faces).map_err(in_file)?;
         if let Some(mut normals) = self.normals {

@@ -219,11 +219,6 @@ impl KnownObject {
         KnownObject { templates, matcher, surfaces, mesh, learned: None }
     }
 
-    /// Whether a network knows it.
-    pub fn has_network(&self) -> bool {
-        self.learned.is_some()
-    }
-
     /// The pose of the object's frame when a template lies at a pose.
     pub(crate) fn object_pose(&self, camera_from_view: &Pose, template: usize) -> Pose {
         *camera_from_view * self.templates.templates[template].view_from_object

@@ -1,15 +1,16 @@
 //! Objects never trained on, found in depth images by their templates: what chapter 5 of the dissertation is about.
 //!
-//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh ([`from_mesh`])
-//! or cut out of real depth images ([`from_depth`]). Adding an object is all there is to do: nothing is trained.
+//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh (`from_mesh`)
+//! or cut out of real depth images (`from_depth`). Adding an object is all there is to do: nothing is trained.
 //! In a scene, patches around sampled pixels ([`roi`]) are matched with all templates ([`matching`]), the best ones get
 //! masks ([`mask`]), masks of one object are merged, matched again without their background, and the nearest
-//! templates become poses by their geometry ([`align`]); [`mod@estimate`] puts it together, and [`judge`] says how well a pose
+//! templates become poses by their geometry ([`align`]); [`estimate()`] puts it together, and [`judge`] says how well a pose
 //! agrees with the image when there is no mesh.
 //!
 //! Without the feature `network` (default) there is matching point by point only, and nothing of Burn is compiled.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod align;
 #[cfg(feature = "network")]
@@ -17,15 +18,15 @@ mod by_network;
 #[cfg(feature = "network")]
 mod descriptor_file;
 mod error;
-pub mod estimate;
+mod estimate;
 mod estimator;
-pub mod from_depth;
-pub mod from_mesh;
+mod from_depth;
+mod from_mesh;
 pub mod judge;
 #[cfg(feature = "network")]
 pub mod learned;
 #[cfg(feature = "network")]
-pub mod loss;
+mod loss;
 pub mod mask;
 pub mod mask_check;
 pub mod matching;
@@ -34,7 +35,8 @@ pub mod model;
 #[cfg(feature = "network")]
 pub mod network;
 pub mod patch;
-pub mod pose_distance;
+#[cfg(feature = "network")]
+mod pose_distance;
 #[cfg(feature = "network")]
 mod published;
 #[cfg(feature = "network")]
@@ -45,11 +47,11 @@ pub mod recipe;
 mod regions;
 pub mod roi;
 #[cfg(feature = "network")]
-pub mod samples;
+mod samples;
 mod store;
 mod template;
 #[cfg(feature = "network")]
-pub mod training;
+mod training;
 mod views;
 #[cfg(not(feature = "network"))]
 mod without_network;
@@ -60,5 +62,9 @@ pub use error::{StoreError, TemplateError};
 pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};
 pub use estimator::{MttmEstimator, MttmObject, TEMPLATES_FILE};
 pub use from_depth::DepthView;
+#[cfg(feature = "network")]
+pub use samples::{Anchor, AnchorOptions, Augmentation, Batch, DepthPoolOptions, PairBatchOptions, Pool};
 pub use template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions};
+#[cfg(feature = "network")]
+pub use training::{MttmTraining, MttmTrainingOptions};
 pub use views::{ViewCoverage, view_directions, view_rotation};

@@ -4,16 +4,16 @@ use burn::tensor::activation::log_sigmoid;
 use burn::tensor::{Tensor, TensorData};
 
 /// Margin for templates of other objects (equation 5.4).
-pub const GAMMA: f64 = 10.0;
+pub(crate) const GAMMA: f64 = 10.0;
 
 /// The squared distances of rows: `batch x length` twice to `batch x 1`.
-pub fn squared_distance(a: &Tensor<2>, b: &Tensor<2>) -> Tensor<2> {
+pub(crate) fn squared_distance(a: &Tensor<2>, b: &Tensor<2>) -> Tensor<2> {
     (a.clone() - b.clone()).square().sum_dim(1)
 }
 
 /// Equation 5.3, for each row of descriptors of regions, their positive and their negative templates, with the dynamic margins
 /// of equation 5.4 (`batch x 1`); `counts` (`batch x 1`) says with 1 which rows have a negative template.
-pub fn triplet_loss(
+pub(crate) fn triplet_loss(
     region: &Tensor<2>,
     positive: &Tensor<2>,
     negative: &Tensor<2>,
@@ -27,7 +27,7 @@ pub fn triplet_loss(
 
 /// Equation 5.3 with the positive templates of all other objects in the batch as negative ones: the same images say that much
 /// more. `different` (`batch x batch`) holds 1 where the objects differ.
-pub fn cross_loss(region: &Tensor<2>, positive: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
+pub(crate) fn cross_loss(region: &Tensor<2>, positive: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
     let near = squared_distance(region, positive);
     let product = region.clone().matmul(positive.clone().transpose());
     let of_region = region.clone().square().sum_dim(1);
@@ -38,19 +38,19 @@ pub fn cross_loss(region: &Tensor<2>, positive: &Tensor<2>, different: Tensor<2>
 }
 
 /// Equation 5.5, the mean over the batch.
-pub fn pair_loss(region: &Tensor<2>, positive: &Tensor<2>) -> Tensor<1> {
+pub(crate) fn pair_loss(region: &Tensor<2>, positive: &Tensor<2>) -> Tensor<1> {
     squared_distance(region, positive).mean()
 }
 
 /// Binary cross-entropy of logits, the mean; `truth` from 0 to 1.
-pub fn mask_loss<const D: usize>(logits: Tensor<D>, truth: Tensor<D>) -> Tensor<1> {
+pub(crate) fn mask_loss<const D: usize>(logits: Tensor<D>, truth: Tensor<D>) -> Tensor<1> {
     let yes = log_sigmoid(logits.clone()) * truth.clone();
     let no = log_sigmoid(logits * -1.0) * (truth * -1.0 + 1.0);
     (yes + no).mean() * -1.0
 }
 
 /// The Euclidean distance of rows, the mean: L_pose_reg for quaternions, and the same for places.
-pub fn distance_loss(found: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
+pub(crate) fn distance_loss(found: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
     // The root's slope at zero is infinite.
     (squared_distance(&found, &truth) + 1e-8).sqrt().mean()
 }

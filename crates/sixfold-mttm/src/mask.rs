@@ -13,7 +13,7 @@ pub type Pixels = Vec<u32>;
 const REACH: f64 = 0.75;
 
 /// The pixels whose depth agrees with the template within `tolerance` metres, every `stride`-th of every `stride`-th row.
-pub fn template_mask(
+pub(crate) fn template_mask(
     scene: &DepthRegion,
     template: &Template,
     size: f64,

@@ -15,7 +15,7 @@ use crate::error::TemplateError;
 
 /// More than this fraction of a mask is not left out silently nor with a warning: which surface is the object's is then a guess. Chosen
 /// by hand; not swept.
-pub const MAX_LEFT_OUT: f64 = 1.0 / 3.0;
+pub(crate) const MAX_LEFT_OUT: f64 = 1.0 / 3.0;
 /// From this fraction on it is worth a warning: the lowest millimetres of an object that stands on the plane are left out of right
 /// masks too. Chosen by hand; not swept.
 pub const WORTH_A_WARNING: f64 = 0.03;
@@ -62,7 +62,7 @@ impl CheckedMask {
 /// Leaves out of a mask what depth shows to be something else. Depth in metres, without lens distortion.
 ///
 /// # Errors
-/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than [`MAX_LEFT_OUT`] would be left out.
+/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than `MAX_LEFT_OUT` would be left out.
 pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<CheckedMask, TemplateError> {
     camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;

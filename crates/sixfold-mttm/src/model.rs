@@ -170,7 +170,7 @@ impl MttmModel {
     ///
     /// # Panics
     /// As [`MttmModel::encode`].
-    pub fn encode_templates(&self, patches: &[Patch]) -> Encoded {
+    pub(crate) fn encode_templates(&self, patches: &[Patch]) -> Encoded {
         let masks = patches.iter().flat_map(template_mask).collect();
         self.without_background(&self.encode(&patches.iter().collect::<Vec<_>>()), masks)
     }
@@ -190,7 +190,11 @@ impl MttmModel {
     ///
     /// # Panics
     /// As [`MttmModel::encode`].
-    pub fn describe_templates(&self, count: usize, patch: impl Fn(usize) -> Patch + Sync) -> Vec<Descriptor> {
+    pub(crate) fn describe_templates(
+        &self,
+        count: usize,
+        patch: impl Fn(usize) -> Patch + Sync,
+    ) -> Vec<Descriptor> {
         let parts: Vec<Vec<Descriptor>> = (0..count.div_ceil(AT_A_TIME))
             .into_par_iter()
             .map(|part| {
@@ -244,7 +248,7 @@ impl MttmModel {
 }
 
 /// The fraction of every one of 14 x 14 cells in which a patch has anything: for a template, the object.
-pub fn template_mask(patch: &Patch) -> Vec<f32> {
+pub(crate) fn template_mask(patch: &Patch) -> Vec<f32> {
     let (side, step) = (patch.side, patch.side / MAP);
     let known = &patch.values[4 * side * side..];
     (0..MAP * MAP)

@@ -9,7 +9,7 @@ use crate::roi::{Cell, Roi};
 use crate::template::{SIDE, Template};
 
 /// Planes of a patch.
-pub const PLANES: usize = 5;
+pub(crate) const PLANES: usize = 5;
 /// Side of the network's patch as a fraction of the object's diameter.
 pub const REACH: f64 = 1.2;
 

@@ -6,13 +6,13 @@ use sixfold_geometry::nalgebra::UnitQuaternion;
 use crate::template::{SIDE, Template};
 
 /// Mean differences of depth below this are none, metres.
-pub const LOWER: f64 = 0.1;
+pub(crate) const LOWER: f64 = 0.1;
 /// And above this all there can be.
-pub const UPPER: f64 = 0.5;
+pub(crate) const UPPER: f64 = 0.5;
 
 /// Equation 5.1 for two views of one object from the same distance: the mean difference of depth over the pixels that
 /// show it in one of them, where the background has depth 0; 0 below [`LOWER`], 1 above [`UPPER`].
-pub fn appearance_distance(a: &Template, b: &Template) -> f64 {
+pub(crate) fn appearance_distance(a: &Template, b: &Template) -> f64 {
     let (mut sum, mut pixels) = (0.0, 0usize);
     for y in 0..SIDE {
         for x in 0..SIDE {
@@ -33,7 +33,10 @@ pub fn appearance_distance(a: &Template, b: &Template) -> f64 {
 
 /// Equation 5.2: the angle between two rotations (half of it, as a quaternion's product gives it), radians, times how different
 /// they look.
-pub fn pose_distance(a: (&UnitQuaternion<f64>, &Template), b: (&UnitQuaternion<f64>, &Template)) -> f64 {
+pub(crate) fn pose_distance(
+    a: (&UnitQuaternion<f64>, &Template),
+    b: (&UnitQuaternion<f64>, &Template),
+) -> f64 {
     let dot = a.0.coords.dot(&b.0.coords).abs().min(1.0);
     dot.acos() * appearance_distance(a.1, b.1)
 }

@@ -2,13 +2,12 @@
 //! look at them, and the network learns to match regions with templates. Interrupted at any time, it is resumed.
 
 use std::path::PathBuf;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use sixfold_geometry::Progress;
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::choice::Choice;
@@ -112,9 +111,6 @@ impl Default for MttmRecipe {
     }
 }
 
-/// Reports how many of how many things are made.
-type Made<'a> = dyn FnMut(usize, usize) + Send + 'a;
-
 impl MttmRecipe {
     /// The dissertation's training (sections 5.2.3 and 5.3.1): its network, its losses, 20,000 views of scenes.
     pub fn published() -> Self {
@@ -211,11 +207,11 @@ impl Recipe for MttmRecipe {
         options: &mut DepthPoolOptions,
         session: &mut Session<'_>,
     ) -> Result<Option<Pool>, TrainError> {
-        let events = &mut *session.events;
-        let made = &mut |done, all| events(TrainingEvent::Preparing(done, all));
-        let Some(pool) = make_pool(self.objects, self.scenes, options, session.stop, made)? else {
-            return Ok(None);
+        let pool = {
+            let progress = session.progress(TrainingEvent::Preparing);
+            make_pool(self.objects, self.scenes, options, &progress)?
         };
+        let Some(pool) = pool else { return Ok(None) };
         session.note(&format!("scenes: {} regions with an object", pool.with_object().len()));
         let first = Batch::of_step(&pool, &self.options().batch, self.seed, 0);
         write_rgb(&session.out.join("samples.png"), &preview(&first, options.anchors.side, 10))
@@ -235,9 +231,8 @@ impl Recipe for MttmRecipe {
         let test = DepthPoolOptions { seed: self.seed ^ 0x7e57, ..pool };
         let objects = (self.objects / TEST_OBJECTS.0).max(TEST_OBJECTS.1);
         let scenes = (self.scenes / TEST_SCENES.0).max(TEST_SCENES.1);
-        let events = &mut *session.events;
-        let made = &mut |done, all| events(TrainingEvent::Measuring(done, all));
-        let Some(test) = make_pool(objects, scenes, &test, session.stop, made)? else { return Ok(None) };
+        let test = make_pool(objects, scenes, &test, &session.progress(TrainingEvent::Measuring))?;
+        let Some(test) = test else { return Ok(None) };
         session.note(&format!("test scenes: {} regions with an object", test.with_object().len()));
         let quality = quality(&network, &test);
         card.extra["quality"] = serde_json::to_value(quality).map_err(TrainError::method)?;
@@ -251,8 +246,7 @@ fn make_pool(
     objects: usize,
     scenes: usize,
     options: &DepthPoolOptions,
-    stop: &AtomicBool,
-    made: &mut Made<'_>,
+    progress: &dyn Progress,
 ) -> Result<Option<Pool>, TrainError> {
     let objects: Vec<(Mesh, ConvexParts)> = (0..objects)
         .into_par_iter()
@@ -273,24 +267,16 @@ fn make_pool(
     // In parts, so that progress is shown and an interruption noticed.
     let mut arrangements: Vec<Arrangement> = vec![];
     for start in (0..scenes).step_by(AT_A_TIME) {
-        if stop.load(Ordering::Relaxed) {
-            return Ok(None);
-        }
         let part: Vec<Arrangement> = (start..(start + AT_A_TIME).min(scenes))
             .into_par_iter()
             .map(|scene| arrange(&hulls, &pile, options.seed, scene as u64))
             .collect();
         arrangements.extend(part);
-        made(arrangements.len(), 2 * scenes);
-    }
-    let done = AtomicUsize::new(0);
-    let made = Mutex::new(made);
-    let pool = Pool::new(&meshes, &arrangements, options, stop, || {
-        if let Ok(mut made) = made.lock() {
-            made(scenes + done.fetch_add(1, Ordering::Relaxed) + 1, 2 * scenes);
+        if !progress.report(arrangements.len(), 2 * scenes) {
+            return Ok(None);
         }
-    });
-    Ok(pool)
+    }
+    Ok(Pool::new(&meshes, &arrangements, options, &|done, _| progress.report(scenes + done, 2 * scenes)))
 }
 
 /// Some of the objects, fallen.

@@ -72,7 +72,7 @@ impl Regions {
     ///
     /// # Panics
     /// For no numbers.
-    pub fn encoded(&self, numbers: &[usize]) -> Encoded {
+    pub(crate) fn encoded(&self, numbers: &[usize]) -> Encoded {
         let one = |&i: &usize| self.encoded[i / AT_A_TIME].select(&[i % AT_A_TIME]);
         Encoded::joined(&numbers.iter().map(one).collect::<Vec<_>>())
     }
@@ -94,7 +94,7 @@ pub(crate) struct RegionCache {
 
 impl RegionCache {
     /// Those for an object's size; described now if they are asked for the first time.
-    pub fn of(&self, scene: &DepthRegion, learned: &Learned) -> Arc<Regions> {
+    pub(crate) fn of(&self, scene: &DepthRegion, learned: &Learned) -> Arc<Regions> {
         let key = (learned.model().fingerprint(), learned.size().to_bits());
         let known = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(regions) = known().get(&key) {

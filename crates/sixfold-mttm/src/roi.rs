@@ -27,7 +27,7 @@ pub type Cell = [f32; 4];
 pub const UNKNOWN: Cell = [-1e6, 0.0, 0.0, 0.0];
 
 /// The rotation camera from ROI: z to the ray through `point`, with as little turn as possible.
-pub fn ray_rotation(point: &Vec3) -> UnitQuaternion<f64> {
+pub(crate) fn ray_rotation(point: &Vec3) -> UnitQuaternion<f64> {
     UnitQuaternion::rotation_between(&Vec3::z(), point).unwrap_or_else(UnitQuaternion::identity)
 }
 

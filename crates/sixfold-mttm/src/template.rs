@@ -129,7 +129,7 @@ impl Template {
     }
 
     /// The patch as a depth image of [`Template::camera`], metres.
-    pub fn depth_image(&self) -> DepthImage {
+    pub(crate) fn depth_image(&self) -> DepthImage {
         DepthImage::from_fn(SIDE, SIDE, |x, y| {
             self.relative_depth(x, y).map_or(0.0, |z| (self.distance + z) as f32)
         })

@@ -270,8 +270,7 @@ mod tests {
             })
             .collect();
         let options = DepthPoolOptions { views: 3, ..DepthPoolOptions::for_side(CompactConfig::SIDE) };
-        let stop = AtomicBool::new(false);
-        Pool::new(&meshes, &[arrangement.clone(), arrangement], &options, &stop, || ()).unwrap()
+        Pool::new(&meshes, &[arrangement.clone(), arrangement], &options, &()).unwrap()
     }
 
     #[test]

@@ -17,14 +17,14 @@ const SLOPE: f32 = 0.2;
 
 /// The discriminator. It has no options but its seed.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct DiscriminatorConfig {
+pub(crate) struct DiscriminatorConfig {
     /// Seed of the random weights.
     pub seed: u64,
 }
 
 impl DiscriminatorConfig {
     /// The network with random weights (He et al. 2015).
-    pub fn init(&self, device: &Device) -> Discriminator {
+    pub(crate) fn init(&self, device: &Device) -> Discriminator {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         let padding = ConvSpec::same(2, KERNEL, 2);
         let stages = CHANNELS
@@ -39,7 +39,7 @@ impl DiscriminatorConfig {
     }
 }
 
-/// The discriminator, made by [`DiscriminatorConfig`].
+/// The discriminator, made by `DiscriminatorConfig`.
 #[derive(Module, Debug)]
 pub struct Discriminator {
     stages: Vec<Stage>,

@@ -2,10 +2,10 @@
 
 use burn::tensor::{Tensor, TensorData};
 
-pub use crate::ops::doubled;
+pub(crate) use crate::ops::doubled;
 
 /// Enlargement by any whole factor, as two matrix products.
-pub fn enlarged(x: Tensor<4>, factor: usize) -> Tensor<4> {
+pub(crate) fn enlarged(x: Tensor<4>, factor: usize) -> Tensor<4> {
     if factor == 1 {
         return x;
     }

@@ -78,7 +78,7 @@ impl Fingerprint {
     }
 
     /// The same for the names that are asked for alone, before the rest is known.
-    pub fn difference_from_part(&self, asked: &Fingerprint) -> Option<String> {
+    pub(crate) fn difference_from_part(&self, asked: &Fingerprint) -> Option<String> {
         self.difference_in(asked, asked.0.keys())
     }
 

@@ -1,6 +1,7 @@
 //! Backbones, fast convolutions, weight files and the training loop on Burn.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod kernels;
 pub mod layers;
@@ -9,14 +10,14 @@ pub mod ops;
 pub mod recurrent;
 
 pub mod batch_norm;
-pub mod checkpoint;
+mod checkpoint;
 pub mod choice;
 pub mod conv_norm;
 pub mod conv_transpose;
 pub mod critic;
 pub mod dense;
 pub mod densenet;
-pub mod discriminator;
+mod discriminator;
 mod enlarge;
 mod files;
 pub mod fingerprint;
@@ -32,3 +33,6 @@ pub mod training;
 pub mod training_log;
 pub mod weights;
 pub mod xfeat;
+
+pub use checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
+pub use discriminator::Discriminator;

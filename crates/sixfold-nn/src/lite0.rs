@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 pub const ENCODER_ARCHITECTURE: &str = "efficientnet-lite0-5-stages";
 
 /// Its stages, all of which may stay as they are in a training.
-pub const ENCODER_STAGES: usize = 5;
+pub(crate) const ENCODER_STAGES: usize = 5;
 
 /// The ImageNet encoder that this crate carries (1.4 MB, Apache-2.0; its card lies beside it).
 const ENCODER: &[u8] = include_bytes!("../weights/efficientnet-lite0-encoder.safetensors");

@@ -4,9 +4,11 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
+use sixfold_geometry::Progress;
 use sixfold_io::WriteLock;
 
 use crate::checkpoint::Checkpoint;
@@ -64,6 +66,20 @@ impl<'a> Session<'a> {
     /// Whether the training is to stop.
     pub fn is_stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Receives the progress of one function as events of one kind, and stops the function with the training.
+    pub fn progress<'s>(
+        &'s mut self,
+        kind: fn(usize, usize) -> TrainingEvent<'static>,
+    ) -> impl Progress + use<'s, 'a> {
+        let (events, stop) = (Mutex::new(&mut *self.events), self.stop);
+        move |done, total| {
+            if let Ok(mut events) = events.lock() {
+                events(kind(done, total));
+            }
+            !stop.load(Ordering::Relaxed)
+        }
     }
 
     /// Says something that the user should know.

@@ -105,10 +105,10 @@ pub fn restore<T: Training>(training: &mut T, checkpoint: &Checkpoint) -> Result
     Ok(())
 }
 
-/// [`fit_on`] samples that the caller made of nothing but the training's settings.
+/// `fit_on` samples that the caller made of nothing but the training's settings.
 ///
 /// # Errors
-/// As [`fit_on`].
+/// As `fit_on`.
 pub fn fit<T: Training>(
     training: &mut T,
     samples: &T::Samples,
@@ -125,7 +125,7 @@ pub fn fit<T: Training>(
 ///
 /// # Errors
 /// [`TrainError`]; the last checkpoints stay.
-pub fn fit_on<T: Training>(
+pub(crate) fn fit_on<T: Training>(
     inputs: &Fingerprint,
     training: &mut T,
     samples: &T::Samples,

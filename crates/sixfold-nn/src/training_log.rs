@@ -85,7 +85,6 @@ pub enum TrainingLogError {
 pub struct TrainingLog {
     path: PathBuf,
     file: File,
-    last_step: Option<u64>,
 }
 
 impl TrainingLog {
@@ -96,11 +95,9 @@ impl TrainingLog {
     /// [`TrainingLogError::Read`], [`TrainingLogError::Write`] and [`TrainingLogError::Line`].
     pub fn open(path: &Path, resumed_step: u64) -> Result<Self, TrainingLogError> {
         let write_error = |source| TrainingLogError::Write { file: path.to_owned(), source };
-        let mut last_step = None;
         if path.exists() {
             let Lines { records, torn } = read_lines(path)?;
             let kept: Vec<_> = records.iter().filter(|r| r.step <= resumed_step).collect();
-            last_step = kept.last().map(|r| r.step);
             if torn || kept.len() < records.len() {
                 write_atomically_with(path, |file| {
                     kept.iter().try_for_each(|record| file.write_all(line(record)?.as_bytes()))
@@ -109,7 +106,7 @@ impl TrainingLog {
             }
         }
         let file = OpenOptions::new().create(true).append(true).open(path).map_err(write_error)?;
-        Ok(TrainingLog { path: path.to_owned(), file, last_step })
+        Ok(TrainingLog { path: path.to_owned(), file })
     }
 
     /// Adds a record as one line; it is with the operating system when this returns.
@@ -119,13 +116,7 @@ impl TrainingLog {
     pub fn append(&mut self, record: &TrainingRecord) -> Result<(), TrainingLogError> {
         let written = line(record).and_then(|line| self.file.write_all(line.as_bytes()));
         written.map_err(|source| TrainingLogError::Write { file: self.path.clone(), source })?;
-        self.last_step = Some(record.step);
         Ok(())
-    }
-
-    /// Step of the last record.
-    pub fn last_step(&self) -> Option<u64> {
-        self.last_step
     }
 }
 
@@ -185,7 +176,7 @@ const MAX_PANELS: usize = 24;
 ///
 /// # Errors
 /// [`TrainingLogError::NothingToDraw`] without records, [`TrainingLogError::Write`].
-pub fn draw_curves(log: &[TrainingRecord], png: &Path) -> Result<(), TrainingLogError> {
+pub(crate) fn draw_curves(log: &[TrainingRecord], png: &Path) -> Result<(), TrainingLogError> {
     let mut curves: BTreeMap<&str, Vec<(f64, f64)>> = BTreeMap::new();
     for record in log {
         for (name, value) in &record.losses {
@@ -323,7 +314,8 @@ mod tests {
         fill(&path, 1..=5, 0);
         let records = read_training_log(&path).unwrap();
         assert_eq!(records, (1..=5).map(record).collect::<Vec<_>>());
-        assert_eq!(TrainingLog::open(&path, 5).unwrap().last_step(), Some(5));
+        TrainingLog::open(&path, 5).unwrap();
+        assert_eq!(read_training_log(&path).unwrap(), records);
     }
 
     #[test]

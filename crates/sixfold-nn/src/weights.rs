@@ -20,7 +20,7 @@ use sixfold_io::write_atomically_with;
 use crate::files::explain;
 
 /// Version of the weight file's layout that this version of Sixfold writes and reads.
-pub const FORMAT_VERSION: u32 = 1;
+pub(crate) const FORMAT_VERSION: u32 = 1;
 
 const CARD_KEY: &str = "sixfold_card";
 /// The longest header that is read. The largest networks have a few thousand tensors, 100 bytes each.
@@ -32,7 +32,7 @@ const MAX_HEADER: u64 = 32 << 20;
 pub struct ModelCard {
     /// Name of the network's architecture. Loading asks for it.
     pub architecture: String,
-    /// Version of the file's layout, see [`FORMAT_VERSION`]. [`save_weights`] fills it in.
+    /// Version of the file's layout, see `FORMAT_VERSION`. [`save_weights`] fills it in.
     pub format_version: u32,
     /// One line for people.
     pub title: String,

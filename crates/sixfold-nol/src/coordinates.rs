@@ -12,7 +12,7 @@ use sixfold_render::{BoundingBoxScale, RenderOptions, SceneObject, VisibilityBuf
 ///
 /// # Errors
 /// What the system says.
-pub fn write_coordinates(path: &Path, mesh: &Mesh, camera: &Camera, pose: &Pose) -> io::Result<()> {
+pub(crate) fn write_coordinates(path: &Path, mesh: &Mesh, camera: &Camera, pose: &Pose) -> io::Result<()> {
     let (low, high) = mesh.bounding_box();
     let scale = BoundingBoxScale::of_corners(&low, &high);
     let mut frame = VisibilityBuffer::new(camera);

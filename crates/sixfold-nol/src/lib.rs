@@ -6,9 +6,10 @@
 //! every photograph that sees the same place of the surface ([`SourceView::project`]).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod agreement;
-pub mod coordinates;
+mod coordinates;
 mod error;
 mod features;
 pub mod loss;
@@ -29,6 +30,7 @@ mod surface;
 pub mod synthesis;
 pub mod training;
 pub mod view_grid;
+mod view_split;
 mod window;
 
 pub use error::NolError;
@@ -36,4 +38,4 @@ pub use features::SourceFeatures;
 pub use maps::Maps;
 pub use projection::{Projection, TargetSurface};
 pub use source::SourceView;
-pub use window::object_window;
+pub use view_split::{ViewSplit, ViewSplitError, WrittenViews};

@@ -47,7 +47,7 @@ impl Perceptual {
 
 /// Equation 4.1 without its weights: colours and features, each a mean over the pixels of `mask` (`B x 1 x height x width`,
 /// M^D: 1 where any source is valid).
-pub fn image_loss(
+pub(crate) fn image_loss(
     image: Tensor<4>,
     truth: Tensor<4>,
     mask: Tensor<4>,
@@ -74,7 +74,7 @@ pub fn image_loss(
 
 /// Equation 4.2 without its weight: the absolute second differences of X^S (`B x 17 x height x width`) in rows, in columns and
 /// mixed, where all pixels that they are taken from lie in the mask.
-pub fn smooth_loss(sum: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
+pub(crate) fn smooth_loss(sum: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     let [_, channels, height, width] = sum.dims();
     let part = |x: &Tensor<4>, y: usize, left: usize, rows: usize, columns: usize| {
         x.clone().narrow(2, y, rows).narrow(3, left, columns)
@@ -95,7 +95,7 @@ pub fn smooth_loss(sum: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
 }
 
 /// Mean squared error of colours (-1 to 1, `B x 3`) over the mask, as of values from 0 to 1.
-pub fn squared_error(image: Tensor<4>, truth: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
+pub(crate) fn squared_error(image: Tensor<4>, truth: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     let error = ((image - truth) * 0.5).square() * mask.clone();
     error.sum() / (mask.sum() * COLOURS as f64 + 1e-3)
 }

@@ -16,7 +16,7 @@ impl Maps {
     ///
     /// # Panics
     /// When `planes` does not hold `channels * side * side` numbers.
-    pub fn from_planes(planes: &[f32], channels: usize, side: usize) -> Self {
+    pub(crate) fn from_planes(planes: &[f32], channels: usize, side: usize) -> Self {
         let area = side * side;
         assert_eq!(planes.len(), channels * area, "one number per pixel and channel");
         let mut data = vec![0.0; planes.len()];
@@ -38,7 +38,7 @@ impl Maps {
     /// The colours of a square patch without what changes slowly: blurred by `sigma` pixels, less the mean over a wide
     /// neighbourhood (`wide` pixels) of what lies `inside` (0 to 1 per pixel). Shading and shadows change slowly, paint does
     /// not; and what lies beside the object has no part in either mean.
-    pub fn of_detail(patch: &Patch, inside: &[f32], sigma: f32, wide: f32) -> Self {
+    pub(crate) fn of_detail(patch: &Patch, inside: &[f32], sigma: f32, wide: f32) -> Self {
         let area = patch.width * patch.height;
         let mean = |sigma: f32| {
             let mut masked = patch.clone();
@@ -90,7 +90,14 @@ impl Maps {
     }
 
     /// The channels at a pixel and their change per pixel to the right and downwards (central differences over one pixel).
-    pub fn sample_with_gradient(&self, x: f32, y: f32, out: &mut [f32], dx: &mut [f32], dy: &mut [f32]) {
+    pub(crate) fn sample_with_gradient(
+        &self,
+        x: f32,
+        y: f32,
+        out: &mut [f32],
+        dx: &mut [f32],
+        dy: &mut [f32],
+    ) {
         self.sample(x, y, out);
         let mut before = vec![0.0f32; self.channels];
         for (gradient, [u, v]) in [(dx, [0.5f32, 0.0]), (dy, [0.0, 0.5])] {

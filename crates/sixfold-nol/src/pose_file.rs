@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::{Deserialize, Serialize};
 use sixfold_data::{PosedImage, RoughImage, RoughImages, TrainingSetError};
-use sixfold_geometry::Pose;
 use sixfold_geometry::nalgebra::Matrix4;
+use sixfold_geometry::{Pose, Progress};
 use sixfold_mesh::Mesh;
 
 use crate::error::NolError;
@@ -141,8 +142,8 @@ impl PoseFile {
         }
     }
 
-    /// Makes the poses better unless `file` has them already or `options` are none, and keeps them there. `progress` gets what
-    /// is done, 0 to 1, and returns whether to go on; `None` where it did not.
+    /// Makes the poses better unless `file` has them already or `options` are none, and keeps them there. `None` once
+    /// `progress` stops it.
     ///
     /// # Errors
     /// [`PoseFileError`].
@@ -151,20 +152,20 @@ impl PoseFile {
         options: Option<&PoseRefinementOptions>,
         disturbed: bool,
         file: &Path,
-        mut progress: impl FnMut(f64) -> bool,
+        progress: &dyn Progress,
     ) -> Result<Option<PoseFile>, PoseFileError> {
         let mut poses = PoseFile::given(images, options.is_some(), disturbed);
         if let Some(options) = options {
             if file.exists() {
                 return PoseFile::read(file).map(Some);
             }
-            let mut stopped = false;
-            poses.refine(images, options, |done| {
-                stopped |= !progress(done);
-                !stopped
+            let stopped = AtomicBool::new(false);
+            poses.refine(images, options, &|done, total| {
+                let stops = !progress.report(done, total);
+                !(stopped.fetch_or(stops, Ordering::Relaxed) || stops)
             })?;
             // The last step may have been the one that was not wanted any more.
-            if stopped || !progress(1.0) {
+            if stopped.into_inner() || !progress.report(1, 1) {
                 return Ok(None);
             }
         }
@@ -210,7 +211,7 @@ impl PoseFile {
         &mut self,
         images: &RoughImages,
         options: &PoseRefinementOptions,
-        progress: impl FnMut(f64) -> bool,
+        progress: &dyn Progress,
     ) -> Result<(), PoseFileError> {
         let sources = all(images);
         let meshes: Vec<Mesh> = images.objects.iter().map(|o| o.mesh.clone()).collect();

@@ -20,7 +20,7 @@ pub(crate) struct Preview {
 }
 
 impl Preview {
-    pub fn new(textures: &Backgrounds, options: &ViewSampleOptions, seed: u64) -> Self {
+    pub(crate) fn new(textures: &Backgrounds, options: &ViewSampleOptions, seed: u64) -> Self {
         // Numbers that no training comes to.
         let sample = |row| make_sample(textures, options, SIDE, SOURCES, seed, u64::MAX - row);
         let samples: Vec<_> = (0..ROWS).map(sample).collect();
@@ -29,7 +29,7 @@ impl Preview {
 
     /// Draws sources, the true target, the sources' average, X^D and X^phi into `folder`. An image that cannot be written is no
     /// reason to stop a training.
-    pub fn draw(&self, network: &Network, folder: &Path) {
+    pub(crate) fn draw(&self, network: &Network, folder: &Path) {
         let passed = pass(network, self.batch.clone(), &Device::flex());
         let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
         let (average, _) = self.batch.average();

@@ -59,7 +59,7 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
     Ok(notes)
 }
 
-/// As [`choose_images`], by the distance of the poses: [`choose_by_pose`] with the dissertation's numbers for images in which nothing
+/// As [`choose_images`], by the distance of the poses: `choose_by_pose` with the dissertation's numbers for images in which nothing
 /// hides the objects.
 pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
     let poses: Vec<Pose> = object.images.iter().map(|i| *i.posed.camera_from_object()).collect();
@@ -73,7 +73,7 @@ pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
 
 /// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times
 /// the fraction of its mask there; 0 where it does not.
-pub fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> Vec<f32> {
+pub(crate) fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> Vec<f32> {
     let side = source.side();
     points
         .iter()
@@ -92,7 +92,7 @@ pub fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> V
 /// when the best one adds less than `min_gain` points.
 ///
 /// `shown` has [`shown_points`] of every photograph; `only` says which points count, all if `None`.
-pub fn choose_by_surface(
+pub(crate) fn choose_by_surface(
     shown: &[Vec<f32>],
     only: Option<&[bool]>,
     most: usize,
@@ -129,7 +129,12 @@ pub fn choose_by_surface(
 /// Chooses photographs at random such that no two have poses nearer than `apart` (metres between cameras in the object's frame
 /// and radians between their directions; both must be undercut for a photograph to be left out). The dissertation's numbers
 /// are 0.3 m and 45 degrees.
-pub fn choose_by_pose(camera_from_object: &[Pose], apart: [f64; 2], most: usize, seed: u64) -> Vec<usize> {
+pub(crate) fn choose_by_pose(
+    camera_from_object: &[Pose],
+    apart: [f64; 2],
+    most: usize,
+    seed: u64,
+) -> Vec<usize> {
     let mut order: Vec<usize> = (0..camera_from_object.len()).collect();
     order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
     let mut chosen: Vec<usize> = vec![];

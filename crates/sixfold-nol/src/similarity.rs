@@ -34,7 +34,7 @@ pub struct Similarity {
 
 /// Peak signal-to-noise ratio in decibels over the pixels of a mask. Both images have the mask's size and values from 0 to 1.
 /// 100 for images without difference; `None` for an empty mask.
-pub fn psnr_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
+pub(crate) fn psnr_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
     let area = mask.as_slice().len();
     let (mut sum, mut count) = (0.0, 0usize);
     for at in (0..area).filter(|at| mask.as_slice()[*at]) {
@@ -48,7 +48,7 @@ pub fn psnr_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
 
 /// Structural similarity: the mean over the pixels of a mask and over red, green and blue. The window (Gaussian of 1.5 pixels,
 /// 11 x 11) counts only what lies in the mask, so that nothing beside the object has a part in it. `None` for an empty mask.
-pub fn ssim_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
+pub(crate) fn ssim_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
     let (width, height) = mask.size();
     let area = width * height;
     let inside: Vec<f64> = mask.as_slice().iter().map(|m| f64::from(u8::from(*m))).collect();

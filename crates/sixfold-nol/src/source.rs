@@ -57,7 +57,7 @@ impl SourceView {
     }
 
     /// A view from a crop that is there already.
-    pub fn of_crop(patch: Patch, visible: Coverage, camera: Camera, pose: Pose, mesh: &Mesh) -> Self {
+    pub(crate) fn of_crop(patch: Patch, visible: Coverage, camera: Camera, pose: Pose, mesh: &Mesh) -> Self {
         let (low, high) = mesh.bounding_box();
         let mut view = SourceView {
             patch,
@@ -97,7 +97,7 @@ impl SourceView {
     }
 
     /// Another pose for the same crop.
-    pub fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut VisibilityBuffer) {
+    pub(crate) fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut VisibilityBuffer) {
         self.camera_from_object = camera_from_object;
         frame.set_camera(&self.camera);
         frame.render(&[SceneObject { mesh, camera_from_object }], &RenderOptions::default());

@@ -81,7 +81,7 @@ impl NolTrainingOptions {
     }
 
     /// The same with the losses of one column of table 4.6.
-    pub fn with_losses(self, losses: NolLosses) -> Self {
+    pub(crate) fn with_losses(self, losses: NolLosses) -> Self {
         let [colours, features, smoothness] = WEIGHTS;
         let (weights, adversarial) = match losses {
             NolLosses::L1 => ([colours, 0.0, 0.0], 0.0),
@@ -220,7 +220,7 @@ impl NolTraining {
 
     /// Draws `preview.png` beside every checkpoint: a row a synthetic object with textures from `textures`: sources, the true
     /// target, the sources' average, X^D, X^phi.
-    pub fn with_preview(mut self, textures: &Backgrounds) -> Self {
+    pub(crate) fn with_preview(mut self, textures: &Backgrounds) -> Self {
         self.preview = Some(Preview::new(textures, &self.options.samples, self.options.common.seed));
         self
     }

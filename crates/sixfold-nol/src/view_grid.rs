@@ -115,7 +115,7 @@ fn looking_at(centre: &Vec3, aim: &Aim, distance: f64, roll: f64) -> Pose {
 }
 
 /// A view with a soft border over a background of its size.
-pub fn over_background(view: &NewView, mut background: Patch) -> RgbImage {
+pub(crate) fn over_background(view: &NewView, mut background: Patch) -> RgbImage {
     let (width, height) = view.mask.size();
     let mut soft = Coverage::from_fn(width, height, |x, y| f32::from(u8::from(view.mask[(x, y)])));
     soft.blur(0.7);

@@ -6,7 +6,7 @@ use sixfold_synth::augment::Window;
 
 /// A square about the mesh at a pose, `room` times as wide as the longer side of its box in the image; `None` where a vertex
 /// lies behind the camera.
-pub fn object_window(camera: &Camera, mesh: &Mesh, pose: &Pose, room: f64) -> Option<Window> {
+pub(crate) fn object_window(camera: &Camera, mesh: &Mesh, pose: &Pose, room: f64) -> Option<Window> {
     let mut low = Vec2::repeat(f64::INFINITY);
     let mut high = Vec2::repeat(f64::NEG_INFINITY);
     for v in mesh.vertices() {

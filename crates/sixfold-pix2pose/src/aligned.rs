@@ -12,7 +12,7 @@ use crate::refine::{OutlineRefinementOptions, refine};
 use sixfold_align::outline::projected_box;
 use sixfold_data::PosedImage;
 use sixfold_geometry::stats::upper_median;
-use sixfold_geometry::{Camera, OptionError, Pose, Rect, RgbImage, Vec2};
+use sixfold_geometry::{Camera, OptionError, Pose, Progress, Rect, RgbImage, Vec2};
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
 
@@ -133,20 +133,23 @@ const SYMMETRY_STEP: f64 = 0.1;
 /// What aligned poses are off by on posed images, object by object. The shift is one for all, for it lies in camera and
 /// annotations; distances are shrunk towards zero as far as their scatter does not tell them from it (empirical Bayes, James
 /// and Stein 1961). `objects` are meshes as [`sixfold_align::outline::outline_mesh`] makes them, with their symmetries.
+/// `progress` receives the images; `None` when it was stopped.
 ///
 /// # Errors
 /// As [`estimate`], for objects that the model does not know.
-pub fn measure_corrections(
+pub(crate) fn measure_corrections(
     model: &Pix2PoseModel,
     photographs: &[PosedImage],
     objects: &BTreeMap<u32, (Mesh, ModelInfo)>,
-    mut progress: impl FnMut(),
-) -> Result<BTreeMap<u32, Correction>, EstimateError> {
+    progress: &dyn Progress,
+) -> Result<Option<BTreeMap<u32, Correction>>, EstimateError> {
     let options = AlignOptions { correct: false, ..AlignOptions::default() };
     let mut shifts = Vec::new();
     let mut depths: BTreeMap<u32, Vec<f64>> = objects.keys().map(|id| (*id, Vec::new())).collect();
-    for photograph in photographs {
-        progress();
+    for (number, photograph) in photographs.iter().enumerate() {
+        if !progress.report(number + 1, photographs.len()) {
+            return Ok(None);
+        }
         let id = photograph.object_id();
         let Some((mesh, info)) = objects.get(&id) else { continue };
         let camera = photograph.camera();
@@ -170,7 +173,7 @@ pub fn measure_corrections(
         }
         depths.entry(id).or_default().push(found.translation().z / truth.translation().z - 1.0);
     }
-    Ok(corrections(&shifts, depths))
+    Ok(Some(corrections(&shifts, depths)))
 }
 
 /// What is known from the `shifts` of all photographs (pixels) and the relative errors of every object's distance.

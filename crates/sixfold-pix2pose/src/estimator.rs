@@ -305,7 +305,7 @@ const VISIBLE: f32 = 0.5;
 
 /// What the network saw and returned: input, coordinates (black where the object is not seen), expected error and visibility
 /// (black 0, white 1), side by side.
-pub fn view_image(view: &View) -> RgbImage {
+pub(crate) fn view_image(view: &View) -> RgbImage {
     let (input, p) = (&view.input, &view.prediction);
     Image::from_fn(4 * TILE + 3 * GAP, TILE, |x, y| {
         let (tile, x) = (x / (TILE + GAP), x % (TILE + GAP));

@@ -2,17 +2,18 @@
 //! from an RGB crop, and poses from them.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod adversarial;
 pub mod aligned;
 pub mod depth;
 pub mod estimate;
 pub mod estimator;
-pub mod loss;
+mod loss;
 pub mod model;
 pub mod networks;
 pub mod object;
-pub mod outlier_threshold;
+mod outlier_threshold;
 pub mod preset;
 pub mod recipe;
 pub mod refine;

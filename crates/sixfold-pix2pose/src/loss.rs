@@ -9,7 +9,7 @@ use sixfold_geometry::stats::sigmoid;
 
 /// What a network's channels mean, and how its pixels are weighed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OutputKind {
+pub(crate) enum OutputKind {
     /// The dissertation's: three coordinates in -1..1 and the error in 0..1, after their activations. Background pixels
     /// have the target 0 and count; sums are divided by all pixels.
     Paper,
@@ -20,7 +20,7 @@ pub enum OutputKind {
 
 impl OutputKind {
     /// Channels of the output.
-    pub fn channels(self) -> usize {
+    pub(crate) fn channels(self) -> usize {
         match self {
             OutputKind::Paper => 4,
             OutputKind::Compact => 5,
@@ -30,7 +30,7 @@ impl OutputKind {
 
 /// Weights of the terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LossOptions {
+pub(crate) struct LossOptions {
     /// Weight of object pixels, beta of equation 3.1.
     pub beta: f32,
     /// Whether hidden pixels of the object weigh beta too, as in equation 3.1; otherwise visible ones alone, as in the author's code.
@@ -43,7 +43,7 @@ pub struct LossOptions {
 
 impl LossOptions {
     /// The dissertation's weights; for the compact network a larger one for the error, which counts on the object only.
-    pub fn of(kind: OutputKind) -> Self {
+    pub(crate) fn of(kind: OutputKind) -> Self {
         match kind {
             OutputKind::Paper => Self { beta: 3.0, whole_mask: false, error: 0.5, visibility: 0.0 },
             OutputKind::Compact => Self { beta: 3.0, whole_mask: false, error: 2.0, visibility: 0.3 },
@@ -53,7 +53,7 @@ impl LossOptions {
 
 /// Targets of a batch, image after image.
 #[derive(Debug, Clone, Copy)]
-pub struct Targets<'a> {
+pub(crate) struct Targets<'a> {
     /// `batch x 3 x side x side`, normalised coordinates of the whole object.
     pub coordinates: &'a [f32],
     /// `batch x side x side`, 1 where the object is, hidden parts included.
@@ -64,7 +64,7 @@ pub struct Targets<'a> {
 
 /// Means over the batch, and the gradient with respect to the output.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LossValue {
+pub(crate) struct LossValue {
     /// Weighted L1 distance of the coordinates.
     pub coordinates: f64,
     /// Error prediction (before its weight).
@@ -80,7 +80,7 @@ pub struct LossValue {
 ///
 /// # Panics
 /// If the lengths do not fit each other or the pool is empty.
-pub fn loss(
+pub(crate) fn loss(
     raw: &[f32],
     targets: &Targets<'_>,
     pixels: usize,

@@ -19,7 +19,7 @@ pub const COMPACT: &str = "pix2pose-compact";
 /// Name of the dissertation's generator in weight files.
 pub const PAPER: &str = "pix2pose-paper";
 /// Name of the generator with a ResNet-50 encoder in weight files.
-pub const RESNET50: &str = "pix2pose-resnet50";
+pub(crate) const RESNET50: &str = "pix2pose-resnet50";
 
 /// A network of one of the three kinds. Those of the dissertation know one object.
 #[derive(Debug, Clone)]
@@ -206,7 +206,7 @@ impl Pix2PoseModel {
     }
 
     /// Sets what aligned poses of its objects are off by; other objects stay as they are.
-    pub fn set_corrections(&mut self, corrections: &BTreeMap<u32, Correction>) {
+    pub(crate) fn set_corrections(&mut self, corrections: &BTreeMap<u32, Correction>) {
         for object in &mut self.objects {
             if let Some(correction) = corrections.get(&object.id) {
                 object.correction = *correction;
@@ -216,7 +216,7 @@ impl Pix2PoseModel {
     }
 
     /// Sets the outlier thresholds of all its objects.
-    pub fn set_thresholds(&mut self, thresholds: &[f32]) {
+    pub(crate) fn set_thresholds(&mut self, thresholds: &[f32]) {
         self.objects.iter_mut().for_each(|object| object.thresholds = thresholds.to_vec());
         self.describe_objects();
     }
@@ -367,7 +367,7 @@ pub fn paper_input(rgb: &[f32]) -> Vec<f32> {
 }
 
 /// Images of `3 x side x side` values in 0..1 as torchvision's ResNet-50 takes them.
-pub fn resnet_input(rgb: &[f32]) -> Vec<f32> {
+pub(crate) fn resnet_input(rgb: &[f32]) -> Vec<f32> {
     const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
     const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
     let plane = 128 * 128;
@@ -375,6 +375,6 @@ pub fn resnet_input(rgb: &[f32]) -> Vec<f32> {
 }
 
 /// Values in 0..1 as EfficientNet-Lite0 takes them: `(255 v - 127) / 128`.
-pub fn network_input(rgb: &[f32]) -> Vec<f32> {
+pub(crate) fn network_input(rgb: &[f32]) -> Vec<f32> {
     rgb.iter().map(|v| (v * 255.0 - 127.0) / 128.0).collect()
 }

@@ -148,7 +148,7 @@ impl Correction {
 }
 
 /// Outlier thresholds of the entries to the BOP challenge (section 3.4.5).
-pub const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
+pub(crate) const BOP_THRESHOLDS: [f32; 3] = [0.15, 0.25, 0.35];
 
 /// A symmetry as a map of normalised coordinates: `linear * n + offset`.
 ///

@@ -8,7 +8,7 @@ use crate::model::{Pix2PoseModel, Prediction};
 use crate::samples::SampleSource;
 
 /// The values that are tried (section 3.4.1).
-pub const CANDIDATES: [f32; 3] = [0.1, 0.2, 0.3];
+pub(crate) const CANDIDATES: [f32; 3] = [0.1, 0.2, 0.3];
 /// Samples that decide.
 const SAMPLES: u64 = 64;
 /// Samples in a batch.
@@ -18,14 +18,14 @@ const VISIBLE: f32 = 0.5;
 
 /// For each candidate the pixels that are kept and visible, and those that are either.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Overlap {
+pub(crate) struct Overlap {
     both: [u64; CANDIDATES.len()],
     either: [u64; CANDIDATES.len()],
 }
 
 impl Overlap {
     /// Adds a prediction of the first stage and where the object is visible (1 there, else 0), pixel by pixel.
-    pub fn add(&mut self, prediction: &Prediction, visible: &[f32]) {
+    pub(crate) fn add(&mut self, prediction: &Prediction, visible: &[f32]) {
         for (candidate, threshold) in CANDIDATES.iter().enumerate() {
             for ((seen, error), truth) in prediction.visible.iter().zip(&prediction.error).zip(visible) {
                 let (kept, truth) = (*seen > VISIBLE && error < threshold, *truth > 0.5);
@@ -36,7 +36,7 @@ impl Overlap {
     }
 
     /// The candidate with the largest intersection over union; of equal ones the smallest.
-    pub fn best(&self) -> f32 {
+    pub(crate) fn best(&self) -> f32 {
         let ratio = |i: usize| self.both[i] as f64 / self.either[i].max(1) as f64;
         let best = (0..CANDIDATES.len()).rev().max_by(|a, b| ratio(*a).total_cmp(&ratio(*b)));
         CANDIDATES[best.unwrap_or(0)]
@@ -44,7 +44,7 @@ impl Overlap {
 }
 
 /// The threshold of one object of a model, on samples of the first stage. The same source and seed choose the same.
-pub fn choose(model: &Pix2PoseModel, object_index: usize, source: &SampleSource, seed: u64) -> f32 {
+pub(crate) fn choose(model: &Pix2PoseModel, object_index: usize, source: &SampleSource, seed: u64) -> f32 {
     let mut overlap = Overlap::default();
     for batch in 0..SAMPLES / BATCH {
         let numbers = batch * BATCH..(batch + 1) * BATCH;

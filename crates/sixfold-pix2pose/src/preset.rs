@@ -105,7 +105,7 @@ impl Preset {
 
     /// What is known of an object, with the pool of symmetric poses of appendix A.1 in place of the stated ones. The pool's
     /// turns are about axes through the centre of the object's box. [`Preset::Bop`] leaves the stated ones.
-    pub fn with_pool(self, id: u32, info: &ModelInfo) -> ModelInfo {
+    pub(crate) fn with_pool(self, id: u32, info: &ModelInfo) -> ModelInfo {
         let turns = match (self, id) {
             (Preset::Bop, _) => return info.clone(),
             (Preset::Linemod | Preset::Lmo, 10 | 11) => Turns::HalfZ,

@@ -469,12 +469,11 @@ impl Recipe for Pix2PoseRecipe {
         if real.is_empty() {
             return Ok(Some(()));
         }
-        let mut done = 0;
-        let corrections = measure_corrections(&model, &real, &outlines, || {
-            done += 1;
-            (session.events)(TrainingEvent::Measuring(done, real.len()));
-        })
-        .map_err(TrainError::method)?;
+        let corrections = {
+            let progress = session.progress(TrainingEvent::Measuring);
+            measure_corrections(&model, &real, &outlines, &progress).map_err(TrainError::method)?
+        };
+        let Some(corrections) = corrections else { return Ok(None) };
         model.set_corrections(&corrections);
         model.save(&path).map_err(TrainError::method)?;
         Ok(Some(()))

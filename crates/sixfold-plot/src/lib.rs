@@ -4,6 +4,7 @@
 //! the right and y down from the top left corner.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod font;
 mod ticks;

@@ -229,7 +229,7 @@ fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usi
 
 /// How well the visible samples agree with the depth image, in 0..=1.
 #[doc(hidden)]
-pub fn screening_score(
+pub(crate) fn screening_score(
     scene: &DepthRegion,
     model: &ObjectModel,
     pose: &Pose,

@@ -2,15 +2,16 @@
 //! verification.
 //!
 //! The way of one image: a [`DepthRegion`](sixfold_align::DepthRegion) is prepared once; for every object its [`ObjectModel`] votes for poses
-//! ([`model`], [`voting`]), similar poses are joined ([`clustering`]), the best are refined by ICP and
-//! judged by rendering ([`mod@sixfold_align::verify`]); [`estimate()`] puts it together.
+//! ([`voting`]), similar poses are joined ([`clustering`]), the best are refined by ICP and
+//! judged by rendering ([`sixfold_align::verify()`]); [`estimate()`] puts it together.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 pub mod clustering;
 pub mod estimate;
 mod estimator;
-pub mod model;
+mod model;
 mod model_file;
 pub mod voting;
 

@@ -87,7 +87,7 @@ impl ModelOptions {
 }
 
 /// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each of a word.
-pub const VIEWS: usize = 64;
+pub(crate) const VIEWS: usize = 64;
 /// Side of a view, pixels: several in the width of a sampling step. Chosen by hand; not swept.
 const VIEW_PIXELS: usize = 160;
 /// Distance of the views, in diameters; chosen by hand, not swept.
@@ -162,7 +162,7 @@ pub(crate) struct FeatureTable {
 impl FeatureTable {
     /// Number of the feature's row.
     #[inline]
-    pub fn row(&self, distance: usize, angles: [usize; 3]) -> usize {
+    pub(crate) fn row(&self, distance: usize, angles: [usize; 3]) -> usize {
         ((distance * self.angle_steps + angles[0]) * self.angle_steps + angles[1]) * self.angle_steps
             + angles[2]
     }

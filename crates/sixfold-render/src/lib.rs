@@ -7,8 +7,10 @@
 //! between rounded corners. One thread or many: same bytes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod outputs;
+mod portrait;
 mod raster;
 mod sensor;
 mod shade;
@@ -16,7 +18,8 @@ mod shadow;
 mod table;
 
 pub use outputs::{BoundingBoxScale, Surface};
+pub use portrait::{portrait, portrait_camera, portrait_pose};
 pub use raster::{Canvas, Culling, RenderOptions, SceneObject, VisibilityBuffer, render_depth};
 pub use sensor::{DepthSensor, Draws, simulate_depth};
 pub use shade::{Light, Material, shade};
-pub use table::{plane_mesh, support_plane};
+pub use table::{DepthOnTable, depth_on_table, support_plane};

@@ -151,7 +151,7 @@ impl<T: Copy> Canvas<T> {
     }
 
     /// What was drawn last, as the caller's own.
-    pub fn into_image(self) -> Image<T> {
+    pub(crate) fn into_image(self) -> Image<T> {
         self.image
     }
 

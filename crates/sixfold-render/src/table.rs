@@ -1,10 +1,11 @@
 //! The table under a set of posed objects: the plane that most of them touch from above. Ground truth of real
 //! scenes knows the objects but not what they stand on; simulated depth needs both.
 
-use sixfold_geometry::{Camera, Plane, Vec2, Vec3, sphere_directions};
+use sixfold_geometry::{Camera, DepthImage, Plane, Pose, Vec2, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
 
-use crate::raster::SceneObject;
+use crate::raster::{RenderOptions, SceneObject, VisibilityBuffer};
+use crate::sensor::{DepthSensor, simulate_depth};
 
 /// Gaps larger than this say no more than that the object does not stand there, metres.
 const GAP_LIMIT: f64 = 0.02;
@@ -80,7 +81,7 @@ pub fn support_plane(objects: &[SceneObject<'_>]) -> Option<Plane> {
 }
 
 /// A square of the plane as a mesh in the camera frame, `size` metres wide, centred where the camera's axis meets it.
-pub fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
+pub(crate) fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
     let ray = camera.unproject(&Vec2::new(camera.width as f64 / 2.0, camera.height as f64 / 2.0), 1.0);
     let along = plane.normal.dot(&ray);
     let centre = if along.abs() > 1e-6 { ray * (plane.offset / along) } else { plane.normal * plane.offset };
@@ -90,10 +91,47 @@ pub fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Mesh> {
     Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok()
 }
 
+/// Width of the table of [`depth_on_table`], metres.
+const TABLE: f64 = 3.0;
+
+/// The depth of objects, on a table where there is one.
+pub struct DepthOnTable {
+    /// As it is.
+    pub ideal: DepthImage,
+    /// As the depth camera measures it.
+    pub measured: DepthImage,
+    /// Whether there is a table: asked for, and a plane lies under the objects.
+    pub has_table: bool,
+}
+
+/// What a depth camera sees of posed objects on the table that they stand on, if they may have one; `sensor` is its noise with a
+/// seed.
+pub fn depth_on_table(
+    posed: &[(&Mesh, Pose)],
+    camera: &Camera,
+    with_table: bool,
+    sensor: Option<(&DepthSensor, u64)>,
+) -> DepthOnTable {
+    let mut objects: Vec<SceneObject<'_>> =
+        posed.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
+    let plane = if with_table { support_plane(&objects) } else { None };
+    let table = plane.and_then(|p| plane_mesh(&p, camera, TABLE));
+    if let Some(mesh) = &table {
+        objects.push(SceneObject { mesh, camera_from_object: Pose::identity() });
+    }
+    let mut frame = VisibilityBuffer::new(camera);
+    frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
+    let ideal = frame.depth();
+    let measured = match sensor {
+        None => ideal.clone(),
+        Some((sensor, seed)) => simulate_depth(&ideal, &frame.normals(&objects), sensor, seed),
+    };
+    DepthOnTable { ideal, measured, has_table: table.is_some() }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sixfold_geometry::Pose;
 
     fn cube() -> Mesh {
         let vertices = (0..8)

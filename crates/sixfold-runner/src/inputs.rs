@@ -22,7 +22,7 @@ pub(crate) fn hex(hash: u64) -> String {
 
 impl Inputs {
     /// The mesh of an object and what is known of it.
-    pub fn of_object(dataset: &BopDataset, id: u32, infos: Option<&ModelsInfo>) -> Inputs {
+    pub(crate) fn of_object(dataset: &BopDataset, id: u32, infos: Option<&ModelsInfo>) -> Inputs {
         let mut inputs = Inputs::default();
         let model = dataset.model_path(id, Models::Rendering);
         let info = model.with_file_name("models_info.json");
@@ -33,7 +33,7 @@ impl Inputs {
 
     /// What a method reads of an image, and what says where to look in it. A file that cannot be read counts as none: the method
     /// will report it.
-    pub fn of_image(
+    pub(crate) fn of_image(
         scene: &Scene,
         im_id: u32,
         targets: &[Target],
@@ -66,14 +66,14 @@ impl Inputs {
     }
 
     /// What a detector reads of an image.
-    pub fn of_colour(scene: &Scene, im_id: u32) -> Inputs {
+    pub(crate) fn of_colour(scene: &Scene, im_id: u32) -> Inputs {
         let mut inputs = Inputs::default();
         inputs.file("colour image", scene.rgb_path(im_id));
         inputs
     }
 
     /// Of an image that is not asked for.
-    pub fn without_targets(dataset: &Path) -> Inputs {
+    pub(crate) fn without_targets(dataset: &Path) -> Inputs {
         let mut inputs = Inputs::default();
         inputs.value("list of targets", &"none", dataset.to_owned());
         inputs
@@ -91,12 +91,12 @@ impl Inputs {
     }
 
     /// The hashes, for a record.
-    pub fn hashes(&self) -> BTreeMap<String, String> {
+    pub(crate) fn hashes(&self) -> BTreeMap<String, String> {
         self.0.iter().map(|(name, (hash, _))| ((*name).to_owned(), hash.clone())).collect()
     }
 
     /// The first input that is another than before, and its file.
-    pub fn difference(&self, before: &BTreeMap<String, String>) -> Option<(&'static str, PathBuf)> {
+    pub(crate) fn difference(&self, before: &BTreeMap<String, String>) -> Option<(&'static str, PathBuf)> {
         let differs =
             |(name, (hash, _)): &(&&'static str, &(String, PathBuf))| before.get(**name) != Some(hash);
         self.0.iter().find(differs).map(|(name, (_, file))| (*name, file.clone()))

@@ -2,6 +2,8 @@
 //! ([`DatasetRun`]), where regions come from the ground truth, a file of detections or a detector
 //! ([`RegionSource`]); and a detector by itself on all images of a dataset ([`DetectionRun`]).
 
+#![warn(unreachable_pub, unnameable_types)]
+
 mod dataset;
 mod detection;
 mod error;

@@ -79,7 +79,7 @@ const SAVED_EVERY: Duration = Duration::from_secs(1);
 
 impl RunRecord {
     /// The record of `results`: a new one, or the one that is there if it was made with the same options.
-    pub fn open(results: &Path, method: &str, options: &RunOptions) -> Result<RunRecord, RunError> {
+    pub(crate) fn open(results: &Path, method: &str, options: &RunOptions) -> Result<RunRecord, RunError> {
         let mut path = results.as_os_str().to_owned();
         path.push(".run.json");
         let path = PathBuf::from(path);
@@ -115,7 +115,7 @@ impl RunRecord {
     }
 
     /// Takes down what an object is known by; an error where the rows that are there were made with another.
-    pub fn object(&mut self, id: u32, inputs: &Inputs) -> Result<(), RunError> {
+    pub(crate) fn object(&mut self, id: u32, inputs: &Inputs) -> Result<(), RunError> {
         if let Some(before) = self.record.objects.get(&id) {
             return self.same(before, inputs, &format!("object {id}"));
         }
@@ -124,7 +124,7 @@ impl RunRecord {
     }
 
     /// An error where an image that is done was done with other inputs than `now` says.
-    pub fn check_images(
+    pub(crate) fn check_images(
         &self,
         stop: &AtomicBool,
         mut now: impl FnMut(u32, u32) -> Inputs,
@@ -148,12 +148,12 @@ impl RunRecord {
     }
 
     /// Whether an image is done.
-    pub fn is_done(&self, scene_id: u32, im_id: u32) -> bool {
+    pub(crate) fn is_done(&self, scene_id: u32, im_id: u32) -> bool {
         self.done.contains(&(scene_id, im_id))
     }
 
     /// Forgets the images that have not as many rows in the result file as they were written with. `rows`: scene and image of each.
-    pub fn forget_unless_whole(&mut self, rows: impl Iterator<Item = (u32, u32)>) {
+    pub(crate) fn forget_unless_whole(&mut self, rows: impl Iterator<Item = (u32, u32)>) {
         let mut counts: BTreeMap<(u32, u32), usize> = BTreeMap::new();
         for image in rows {
             *counts.entry(image).or_default() += 1;
@@ -163,28 +163,33 @@ impl RunRecord {
     }
 
     /// Takes down an image with this many rows, which are on the disk.
-    pub fn finished(&mut self, image: (u32, u32), rows: usize, inputs: &Inputs) -> Result<(), RunError> {
+    pub(crate) fn finished(
+        &mut self,
+        image: (u32, u32),
+        rows: usize,
+        inputs: &Inputs,
+    ) -> Result<(), RunError> {
         self.add(image, rows, inputs);
         if self.is_due() { self.save() } else { Ok(()) }
     }
 
     /// Takes down an image with this many rows, which will be on the disk before the record is saved.
-    pub fn add(&mut self, (scene_id, im_id): (u32, u32), rows: usize, inputs: &Inputs) {
+    pub(crate) fn add(&mut self, (scene_id, im_id): (u32, u32), rows: usize, inputs: &Inputs) {
         self.done.insert((scene_id, im_id));
         self.record.done.push(DoneImage { scene_id, im_id, rows, inputs: inputs.hashes() });
     }
 
     /// Whether it is time to save the record.
-    pub fn is_due(&self) -> bool {
+    pub(crate) fn is_due(&self) -> bool {
         self.saved.elapsed() >= SAVED_EVERY
     }
 
     /// Removes the record of results that have gone elsewhere.
-    pub fn remove(self) -> Result<(), RunError> {
+    pub(crate) fn remove(self) -> Result<(), RunError> {
         std::fs::remove_file(&self.path).map_err(|source| RunError::Io { path: self.path, source })
     }
 
-    pub fn save(&mut self) -> Result<(), RunError> {
+    pub(crate) fn save(&mut self) -> Result<(), RunError> {
         let io = |source| RunError::Io { path: self.path.clone(), source };
         let text = serde_json::to_string_pretty(&self.record).map_err(|e| io(std::io::Error::other(e)))?;
         write_atomically(&self.path, text.as_bytes()).map_err(io)?;

@@ -64,7 +64,7 @@ impl RegionSource {
 
     /// What to tell a user whose detections are of none of the targets: with other numbers of scenes, images or objects all of
     /// them are passed over.
-    pub fn without_match(&self, targets: &[Target]) -> Option<String> {
+    pub(crate) fn without_match(&self, targets: &[Target]) -> Option<String> {
         let RegionSource::Detections(all) = self else { return None };
         let is_for = |d: &Detection, t: &Target| {
             (d.scene_id, d.image_id, Some(d.category_id)) == (t.scene_id, t.im_id, t.object.map(|o| o.obj_id))

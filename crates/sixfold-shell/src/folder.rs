@@ -132,7 +132,7 @@ impl DatasetFolder {
     /// Writes the models with their `models_info.json`.
     ///
     /// # Errors
-    /// As [`DatasetFolder::write_once`].
+    /// As `DatasetFolder::write_once`.
     pub fn write_models<'a>(
         &self,
         models: impl Iterator<Item = (u32, &'a Mesh, &'a ModelInfo)>,
@@ -152,7 +152,7 @@ impl DatasetFolder {
     ///
     /// # Errors
     /// When it is there and holds something else: images that are there already belong to it.
-    pub fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
+    pub(crate) fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
         match std::fs::read(file) {
             Ok(there) if there == bytes => Ok(()),
             Ok(_) => bail!(
@@ -296,6 +296,21 @@ fn note_files(list: &Path, names: &[String]) -> std::io::Result<()> {
     // A process that was killed may have left half a line.
     let gap = if before.last().is_some_and(|byte| *byte != b'\n') { "\n" } else { "" };
     file.write_all(format!("{gap}{}\n", names.join("\n")).as_bytes())
+}
+
+/// Copies the files of a folder, those in folders within it excepted.
+///
+/// # Errors
+/// When one cannot be read or written.
+pub fn copy_files(from: &Path, to: &Path) -> Result<()> {
+    std::fs::create_dir_all(to).with_context(|| format!("folder {}", to.display()))?;
+    for entry in std::fs::read_dir(from).with_context(|| format!("folder {}", from.display()))? {
+        let path = entry?.path();
+        if let Some(name) = path.file_name().filter(|_| path.is_file()) {
+            std::fs::copy(&path, to.join(name)).with_context(|| format!("cannot copy {}", path.display()))?;
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]

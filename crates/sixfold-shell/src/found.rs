@@ -1,8 +1,8 @@
-//! What was found in one image, for files, screen and people: `poses.json` and the table first, then the images.
+//! What was found in an image, for files, screen and people: `poses.json` and the table first, then the images.
 
 use anyhow::Result;
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
-use sixfold_runner::{FoundObject, ImageReport, pose_table};
+use sixfold_runner::{FoundObject, ImageReport, ImageResult, pose_table};
 
 use crate::Outcome;
 use crate::folder::OutputFolder;
@@ -103,6 +103,29 @@ impl SearchedImage<'_> {
         }
         overlay::draw(&background, self.camera, &drawn)
     }
+}
+
+/// The poses that were found in an image of a dataset over it; none for an image without pixels.
+///
+/// # Errors
+/// When the image cannot be read.
+pub fn overlay_of(result: &ImageResult<'_>) -> Result<Option<RgbImage>> {
+    let (scene, im_id) = (result.scene, result.im_id);
+    let camera = scene.camera(im_id)?;
+    let background = match (scene.rgb(im_id)?, scene.depth(im_id)?) {
+        (Some(rgb), _) => rgb,
+        (None, Some(depth)) => overlay::depth_picture(&depth),
+        (None, None) => return Ok(None),
+    };
+    let drawn: Vec<Drawn<'_>> = result
+        .found
+        .iter()
+        .map(|p| {
+            let certainty = overlay::certainty(&p.estimate);
+            Drawn::of_dataset(p.obj_id, p.mesh, p.estimate.camera_from_object, certainty)
+        })
+        .collect();
+    Ok(Some(overlay::draw(&background, &camera, &drawn)))
 }
 
 fn file_name(name: &str) -> String {

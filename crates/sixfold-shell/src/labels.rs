@@ -20,11 +20,11 @@ const NEAR: f64 = 6.0;
 const DARK: [u8; 3] = [24; 3];
 
 /// A rectangle in pixels: left, top, right, bottom.
-pub type Corners = [f64; 4];
+pub(crate) type Corners = [f64; 4];
 
 /// A text and what it names.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Label {
+pub(crate) struct Label {
     /// A line of ASCII.
     pub text: String,
     /// Where the thing is that it names.
@@ -96,7 +96,7 @@ fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Plac
 
 /// Writes labels into an image: the first ones nearest to what they name, none over another, each within the image, with a line
 /// where one had to move away. What finds no room is left out.
-pub fn draw_labels(image: &mut RgbImage, labels: &[Label]) {
+pub(crate) fn draw_labels(image: &mut RgbImage, labels: &[Label]) {
     let dot = (image.width() / WIDTH_OF_A_DOT).max(1);
     let places = places(labels, image.size(), dot);
     let found = || labels.iter().zip(&places).filter_map(|(l, p)| Some((l, (*p)?)));

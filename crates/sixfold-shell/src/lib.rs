@@ -1,16 +1,19 @@
 //! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
 //! arguments, stores and scenes that both take.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 // First: its macros take the place of the standard ones in all that follows.
 #[macro_use]
 pub mod screen;
 
+pub mod board;
 pub mod folder;
 pub mod found;
 pub mod frames;
 pub mod grasp;
 pub mod idle;
-pub mod labels;
+mod labels;
 pub mod meshes;
 pub mod objects;
 pub mod output;
@@ -20,6 +23,7 @@ pub mod progress;
 pub mod ranges;
 #[cfg(feature = "physics")]
 pub mod scenes;
+pub mod sheets;
 #[cfg(feature = "networks")]
 pub mod training;
 

@@ -17,7 +17,7 @@ pub struct JsonArguments {
 
 impl JsonArguments {
     /// Whether JSON replaces the table on the screen.
-    pub fn on_screen(&self) -> bool {
+    pub(crate) fn on_screen(&self) -> bool {
         matches!(self.json, Some(None))
     }
 

@@ -1,5 +1,6 @@
 //! Progress on standard error, and a clean stop on interrupt.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -96,5 +97,40 @@ impl Progress {
     /// Takes the bar away.
     pub fn finish(self) {
         self.bar.finish_and_clear();
+    }
+}
+
+/// The bar of a function of a library, from its first report on.
+pub struct Bar {
+    what: &'static str,
+    bar: Mutex<Option<Progress>>,
+    stop: Option<&'static AtomicBool>,
+}
+
+impl Bar {
+    /// Of a function that an interrupt need not stop, for nothing of it is on the disk yet.
+    pub fn new(what: &'static str) -> Bar {
+        Bar { what, bar: Mutex::new(None), stop: None }
+    }
+
+    /// Of a function that an interrupt stops at its next whole part.
+    pub fn stopped_by_interrupts(what: &'static str) -> Bar {
+        Bar { stop: Some(interrupted()), ..Bar::new(what) }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(self) {
+        if let Ok(Some(bar)) = self.bar.into_inner() {
+            bar.finish();
+        }
+    }
+}
+
+impl sixfold_geometry::Progress for Bar {
+    fn report(&self, done: usize, total: usize) -> bool {
+        if let Ok(mut bar) = self.bar.lock() {
+            bar.get_or_insert_with(|| Progress::new(self.what, total)).set(done);
+        }
+        self.stop.is_none_or(|stop| !stop.load(Ordering::Relaxed))
     }
 }

@@ -2,8 +2,10 @@
 //! dissertation, section 5.2.1).
 
 use std::path::Path;
+use std::sync::Mutex;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
+use rayon::prelude::*;
 use serde::Serialize;
 use sixfold_bop::{
     BopDataset, GroundTruth, NewImage, ObjectVisibility, SceneWriter, VISIBILITY_DELTA,
@@ -196,6 +198,27 @@ impl SceneMaker<'_> {
         }
         writer.finish()?;
         Ok(Made { dropped: scene.dropped, resting: scene.resting.len() })
+    }
+
+    /// Makes scenes, several at a time; what came of all of them.
+    ///
+    /// # Errors
+    /// When one cannot be written, or the user interrupts.
+    pub fn write_all(&self, scenes: &[u32]) -> Result<Made> {
+        let progress = Mutex::new((Progress::new("scenes", scenes.len()), Made::default()));
+        scenes.par_iter().try_for_each(|&scene_id| -> Result<()> {
+            check_interrupt("give the same command again to continue")?;
+            let made = self.write(scene_id)?;
+            if let Ok(mut shared) = progress.lock() {
+                shared.1.dropped += made.dropped;
+                shared.1.resting += made.resting;
+                shared.0.step(format!("scene {scene_id}: {} objects", made.resting));
+            }
+            Ok(())
+        })?;
+        let (progress, made) = progress.into_inner().map_err(|_| anyhow!("a scene ended in a panic"))?;
+        progress.finish();
+        Ok(made)
     }
 
     /// Whether a scene is there: the text file that is written last stands for all of it.

@@ -21,6 +21,7 @@
 //! ```
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
 mod attempt;
 mod error;
@@ -37,7 +38,7 @@ pub use attempt::{Attempt, AttemptOptions, AttemptOutcome, Scene, attempt, scene
 pub use error::SimulationError;
 pub use parts::{ConvexParts, PartsOptions};
 pub use pile::{PileOptions, drop_objects};
-pub use settle::{settle, settle_at_centre};
+pub use settle::settle_at_centre;
 pub use statistics::{wilson_interval, wilson_interval_of_fraction};
 pub use tabletop::{Tabletop, TabletopImage, TabletopOptions};
 pub use trial::{Outcome, TrialOptions, TrialReport, try_grasp};

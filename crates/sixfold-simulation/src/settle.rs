@@ -9,7 +9,7 @@ use crate::world::{body_pose, insert_object, world};
 /// Lets an object fall onto the table from a pose above it (the lowest point is put 2 mm over the table) and gives the
 /// pose in which it rests; `None` when it still moves after four seconds or rolled off further than half a metre.
 /// Its turning is damped, so that round things do not roll for ever.
-pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
+pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     const STEP: f64 = 0.002;
     let lowest = parts
         .parts()
@@ -38,7 +38,7 @@ pub fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     None
 }
 
-/// As [`settle`], with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
+/// As `settle`, with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
 /// it rolled.
 pub fn settle_at_centre(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     let rest = settle(parts, world_from_object)?;

@@ -5,6 +5,8 @@
 //! Everything random takes the caller's generator, so that a sample is a function of seed and number alone, whatever thread
 //! draws it. Metres, except where a shape is of size one.
 
+#![warn(unreachable_pub, unnameable_types)]
+
 pub mod augment;
 mod colors;
 pub mod distractors;

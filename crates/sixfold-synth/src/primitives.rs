@@ -30,7 +30,7 @@ pub fn cuboid(size: Vec3) -> Result<Mesh, MeshError> {
 ///
 /// # Errors
 /// [`MeshError`] for numbers that are not finite or a profile without points.
-pub fn lathed(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
+pub(crate) fn lathed(profile: &[(f64, f64)]) -> Result<Mesh, MeshError> {
     let mut faces = vec![];
     for (row, pair) in profile.windows(2).enumerate() {
         for [lower, upper] in band(row * SIDES, (row + 1) * SIDES, SIDES) {

@@ -30,8 +30,7 @@ pub use error::TeachError;
 pub use located::{Located, SeenTags, locate};
 pub use record::{Stored, export_bop, photographs_of};
 pub use shape::{
-    Capture, FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Progress, Segmentation, Shape, ShapeOptions, reconstruct,
-    segment,
+    Capture, FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Segmentation, Shape, ShapeOptions, reconstruct, segment,
 };
 pub use silhouette::{SalientSegmenter, Segmenter};
 pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching};

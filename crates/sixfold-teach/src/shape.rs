@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 use sixfold_board::Board;
-use sixfold_geometry::{DepthImage, Image, Mask, Pose, Vec3};
+use sixfold_geometry::{DepthImage, Image, Mask, Pose, Progress, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Culling, RenderOptions, SceneObject, VisibilityBuffer};
 
@@ -30,6 +30,8 @@ const TOGETHER: f64 = 0.015;
 const SAME: f64 = 0.7;
 /// How high above the board an object reaches at most, as a fraction of the sheet's longer side.
 const HEIGHT: f64 = 1.0;
+/// Steps of a reconstruction that are reported.
+const SHAPE_STEPS: usize = 4;
 /// What touches the board within this height belongs to the table: flat shadows, the sheet's own thickness; metres.
 const TABLE: f64 = 0.0005;
 
@@ -94,11 +96,8 @@ impl Capture {
     }
 }
 
-/// Called between steps with what is done, 0 to 1; `false` stops.
-pub type Progress<'a> = &'a mut dyn FnMut(&'static str, f64) -> bool;
-
-pub(crate) fn step(progress: &mut Progress<'_>, what: &'static str, done: f64) -> Result<(), TeachError> {
-    if progress(what, done) { Ok(()) } else { Err(TeachError::Stopped) }
+pub(crate) fn step(progress: &dyn Progress, done: usize, total: usize) -> Result<(), TeachError> {
+    if progress.report(done, total) { Ok(()) } else { Err(TeachError::Stopped) }
 }
 
 /// Where the photographs show the object.
@@ -139,15 +138,15 @@ pub fn segment(
     capture: &Capture,
     segmenter: &dyn Segmenter,
     options: &ShapeOptions,
-    mut progress: Progress<'_>,
+    progress: &dyn Progress,
 ) -> Result<Segmentation, TeachError> {
     check_photographs(capture)?;
     let all: Vec<usize> = (0..capture.photographs.len()).collect();
-    let volume = rough_volume(capture, &all, segmenter, options, &mut progress)?;
+    let volume = rough_volume(capture, &all, segmenter, options, progress)?;
     // Once more in views of the object alone, with what is around it.
     let around = volume.scaled(1.3).within(&capture.volume);
     let views = views_of(capture, &around, options.fine_side, &all);
-    let views = with_cues(views, capture, segmenter, &mut progress, "masks")?;
+    let views = with_cues(views, capture, segmenter, progress, all.len())?;
     let odds: Vec<(View, Image<f32>)> = views.iter().map(|(_, v, c)| (v.clone(), c.sum())).collect();
     let shape = consensus(&odds, &around, options.coarse_cells, capture.floor());
     let shape = only_largest(&shape).ok_or_else(no_object)?;
@@ -196,13 +195,13 @@ fn with_cues(
     views: Vec<(usize, View)>,
     capture: &Capture,
     segmenter: &dyn Segmenter,
-    progress: &mut Progress<'_>,
-    what: &'static str,
+    progress: &dyn Progress,
+    first: usize,
 ) -> Result<Vec<Seen>, TeachError> {
-    let all = views.len();
+    let total = 2 * capture.photographs.len();
     let mut seen = vec![];
     for (done, (number, view)) in views.into_iter().enumerate() {
-        step(progress, what, done as f64 / all as f64)?;
+        step(progress, first + done, total)?;
         let cues = Cues::new(&view, capture.board.as_ref(), segmenter).map_err(TeachError::Masks)?;
         seen.push((number, view, cues));
     }
@@ -215,14 +214,14 @@ fn rough_volume(
     all: &[usize],
     segmenter: &dyn Segmenter,
     options: &ShapeOptions,
-    progress: &mut Progress<'_>,
+    progress: &dyn Progress,
 ) -> Result<Volume, TeachError> {
     let views = views_of(capture, &capture.volume, options.coarse_side, all);
     let least = if capture.photographs.iter().any(|p| p.depth.is_some()) { 1 } else { FEWEST_PHOTOGRAPHS };
     if views.len() < least {
         return Err(TeachError::TooFewPhotographs { found: views.len(), least, reasons: String::new() });
     }
-    let views = with_cues(views, capture, segmenter, progress, "looking for the object")?;
+    let views = with_cues(views, capture, segmenter, progress, 0)?;
     let odds: Vec<(View, Image<f32>)> = views.into_iter().map(|(_, v, c)| (v, c.sum())).collect();
     let shape = consensus(&odds, &capture.volume, options.coarse_cells, capture.floor());
     let parts = objects(&shape);
@@ -369,10 +368,10 @@ pub fn reconstruct(
     capture: &Capture,
     found: &Segmentation,
     options: &ShapeOptions,
-    mut progress: Progress<'_>,
+    progress: &dyn Progress,
 ) -> Result<Shape, TeachError> {
     let used: Vec<usize> = (0..found.masks.len()).filter(|i| found.masks[*i].is_some()).collect();
-    step(&mut progress, "shape", 0.0)?;
+    step(progress, 0, SHAPE_STEPS)?;
     let numbered = views_of(capture, &found.volume, options.fine_side, &used);
     let masks: Vec<Mask> = numbered
         .iter()
@@ -384,24 +383,24 @@ pub fn reconstruct(
     let parts = rough.components();
     let first = parts.first().ok_or_else(no_object)?;
     let volume = rough.volume_of(first).grown(2.0 * rough.step);
-    step(&mut progress, "shape", 0.2)?;
+    step(progress, 1, SHAPE_STEPS)?;
     let fine = hull(&outlined, &volume, options.fine_cells, capture.floor());
     let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
         Some(known) => {
-            step(&mut progress, "shape", 0.6)?;
+            step(progress, 2, SHAPE_STEPS)?;
             (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.least), known.fraction)
         }
         None => (fine, 0.0),
     };
     let mesh = surface(&fine.smoothed(0.8)).ok_or_else(no_object)?;
-    step(&mut progress, "shape", 0.8)?;
+    step(progress, 3, SHAPE_STEPS)?;
     let mesh = simplify(&mesh, options.faces);
     let paint = painted(&mesh, &views);
     let origin = centre(&mesh);
     let world_from_object = Pose::from_translation(origin);
     let mesh = mesh.transformed(&world_from_object.inverse());
     let mesh = mesh.clone().with_colors(paint.colors).unwrap_or(mesh);
-    step(&mut progress, "shape", 1.0)?;
+    step(progress, 4, SHAPE_STEPS)?;
     Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth })
 }
 

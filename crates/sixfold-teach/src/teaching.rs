@@ -15,7 +15,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use sixfold_board::{Board, Paper};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Camera, Mask, Pose, Vec3};
+use sixfold_geometry::{Camera, Mask, Pose, Progress, Vec3};
 use sixfold_io::{
     ImageFile, WriteLock, limits, read_depth, read_mask, read_regular_text, read_rgb, write_atomically,
     write_mask,
@@ -26,7 +26,7 @@ use crate::error::TeachError;
 use crate::located::{Located, SeenTags, locate};
 use crate::record::Posed;
 use crate::reduce::reduced_photograph;
-use crate::shape::{Capture, Progress, Segmentation, Shape, ShapeOptions, reconstruct, segment, step};
+use crate::shape::{Capture, Segmentation, Shape, ShapeOptions, reconstruct, segment, step};
 use crate::silhouette::Segmenter;
 use crate::view::{PosedPhotograph, Volume};
 
@@ -303,14 +303,14 @@ impl Teaching {
     ///
     /// # Errors
     /// [`TeachError`].
-    pub fn locate(&mut self, mut progress: Progress<'_>) -> Result<(), TeachError> {
+    pub fn locate(&mut self, progress: &dyn Progress) -> Result<(), TeachError> {
         if self.state.located.is_some() {
             return Ok(());
         }
         let count = self.state.photographs.len();
         let mut seen = vec![];
         for (done, photograph) in self.state.photographs.iter().enumerate() {
-            step(&mut progress, "finding tags", done as f64 / count as f64)?;
+            step(progress, done, count)?;
             let image = read_rgb(&self.path("photographs", &photograph.file))?;
             seen.push(SeenTags::of(&photograph.name, &image));
         }
@@ -374,7 +374,7 @@ impl Teaching {
         &mut self,
         segmenter: &dyn Segmenter,
         options: &ShapeOptions,
-        progress: Progress<'_>,
+        progress: &dyn Progress,
     ) -> Result<(), TeachError> {
         if self.state.volume.is_some() {
             return Ok(());
@@ -424,7 +424,7 @@ impl Teaching {
     ///
     /// # Errors
     /// [`TeachError`].
-    pub fn reconstruct(&mut self, options: &ShapeOptions, progress: Progress<'_>) -> Result<(), TeachError> {
+    pub fn reconstruct(&mut self, options: &ShapeOptions, progress: &dyn Progress) -> Result<(), TeachError> {
         if self.state.shape.is_some() {
             return Ok(());
         }
@@ -476,21 +476,6 @@ impl Teaching {
         }
         let path = self.folder.join("mesh.ply");
         read_mesh(&path, Unit::Metre).map_err(|e| TeachError::File { path, what: e.to_string() })
-    }
-
-    /// All steps that are not done.
-    ///
-    /// # Errors
-    /// [`TeachError`].
-    pub fn run(
-        &mut self,
-        segmenter: &dyn Segmenter,
-        options: &ShapeOptions,
-        progress: Progress<'_>,
-    ) -> Result<(), TeachError> {
-        self.locate(progress)?;
-        self.find_masks(segmenter, options, progress)?;
-        self.reconstruct(options, progress)
     }
 
     /// A photograph's mask, without lens distortion, once it is found.

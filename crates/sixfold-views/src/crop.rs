@@ -10,7 +10,7 @@ const MAX_TAPS: usize = 6;
 
 /// A pinhole camera that looks at a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Crop {
+pub(crate) struct Crop {
     /// The square camera.
     pub camera: Camera,
     /// From the frame of the image's camera to that of the crop's; both stand in the same place.
@@ -20,7 +20,7 @@ pub struct Crop {
 impl Crop {
     /// A crop of `side` pixels that shows a box and around it as much as makes it `factor` times as large; `None` where the box has no
     /// size or lies beside every image.
-    pub fn of_box(camera: &Camera, bbox: &Rect, factor: f64, side: usize) -> Option<Crop> {
+    pub(crate) fn of_box(camera: &Camera, bbox: &Rect, factor: f64, side: usize) -> Option<Crop> {
         if !(bbox.width > 0.0 && bbox.height > 0.0) {
             return None;
         }
@@ -48,18 +48,18 @@ impl Crop {
     }
 
     /// A pose in the crop's frame from one in the image's.
-    pub fn to_crop(&self, camera_from_object: &Pose) -> Pose {
+    pub(crate) fn to_crop(&self, camera_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera, Vec3::zeros()) * *camera_from_object
     }
 
     /// A pose in the image's frame from one in the crop's.
-    pub fn to_camera(&self, crop_from_object: &Pose) -> Pose {
+    pub(crate) fn to_camera(&self, crop_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera.inverse(), Vec3::zeros()) * *crop_from_object
     }
 
     /// The crop's pixels of an image of `camera` (without lens distortion): bilinear, an average over several samples where the image
     /// is reduced; `outside` beside it.
-    pub fn cut(&self, image: &RgbImage, camera: &Camera, outside: [f32; 3]) -> Patch {
+    pub(crate) fn cut(&self, image: &RgbImage, camera: &Camera, outside: [f32; 3]) -> Patch {
         let side = self.camera.width;
         let mut patch = Patch::filled(side, side, outside);
         let (width, height) = image.size();

@@ -98,7 +98,7 @@ impl ViewsOptions {
 
 /// A pose with what speaks for it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hypothesis {
+pub(crate) struct Hypothesis {
     /// From the object's frame to the camera's; to the crop's while it is refined there.
     pub camera_from_object: Pose,
     /// How well the crop agrees with the object rendered there, 0 to 1: the part of it that the crop shows where the render does, as the
@@ -108,21 +108,8 @@ pub struct Hypothesis {
     pub inliers: usize,
 }
 
-/// What was found in a crop.
-#[derive(Debug, Clone)]
-pub struct Found {
-    /// The crop.
-    pub crop: Crop,
-    /// Its colours.
-    pub patch: Patch,
-    /// Poses, best first.
-    pub hypotheses: Vec<Hypothesis>,
-    /// The most similar templates, best first: number and similarity.
-    pub templates: Vec<(usize, f32)>,
-}
-
 /// Everything that estimating one object's poses needs.
-pub struct Views<'a> {
+pub(crate) struct Views<'a> {
     /// Makes features.
     pub extractor: &'a Extractor,
     /// The object's surface.
@@ -157,7 +144,12 @@ impl Views<'_> {
     ///
     /// # Errors
     /// [`ViewsError`].
-    pub fn find(&self, image: &RgbImage, camera: &Camera, bbox: &Rect) -> Result<Option<Found>, ViewsError> {
+    pub(crate) fn find(
+        &self,
+        image: &RgbImage,
+        camera: &Camera,
+        bbox: &Rect,
+    ) -> Result<Option<Vec<Hypothesis>>, ViewsError> {
         let Some(part) = Part::new(self.extractor, image, camera, bbox, self.options.side)? else {
             return Ok(None);
         };
@@ -167,7 +159,7 @@ impl Views<'_> {
         let closer =
             self.closer_all(hypotheses[..close].iter().map(|h| (*h, *bbox)).collect(), image, camera)?;
         hypotheses.splice(..close, closer);
-        Ok(Some(Found { crop: part.crop, patch: part.patch, hypotheses, templates: ranked }))
+        Ok(Some(hypotheses))
     }
 
     /// The templates most alike a crop, best first: number and similarity.
@@ -568,7 +560,7 @@ pub(crate) mod tests {
                 refiner: None,
                 options: &options,
             };
-            views.find(&image, &camera, bbox).unwrap().unwrap().hypotheses
+            views.find(&image, &camera, bbox).unwrap().unwrap()
         };
         for outline in [false, true] {
             let found = find(outline, &bbox);

@@ -230,7 +230,7 @@ impl PoseEstimator for ViewsEstimator {
             );
             return Err(EstimatorError::Region { source: source.into() });
         };
-        Ok(found.hypotheses.first().and_then(|h| estimate(h, region.score)).into_iter().collect())
+        Ok(found.first().and_then(|h| estimate(h, region.score)).into_iter().collect())
     }
 }
 

@@ -47,7 +47,7 @@ impl Extractor {
         Extractor { network, device }
     }
 
-    /// Features of crops of `side` x `side` pixels as [`crate::network::input`] makes them.
+    /// Features of crops of `side` x `side` pixels as `crate::network::input` makes them.
     ///
     /// # Errors
     /// [`ViewsError::Network`] where the network's output cannot be read.

@@ -3,25 +3,31 @@
 //!
 //! Without a region, a detector of any object proposes some, and the templates choose among them (`search`).
 //!
-//! A region is cut out as a camera sees it that looks at its middle ([`crop`]). Its features ([`features`]) are compared with those of all
-//! [`templates`]; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
-//! ([`estimate`]). The network ([`network`]) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects ([`training`]).
+//! A region is cut out as a camera sees it that looks at its middle (`crop`). Its features (`features`) are compared with those of all
+//! `templates`; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
+//! (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects (`training`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
 
-pub mod crop;
+mod crop;
 mod error;
-pub mod estimate;
+mod estimate;
 pub mod estimator;
-pub mod features;
+mod features;
 mod file;
 mod matching;
-pub mod network;
+mod network;
 pub mod recipe;
 pub mod refiner;
 mod samples;
 mod search;
-pub mod templates;
-pub mod training;
+mod templates;
+mod training;
 
 pub use error::ViewsError;
+pub use estimate::ViewsOptions;
+pub use features::{Extractor, FeatureMap};
+pub use network::ViewNetwork;
+pub use templates::TemplateOptions;
+pub use training::{Batch, ViewsTraining, ViewsTrainingOptions};

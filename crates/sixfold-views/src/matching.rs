@@ -9,7 +9,7 @@ use crate::templates::Template;
 const QUICK_STEP: usize = 4;
 
 /// The product of two features.
-pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+pub(crate) fn dot(a: &[f32], b: &[f32]) -> f32 {
     let (a, _) = a.as_chunks::<16>();
     let (b, _) = b.as_chunks::<16>();
     let mut sums = [0.0f32; 16];
@@ -23,7 +23,7 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
 
 /// How alike a template and a crop are: the mean over the template's features of the best product with one of the crop's within
 /// `reach` cells.
-pub fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
+pub(crate) fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
     if template.cells.is_empty() {
         return 0.0;
     }
@@ -35,7 +35,7 @@ pub fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
 }
 
 /// The same by every [`QUICK_STEP`]th feature, looked for in the neighbouring cells alone: about twelve times as fast.
-pub fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
+pub(crate) fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
     let (mut sum, mut count) = (0.0, 0.0);
     for (i, cell) in template.cells.iter().enumerate().step_by(QUICK_STEP) {
         sum += best_near(template.feature(i), map, usize::from(*cell), 1).1;
@@ -45,7 +45,7 @@ pub fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
 }
 
 /// The cell within `reach` of `cell` whose feature is nearest, and the product.
-pub fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
+pub(crate) fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
     let mut best = (cell, f32::NEG_INFINITY);
     for at in near(map.cells, cell, reach) {
         let product = dot(feature, map.feature(at));
@@ -65,7 +65,7 @@ fn near(n: usize, cell: usize, reach: usize) -> impl Iterator<Item = usize> {
 
 /// A feature of the template and one of the crop that choose each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Match {
+pub(crate) struct Match {
     /// Which of the template's features.
     pub index: usize,
     /// The cell of the crop.
@@ -75,7 +75,7 @@ pub struct Match {
 }
 
 /// Features that choose each other within `reach` cells.
-pub fn mutual_matches(template: &Template, map: &FeatureMap, reach: usize) -> Vec<Match> {
+pub(crate) fn mutual_matches(template: &Template, map: &FeatureMap, reach: usize) -> Vec<Match> {
     let n = map.cells;
     let mut back: Vec<(f32, u32)> = vec![(f32::NEG_INFINITY, u32::MAX); n * n];
     let mut forward = Vec::with_capacity(template.cells.len());

@@ -11,10 +11,10 @@ use sixfold_nn::weights::{ModelCard, WeightsError, load_weights, load_weights_fr
 use sixfold_nn::xfeat::{Backbone, STEM_CHANNELS, XFeat};
 
 /// Name of the network in weight files.
-pub const ARCHITECTURE: &str = "views-xfeat-colour";
+pub(crate) const ARCHITECTURE: &str = "views-xfeat-colour";
 
 /// Channels of the input: grey, and two of colour.
-pub const INPUTS: usize = 3;
+pub(crate) const INPUTS: usize = 3;
 /// Pixels along each side of the stem's cells.
 const STEM_CELL: usize = 4;
 
@@ -66,7 +66,7 @@ impl ViewNetwork {
         load_weights(ViewNetwork::untrained(device)?, path, ARCHITECTURE)
     }
 
-    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs that [`input`] makes, `batch x 3 x side
+    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs that `input` makes, `batch x 3 x side
     /// x side`; sides are multiples of 32 pixels.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let grey = x.clone().narrow(1, 0, 1);
@@ -77,7 +77,7 @@ impl ViewNetwork {
 
 /// What the network sees of a planar colour crop (0 to 1): grey values with mean 0 and variance 1, and the differences of red from green
 /// and of blue from both on the same scale, for exposure changes neither.
-pub fn input(planes: &[f32]) -> Vec<f32> {
+pub(crate) fn input(planes: &[f32]) -> Vec<f32> {
     let area = planes.len() / 3;
     let (red, rest) = planes.split_at(area);
     let (green, blue) = rest.split_at(area);

@@ -20,7 +20,7 @@ use crate::network::input;
 use crate::templates::{CROP_FACTOR, cells_on_object, input_over_grey, render, wide_camera};
 
 /// Correspondences that are taken from a sample.
-pub const POINTS: usize = 96;
+pub(crate) const POINTS: usize = 96;
 /// Points of an object that are nearer to each other than this part of its diameter are not held apart.
 const SAME_POINT: f32 = 0.05;
 /// A point is seen where the surface in the photograph is at most this part of the diameter away from it.
@@ -30,7 +30,7 @@ const MIN_POINTS: usize = 12;
 
 /// A photograph, two templates, and which of their cells show the same.
 #[derive(Debug, Clone)]
-pub struct Sample {
+pub(crate) struct Sample {
     /// Inputs of the network: the photograph, the template from about the same side, and one from another side.
     pub inputs: [Vec<f32>; 3],
     /// [`POINTS`] cells of the first template.
@@ -277,7 +277,7 @@ fn bilinear(x: f64, y: f64, cells: usize) -> [(usize, f32); 4] {
 }
 
 /// The sample of a number.
-pub fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> Sample {
+pub(crate) fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> Sample {
     let mut random = stream(seed, number);
     loop {
         if let Some(sample) = attempt(textures, side, &mut random) {

@@ -18,7 +18,7 @@ use crate::network::input;
 
 /// One view of an object.
 #[derive(Debug, Clone)]
-pub struct Template {
+pub(crate) struct Template {
     /// From the object's frame to the crop's.
     pub crop_from_object: Pose,
     /// The crop's camera.
@@ -33,13 +33,13 @@ pub struct Template {
 
 impl Template {
     /// The feature of the `i`-th cell.
-    pub fn feature(&self, i: usize) -> &[f32] {
+    pub(crate) fn feature(&self, i: usize) -> &[f32] {
         &self.features[i * CHANNELS..(i + 1) * CHANNELS]
     }
 }
 
 /// An object rendered in one crop.
-pub struct Rendered {
+pub(crate) struct Rendered {
     /// Its colours, before `background`.
     pub image: RgbImage,
     /// The points seen in the object's frame; NaN where nothing is seen.
@@ -47,7 +47,7 @@ pub struct Rendered {
 }
 
 /// The lamp that templates are lit with: at the camera.
-pub fn head_light() -> Vec<Light> {
+pub(crate) fn head_light() -> Vec<Light> {
     vec![
         Light::Ambient { color: [0.35; 3] },
         Light::Directional { direction: Vec3::new(0.0, 0.0, 1.0), color: [0.65; 3] },
@@ -55,7 +55,7 @@ pub fn head_light() -> Vec<Light> {
 }
 
 /// Renders an object into a frame of its camera.
-pub fn render(
+pub(crate) fn render(
     frame: &mut VisibilityBuffer,
     mesh: &Mesh,
     crop_from_object: &Pose,
@@ -72,7 +72,7 @@ const MAX_FACES: usize = 12_000;
 
 /// The mesh with no more faces than its views need, in the same colours: scans have tens of thousands, and rendering them takes longer
 /// than all the rest. A mesh with a texture stays as it is.
-pub fn view_mesh(mesh: &Mesh) -> Mesh {
+pub(crate) fn view_mesh(mesh: &Mesh) -> Mesh {
     if mesh.faces().len() <= MAX_FACES || mesh.texture().is_some() {
         return mesh.clone();
     }
@@ -92,7 +92,7 @@ pub fn view_mesh(mesh: &Mesh) -> Mesh {
 const CONTRAST: f32 = 0.4;
 
 /// The network's input of a render over plain grey that stands out from the object.
-pub fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
+pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
     let mut planes = Patch::from_rgb(&rendered.image).data;
     let area = planes.len() / 3;
     let hidden: Vec<bool> = rendered.coordinates.as_slice().iter().map(|p| p[0].is_nan()).collect();
@@ -112,10 +112,10 @@ pub fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
 }
 
 /// Side of a crop over the longer side of the object's box; the network was trained with it.
-pub const CROP_FACTOR: f64 = 1.2;
+pub(crate) const CROP_FACTOR: f64 = 1.2;
 
 /// A camera in whose image an object of any side is seen as a whole; only its box is taken from it.
-pub fn wide_camera() -> Camera {
+pub(crate) fn wide_camera() -> Camera {
     Camera {
         fx: 600.0,
         fy: 600.0,
@@ -169,7 +169,7 @@ impl TemplateOptions {
 }
 
 /// Directions spread evenly over the sphere (Fibonacci's lattice).
-pub fn directions(count: usize) -> Vec<Vec3> {
+pub(crate) fn directions(count: usize) -> Vec<Vec3> {
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     (0..count)
         .map(|i| {
@@ -193,7 +193,7 @@ fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
 }
 
 /// The cells of a render whose feature lies on the object, with their points.
-pub fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, Vec<[f32; 3]>) {
+pub(crate) fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, Vec<[f32; 3]>) {
     let mut on = Vec::new();
     let mut points = Vec::new();
     for cell in 0..cells * cells {
@@ -211,7 +211,7 @@ pub fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, Vec<[f32
 ///
 /// # Errors
 /// [`ViewsError`].
-pub fn make_templates(
+pub(crate) fn make_templates(
     mesh: &Mesh,
     name: &str,
     diameter: f64,
@@ -276,6 +276,6 @@ fn render_side(
 }
 
 /// The features of some cells.
-pub fn gathered(map: &FeatureMap, cells: &[u16]) -> Vec<f32> {
+pub(crate) fn gathered(map: &FeatureMap, cells: &[u16]) -> Vec<f32> {
     cells.iter().flat_map(|c| map.feature(usize::from(*c)).iter().copied()).collect()
 }

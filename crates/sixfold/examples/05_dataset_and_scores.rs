@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     })?;
     println!("{} poses of {} targets are in {}", summary.poses, summary.targets, summary.results);
 
-    let scores = evaluate(&dataset, &read_results(&results)?, &targets, &EvalOptions::default(), &|_| {})?;
+    let scores = evaluate(&dataset, &read_results(&results)?, &targets, &EvalOptions::default(), &())?;
     println!("AR {:.3}", scores.ar.ok_or("a score is missing")?);
     for (object, score) in &scores.objects {
         println!("object {object}: MSSD {:.3?}, MSPD {:.3?}", score.ar_mssd, score.ar_mspd);

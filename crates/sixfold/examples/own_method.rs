@@ -74,7 +74,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         options: &RunOptions::default(),
     };
     let summary = run.run(&results, &AtomicBool::new(false), &mut |_| Ok(()))?;
-    let scores = evaluate(&dataset, &read_results(&results)?, &targets, &EvalOptions::default(), &|_| {})?;
+    let scores = evaluate(&dataset, &read_results(&results)?, &targets, &EvalOptions::default(), &())?;
     println!("{} poses, AR {:.3}", summary.poses, scores.ar.ok_or("a score is missing")?);
     Ok(())
 }

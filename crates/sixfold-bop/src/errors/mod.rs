@@ -12,5 +12,5 @@ mod vsd;
 pub use placement::Placement;
 pub use projection::{mspd, projection_error};
 pub use rotation_translation::{rotation_error, translation_error};
-pub use surface::{add, adi, mssd};
+pub use surface::{add, add_s, adi, mssd};
 pub use vsd::{VsdError, VsdOptions, vsd};

@@ -33,6 +33,16 @@ pub fn add(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: i
     points.mean_norm(&a, &(estimate.translation - ground_truth.translation))
 }
 
+/// ADD(-S): [`adi`] for symmetric objects, [`add`] for others.
+pub fn add_s(
+    points: &ModelPoints,
+    symmetric: bool,
+    estimate: impl Into<Placement>,
+    ground_truth: impl Into<Placement>,
+) -> f64 {
+    if symmetric { adi(points, estimate, ground_truth) } else { add(points, estimate, ground_truth) }
+}
+
 /// Average Distance of model points in metres, each point at the ground-truth pose to the nearest point at the
 /// estimated pose (Hinterstoisser et al. 2012; also written ADD-S). Exact.
 pub fn adi(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: impl Into<Placement>) -> f64 {

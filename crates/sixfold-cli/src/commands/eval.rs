@@ -15,7 +15,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::pictures::Pictures;
-use sixfold_shell::progress::Progress;
+use sixfold_shell::progress::Bar;
 use sixfold_shell::ranges::in_range;
 
 #[derive(Debug, Args)]
@@ -76,19 +76,6 @@ fn score(text: &str) -> Result<f64, String> {
 /// What all objects are called where their names count for nothing.
 const ANY_OBJECT: u32 = 0;
 
-/// The delta of ITODD in the BOP Challenge, metres; of all others it is that of [`EvalOptions`].
-const ITODD: (&str, f64) = ("itodd", 0.005);
-
-/// VSD's delta in metres.
-fn vsd_delta(a: &EvalArguments) -> Result<f64> {
-    if let Some(millimetres) = a.vsd_delta {
-        in_range("--vsd-delta", millimetres, 0.0..=1000.0)?;
-        return Ok(1e-3 * millimetres);
-    }
-    let itodd = a.dataset.file_name().is_some_and(|name| name.eq_ignore_ascii_case(ITODD.0));
-    Ok(if itodd { ITODD.1 } else { EvalOptions::default().vsd.delta })
-}
-
 #[derive(Serialize)]
 struct Whole {
     #[serde(flatten)]
@@ -118,17 +105,14 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
     let mut targets = dataset.targets(a.targets.as_deref())?;
     let left_out = excepted(&dataset, a.except.as_deref())?;
     targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
-    let mut options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::default() };
-    options.vsd.delta = vsd_delta(a)?;
-    let progress = std::sync::Mutex::new(None);
-    let localisation = evaluate(&dataset, &estimates, &targets, &options, &|p| {
-        if let Ok(mut bar) = progress.lock() {
-            bar.get_or_insert_with(|| Progress::new("images", p.total)).set(p.done);
-        }
-    })?;
-    if let Ok(Some(bar)) = progress.into_inner() {
-        bar.finish();
+    let mut options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::for_dataset(&a.dataset) };
+    if let Some(millimetres) = a.vsd_delta {
+        in_range("--vsd-delta", millimetres, 0.0..=1000.0)?;
+        options.vsd.delta = 1e-3 * millimetres;
     }
+    let bar = Bar::new("images");
+    let localisation = evaluate(&dataset, &estimates, &targets, &options, &bar)?;
+    bar.finish();
     let detection =
         a.detection_ap.then(|| evaluate_detection(&dataset, &estimates, &targets, &options)).transpose()?;
     let whole = Whole { localisation, detection };

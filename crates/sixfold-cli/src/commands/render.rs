@@ -5,12 +5,13 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
-use sixfold_geometry::nalgebra::{Matrix4, Rotation3, UnitQuaternion, Vector3};
-use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
+use sixfold_geometry::nalgebra::{Matrix4, UnitQuaternion, Vector3};
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_io::{CameraFile, write_depth, write_mask, write_rgb};
-use sixfold_mesh::{Mesh, Unit};
+use sixfold_mesh::Unit;
 use sixfold_render::{
-    BoundingBoxScale, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade,
+    BoundingBoxScale, Light, Material, RenderOptions, SceneObject, VisibilityBuffer, portrait_camera,
+    portrait_pose, shade,
 };
 
 use sixfold_shell::Outcome;
@@ -53,10 +54,10 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
             }
             file.camera.without_distortion()
         }
-        None => default_camera(640, 480),
+        None => portrait_camera(640, 480),
     };
     let pose = match &a.pose {
-        None => default_pose(&object.mesh, &camera),
+        None => portrait_pose(&object.mesh, &camera),
         Some(n) if n.len() == 6 => {
             if n.iter().any(|v| !v.is_finite()) {
                 bail!("--pose: found {n:?}, expected finite numbers");
@@ -96,40 +97,4 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
         );
     })?;
     Ok(if pixels > 0 { Outcome::Found } else { Outcome::NothingFound })
-}
-
-fn default_camera(width: usize, height: usize) -> Camera {
-    let f = width as f64 / 2.0 / 30f64.to_radians().tan();
-    Camera {
-        fx: f,
-        fy: f,
-        cx: (width as f64 - 1.0) / 2.0,
-        cy: (height as f64 - 1.0) / 2.0,
-        width,
-        height,
-        distortion: None,
-    }
-}
-
-/// From above and in front, so near that the object fills most of the image.
-fn default_pose(mesh: &Mesh, camera: &Camera) -> Pose {
-    let (low, high) = mesh.bounding_box();
-    let radius = (high - low).norm() / 2.0;
-    let narrow = (camera.width as f64 / camera.fx).min(camera.height as f64 / camera.fy) / 2.0;
-    let distance = radius * (1.0 + 1.0 / narrow);
-    let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), 120f64.to_radians());
-    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
-    let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
-    let centre = (low + high) * 0.5;
-    Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * centre)
-}
-
-/// An image of the object on its own.
-pub(super) fn portrait(mesh: &Mesh) -> RgbImage {
-    let camera = default_camera(480, 480);
-    let objects = [SceneObject { mesh, camera_from_object: default_pose(mesh, &camera) }];
-    let mut frame = VisibilityBuffer::new(&camera);
-    frame.render(&objects, &RenderOptions::default());
-    let white = RgbImage::filled(480, 480, [255; 3]);
-    shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&white))
 }

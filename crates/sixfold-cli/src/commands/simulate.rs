@@ -1,22 +1,21 @@
 //! `sixfold simulate-depth`: what a depth camera would have measured in a dataset that has poses but no depth.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, ground_truth_visibility, write_camera, write_targets,
+    BopDataset, Models, NewImage, SceneWriter, Target, VISIBILITY_DELTA, ground_truth_visibility,
+    write_camera, write_targets,
 };
-use sixfold_geometry::{Camera, DepthImage, Pose};
+use sixfold_geometry::Pose;
 use sixfold_mesh::Mesh;
-use sixfold_render::{
-    DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, plane_mesh, simulate_depth, support_plane,
-};
+use sixfold_render::{DepthSensor, depth_on_table};
 
 use sixfold_shell::Outcome;
-use sixfold_shell::folder::{Contents, DatasetFolder, OutputFolder};
+use sixfold_shell::folder::{Contents, DatasetFolder, OutputFolder, copy_files};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
 use sixfold_shell::pictures::Pictures;
@@ -91,9 +90,6 @@ impl SimulateArguments {
     }
 }
 
-/// Width of the simulated table in metres.
-const TABLE: f64 = 3.0;
-
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
@@ -127,15 +123,17 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
             let posed: Vec<(&Mesh, Pose)> =
                 image.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
             let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
-            let (ideal, depth, has_table) = measured(a, &posed, &camera, seed);
-            if !has_table && !a.no_table {
+            let sensor = a.sensor.model();
+            let seen = depth_on_table(&posed, &camera, !a.no_table, sensor.as_ref().map(|s| (s, seed)));
+            let depth = seen.measured;
+            if !seen.has_table && !a.no_table {
                 without_table.push(format!("{scene_id}/{im_id}"));
             }
             if a.pictures.is_some() {
-                let picture = overlay::side_by_side(&ideal, &depth);
+                let picture = overlay::side_by_side(&seen.ideal, &depth);
                 pictures.write(&format!("{scene_id:06}_{im_id:06}.png"), &picture);
             }
-            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), 0.015);
+            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), VISIBILITY_DELTA);
             let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
             let rgb = if a.rgb { scene.rgb(im_id)? } else { None };
             writer.add(&NewImage {
@@ -166,40 +164,4 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;
     Ok(pictures.outcome(if images > 0 { Outcome::Found } else { Outcome::NothingFound }))
-}
-
-/// The depth of posed objects on a table, if they may have one, as it is and as the camera measures it; whether there is a
-/// table.
-fn measured(
-    a: &SimulateArguments,
-    posed: &[(&Mesh, Pose)],
-    camera: &Camera,
-    seed: u64,
-) -> (DepthImage, DepthImage, bool) {
-    let mut objects: Vec<SceneObject<'_>> =
-        posed.iter().map(|(mesh, pose)| SceneObject { mesh, camera_from_object: *pose }).collect();
-    let table =
-        if a.no_table { None } else { support_plane(&objects).and_then(|p| plane_mesh(&p, camera, TABLE)) };
-    if let Some(mesh) = &table {
-        objects.push(SceneObject { mesh, camera_from_object: Pose::identity() });
-    }
-    let mut frame = VisibilityBuffer::new(camera);
-    frame.render(&objects, &RenderOptions { parallel: true, ..RenderOptions::default() });
-    let ideal = frame.depth();
-    let depth = match a.sensor.model() {
-        None => ideal.clone(),
-        Some(sensor) => simulate_depth(&ideal, &frame.normals(&objects), &sensor, seed),
-    };
-    (ideal, depth, table.is_some())
-}
-
-fn copy_files(from: &Path, to: &Path) -> Result<()> {
-    std::fs::create_dir_all(to).with_context(|| format!("folder {}", to.display()))?;
-    for entry in std::fs::read_dir(from).with_context(|| format!("folder {}", from.display()))? {
-        let path = entry?.path();
-        if let Some(name) = path.file_name().filter(|_| path.is_file()) {
-            std::fs::copy(&path, to.join(name)).with_context(|| format!("cannot copy {}", path.display()))?;
-        }
-    }
-    Ok(())
 }

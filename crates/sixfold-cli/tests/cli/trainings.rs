@@ -183,3 +183,33 @@ fn options_that_no_training_can_have() {
         assert!(!tiny.path().join("trained").exists(), "{command}");
     }
 }
+
+#[test]
+fn help_shows_the_defaults() {
+    let dir = tempfile::tempdir().unwrap();
+    let shown = [
+        ("pix2pose", "(default: 8000; the dissertation's networks: 25000). 0: the weights"),
+        ("pix2pose", "(default: 4; the dissertation's networks: 50)"),
+        ("pix2pose", "(default: 0.002; the dissertation's networks: 0.0001)"),
+        ("pix2pose", "Largest rotation of photographs in the image plane, degrees [default: 45]"),
+        ("pix2pose", "Side of the network's input in pixels; the output has half of it [default: 128]"),
+        ("pix2pose", "- tless: T-LESS"),
+        ("detector", "Highest learning rate [default: 0.002]"),
+        ("detector", "Largest rotation in the image plane, degrees [default: 15]"),
+        ("detector", "unless something else is asked for, 0 to 1 [default: 0.4]"),
+        ("nol", "(default: 5000; the dissertation's network: 350000)"),
+        ("nol", "- average: Their mean, for comparison"),
+        ("nol", "[default: lstm]"),
+        #[cfg(feature = "physics")]
+        ("mttm", "Regions with an object in a step (default: 40; the dissertation's network: 16)"),
+        #[cfg(feature = "experience")]
+        ("dgcm", "(default: 10, with 3 negative ones; the dissertation's network: 25 of both)"),
+        #[cfg(feature = "experience")]
+        ("dgcm", "features' (default: 300; the dissertation's network: 1)"),
+    ];
+    for (training, text) in shown {
+        let help = sixfold(dir.path(), &format!("train {training} --help")).expect(0).stdout;
+        let help = help.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(help.contains(text), "{training}: {text}\n{help}");
+    }
+}

@@ -28,14 +28,14 @@ const DECODER: [usize; 4] = [64, 128, 96, 64];
 
 /// Sizes of the compact network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct CompactConfig;
+pub(crate) struct CompactConfig;
 
 impl CompactConfig {
     /// Side of the input in pixels.
-    pub const SIDE: usize = 96;
+    pub(crate) const SIDE: usize = 96;
 
     /// The network with random weights.
-    pub fn init(&self, seed: u64, device: &Device) -> Compact {
+    pub(crate) fn init(&self, seed: u64, device: &Device) -> Compact {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let rng = &mut rng;
         let down = |channels: [usize; 2], rng: &mut ChaCha8Rng| {
@@ -72,7 +72,7 @@ impl CompactConfig {
     }
 }
 
-/// The compact network, made by [`CompactConfig`].
+/// The compact network, made by `CompactConfig`.
 #[derive(Module, Debug)]
 pub struct Compact {
     geometry: Vec<Conv>,

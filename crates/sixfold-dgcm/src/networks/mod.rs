@@ -6,11 +6,13 @@ mod paper;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-pub use compact::{Compact, CompactConfig};
-pub use paper::{Paper, PaperConfig};
+pub use compact::Compact;
+pub(crate) use compact::CompactConfig;
+pub use paper::Paper;
+pub(crate) use paper::PaperConfig;
 
 /// Length of features and codes.
-pub const FEATURE: usize = sixfold_experience::FEATURE;
+pub(crate) const FEATURE: usize = sixfold_experience::FEATURE;
 
 /// What an encoder says of a batch.
 #[derive(Debug, Clone)]

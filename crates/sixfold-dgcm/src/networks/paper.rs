@@ -34,14 +34,14 @@ const BACKBONE: [usize; 4] = [64, 256, 512, 1024];
 
 /// Sizes of the dissertation's network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PaperConfig;
+pub(crate) struct PaperConfig;
 
 impl PaperConfig {
     /// Side of the input in pixels.
-    pub const SIDE: usize = 128;
+    pub(crate) const SIDE: usize = 128;
 
     /// The network with random weights.
-    pub fn init(&self, seed: u64, device: &Device) -> Paper {
+    pub(crate) fn init(&self, seed: u64, device: &Device) -> Paper {
         self.init_with(ResNet50Config::features(3).init(seed, device), seed, device)
     }
 
@@ -49,7 +49,12 @@ impl PaperConfig {
     ///
     /// # Errors
     /// [`PretrainedError`].
-    pub fn from_imagenet(&self, file: &Path, seed: u64, device: &Device) -> Result<Paper, PretrainedError> {
+    pub(crate) fn from_imagenet(
+        &self,
+        file: &Path,
+        seed: u64,
+        device: &Device,
+    ) -> Result<Paper, PretrainedError> {
         Ok(self.init_with(ResNet50Config::features(3).from_pytorch(file, device)?, seed, device))
     }
 
@@ -98,7 +103,7 @@ impl PaperConfig {
     }
 }
 
-/// The dissertation's network, made by [`PaperConfig`].
+/// The dissertation's network, made by `PaperConfig`.
 #[derive(Module, Debug)]
 pub struct Paper {
     backbone: ResNet50,

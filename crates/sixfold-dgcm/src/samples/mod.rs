@@ -4,4 +4,4 @@ mod pairs;
 mod pool;
 
 pub use pairs::{Pair, PairOptions};
-pub use pool::{GraspPoolOptions, Pool};
+pub use pool::{GraspPoolOptions, Pool, View};

@@ -160,7 +160,7 @@ mod tests {
     use rand::SeedableRng;
 
     fn pool() -> Pool {
-        Pool::new(&GraspPoolOptions { views: 96, ..GraspPoolOptions::default() }, |_| ())
+        Pool::new(&GraspPoolOptions { views: 96, ..GraspPoolOptions::default() }, &()).unwrap()
     }
 
     #[test]

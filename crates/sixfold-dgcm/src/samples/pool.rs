@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::random::stream;
-use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
+use sixfold_geometry::{Camera, Mask, Mat3, Pose, Progress, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
@@ -111,20 +111,20 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Makes the views, the same for the same options at any number of threads. `done` receives how many there are so far.
-    pub fn new(options: &GraspPoolOptions, done: impl Fn(usize) + Sync) -> Pool {
+    /// Makes the views, the same for the same options at any number of threads; `progress` receives them. `None` when it was
+    /// stopped.
+    pub fn new(options: &GraspPoolOptions, progress: &dyn Progress) -> Option<Pool> {
         let members = options.views.div_ceil(options.views_per_member.max(1));
         let count = std::sync::atomic::AtomicUsize::new(0);
-        let made: Vec<Vec<View>> = (0..members)
+        let made: Option<Vec<Vec<View>>> = (0..members)
             .into_par_iter()
             .map(|number| {
                 let views = views_of_member(options, number as u64);
                 let before = count.fetch_add(views.len(), std::sync::atomic::Ordering::Relaxed);
-                done(before + views.len());
-                views
+                progress.report(before + views.len(), options.views).then_some(views)
             })
             .collect();
-        let views: Vec<View> = made.into_iter().flatten().take(options.views).collect();
+        let views: Vec<View> = made?.into_iter().flatten().take(options.views).collect();
         let mut kinds: Vec<(Family, Rest)> = vec![];
         let mut groups: Vec<Vec<usize>> = vec![];
         let mut group_of = vec![];
@@ -138,7 +138,7 @@ impl Pool {
             groups[group].push(i);
             group_of.push(group);
         }
-        Pool { views, groups, group_of, options: *options }
+        Some(Pool { views, groups, group_of, options: *options })
     }
 
     /// All views.

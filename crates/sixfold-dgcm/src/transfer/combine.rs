@@ -174,7 +174,7 @@ pub fn rank_by_outcome(
 }
 
 /// Ranks grasps of both kinds by their chance to hold what experience held: the chance to hold anything times
-/// [`Proposals::holds_the_same`]. With experience on one part alone (a handle) the best is on the counterpart of that part,
+/// `Proposals::holds_the_same`. With experience on one part alone (a handle) the best is on the counterpart of that part,
 /// whoever proposed it. The planner's grasps that hold nothing of it are left out; those transferred stay, last, for it is from
 /// such a part that they come.
 pub fn rank_on_part(

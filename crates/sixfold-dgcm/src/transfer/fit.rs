@@ -36,7 +36,7 @@ pub(super) struct Shape {
 
 impl Shape {
     /// Of a view.
-    pub fn new(crop: &Crop) -> Shape {
+    pub(crate) fn new(crop: &Crop) -> Shape {
         let table_from_camera = table_frame(crop);
         let all: Vec<Vec3> =
             crop.pixels().map(|i| table_from_camera.transform_point(&crop.point(i))).collect();
@@ -121,7 +121,7 @@ impl Shape {
     }
 
     /// 1 on what was seen, less beside it, some where nothing could be seen, 0 where there is nothing.
-    pub fn at(&self, p: &Vec3) -> f64 {
+    pub(crate) fn at(&self, p: &Vec3) -> f64 {
         let cell = (p - self.low) * (1.0 / CELL);
         // Below the first cell is none; a comparison costs less than rounding down.
         if cell.x < 0.0 || cell.y < 0.0 || cell.z < 0.0 {
@@ -131,7 +131,7 @@ impl Shape {
     }
 
     /// The centre of the box around points, seen from above.
-    pub fn middle(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
+    pub(crate) fn middle(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
         let (mut low, mut high) = (Vec3::repeat(f64::MAX), Vec3::repeat(f64::MIN));
         for p in points {
             low = low.inf(&p);

@@ -130,7 +130,7 @@ pub struct Proposals {
 impl Proposals {
     /// How much a grasp holds what experience held: the mean of [`Proposals::held_before`] over the pixels between its pads, 0
     /// where none of them was seen, times how near the middle between its pads is to those of experience.
-    pub fn holds_the_same(&self, grasp: &Grasp, gripper: &Gripper) -> f64 {
+    pub(crate) fn holds_the_same(&self, grasp: &Grasp, gripper: &Gripper) -> f64 {
         let held = between_pads(&self.crop, &grasp.camera_from_gripper, grasp.opening, gripper);
         if held.len() < FEWEST_HELD {
             return 0.0;

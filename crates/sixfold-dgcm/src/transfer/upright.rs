@@ -37,7 +37,7 @@ pub(super) struct Upright {
 
 impl Upright {
     /// A point of the experience's table frame in that of what is seen.
-    pub fn map(&self, p: &Vec3) -> Vec3 {
+    pub(crate) fn map(&self, p: &Vec3) -> Vec3 {
         let (sin, cos) = self.yaw.sin_cos();
         let (x, y) = (p.x * self.stretch[0], p.y * self.stretch[0]);
         Vec3::new(cos * x - sin * y, sin * x + cos * y, p.z * self.stretch[1]) + self.shift
@@ -51,14 +51,14 @@ impl Upright {
     }
 
     /// The rotation from the experience's camera to this one's.
-    pub fn rotation(&self, there: &Shape, here: &Shape) -> Pose {
+    pub(crate) fn rotation(&self, there: &Shape, here: &Shape) -> Pose {
         let turn = Pose::new(UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw), Vec3::zeros());
         let whole = here.table_from_camera.inverse() * turn * there.table_from_camera;
         whole.with_translation(Vec3::zeros())
     }
 
     /// A point of the experience's camera in this one's.
-    pub fn map_camera(&self, p: &Vec3, there: &Shape, here: &Shape) -> Vec3 {
+    pub(crate) fn map_camera(&self, p: &Vec3, there: &Shape, here: &Shape) -> Vec3 {
         let p = self.map(&there.table_from_camera.transform_point(p));
         here.table_from_camera.inverse().transform_point(&p)
     }

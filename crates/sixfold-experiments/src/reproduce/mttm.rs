@@ -12,7 +12,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_align::{DepthOptions, DepthRegion, VerificationOptions};
-use sixfold_bop::{BopDataset, ModelPoints, Models, add, adi};
+use sixfold_bop::{BopDataset, ModelPoints, Models, add_s};
 use sixfold_estimator::{Cache, Object, PoseEstimator, downcast};
 use sixfold_geometry::{Camera, DepthImage, Pose};
 use sixfold_mesh::{Mesh, ModelInfo};
@@ -380,8 +380,7 @@ fn measure(
 
 /// ADD, or ADI for symmetric objects, of the vertices that `sixfold eval` takes, as a fraction of the diameter.
 fn pose_error(points: &ModelPoints, info: &ModelInfo, truth: &Pose, found: &Pose) -> f64 {
-    let error = if info.is_symmetric() { adi(points, found, truth) } else { add(points, found, truth) };
-    error / info.diameter
+    add_s(points, info.is_symmetric(), found, truth) / info.diameter
 }
 
 /// Which pixels a rendered instance is seen at.

@@ -100,7 +100,7 @@ impl Compact {
     }
 
     /// See [`super::Network::descriptor`].
-    pub fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
+    pub(crate) fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
         let x = self.down.iter().fold(maps, |x, conv| conv.forward(x));
         self.descriptor_out.forward(elu(self.descriptor.forward(flat(x)), 1.0))
     }

@@ -15,7 +15,7 @@ pub use compact::{Compact, CompactConfig};
 pub use paper::{Paper, PaperConfig};
 
 /// Length of a descriptor.
-pub const DESCRIPTOR: usize = 128;
+pub(crate) const DESCRIPTOR: usize = 128;
 /// Side of a region's map (dissertation: 14).
 pub const MAP: usize = 14;
 
@@ -78,7 +78,7 @@ impl Network {
     }
 
     /// Maps to descriptors, `batch x 128`.
-    pub fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
+    pub(crate) fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
         match self {
             Network::Compact(n) => n.descriptor(maps),
             Network::Paper(n) => n.descriptor(maps),

@@ -102,7 +102,7 @@ impl Paper {
     }
 
     /// See [`super::Network::descriptor`].
-    pub fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
+    pub(crate) fn descriptor(&self, maps: Tensor<4>) -> Tensor<2> {
         dense_layers(&self.descriptor, flat(maps))
     }
 

@@ -40,7 +40,7 @@ impl AnchorOptions {
     }
 
     /// Side of a kept region, pixels.
-    pub fn kept_side(&self) -> usize {
+    pub(crate) fn kept_side(&self) -> usize {
         self.side + 2 * self.border
     }
 }
@@ -50,7 +50,7 @@ const DEPTH_STEPS: f32 = 127.0;
 
 /// A patch in bytes: normals and depth in 127ths, the depth of the whole patch's size, and whether a pixel is known.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SeenPatch {
+pub(crate) struct SeenPatch {
     /// Pixels along a side.
     pub side: usize,
     /// Normal and depth of every pixel, row by row.

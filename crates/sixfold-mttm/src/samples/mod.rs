@@ -4,9 +4,13 @@
 mod anchor;
 mod batch;
 mod pool;
+#[cfg(feature = "recipe")]
 mod preview;
 
-pub use anchor::{Anchor, AnchorOptions, SeenPatch};
+pub use anchor::{Anchor, AnchorOptions};
 pub use batch::{Augmentation, Batch, PairBatchOptions};
-pub use pool::{Arrangement, DepthPoolOptions, Pool};
-pub use preview::preview;
+#[cfg(any(feature = "recipe", test))]
+pub(crate) use pool::Arrangement;
+pub use pool::{DepthPoolOptions, Pool};
+#[cfg(feature = "recipe")]
+pub(crate) use preview::preview;

@@ -1,6 +1,6 @@
 //! All regions a training draws from, cut out of simulated scenes once (dissertation, section 5.3.1: about 20,000 scenes).
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -9,14 +9,14 @@ use serde::{Deserialize, Serialize};
 use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::random::stream;
-use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Vec3};
+use sixfold_geometry::{Camera, DepthImage, Mat3, Pose, Progress, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
 use super::anchor::{Anchor, AnchorOptions, anchor, without_object};
 
 /// Objects on the table z = 0: numbers of meshes with their poses (world from object).
-pub type Arrangement = Vec<(usize, Pose)>;
+pub(crate) type Arrangement = Vec<(usize, Pose)>;
 
 /// How scenes are seen.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -65,7 +65,7 @@ pub struct Pool {
 
 impl Pool {
     /// Draws every arrangement from all of its cameras and cuts the regions out. The same input gives the same pool at any
-    /// number of threads; `progress` is called for every arrangement done. `None` when `stop` was set meanwhile.
+    /// number of threads; `progress` receives every arrangement. `None` when it was stopped.
     ///
     /// # Panics
     /// For an arrangement with a number beyond the meshes.
@@ -73,24 +73,21 @@ impl Pool {
         meshes: &[Mesh],
         arrangements: &[Arrangement],
         options: &DepthPoolOptions,
-        stop: &AtomicBool,
-        progress: impl Fn() + Sync,
+        progress: &dyn Progress,
     ) -> Option<Pool> {
+        let done = AtomicUsize::new(0);
         let per_arrangement: Option<Vec<Vec<Anchor>>> = arrangements
             .par_iter()
             .enumerate()
             .map(|(number, arrangement)| {
-                if stop.load(Ordering::Relaxed) {
-                    return None;
-                }
                 let anchors: Vec<Anchor> = (0..options.views as u64)
                     .flat_map(|view| {
                         let mut random = stream(options.seed, number as u64 * 1000 + view);
                         see(meshes, arrangement, options, &mut random)
                     })
                     .collect();
-                progress();
-                Some(anchors)
+                let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+                progress.report(done, arrangements.len()).then_some(anchors)
             })
             .collect();
         let (with_object, without) = per_arrangement?.into_iter().flatten().partition(|a| a.object.is_some());
@@ -103,7 +100,7 @@ impl Pool {
     }
 
     /// Regions with an object.
-    pub fn with_object(&self) -> &[Anchor] {
+    pub(crate) fn with_object(&self) -> &[Anchor] {
         &self.with_object
     }
 

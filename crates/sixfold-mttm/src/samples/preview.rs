@@ -11,7 +11,7 @@ const ZOOM: usize = 3;
 
 /// A row for each of the first regions of a batch (patches of `side` pixels): the region, the object's cells in it, the positive
 /// template, the negative one; normals as colours, grey where nothing was measured.
-pub fn preview(batch: &Batch, side: usize, rows: usize) -> RgbImage {
+pub(crate) fn preview(batch: &Batch, side: usize, rows: usize) -> RgbImage {
     let rows = rows.min(batch.objects.len());
     let tile = side * ZOOM + ZOOM;
     let mut picture = RgbImage::filled(4 * tile, rows * tile, [255; 3]);

@@ -105,7 +105,7 @@ impl BatchNorm {
     }
 
     /// Whether the statistics of the batch are used and kept for this input.
-    pub fn is_training(&self, x: &Tensor<4>) -> bool {
+    pub(crate) fn is_training(&self, x: &Tensor<4>) -> bool {
         x.device().is_autodiff() && self.training.is_enabled()
     }
 

@@ -38,7 +38,7 @@ pub fn neighbours(x: f32, y: f32, [height, width]: [usize; 2]) -> ([usize; 4], [
 }
 
 /// Fills images (`images x channels x rows x columns` of `places`) from maps (`images x channels x size`).
-pub fn gather_forward(maps: &[f32], channels: usize, size: [usize; 2], places: &Places) -> Vec<f32> {
+pub(crate) fn gather_forward(maps: &[f32], channels: usize, size: [usize; 2], places: &Places) -> Vec<f32> {
     let (small, large) = (size[0] * size[1], places.size[0] * places.size[1]);
     let mut out = vec![0.0; places.images.len() * channels * large];
     if out.is_empty() {
@@ -60,7 +60,7 @@ pub fn gather_forward(maps: &[f32], channels: usize, size: [usize; 2], places: &
 }
 
 /// Gradient of [`gather_forward`] with respect to the maps.
-pub fn gather_backward(dout: &[f32], channels: usize, size: [usize; 2], places: &Places) -> Vec<f32> {
+pub(crate) fn gather_backward(dout: &[f32], channels: usize, size: [usize; 2], places: &Places) -> Vec<f32> {
     let (small, large) = (size[0] * size[1], places.size[0] * places.size[1]);
     let mut dmaps = vec![0.0; places.images.len() * channels * small];
     if dmaps.is_empty() {

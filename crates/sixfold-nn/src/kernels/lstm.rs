@@ -77,7 +77,7 @@ vectorised! {
 
 /// Gates (four planes of `pixels` numbers a channel) and the cell's state before to, first, the hidden state, then the new
 /// state, both in the shape of `before`.
-pub fn lstm_forward(gates: &[f32], before: &[f32], pixels: usize) -> Vec<f32> {
+pub(crate) fn lstm_forward(gates: &[f32], before: &[f32], pixels: usize) -> Vec<f32> {
     let mut out = vec![0.0; 2 * before.len()];
     let (hidden, state) = out.split_at_mut(before.len());
     let planes = hidden.par_chunks_mut(pixels).zip(state.par_chunks_mut(pixels));
@@ -90,7 +90,7 @@ pub fn lstm_forward(gates: &[f32], before: &[f32], pixels: usize) -> Vec<f32> {
 }
 
 /// Gradients with respect to gates and state before, from the output of [`lstm_forward`] and the gradient with respect to it.
-pub fn lstm_backward(
+pub(crate) fn lstm_backward(
     gates: &[f32],
     before: &[f32],
     out: &[f32],

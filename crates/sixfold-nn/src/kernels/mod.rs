@@ -11,10 +11,12 @@ mod lstm;
 mod shared;
 mod upsample;
 
-pub use gather::{Places, SampledPixel, gather_backward, gather_forward, neighbours};
-pub use lstm::{lstm_backward, lstm_forward};
+pub use gather::{Places, SampledPixel, neighbours};
+pub(crate) use gather::{gather_backward, gather_forward};
+pub(crate) use lstm::{lstm_backward, lstm_forward};
 pub use shared::{Activation, ConvSpec};
-pub use upsample::{Upsampling, upsample_2x, upsample_2x_backward};
+pub use upsample::Upsampling;
+pub(crate) use upsample::{upsample_2x, upsample_2x_backward};
 
 use dense::{dense_backward, dense_forward};
 use depthwise::{depthwise_backward, depthwise_forward};
@@ -37,7 +39,7 @@ pub struct ConvShape {
 
 impl ConvShape {
     /// Rows and columns of the output.
-    pub fn output_size(&self, spec: &ConvSpec) -> [usize; 2] {
+    pub(crate) fn output_size(&self, spec: &ConvSpec) -> [usize; 2] {
         let side =
             |i: usize| (self.size[i] + spec.padding[0] + spec.padding[1] - self.kernel) / spec.stride + 1;
         [side(0), side(1)]
@@ -60,7 +62,13 @@ pub struct ConvGradients {
 }
 
 /// `activation(conv(x, weight) + bias)`.
-pub fn conv_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, spec: &ConvSpec) -> Vec<f32> {
+pub(crate) fn conv_forward(
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    shape: &ConvShape,
+    spec: &ConvSpec,
+) -> Vec<f32> {
     if spec.groups == 1 {
         dense_forward(x, weight, bias, shape, spec)
     } else {
@@ -71,7 +79,7 @@ pub fn conv_forward(x: &[f32], weight: &[f32], bias: &[f32], shape: &ConvShape, 
 /// Gradients of [`conv_forward`], from its output `y` and the gradient `dy` with respect to it.
 ///
 /// `wanted` says which of input, and weight with bias, are needed.
-pub fn conv_backward(
+pub(crate) fn conv_backward(
     x: &[f32],
     weight: &[f32],
     y: &[f32],

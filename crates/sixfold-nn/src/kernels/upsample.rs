@@ -13,7 +13,7 @@ pub enum Upsampling {
 }
 
 /// Twice the rows and columns. `x` holds planes of `height x width`.
-pub fn upsample_2x(x: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> Vec<f32> {
+pub(crate) fn upsample_2x(x: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> Vec<f32> {
     let mut out = vec![0.0; x.len() * 4];
     let planes = out.par_chunks_mut(4 * height * width).zip(x.par_chunks(height * width));
     match kind {
@@ -31,7 +31,7 @@ pub fn upsample_2x(x: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> 
 }
 
 /// Gradient of [`upsample_2x`]. `height` and `width` are those of the small image.
-pub fn upsample_2x_backward(dy: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> Vec<f32> {
+pub(crate) fn upsample_2x_backward(dy: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> Vec<f32> {
     let mut out = vec![0.0; dy.len() / 4];
     let planes = out.par_chunks_mut(height * width).zip(dy.par_chunks(4 * height * width));
     match kind {

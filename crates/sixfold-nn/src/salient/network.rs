@@ -76,7 +76,7 @@ impl Stage {
     }
 }
 
-/// The layers, made by [`Layers::empty`] and filled from a weight file.
+/// The layers, made by `Layers::empty` and filled from a weight file.
 #[derive(Module, Debug)]
 pub struct Layers {
     encoder: Vec<Stage>,

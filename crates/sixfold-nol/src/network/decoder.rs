@@ -31,7 +31,7 @@ pub(super) struct DecoderConfig {
 }
 
 impl DecoderConfig {
-    pub fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Decoder {
+    pub(crate) fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Decoder {
         let (filters, wide) = (self.filters, self.filters * self.expansion);
         let narrow = (filters as f32 * self.linear_ratio) as usize;
         let head = ConvConfig::new([CHANNELS, filters], 3, Activation::Linear);
@@ -77,7 +77,7 @@ pub(super) struct Decoder {
 
 impl Decoder {
     /// X^S (`B x 17 x height x width`, sides even) to X^phi (`B x 3 x height x width`).
-    pub fn forward(&self, sum: Tensor<4>) -> Tensor<4> {
+    pub(crate) fn forward(&self, sum: Tensor<4>) -> Tensor<4> {
         let mut x = self.head.forward(sum.clone());
         for block in &self.blocks {
             let inner = block.narrow.forward(block.wide.forward(x.clone()));

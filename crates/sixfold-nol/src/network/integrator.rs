@@ -19,7 +19,7 @@ pub(super) struct IntegratorConfig {
 }
 
 impl IntegratorConfig {
-    pub fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Integrator {
+    pub(crate) fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Integrator {
         let mut inputs = CHANNELS;
         let layers = self.hidden.iter().copied().chain([INTEGRATED]);
         match self.kind {
@@ -60,7 +60,7 @@ pub(super) struct Integrator {
 
 impl Integrator {
     /// `K B x 17 x height x width` to `B x 16 x height x width`.
-    pub fn forward(&self, looked_up: Tensor<4>, valid: &Tensor<4>, sources: usize) -> Tensor<4> {
+    pub(crate) fn forward(&self, looked_up: Tensor<4>, valid: &Tensor<4>, sources: usize) -> Tensor<4> {
         let [all, channels, height, width] = looked_up.dims();
         let batch = all / sources;
         if let Some(average) = &self.average {

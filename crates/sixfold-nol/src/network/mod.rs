@@ -25,9 +25,9 @@ use integrator::{Integrator, IntegratorConfig};
 use weighting::{Weighting, WeightingConfig};
 
 /// Channels of colour, from -1 to 1.
-pub const COLOURS: usize = 3;
+pub(crate) const COLOURS: usize = 3;
 /// Channels that the encoder's maps are reduced to, finest first.
-pub const REDUCED: [usize; 4] = [4, 3, 3, 3];
+pub(crate) const REDUCED: [usize; 4] = [4, 3, 3, 3];
 /// Channels of features.
 pub const FEATURES: usize = 13;
 /// Channels of a looked-up source: colour, features, the cosine of the angle at which it was seen.

@@ -18,7 +18,7 @@ pub(super) struct WeightingConfig {
 }
 
 impl WeightingConfig {
-    pub fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Weighting {
+    pub(crate) fn init(&self, rng: &mut ChaCha8Rng, device: &Device) -> Weighting {
         let mut inputs = CHANNELS + INTEGRATED;
         let mut layers: Vec<Conv> = self
             .channels
@@ -41,7 +41,7 @@ pub(super) struct Weighting {
 
 impl Weighting {
     /// `K B x 17`, `K B x 1` and `B x 16` channels of `height x width`.
-    pub fn forward(
+    pub(crate) fn forward(
         &self,
         looked_up: Tensor<4>,
         valid: Tensor<4>,

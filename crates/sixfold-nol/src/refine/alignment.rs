@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 use sixfold_align::outline::{Outline, color_odds};
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::{Pose, Progress, Vec3};
 use sixfold_mesh::Mesh;
 
 use super::appearance::{Common, Light, Shown, look};
@@ -52,7 +52,13 @@ pub(super) struct RefinementState<'a, 'b> {
     pub objects: &'a [Object],
     pub options: &'a PoseRefinementOptions,
     pub working: Vec<Working<'a>>,
-    pub progress: &'a mut dyn FnMut(f64) -> bool,
+    pub progress: &'a dyn Progress,
+}
+
+/// Reports a fraction of the work in millionths; whether to go on.
+pub(super) fn report(progress: &dyn Progress, fraction: f64) -> bool {
+    const PARTS: f64 = 1e6;
+    progress.report((PARTS * fraction).round() as usize, PARTS as usize)
 }
 
 /// How rough poses still are after a first refinement, of what the given ones were.
@@ -63,7 +69,7 @@ const AGAIN: usize = 1;
 impl RefinementState<'_, '_> {
     /// Makes the poses better: in one arrangement if all objects stood still by their given poses; otherwise every source by
     /// itself, and then in the places where objects stood in some of the images by these better poses.
-    pub fn refine(&mut self) -> Standing {
+    pub(crate) fn refine(&mut self) -> Standing {
         let given: Vec<Pose> = self.working.iter().map(|w| w.given).collect();
         let pairs: Vec<[usize; 2]> = self.sources.iter().map(|s| [s.image, s.object]).collect();
         let each: Vec<Vec<usize>> = (0..self.objects.len()).map(|object| vec![object]).collect();
@@ -145,7 +151,7 @@ impl RefinementState<'_, '_> {
         Some((arrangement, (usual * 6.0 * pairs.len() as f64 / free).sqrt()))
     }
 
-    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` receives numbers in a range. `false`
+    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` receives fractions in a range. `false`
     /// when that stopped it.
     fn align(
         &mut self,
@@ -169,7 +175,7 @@ impl RefinementState<'_, '_> {
             }
             for step in 0..options.steps {
                 let done = ((level - first) * options.steps + step) as f64 / all;
-                if !(self.progress)(range[0] + done * (range[1] - range[0])) {
+                if !report(self.progress, range[0] + done * (range[1] - range[0])) {
                     return false;
                 }
                 let working = &mut self.working;

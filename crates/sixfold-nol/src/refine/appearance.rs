@@ -62,12 +62,12 @@ pub(crate) struct Light {
 }
 
 impl Light {
-    pub fn neutral(channels: usize) -> Self {
+    pub(crate) fn neutral(channels: usize) -> Self {
         Light { gain: vec![1.0; channels], offset: vec![0.0; channels] }
     }
 
     /// Least squares of `common` on `shown`, shrunk towards no change.
-    pub fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
+    pub(crate) fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
         let mut light = Light::neutral(channels);
         for c in 0..channels {
             // Sums over points: weight, x, y, xx, xy.
@@ -98,7 +98,7 @@ impl Light {
         light
     }
 
-    pub fn apply(&self, values: &mut [f32]) {
+    pub(crate) fn apply(&self, values: &mut [f32]) {
         let channels = self.gain.len();
         for (k, v) in values.iter_mut().enumerate() {
             *v = self.gain[k % channels] * *v + self.offset[k % channels];
@@ -123,7 +123,7 @@ const FAR: f32 = 0.08;
 
 impl Common {
     /// `shown` after their light was made alike.
-    pub fn new(shown: &[Shown], channels: usize) -> Self {
+    pub(crate) fn new(shown: &[Shown], channels: usize) -> Self {
         let points = shown.first().map_or(0, |s| s.weights.len());
         let mut common = Common {
             sums: vec![0.0; points * channels],
@@ -166,7 +166,7 @@ impl Common {
     }
 
     /// The mean at every point; 0 where nothing is known.
-    pub fn mean(&self) -> Vec<f32> {
+    pub(crate) fn mean(&self) -> Vec<f32> {
         let mut mean = self.sums.clone();
         for (values, w) in mean.chunks_exact_mut(self.channels.max(1)).zip(&self.weights) {
             values.iter_mut().for_each(|v| *v = if *w > 0.0 { *v / w } else { 0.0 });
@@ -175,7 +175,7 @@ impl Common {
     }
 
     /// The mean of all photographs but one, and the weight behind it.
-    pub fn without(&self, k: usize, shown: &Shown) -> (Vec<f32>, Vec<f32>) {
+    pub(crate) fn without(&self, k: usize, shown: &Shown) -> (Vec<f32>, Vec<f32>) {
         let mut mean = self.sums.clone();
         let mut weights = self.weights.clone();
         for (i, part) in self.parts[k].iter().enumerate() {

@@ -25,7 +25,7 @@ pub(super) struct Wanted {
 
 impl Arrangement {
     /// An arrangement of given poses, exact for a part of them that hangs together.
-    pub fn new(pairs: Vec<[usize; 2]>, poses: &[Pose], images: usize, objects: usize) -> Self {
+    pub(crate) fn new(pairs: Vec<[usize; 2]>, poses: &[Pose], images: usize, objects: usize) -> Self {
         let mut cameras: Vec<Option<Pose>> = vec![None; images];
         let mut places: Vec<Option<Pose>> = vec![None; objects];
         while let Some(first) = (0..objects).find(|o| places[*o].is_none()) {
@@ -51,18 +51,18 @@ impl Arrangement {
     }
 
     /// The pose of a source's object in its image.
-    pub fn camera_from_object(&self, source: usize) -> Pose {
+    pub(crate) fn camera_from_object(&self, source: usize) -> Pose {
         let [image, object] = self.pairs[source];
         self.camera_from_scene[image] * self.scene_from_object[object]
     }
 
     /// Moves an object in its own frame, in all images alike.
-    pub fn move_object(&mut self, object: usize, motion: &Pose) {
+    pub(crate) fn move_object(&mut self, object: usize, motion: &Pose) {
         self.scene_from_object[object] = self.scene_from_object[object] * *motion;
     }
 
     /// Moves all cameras and objects by one Gauss-Newton step. `false` where the system cannot be solved; nothing moves then.
-    pub fn step(&mut self, wanted: &[Wanted], damping: f64) -> bool {
+    pub(crate) fn step(&mut self, wanted: &[Wanted], damping: f64) -> bool {
         let (images, objects) = (self.camera_from_scene.len(), self.scene_from_object.len());
         let size = 6 * (images + objects);
         let mut h = DMatrix::<f64>::zeros(size, size);

@@ -91,7 +91,7 @@ impl Shared<'_, '_> {
     }
 
     /// The motion that the photographs agree on best; `None` where they say nothing about it.
-    pub fn solve(&self, options: &PoseRefinementOptions) -> Option<Pose> {
+    pub(crate) fn solve(&self, options: &PoseRefinementOptions) -> Option<Pose> {
         let scale = options.colors * self.working.len() as f64;
         let (here, noise) = self.disagreement(&Vector6::zeros(), None);
         let mut h = Matrix6::zeros();

@@ -8,10 +8,11 @@
 use rayon::prelude::*;
 use sixfold_align::outline::outline_mesh;
 use sixfold_data::PosedImage;
+use sixfold_geometry::Progress;
 use sixfold_mesh::Mesh;
 use sixfold_render::VisibilityBuffer;
 
-use super::alignment::{Object, RefinementState, shown};
+use super::alignment::{Object, RefinementState, report, shown};
 use super::appearance::Light;
 use super::measure::Working;
 use super::options::{PoseRefinementOptions, Refinement, SourceReport};
@@ -39,7 +40,7 @@ pub fn refine_poses(
     photographs: &[PosedImage],
     mesh: &Mesh,
     options: &PoseRefinementOptions,
-    progress: impl FnMut(f64) -> bool,
+    progress: &dyn Progress,
 ) -> Result<Refinement, NolError> {
     let sources: Vec<PosedSource<'_>> = photographs
         .iter()
@@ -49,8 +50,8 @@ pub fn refine_poses(
     refine_scene(&sources, std::slice::from_ref(mesh), options, progress)
 }
 
-/// Makes the poses of objects in photographs better. `progress` receives the fraction that is done, and stops the work by returning
-/// `false` (the poses of that moment are the result).
+/// Makes the poses of objects in photographs better. Once `progress` stops it, the poses of that moment are the
+/// result; it receives millionths of the work, for there are no parts of equal size.
 ///
 /// # Errors
 /// [`NolError`] for options out of range.
@@ -58,7 +59,7 @@ pub fn refine_scene(
     sources: &[PosedSource<'_>],
     meshes: &[Mesh],
     options: &PoseRefinementOptions,
-    mut progress: impl FnMut(f64) -> bool,
+    progress: &dyn Progress,
 ) -> Result<Refinement, NolError> {
     options.check()?;
     if let Some(wrong) = sources.iter().find(|s| s.object >= meshes.len()) {
@@ -96,11 +97,10 @@ pub fn refine_scene(
         });
     }
     let before = differences(&mut working, &objects, options);
-    let mut scene =
-        RefinementState { sources, meshes, objects: &objects, options, working, progress: &mut progress };
+    let mut scene = RefinementState { sources, meshes, objects: &objects, options, working, progress };
     let standing = scene.refine();
-    let RefinementState { mut working, progress, .. } = scene;
-    progress(1.0);
+    let RefinementState { mut working, .. } = scene;
+    report(progress, 1.0);
     let after = differences(&mut working, &objects, options);
     let mut reports: Vec<SourceReport> = working
         .iter()

@@ -76,7 +76,7 @@ pub(super) fn wanted_by(given: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2
 
 impl Working<'_> {
     /// Colours are compared inside the silhouette only, as far from its border as the blur carries what lies beside it.
-    pub fn allow(&mut self, blur: f32) {
+    pub(crate) fn allow(&mut self, blur: f32) {
         let side = self.view.side();
         let mut inside = Coverage::from_fn(side, side, |x, y| {
             let i = y * side + x;
@@ -88,7 +88,7 @@ impl Working<'_> {
     }
 
     /// The colours to be compared.
-    pub fn maps(&self, blur: f32, options: &PoseRefinementOptions) -> Maps {
+    pub(crate) fn maps(&self, blur: f32, options: &PoseRefinementOptions) -> Maps {
         if options.wide <= 0.0 {
             return Maps::of_patch(&self.view.patch, blur);
         }
@@ -103,7 +103,7 @@ impl Working<'_> {
     }
 
     /// What the photograph says about its pose: colours and outline, as normal equations of a twist about the object's centre.
-    pub fn measure(&mut self, terms: &Terms<'_>, options: &PoseRefinementOptions) -> Wanted {
+    pub(crate) fn measure(&mut self, terms: &Terms<'_>, options: &PoseRefinementOptions) -> Wanted {
         let pose = self.pose;
         let centre = pose.transform_point(terms.centre);
         let mut equations = NormalEquations::default();
@@ -121,7 +121,12 @@ impl Working<'_> {
     }
 
     /// Outline and given pose without the colours.
-    pub fn measure_anchors(&mut self, centre: &Vec3, reach: f64, options: &PoseRefinementOptions) -> Wanted {
+    pub(crate) fn measure_anchors(
+        &mut self,
+        centre: &Vec3,
+        reach: f64,
+        options: &PoseRefinementOptions,
+    ) -> Wanted {
         let pose = self.pose;
         let mut wanted = wanted_by(&self.given, &pose, centre, options.rough);
         let lines = self.outline.as_mut().map(|outline| outline.lines(reach, &pose)).unwrap_or_default();
@@ -186,7 +191,7 @@ impl Working<'_> {
         }
     }
 
-    pub fn report(
+    pub(crate) fn report(
         &self,
         centre: &Vec3,
         difference: [f64; 2],

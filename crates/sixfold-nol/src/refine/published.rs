@@ -38,7 +38,7 @@ impl Default for PublishedRuleOptions {
 /// Moves one photograph's pose by the published rule. `target` is the view of the first rendering, `rendered` its channels at
 /// the target's pixels (`pixels x channels`), `known` which of them are; `maps` are the photograph's same channels.
 /// Returns the pose and the errors before and after.
-pub fn published_rule(
+pub(crate) fn published_rule(
     view: &mut SourceView,
     maps: &Maps,
     mesh: &Mesh,

@@ -29,7 +29,7 @@ type Both = (usize, usize, usize);
 
 impl Places {
     /// Places of sources, image and object each, with their given poses; `centres` are the objects' in their own frames.
-    pub fn new(pairs: &[[usize; 2]], given: &[Pose], centres: &[Vec3], rough: [f64; 2]) -> Places {
+    pub(crate) fn new(pairs: &[[usize; 2]], given: &[Pose], centres: &[Vec3], rough: [f64; 2]) -> Places {
         let mut images: BTreeMap<usize, BTreeMap<usize, usize>> = BTreeMap::new();
         for (source, [image, object]) in pairs.iter().enumerate() {
             images.entry(*image).or_default().insert(*object, source);
@@ -159,12 +159,12 @@ pub(super) struct Joined(Vec<usize>);
 
 impl Joined {
     /// Every number below `count` by itself.
-    pub fn new(count: usize) -> Joined {
+    pub(crate) fn new(count: usize) -> Joined {
         Joined((0..count).collect())
     }
 
     /// The number that stands for a number's set.
-    pub fn root(&mut self, mut at: usize) -> usize {
+    pub(crate) fn root(&mut self, mut at: usize) -> usize {
         while self.0[at] != at {
             self.0[at] = self.0[self.0[at]];
             at = self.0[at];
@@ -173,7 +173,7 @@ impl Joined {
     }
 
     /// Makes two sets one.
-    pub fn join(&mut self, a: usize, b: usize) {
+    pub(crate) fn join(&mut self, a: usize, b: usize) {
         let (a, b) = (self.root(a), self.root(b));
         self.0[a.max(b)] = a.min(b);
     }

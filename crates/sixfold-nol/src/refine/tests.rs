@@ -83,7 +83,7 @@ fn rough_poses_of_a_painted_block_become_exact() {
     let outline = PoseRefinementOptions { line: 0.3, ..default.clone() };
     let paint = PoseRefinementOptions { wide: 0.0, shared: 2, colors: 40.0, ..default.clone() };
     for (options, most) in [(default, [0.0035, 0.015]), (outline, [0.002, 0.006]), (paint, [0.0015, 0.009])] {
-        let refined = refine_poses(&photographs, &mesh, &options, |_| true).unwrap();
+        let refined = refine_poses(&photographs, &mesh, &options, &()).unwrap();
         let after: Vec<Pose> = refined.sources.iter().map(|s| s.camera_from_object).collect();
         let (before, after) = (errors(&given, &truth), errors(&after, &truth));
         assert!(after[0] < most[0] && after[1] < most[1], "{options:?}: {before:?} {after:?}");
@@ -96,7 +96,7 @@ fn a_photograph_with_a_wrong_pose_is_dropped() {
     let wrong = photographs[4].camera_from_object();
     let moved = wrong.with_translation(wrong.translation() + Vec3::new(0.07, 0.03, 0.0));
     photographs[4] = photographs[4].with_pose(moved).unwrap();
-    let refined = refine_poses(&photographs, &mesh, &PoseRefinementOptions::default(), |_| true).unwrap();
+    let refined = refine_poses(&photographs, &mesh, &PoseRefinementOptions::default(), &()).unwrap();
     for (k, source) in refined.sources.iter().enumerate() {
         assert_eq!(source.dropped.is_some(), k == 4, "{k}: {source:?}");
     }
@@ -141,7 +141,7 @@ fn objects_that_stood_still_share_their_cameras() {
     let sources = sources(&first, &second);
     // The second block is painted nowhere: what is left is the common arrangement.
     let options = PoseRefinementOptions { colors: 0.0, line: 0.0, ..PoseRefinementOptions::default() };
-    let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, |_| true).unwrap();
+    let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, &()).unwrap();
     assert!(refined.still && refined.disagreement.unwrap() < 2.0, "{:?}", refined.disagreement);
     assert_eq!(refined.places, 2);
     let given: Vec<Pose> = sources.iter().map(|s| *s.photograph.camera_from_object()).collect();
@@ -150,7 +150,7 @@ fn objects_that_stood_still_share_their_cameras() {
     assert!(after[0] < 0.85 * before[0] && after[1] < 0.85 * before[1], "{before:?} {after:?}");
     // Moved between photographs, nothing is shared: the given poses stay.
     let options = PoseRefinementOptions { scene: SceneKind::Moving, ..options };
-    let moving = refine_scene(&sources, &[block(), block()], &options, |_| true).unwrap();
+    let moving = refine_scene(&sources, &[block(), block()], &options, &()).unwrap();
     assert!(moving.sources.iter().zip(&given).all(|(s, g)| s.camera_from_object.distance_to(g) < 1e-6));
 }
 
@@ -160,7 +160,7 @@ fn objects_that_were_moved_once_share_their_cameras_before_and_after() {
         two_blocks(|image| if image < 5 { between(1.0, 0.15) } else { between(-0.4, -0.1) });
     let sources = sources(&first, &second);
     let options = PoseRefinementOptions { colors: 0.0, line: 0.0, ..PoseRefinementOptions::default() };
-    let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, |_| true).unwrap();
+    let refined = refine_scene(&sources, &[mesh.clone(), mesh], &options, &()).unwrap();
     // Who moved, nobody can say: both objects have a place before and one after.
     assert!(!refined.still && refined.disagreement.unwrap() > 2.0, "{:?}", refined.disagreement);
     assert_eq!(refined.places, 4);

@@ -35,7 +35,7 @@ impl Looked {
 }
 
 /// Looks a target up in a source; what the source's mask leaves out is not seen.
-pub fn look_up(source: &SourceView, target: &TargetSurface) -> Looked {
+pub(crate) fn look_up(source: &SourceView, target: &TargetSurface) -> Looked {
     let mut looked = Looked::default();
     for (i, (point, normal)) in target.points.iter().zip(&target.normals).enumerate() {
         let Some((pixel, cosine)) = source.see(point, normal) else { continue };
@@ -150,7 +150,7 @@ impl Batch {
     ///
     /// # Panics
     /// If they differ in that, or there are none.
-    pub fn of_samples(samples: &[Sample]) -> Batch {
+    pub(crate) fn of_samples(samples: &[Sample]) -> Batch {
         let (side, sources) = (samples[0].target.width, samples[0].sources.len());
         let (count, pixels) = (samples.len(), side * side);
         let all = sources * count;

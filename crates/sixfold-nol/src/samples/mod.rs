@@ -8,7 +8,8 @@ mod batch;
 mod object;
 mod view;
 
-pub use batch::{Batch, Looked, ViewBatchOptions, look_up};
+pub(crate) use batch::look_up;
+pub use batch::{Batch, Looked, ViewBatchOptions};
 pub(crate) use batch::{order, share};
 pub use object::PaintedObject;
 pub use view::{Sample, ViewSampleOptions, make_sample};

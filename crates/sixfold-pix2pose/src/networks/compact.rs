@@ -15,7 +15,7 @@ use sixfold_nn::lite0::{Lite0, Lite0Config};
 use sixfold_nn::ops::{pixel_shuffle, upsample};
 
 /// Channels of the output: three coordinates, the error's logit, the visibility's logit.
-pub const CHANNELS: usize = 5;
+pub(crate) const CHANNELS: usize = 5;
 
 /// Channels of the encoder's maps at 1/2, 1/4, 1/8 and 1/16 of the resolution.
 const SKIPS: [usize; 4] = [16, 24, 40, 112];

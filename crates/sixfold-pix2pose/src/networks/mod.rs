@@ -4,6 +4,6 @@ mod compact;
 mod paper;
 mod resnet50;
 
-pub use compact::{Compact, CompactConfig};
+pub use compact::{Compact, CompactConfig, Decoder};
 pub use paper::{GeneratorOutput, PaperGenerator, PaperGeneratorConfig, SIDE};
 pub use resnet50::{ResNet50Generator, ResNet50GeneratorConfig};

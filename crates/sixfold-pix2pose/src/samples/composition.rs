@@ -38,7 +38,7 @@ impl Scenery<'_> {
     }
 
     /// The object pasted on a background with clutter.
-    pub fn paste(&self, object: &Patch, visible: Coverage, random: &mut Random) -> Composition {
+    pub(crate) fn paste(&self, object: &Patch, visible: Coverage, random: &mut Random) -> Composition {
         let size = self.options.size;
         let mut image = self.background(random);
         for _ in 0..random.random_range(0..=self.options.clutter) {
@@ -57,7 +57,7 @@ impl Scenery<'_> {
     }
 
     /// A photograph as it is; what lies outside of it is grey or background.
-    pub fn keep(
+    pub(crate) fn keep(
         &self,
         mut photograph: Patch,
         inside: &Coverage,
@@ -74,7 +74,7 @@ impl Scenery<'_> {
     }
 
     /// Hides a part of the object behind shapes or images of other objects.
-    pub fn occlude(&self, composition: &mut Composition, random: &mut Random) {
+    pub(crate) fn occlude(&self, composition: &mut Composition, random: &mut Random) {
         let options = self.options;
         if random.random::<f32>() >= options.occlusion_probability {
             return;
@@ -105,7 +105,7 @@ impl Scenery<'_> {
     }
 
     /// Hides all that a part of the crop shows.
-    pub fn hide(&self, composition: &mut Composition, cover: &Coverage, random: &mut Random) {
+    pub(crate) fn hide(&self, composition: &mut Composition, cover: &Coverage, random: &mut Random) {
         composition.image.blend(&self.material(random), cover);
         composition.visible.remove(cover);
     }

@@ -20,18 +20,18 @@ pub(crate) struct Extent {
 }
 
 impl Extent {
-    pub fn of(points: impl IntoIterator<Item = Vec2>) -> Option<Extent> {
+    pub(crate) fn of(points: impl IntoIterator<Item = Vec2>) -> Option<Extent> {
         let mut points = points.into_iter();
         let first = points.next()?;
         let (low, high) = points.fold((first, first), |(low, high), p| (low.inf(&p), high.sup(&p)));
         Some(Extent { low, high })
     }
 
-    pub fn centre(&self) -> Vec2 {
+    pub(crate) fn centre(&self) -> Vec2 {
         (self.low + self.high) * 0.5
     }
 
-    pub fn longest(&self) -> f64 {
+    pub(crate) fn longest(&self) -> f64 {
         (self.high - self.low).max()
     }
 
@@ -55,7 +55,7 @@ impl Extent {
     }
 
     /// A box of one point, for lack of a better one.
-    pub fn at(point: Vec2) -> Extent {
+    pub(crate) fn at(point: Vec2) -> Extent {
         Extent { low: point, high: point }
     }
 }
@@ -69,7 +69,7 @@ pub(super) struct Cut {
 
 impl Cut {
     /// What lies beyond it in a crop.
-    pub fn beyond(&self, window: &Window, size: usize) -> Coverage {
+    pub(crate) fn beyond(&self, window: &Window, size: usize) -> Coverage {
         let step = window.side / size as f64;
         let corner = window.centre - Vec2::repeat(0.5 * window.side - 0.5 * step);
         Coverage::from_fn(size, size, |x, y| {

@@ -79,7 +79,7 @@ pub fn note_left_out(errors: &[StoreError], place: &str) {
 
 /// The file in which a store that can be written is on this machine: its own, or that of the robot's copy, which is in `out`
 /// where nothing else is said.
-pub fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Path) -> Result<PathBuf> {
+pub(crate) fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Path) -> Result<PathBuf> {
     match (&outbox.outbox, place) {
         (Some(file), StorePlace::File(_)) => bail!(
             "--outbox: {} is for --experiences on a server, postgres://user@host/database",
@@ -92,7 +92,7 @@ pub fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Path) -> R
 }
 
 /// A store, made where there is none. When it lies on a server, `file` is between, so that the server may go away.
-pub fn writable_store(place: &StorePlace, file: &Path) -> Result<Box<dyn ExperienceStore + Send>> {
+pub(crate) fn writable_store(place: &StorePlace, file: &Path) -> Result<Box<dyn ExperienceStore + Send>> {
     Ok(place.create_with_outbox(file, |notice| eprintln!("note: {notice}"))?)
 }
 

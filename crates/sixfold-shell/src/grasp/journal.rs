@@ -161,7 +161,7 @@ impl StoreJournal {
     }
 
     /// Why it cannot be continued with a store that keeps only `kept` of its rows.
-    pub fn of_another_store(&self, kept: usize, place: &str) -> String {
+    pub(crate) fn of_another_store(&self, kept: usize, place: &str) -> String {
         format!(
             "{}: holds {} scenes, of which the store {place} has {kept}: it is another store than the one that they went into, or \
              an earlier state of it; give that one, or start again with another --out",

@@ -12,6 +12,33 @@ use crate::Outcome;
 use crate::folder::OutputFolder;
 use crate::progress::{Progress, check_interrupt};
 
+/// What was stored.
+#[derive(Serialize)]
+pub struct Added {
+    /// Number of the experience.
+    pub id: i64,
+    /// False when it was there already.
+    pub new: bool,
+    /// Pixels of its region of interest.
+    pub region_pixels: usize,
+}
+
+/// Stores an experience whose grasp was read from the file `grasp`.
+///
+/// # Errors
+/// When grasp and depth image do not belong together; [`StoreError`].
+pub fn add(place: &StorePlace, experience: &Experience, grasp: &Path) -> Result<Added> {
+    let region_pixels = experience.region.iter().filter(|r| **r).count();
+    if region_pixels == 0 {
+        bail!(
+            "{}: the gripper is nowhere near the object; do grasp and depth image belong together, and is the grasp in metres in the camera's frame?",
+            grasp.display()
+        );
+    }
+    let (id, new) = place.create()?.add(experience)?;
+    Ok(Added { id, new, region_pixels })
+}
+
 /// What was removed.
 #[derive(Default, Serialize)]
 pub struct Forgotten {

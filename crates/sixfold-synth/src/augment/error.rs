@@ -51,7 +51,7 @@ impl AugmentError {
     ///
     /// # Errors
     /// [`AugmentError::Option`].
-    pub fn check_range(
+    pub(crate) fn check_range(
         field: &'static str,
         range: [f32; 2],
         low: f32,
@@ -68,7 +68,7 @@ impl AugmentError {
     ///
     /// # Errors
     /// [`AugmentError::Option`].
-    pub fn check_probability(field: &'static str, found: f32) -> Result<(), AugmentError> {
+    pub(crate) fn check_probability(field: &'static str, found: f32) -> Result<(), AugmentError> {
         AugmentError::check_range(field, [found, found], 0.0, 1.0, "a probability between 0 and 1")
     }
 }

@@ -21,7 +21,7 @@ use sixfold_mesh::{Mesh, MeshError};
 use crate::profiles;
 use solids::Builder;
 
-pub use toy::{TOY_DIAMETER, TOY_MIN_SIDE, toy};
+pub use toy::toy;
 
 /// Sides of lathed solids.
 const SIDES: usize = 40;
@@ -135,7 +135,7 @@ pub struct Member {
 
 impl Member {
     /// The part that a face belongs to.
-    pub fn part_of_face(&self, face: usize) -> &'static str {
+    pub(crate) fn part_of_face(&self, face: usize) -> &'static str {
         self.parts.iter().find(|(_, end)| face < *end).map_or("body", |(name, _)| name)
     }
 
@@ -152,7 +152,7 @@ impl Member {
 }
 
 /// Range of the factors by which the axes of a member are stretched: table 6.1.
-pub const AXIS_SCALE: (f64, f64) = (0.8, 1.5);
+pub(crate) const AXIS_SCALE: (f64, f64) = (0.8, 1.5);
 
 /// Draws a member of a family.
 ///

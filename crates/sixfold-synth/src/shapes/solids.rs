@@ -36,18 +36,18 @@ pub(super) struct Builder {
 
 impl Builder {
     /// How many faces there are so far.
-    pub fn faces(&self) -> usize {
+    pub(crate) fn faces(&self) -> usize {
         self.faces.len()
     }
 
     /// The mesh with its vertices stretched along the axes.
-    pub fn finish(self, scale: &Vec3) -> Result<Mesh, MeshError> {
+    pub(crate) fn finish(self, scale: &Vec3) -> Result<Mesh, MeshError> {
         Mesh::new(self.vertices.iter().map(|v| v.component_mul(scale)).collect(), self.faces)
     }
 
     /// The shape that a profile of (radius, height) points sweeps about z, the solid on the profile's left hand (radius to
     /// the right, height up). Every piece of the profile is cut into `rows`.
-    pub fn lathed(&mut self, profile: &[(f64, f64)], sides: usize, rows: usize) {
+    pub(crate) fn lathed(&mut self, profile: &[(f64, f64)], sides: usize, rows: usize) {
         let mut fine = vec![];
         for pair in profile.windows(2) {
             for k in 0..rows {
@@ -70,7 +70,7 @@ impl Builder {
     }
 
     /// A box with these side lengths, its middle at `pose`, every side cut into `cells` times `cells`.
-    pub fn cuboid(&mut self, size: &Vec3, pose: &Pose, cells: usize) {
+    pub(crate) fn cuboid(&mut self, size: &Vec3, pose: &Pose, cells: usize) {
         for axis in 0..3 {
             for sign in [-1.0, 1.0] {
                 let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
@@ -101,7 +101,7 @@ impl Builder {
 
     /// A bar of elliptic section along a path in the plane through `side` (a unit vector): half as wide as `radii.0` in
     /// the plane of the path and `radii.1` along `side`, closed at both ends.
-    pub fn tube(&mut self, path: &[Vec3], side: &Vec3, radii: (f64, f64), sides: usize) {
+    pub(crate) fn tube(&mut self, path: &[Vec3], side: &Vec3, radii: (f64, f64), sides: usize) {
         let first = self.vertices.len();
         let n = path.len();
         for i in 0..n {

@@ -22,7 +22,7 @@ pub(super) struct Sweep {
 
 impl Sweep {
     /// The profile of a superquadric: `exponent` 1 an ellipsoid, towards 0 a cylinder, 2 a double cone.
-    pub fn round_profile(exponent: f64, rows: usize) -> Vec<(f64, f64)> {
+    pub(crate) fn round_profile(exponent: f64, rows: usize) -> Vec<(f64, f64)> {
         (0..=rows)
             .map(|k| {
                 let angle = -FRAC_PI_2 + PI * (k as f64 + 0.7) / (rows as f64 + 1.4);
@@ -32,7 +32,7 @@ impl Sweep {
     }
 
     /// A profile through some (fraction of the path, fraction of the radii) points.
-    pub fn profile_through(points: &[(f64, f64)], rows: usize) -> Vec<(f64, f64)> {
+    pub(crate) fn profile_through(points: &[(f64, f64)], rows: usize) -> Vec<(f64, f64)> {
         (0..=rows)
             .map(|k| {
                 let s = k as f64 / rows as f64;
@@ -59,7 +59,7 @@ impl Sweep {
     }
 
     /// Its surface: closed, the faces look outwards.
-    pub fn mesh(&self, sides: usize) -> Result<Mesh, MeshError> {
+    pub(crate) fn mesh(&self, sides: usize) -> Result<Mesh, MeshError> {
         let mut vertices = Vec::with_capacity(self.profile.len() * sides + 2);
         for &(s, radius) in &self.profile {
             let (point, across) = self.at(s);

@@ -15,13 +15,13 @@ use super::solids::Builder;
 use super::sweep::Sweep;
 
 /// Range of a toy's diameter, metres.
-pub const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);
+pub(crate) const TOY_DIAMETER: (f64, f64) = (0.07, 0.28);
 /// The second largest side of a toy's box is at least this, metres.
-pub const TOY_MIN_SIDE: f64 = 0.03;
+pub(crate) const TOY_MIN_SIDE: f64 = 0.03;
 /// Maximum number of solids in a toy.
 const MOST: usize = 8;
 
-/// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in [`TOY_DIAMETER`] (each
+/// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in `TOY_DIAMETER` (each
 /// as likely as any other). Its solids overlap, so parts of their surfaces lie inside.
 ///
 /// # Errors

@@ -18,7 +18,7 @@ use crate::network::input;
 use crate::samples::{Framing, Photograph, SEEN, between, distance, object, photograph};
 
 /// Renders of each photograph.
-pub const RENDERS: usize = 4;
+pub(crate) const RENDERS: usize = 4;
 /// A render that shows the object in fewer cells teaches nothing.
 const MIN_CELLS: usize = 12;
 /// The largest changes of a pose that is to be refined: an angle, a displacement in cells, a factor of distance.
@@ -27,7 +27,7 @@ const SHIFT: f64 = 2.2;
 const DISTANCE: f64 = 0.16;
 
 /// A photograph and renders of the same object.
-pub struct RefinerSample {
+pub(crate) struct RefinerSample {
     /// The network's input of the photograph.
     pub photograph: Vec<f32>,
     /// The renders.
@@ -35,7 +35,7 @@ pub struct RefinerSample {
 }
 
 /// A render, and where the photograph shows what it shows.
-pub struct Target {
+pub(crate) struct Target {
     /// The render.
     pub shown: Shown,
     /// For each of its cells, how far from there the photograph has its point, cells.
@@ -143,7 +143,7 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<R
 }
 
 /// The sample of a number.
-pub fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> RefinerSample {
+pub(crate) fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> RefinerSample {
     let mut random = stream(seed, number);
     loop {
         if let Some(sample) = attempt(textures, side, &mut random) {

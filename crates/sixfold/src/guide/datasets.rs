@@ -46,7 +46,7 @@
 //! write_results(&results, &estimates)?;
 //!
 //! let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
-//! let scores = evaluate(&dataset, &read_results(&results)?, targets, &options, &|_| {})?;
+//! let scores = evaluate(&dataset, &read_results(&results)?, targets, &options, &())?;
 //! assert_eq!((scores.ar_mssd, scores.ar_mspd), (Some(1.0), Some(1.0)));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -80,7 +80,7 @@
 //! assert_eq!(summary.poses, 1);
 //!
 //! let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
-//! let scores = evaluate(&dataset, &read_results(&results)?, targets, &options, &|_| {})?;
+//! let scores = evaluate(&dataset, &read_results(&results)?, targets, &options, &())?;
 //! assert!(scores.ar_mssd > Some(0.5));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

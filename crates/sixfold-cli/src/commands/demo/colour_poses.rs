@@ -23,8 +23,6 @@ use sixfold_shell::training::was_trained_on;
 const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
 /// The detector of the sample objects.
 const DETECTOR: &str = "weights/detector-lmo.safetensors";
-/// Detections this sure are passed on, as `sixfold estimate --dataset` does.
-const MIN_DETECTION: f32 = 0.1;
 
 pub(super) fn run(
     a: &DemoArguments,
@@ -83,8 +81,7 @@ fn with_model(
     if let Some((trained, file)) = detector {
         detector_card = Some(trained.model().card().clone());
         detector_file = Some(file);
-        let trained = trained.with_threshold(MIN_DETECTION);
-        regions = RegionSource::of_detector(Box::new(trained), known.keys().copied())?;
+        regions = RegionSource::of_detector(Box::new(trained.for_dataset()), known.keys().copied())?;
     }
     let mut colour = Colour {
         weights: Some(weights.to_owned()),

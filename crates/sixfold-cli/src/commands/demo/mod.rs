@@ -115,7 +115,7 @@ pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
         }
     }
     progress.finish();
-    let evaluation = evaluate(&dataset, &results, &dataset.targets(None)?, &EvalOptions::default(), &|_| {})?;
+    let evaluation = evaluate(&dataset, &results, &dataset.targets(None)?, &EvalOptions::default(), &())?;
     pictures.extend(out.with("recall.png", |curves| write_recall_curves(curves, &evaluation)));
     let colour = colour_poses::run(a, &mut out, &dataset, &targets, &known)?;
     let correct = rows.iter().filter(|r| r.add_s_of_diameter < 0.1).count();

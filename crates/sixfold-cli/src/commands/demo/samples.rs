@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow, bail};
-use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models, Placement, adi};
+use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models};
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
 
@@ -62,10 +62,5 @@ pub(super) fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
 
 /// ADD, or ADI for symmetric objects, in metres.
 pub(super) fn add_s(known: &Known, camera_from_object: Pose, truth: &GroundTruth) -> f64 {
-    let estimated = Placement::from(camera_from_object);
-    if known.info.is_symmetric() {
-        adi(&known.points, estimated, truth.placement())
-    } else {
-        sixfold_bop::add(&known.points, estimated, truth.placement())
-    }
+    sixfold_bop::add_s(&known.points, known.info.is_symmetric(), camera_from_object, truth.placement())
 }

@@ -14,7 +14,7 @@ use crate::commands::without_networks::MESSAGE;
 /// No poses, and why; an error where weights were given.
 pub(super) fn run(
     a: &DemoArguments,
-    _pictures: &mut Pictures,
+    _out: &mut Pictures,
     _dataset: &BopDataset,
     _targets: &[Target],
     _known: &BTreeMap<u32, Known>,

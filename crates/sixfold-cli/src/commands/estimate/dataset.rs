@@ -8,9 +8,9 @@ use sixfold_bop::{BopDataset, Target};
 use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunError};
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
+use sixfold_shell::found::overlay_of;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::report;
-use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::progress::{Progress, interrupted};
 
 use super::arguments::{CommonArguments, EstimateArguments};
@@ -110,22 +110,8 @@ fn regions(
 
 /// Draws the poses of an image over it.
 fn draw(folder: &mut OutputFolder, result: &ImageResult<'_>) -> Result<()> {
-    let (scene, im_id) = (result.scene, result.im_id);
-    let camera = scene.camera(im_id)?;
-    let background = match (scene.rgb(im_id)?, scene.depth(im_id)?) {
-        (Some(rgb), _) => rgb,
-        (None, Some(depth)) => overlay::depth_picture(&depth),
-        (None, None) => return Ok(()),
-    };
-    let drawn: Vec<Drawn<'_>> = result
-        .found
-        .iter()
-        .map(|p| {
-            let certainty = overlay::certainty(&p.estimate);
-            Drawn::of_dataset(p.obj_id, p.mesh, p.estimate.camera_from_object, certainty)
-        })
-        .collect();
-    let name = format!("{:06}_{im_id:06}.png", result.scene_id);
-    folder.write_rgb(&name, &overlay::draw(&background, &camera, &drawn))?;
+    if let Some(overlay) = overlay_of(result)? {
+        folder.write_rgb(&format!("{:06}_{:06}.png", result.scene_id, result.im_id), &overlay)?;
+    }
     Ok(())
 }

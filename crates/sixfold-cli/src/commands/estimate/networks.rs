@@ -24,10 +24,6 @@ use super::methods::{Method, MethodArguments, PresetArguments, depth_options};
 
 /// Who matches with `--method mttm`, unless `--matcher` says so.
 pub(super) const DEFAULT_MATCHER: &str = "both";
-/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
-const MIN_SCORE: f32 = 0.4;
-/// In datasets, detections this sure are passed on: a pose's own confidence sorts them further.
-const MIN_DETECTION: f32 = 0.1;
 
 /// Poses from colour.
 pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
@@ -147,17 +143,13 @@ impl MethodArguments for Pix2PoseArguments {
 /// Where a detector sees the object best, if at all.
 pub(super) fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Region>> {
     let detector = TrainedDetector::load(weights)?;
-    let threshold = detector.options().threshold.min(MIN_SCORE);
-    let detector = detector.with_threshold(threshold);
     detector.check_object(id).with_context(|| weights.display().to_string())?;
-    let found = detector.detect(image)?.into_iter().filter(|d| d.object_id == id);
-    let best = found.max_by(|a, b| a.region.score.total_cmp(&b.region.score));
-    Ok(best.map(|d| d.region))
+    Ok(detector.best(image, id)?)
 }
 
 /// Where a detector sees the objects `ids` in a dataset.
 pub(super) fn regions(weights: &Path, ids: BTreeSet<u32>) -> Result<RegionSource> {
-    let detector = TrainedDetector::load(weights)?.with_threshold(MIN_DETECTION);
+    let detector = TrainedDetector::load(weights)?.for_dataset();
     let of_detector = RegionSource::of_detector(Box::new(detector), ids);
     of_detector.with_context(|| weights.display().to_string())
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_estimator::Region;
-use sixfold_geometry::{Camera, Mask, Rect, RgbImage, Vec2};
+use sixfold_geometry::{Camera, Mask, Rect, RgbImage, undistort_box};
 use sixfold_io::read_mask;
 
 use super::arguments::CommonArguments;
@@ -22,7 +22,7 @@ pub(super) enum Where {
 
 /// What the options say. `lens` is the camera with its distortion, `image` the colour image without.
 pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>) -> Result<Where> {
-    let boxed = given_box(a, lens)?.map(|b| undistorted(&b, lens));
+    let boxed = given_box(a, lens)?.map(|b| undistort_box(&b, lens));
     if let Some(weights) = &a.detector {
         if boxed.is_some() || a.mask.is_some() {
             bail!("--detector: give it, or --box or --mask, but not both");
@@ -81,24 +81,5 @@ fn given_mask(path: &Path, lens: &Camera, boxed: Option<&Rect>) -> Result<Region
         return Ok(region);
     }
     // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
-    Ok(Region::of_box(undistorted(&region.bbox, lens)))
-}
-
-/// The box that holds what a box of the raw image shows, in the pinhole image.
-fn undistorted(region: &Rect, lens: &Camera) -> Rect {
-    if lens.distortion.is_none() {
-        return *region;
-    }
-    let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
-    for (u, v) in (0..=4).flat_map(|u| (0..=4).map(move |v| (u, v))) {
-        let along = |i: i32, start: f64, size: f64| start + 0.25 * f64::from(i) * size;
-        let at = Vec2::new(along(u, region.x, region.width), along(v, region.y, region.height));
-        if let Some(at) = lens.undistort_point(&at) {
-            (low, high) = (low.inf(&at), high.sup(&at));
-        }
-    }
-    if low.x > high.x {
-        return *region;
-    }
-    Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y }
+    Ok(Region::of_box(undistort_box(&region.bbox, lens)))
 }

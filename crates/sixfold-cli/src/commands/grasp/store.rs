@@ -147,14 +147,6 @@ pub(super) fn run(a: &StoreArguments) -> Result<Outcome> {
     }
 }
 
-#[derive(Serialize)]
-struct Added {
-    id: i64,
-    /// False when it was there already.
-    new: bool,
-    region_pixels: usize,
-}
-
 fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
     let grasp = read_grasp(&a.grasp, a.number)?;
@@ -167,16 +159,9 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
         Crop::of_view(view, network.crop_options()).with_context(|| a.input.depth.display().to_string())?;
     let part = a.part.as_deref();
     let experience = Experience::new(&network, crop, &grasp, &gripper, &a.object, part, now(), &a.provenance);
-    let region_pixels = experience.region.iter().filter(|r| **r).count();
-    if region_pixels == 0 {
-        bail!(
-            "{}: the gripper is nowhere near the object; do grasp and depth image belong together, and is the grasp in metres in the camera's frame?",
-            a.grasp.display()
-        );
-    }
-    let (id, new) = a.file.create()?.add(&experience)?;
-    report(json, &Added { id, new, region_pixels }, || {
-        println!("experience {id} {}", if new { "is stored" } else { "was stored already" });
+    let added = store::add(&a.file, &experience, &a.grasp)?;
+    report(json, &added, || {
+        println!("experience {} {}", added.id, if added.new { "is stored" } else { "was stored already" });
     })?;
     Ok(Outcome::Found)
 }

@@ -14,6 +14,7 @@ use sixfold_io::write_rgb;
 use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, ModelsInfo, read_mesh};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
+use sixfold_render::portrait;
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report};
 
@@ -166,7 +167,7 @@ fn show(store: &ObjectStore, name: &str, picture: Option<&Path>, json: &JsonArgu
     let listed = Listed { name: name.to_owned(), record: store.record(name)? };
     if let Some(file) = picture {
         let object = store.load(name)?;
-        write_rgb(file, &super::render::portrait(object.needed_mesh("ppf")?))?;
+        write_rgb(file, &portrait(object.needed_mesh("ppf")?))?;
     }
     report(json, &listed, || {
         let r = &listed.record;

@@ -2,23 +2,21 @@
 //! dataset (K. Park, dissertation, section 5.2.1, and its data sets of several objects).
 
 pub(crate) mod arguments;
-mod preview;
 
 use std::path::Path;
-use std::sync::Mutex;
 
-use anyhow::{Result, anyhow};
-use rayon::prelude::*;
+use anyhow::Result;
 use serde::Serialize;
 use sixfold_bop::{BopDataset, write_camera, write_targets};
+use sixfold_io::write_rgb;
 
 use self::arguments::SimulateScenesArguments;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::pictures::Pictures;
-use sixfold_shell::progress::{Progress, check_interrupt};
-use sixfold_shell::scenes::{Counts, DEPTH_SCALE, Made, SceneMaker, write_objects};
+use sixfold_shell::scenes::{Counts, DEPTH_SCALE, SceneMaker, write_objects};
+use sixfold_shell::sheets::first_scenes;
 
 #[derive(Serialize)]
 struct Summary {
@@ -63,7 +61,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     };
     let start = std::time::Instant::now();
     let missing: Vec<u32> = (0..a.scenes as u32).filter(|id| !maker.is_whole(*id)).collect();
-    let made = make(&maker, &missing)?;
+    let made = maker.write_all(&missing)?;
     let seconds = start.elapsed().as_secs_f64();
     let dataset = BopDataset::open(&a.out, &a.split)?;
     let targets_file = a.out.join("test_targets_bop19.json");
@@ -72,7 +70,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     }
     let mut pictures = Pictures::default();
     if !a.no_rgb {
-        pictures.did(preview::write(&a.out.join("preview.png"), &dataset));
+        pictures.did(preview(&a.out, &dataset));
     }
     let Counts { images, instances, visible } = Counts::of(&dataset)?;
     let summary = Summary {
@@ -93,22 +91,11 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     Ok(pictures.outcome(if instances > 0 { Outcome::Found } else { Outcome::NothingFound }))
 }
 
-/// Makes scenes, several at a time; what came of all of them.
-fn make(maker: &SceneMaker<'_>, scenes: &[u32]) -> Result<Made> {
-    let progress = Mutex::new((Progress::new("scenes", scenes.len()), Made::default()));
-    scenes.par_iter().try_for_each(|&scene_id| -> Result<()> {
-        check_interrupt("give the same command again to continue")?;
-        let made = maker.write(scene_id)?;
-        if let Ok(mut shared) = progress.lock() {
-            shared.1.dropped += made.dropped;
-            shared.1.resting += made.resting;
-            shared.0.step(format!("scene {scene_id}: {} objects", made.resting));
-        }
-        Ok(())
-    })?;
-    let (progress, made) = progress.into_inner().map_err(|_| anyhow!("a scene ended in a panic"))?;
-    progress.finish();
-    Ok(made)
+fn preview(out: &Path, dataset: &BopDataset) -> Result<()> {
+    match first_scenes(dataset)? {
+        Some(sheet) => Ok(write_rgb(&out.join("preview.png"), &sheet)?),
+        None => Ok(()),
+    }
 }
 
 fn table(out: &Path, s: &Summary) {

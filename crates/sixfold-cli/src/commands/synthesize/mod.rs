@@ -4,31 +4,32 @@
 pub(crate) mod arguments;
 mod input;
 mod pictures;
-mod views;
 
 use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::Ordering;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::write_camera;
 use sixfold_data::{RoughImages, RoughObject};
+use sixfold_geometry::Progress as _;
 use sixfold_geometry::stats::upper_median;
-use sixfold_nol::SourceView;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::model::NolModel;
 use sixfold_nol::pose_file::PoseFile;
 use sixfold_nol::select::{choose_images, choose_images_by_pose};
 use sixfold_nol::synthesis::{ViewMaker, Weighting};
+use sixfold_nol::{SourceView, ViewSplit, WrittenViews};
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
 use self::arguments::{RefinementKind, SelectKind, WeightingKind};
-use self::views::Written;
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::pictures::Pictures;
-use sixfold_shell::progress::{Progress, interrupted};
+use sixfold_shell::progress::{Bar, Progress, interrupted};
 
 /// Side of the crops that new views take their colours from, pixels.
 const CROP: usize = 256;
@@ -103,7 +104,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         first_camera = first_camera.or(written.camera);
     }
     progress.finish();
-    sheets.did(pictures::sheet(&a.out.join("preview.png"), &rows));
+    sheets.did(pictures::preview(&a.out.join("preview.png"), &rows));
     // BOP has one such file a dataset, for tools that need any camera: that of the first image. Each image's own intrinsics are
     // in scene_camera.json.
     if let Some(camera) = first_camera {
@@ -132,19 +133,17 @@ fn refined_poses(
     sheets: &mut Pictures,
 ) -> Result<PoseFile> {
     let file = a.out.join("poses.json");
-    let mut progress = Progress::new("poses, per cent", 100);
-    let stop = interrupted();
+    let bar = Bar::stopped_by_interrupts("poses, per cent");
     let options = a.refinement();
     let disturbed = !a.disturb.is_empty();
     let poses = if options.is_some() && a.refinement_kind() == RefinementKind::Published {
         Some(PoseFile::refined_as_published(images, model, disturbed, &file)?)
     } else {
-        PoseFile::refined(images, options.as_ref(), disturbed, &file, |done| {
-            progress.set((100.0 * done) as usize);
-            !stop.load(std::sync::atomic::Ordering::Relaxed)
+        PoseFile::refined(images, options.as_ref(), disturbed, &file, &|done, total| {
+            bar.report(100 * done / total, 100)
         })?
     };
-    progress.finish();
+    bar.finish();
     let Some(poses) = poses else { bail!("interrupted; give the same command again") };
     sheets.did(pictures::refinement(&a.out.join("poses.png"), images, &poses));
     poses.apply(images, &file)?.iter().for_each(|note| eprintln!("note: {note}"));
@@ -173,7 +172,7 @@ impl Views<'_> {
         count: usize,
         poses: &PoseFile,
         progress: &mut Progress,
-    ) -> Result<(ObjectSummary, Written)> {
+    ) -> Result<(ObjectSummary, WrittenViews)> {
         let weighting = match (&self.model, self.a.weighting) {
             (Some(model), _) => Weighting::Network(model),
             (None, WeightingKind::Best) => Weighting::Best,
@@ -187,7 +186,22 @@ impl Views<'_> {
         let differing = leave_out_what_differs(&mut sources, &object.mesh);
         let maker = ViewMaker::new(&object.mesh, sources, weighting, self.a.per_view)
             .with_context(|| format!("object {}", object.id))?;
-        let written = views::write(self.a, object, &maker, &self.backgrounds, progress)?;
+        let split = ViewSplit {
+            dataset: &self.a.out,
+            split: &self.a.new_split,
+            grid: self.a.grid(),
+            backgrounds: &self.backgrounds,
+            with_photographs: self.a.with_photographs,
+        };
+        let (stop, progress) = (interrupted(), Mutex::new(progress));
+        let written = split.write(object, &maker, &|_, _| {
+            if let Ok(mut progress) = progress.lock() {
+                progress.step(format!("object {}", object.id));
+            }
+            !stop.load(Ordering::Relaxed)
+        })?;
+        let written =
+            written.ok_or_else(|| anyhow!("interrupted; give the same command again to continue"))?;
         let of_object = || poses.photographs.iter().filter(|p| p.object == object.id);
         let summary = ObjectSummary {
             id: object.id,

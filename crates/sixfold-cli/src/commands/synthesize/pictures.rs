@@ -12,6 +12,7 @@ use sixfold_nol::pose_file::PoseFile;
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use sixfold_shell::overlay;
+use sixfold_shell::sheets::{paste, sheet};
 
 /// Side of an image in a sheet.
 const SIDE: usize = 160;
@@ -59,35 +60,11 @@ pub(super) fn refinement(path: &Path, images: &RoughImages, poses: &PoseFile) ->
     Ok(write_rgb(path, &sheet)?)
 }
 
-/// A sheet of images, row by row, each with a text.
-pub(super) fn sheet(path: &Path, rows: &[Vec<(RgbImage, String)>]) -> Result<()> {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+/// A sheet of square images, row by row, each with a text.
+pub(super) fn preview(path: &Path, rows: &[Vec<(RgbImage, String)>]) -> Result<()> {
     let side = rows.iter().flatten().map(|(p, _)| p.width()).max().unwrap_or(0);
-    if columns == 0 || side == 0 {
-        return Ok(());
-    }
-    let mut sheet = RgbImage::filled(columns * side, rows.len() * side, [24; 3]);
-    for (row, list) in rows.iter().enumerate() {
-        for (column, (picture, text)) in list.iter().enumerate() {
-            paste(&mut sheet, picture, column * side, row * side);
-            if !text.is_empty() {
-                overlay::label(
-                    &mut sheet,
-                    [(column * side + 2) as f64, (row * side + 12) as f64],
-                    text,
-                    [255; 3],
-                );
-            }
-        }
-    }
-    Ok(write_rgb(path, &sheet)?)
-}
-
-fn paste(sheet: &mut RgbImage, picture: &RgbImage, left: usize, top: usize) {
-    let (width, height) = picture.size();
-    for y in 0..height {
-        for x in 0..width {
-            sheet[(left + x, top + y)] = picture[(x, y)];
-        }
+    match sheet(rows, (side, side)) {
+        Some(sheet) => Ok(write_rgb(path, &sheet)?),
+        None => Ok(()),
     }
 }

@@ -136,8 +136,9 @@ pub(super) fn refine(
                     Some(PosedSource { object, image: s.frame, photograph: &s.photograph })
                 })
                 .collect();
-            let going = |_| !sixfold_shell::progress::interrupted().load(std::sync::atomic::Ordering::SeqCst);
-            let refined = refine_scene(&scene, &meshes, &options, going)?;
+            let going =
+                |_, _| !sixfold_shell::progress::interrupted().load(std::sync::atomic::Ordering::SeqCst);
+            let refined = refine_scene(&scene, &meshes, &options, &going)?;
             sixfold_shell::progress::check_interrupt(super::GO_ON)?;
             let reports = refined.sources;
             (

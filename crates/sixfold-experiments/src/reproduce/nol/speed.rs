@@ -49,7 +49,7 @@ pub(super) fn measure(material: &Material, sources: &[Source], networks: &Networ
     let photographs: Vec<PosedImage> =
         sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect();
     let start = Instant::now();
-    refine_poses(&photographs, mesh, &PoseRefinementOptions::default(), |_| true)?;
+    refine_poses(&photographs, mesh, &PoseRefinementOptions::default(), &())?;
     let refinement = start.elapsed().as_secs_f64();
     let start = Instant::now();
     let ways = ways("", mesh, &photographs, &networks[..networks.len().min(1)], SIDE, false);

@@ -228,7 +228,7 @@ impl Bench {
         let right: Vec<Target> = self.targets.iter().filter(overlaps).copied().collect();
         let share = right.len() as f64 / self.targets.len().max(1) as f64;
         let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
-        let e = evaluate(&self.dataset, estimates, &right, &options, &|_| {})?;
+        let e = evaluate(&self.dataset, estimates, &right, &options, &())?;
         Ok(RightBoxes { share, add_s: e.add_s_recall.get("mean").copied().flatten() })
     }
 
@@ -243,7 +243,7 @@ impl Bench {
         regions: usize,
     ) -> Result<Row> {
         let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
-        let e = evaluate(&self.dataset, estimates, &self.targets, &options, &|_| {})?;
+        let e = evaluate(&self.dataset, estimates, &self.targets, &options, &())?;
         let objects: BTreeMap<u32, ObjectScore> = e
             .objects
             .iter()

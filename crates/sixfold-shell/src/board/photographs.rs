@@ -3,29 +3,35 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use crate::progress::{Progress, check_interrupt};
 use anyhow::{Context, Result, bail};
 use sixfold_board::{BoardError, Tag, detect_tags};
 use sixfold_geometry::{Image, RgbImage};
 use sixfold_io::read_rgb;
-use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Width of a photograph in the overview, pixels.
 pub(super) const THUMBNAIL: usize = 480;
 
 /// A photograph, and what it shows of the board.
-pub(super) struct Photograph {
+pub struct Photograph {
+    /// Where it was read.
     pub file: PathBuf,
     /// Width and height, pixels; zero where it cannot be read.
     pub size: (usize, usize),
+    /// The tags in it.
     pub tags: Vec<Tag>,
-    pub thumbnail: RgbImage,
+    pub(super) thumbnail: RgbImage,
     /// Why it is not used, as far as it alone says.
     pub left_out: Option<String>,
+    /// Whether it cannot be read.
     pub unreadable: bool,
 }
 
 /// The photographs among these files and in these folders, in the order of their names within a folder.
-pub(super) fn files(given: &[PathBuf]) -> Result<Vec<PathBuf>> {
+///
+/// # Errors
+/// For a folder that cannot be read, or has none.
+pub fn photograph_files(given: &[PathBuf]) -> Result<Vec<PathBuf>> {
     let mut files = vec![];
     for path in given {
         if path.is_dir() {
@@ -58,7 +64,11 @@ fn is_photograph(file: &Path) -> bool {
     extension.is_some_and(|e| ["png", "jpg", "jpeg", "heic", "heif"].contains(&e.as_str()))
 }
 
-pub(super) fn read(files: &[PathBuf]) -> Result<Vec<Photograph>> {
+/// Reads photographs and finds their tags. One that cannot be read says so and stops nothing.
+///
+/// # Errors
+/// When the user interrupts.
+pub fn read_photographs(files: &[PathBuf]) -> Result<Vec<Photograph>> {
     let mut progress = Progress::new("finding tags", files.len());
     let mut photographs = vec![];
     for file in files {
@@ -92,7 +102,10 @@ fn photograph(file: &Path) -> Photograph {
 }
 
 /// The size of most photographs; those of another are left out.
-pub(super) fn leave_out_other_sizes(photographs: &mut [Photograph]) -> Result<(usize, usize)> {
+///
+/// # Errors
+/// When none shows a tag.
+pub(crate) fn leave_out_other_sizes(photographs: &mut [Photograph]) -> Result<(usize, usize)> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for photograph in photographs.iter().filter(|p| !p.tags.is_empty()) {
         *counts.entry(photograph.size).or_default() += 1;

@@ -1,11 +1,11 @@
-//! What was found, as pictures.
+//! A calibration as images: the photographs with what was found in them, and the residuals.
 
+use crate::overlay::{label, line};
 use sixfold_geometry::{Camera, Image, Pose, RgbImage, Vec3};
 use sixfold_plot::{COLORS, Canvas, FAINT, INK};
-use sixfold_shell::overlay::{label, line};
 
 use super::Calibrated;
-use super::reading::{Photograph, THUMBNAIL};
+use super::photographs::{Photograph, THUMBNAIL};
 
 const GOOD: [u8; 3] = [60, 220, 90];
 const BAD: [u8; 3] = [255, 90, 60];
