@@ -21,6 +21,7 @@ use crate::commands::object::arguments::ObjectArguments;
 use crate::commands::render::RenderArguments;
 use crate::commands::simulate::SimulateArguments;
 use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
+use crate::commands::teach::{AFTER_HELP as TEACH_HELP, TeachArguments};
 use crate::commands::train::TrainArguments;
 use sixfold_shell::ranges::threads;
 
@@ -107,6 +108,9 @@ pub(crate) enum Command {
         sixfold calibrate photographs --out out/calibration\n  \
         sixfold calibrate photographs --camera out/calibration/camera.json --out out/poses")]
     Calibrate(CalibrateArguments),
+    /// Learn a new object from photographs of it on the printed board: mesh, symmetries, a record to find it by
+    #[command(hide = !NETWORKS, after_help = TEACH_HELP)]
+    Teach(Box<TeachArguments>),
     /// Print shell completions
     #[command(
         after_help = "Example:\n  sixfold completions bash > ~/.local/share/bash-completion/completions/sixfold"

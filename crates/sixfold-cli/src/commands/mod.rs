@@ -20,13 +20,15 @@ pub(crate) mod simulate_scenes;
 #[cfg(feature = "networks")]
 pub(crate) mod synthesize;
 #[cfg(feature = "networks")]
+pub(crate) mod teach;
+#[cfg(feature = "networks")]
 pub(crate) mod train;
 #[cfg(not(feature = "networks"))]
 pub(crate) mod without_networks;
 #[cfg(not(feature = "networks"))]
 pub(crate) use self::{
     without_networks as detect, without_networks as detect_arguments, without_networks as synthesize,
-    without_networks as train,
+    without_networks as teach, without_networks as train,
 };
 
 /// Whether the commands that need a network are built in; without them they say so, and help does not list them.

@@ -20,6 +20,7 @@ pub(crate) struct Unanswered {
 
 pub(crate) type DetectArguments = Unanswered;
 pub(crate) type SynthesizeArguments = Unanswered;
+pub(crate) type TeachArguments = Unanswered;
 pub(crate) type TrainArguments = Unanswered;
 
 /// Nothing can be said of how to use a command that is not there.

@@ -45,6 +45,19 @@ pub(crate) enum ObjectCommand {
         sixfold object symmetries bottle.ply --unit mm --out symmetries.png\n  \
         sixfold object symmetries can --noise 1 --json")]
     Symmetries(SymmetriesArguments),
+    /// Write one object as a BOP dataset: its model, and the photographs it was taught from
+    #[cfg(feature = "networks")]
+    #[command(after_help = "Example:\n  sixfold object export mug --bop out/mug")]
+    Export {
+        /// Its name
+        name: String,
+        /// Folder of the new dataset
+        #[arg(long, value_name = "DIR")]
+        bop: PathBuf,
+        /// Its number in the dataset
+        #[arg(long, value_name = "ID", default_value_t = 1)]
+        id: u32,
+    },
     /// Remove one object
     #[command(after_help = "Example:\n  sixfold object remove mug")]
     Remove {

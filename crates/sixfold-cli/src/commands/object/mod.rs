@@ -1,4 +1,4 @@
-//! `sixfold object add|list|show|symmetries|remove`.
+//! `sixfold object add|list|show|symmetries|export|remove`.
 
 pub(crate) mod arguments;
 mod symmetries;
@@ -16,6 +16,8 @@ use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptio
 use sixfold_ppf::PpfEstimator;
 use sixfold_render::portrait;
 use sixfold_shell::Outcome;
+#[cfg(feature = "networks")]
+use sixfold_shell::folder::{Contents, DatasetFolder};
 use sixfold_shell::output::{JsonArguments, report};
 
 use self::arguments::{AddArguments, Axis, ObjectArguments, ObjectCommand};
@@ -46,12 +48,32 @@ pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
         ObjectCommand::List => list(&store, &a.store, &a.json),
         ObjectCommand::Show { name, picture } => show(&store, name, picture.as_deref(), &a.json),
         ObjectCommand::Symmetries(symmetries) => symmetries::run(symmetries, &a.store, &a.json),
+        #[cfg(feature = "networks")]
+        ObjectCommand::Export { name, bop, id } => export(&store, name, bop, *id, &a.json),
         ObjectCommand::Remove { name } => {
             store.remove(name)?;
             report(&a.json, &serde_json::json!({ "removed": name }), || println!("removed {name}"))?;
             Ok(Outcome::Found)
         }
     }
+}
+
+/// Writes an object as a dataset.
+#[cfg(feature = "networks")]
+fn export(store: &ObjectStore, name: &str, bop: &Path, id: u32, json: &JsonArguments) -> Result<Outcome> {
+    let object = store.load(name)?;
+    let folder =
+        DatasetFolder::take(bop, "object export", serde_json::json!({ "object": name, "id": id }), &[])?;
+    let mut contents = Contents::default();
+    if let (Some(mesh), Some(info)) = (&object.mesh, &object.info) {
+        contents.add_object(name, mesh, info);
+    }
+    folder.begin(&contents)?;
+    let images = sixfold_teach::export_bop(&object, id, bop)?;
+    report(json, &serde_json::json!({ "dataset": bop, "id": id, "images": images }), || {
+        println!("{}: object {id}, {images} photographs in train_real/000001", bop.display());
+    })?;
+    Ok(Outcome::Found)
 }
 
 /// Stores an object that is known from depth images.

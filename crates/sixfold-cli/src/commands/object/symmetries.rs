@@ -16,7 +16,7 @@ use sixfold_shell::output::{JsonArguments, pose_rows, report};
 use sixfold_shell::{Outcome, objects};
 
 use super::arguments::AddArguments;
-use crate::commands::render::portrait;
+use sixfold_render::portrait;
 
 /// Height of the line of text over each image, pixels.
 const CAPTION: usize = 26;
