@@ -171,7 +171,7 @@ impl Recipe for DgcmRecipe {
             (DgcmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
             (DgcmKind::Paper, None) => Network::Paper(PaperConfig.init(self.seed, &device)),
             (DgcmKind::Paper, Some(file)) => {
-                let network = PaperConfig.from_imagenet(file, self.seed, &device);
+                let network = PaperConfig.init_from_imagenet(file, self.seed, &device);
                 Network::Paper(network.map_err(TrainError::about("encoder"))?)
             }
         };

@@ -48,12 +48,12 @@ impl Crop {
     }
 
     /// A pose in the crop's frame from one in the image's.
-    pub(crate) fn to_crop(&self, camera_from_object: &Pose) -> Pose {
+    pub(crate) fn to_crop(self, camera_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera, Vec3::zeros()) * *camera_from_object
     }
 
     /// A pose in the image's frame from one in the crop's.
-    pub(crate) fn to_camera(&self, crop_from_object: &Pose) -> Pose {
+    pub(crate) fn to_camera(self, crop_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera.inverse(), Vec3::zeros()) * *crop_from_object
     }
 

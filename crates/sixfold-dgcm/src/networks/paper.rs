@@ -49,7 +49,7 @@ impl PaperConfig {
     ///
     /// # Errors
     /// [`PretrainedError`].
-    pub(crate) fn from_imagenet(
+    pub(crate) fn init_from_imagenet(
         &self,
         file: &Path,
         seed: u64,
