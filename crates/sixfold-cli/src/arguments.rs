@@ -19,6 +19,7 @@ use crate::commands::experiments::Forwarded;
 use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::object::arguments::ObjectArguments;
 use crate::commands::render::RenderArguments;
+use crate::commands::serve::ServeArguments;
 use crate::commands::simulate::SimulateArguments;
 use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
 use crate::commands::train::TrainArguments;
@@ -107,6 +108,9 @@ pub(crate) enum Command {
         sixfold calibrate photographs --out out/calibration\n  \
         sixfold calibrate photographs --camera out/calibration/camera.json --out out/poses")]
     Calibrate(CalibrateArguments),
+    /// Serve web pages and an HTTP API on this machine: objects, poses, grasps
+    #[command(hide = !crate::commands::serve::IS_BUILT_IN, after_help = crate::commands::serve::AFTER_HELP)]
+    Serve(Box<ServeArguments>),
     /// Print shell completions
     #[command(
         after_help = "Example:\n  sixfold completions bash > ~/.local/share/bash-completion/completions/sixfold"

@@ -43,6 +43,7 @@ fn main() -> ExitCode {
         Command::Object(a) => commands::object::run(a),
         Command::Board(a) => commands::board::run(a),
         Command::Calibrate(a) => commands::calibrate::run(a),
+        Command::Serve(a) => commands::serve::run(a),
         Command::Completions(a) => commands::completions::run(a, Arguments::command()),
     })
 }
