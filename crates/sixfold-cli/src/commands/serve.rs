@@ -48,7 +48,7 @@ mod built_in {
         )]
         pub store: PathBuf,
         /// Folder of jobs, with their uploaded files and results
-        #[arg(long, value_name = "DIR", env = "SIXFOLD_DATA_DIR", default_value = "sixfold-data")]
+        #[arg(long, value_name = "DIR", default_value = "sixfold-data")]
         pub data: PathBuf,
         /// Jobs that are worked on at once; each uses all --threads
         #[arg(long, value_name = "N", default_value = "1", value_parser = count::<64>)]
