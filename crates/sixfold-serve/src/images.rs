@@ -139,34 +139,31 @@ impl Images {
             )
         })?;
         let file = CameraFile::parse(camera, camera_name).map_err(|e| ApiError::of_camera(&e))?;
-        let depth = bytes.depth.as_deref().map(|b| depth(b, depth_scale.or(file.depth_scale))).transpose()?;
-        let rgb = bytes.rgb.as_deref().map(|b| {
-            ImageFile::of_bytes(Path::new("rgb"), b).rgb().map_err(|e| ApiError::of_image("rgb", &e))
-        });
-        let rgb = rgb.transpose()?;
-        let size = match (&depth, &rgb) {
-            (Some(depth), _) => depth.size(),
-            (None, Some(rgb)) => rgb.size(),
-            (None, None) => {
-                return Err(ApiError::field(
-                    "depth",
-                    "no image",
-                    "a depth image, a colour image or both",
-                    "send them as the file fields depth and rgb",
-                ));
-            }
+        // By their headers alone: nothing is decoded that is not as large as it should be.
+        let size_of = |field: &str, bytes: &Option<Vec<u8>>| {
+            let size = |b: &[u8]| image(field, b).size().map_err(|e| ApiError::of_image(field, &e));
+            bytes.as_deref().map(size).transpose()
         };
-        if let Some(rgb) = &rgb {
-            same_size("rgb", rgb.size(), size)?;
+        let (of_depth, of_rgb) = (size_of("depth", &bytes.depth)?, size_of("rgb", &bytes.rgb)?);
+        let Some(size) = of_depth.or(of_rgb) else {
+            return Err(ApiError::field(
+                "depth",
+                "no image",
+                "a depth image, a colour image or both",
+                "send them as the file fields depth and rgb",
+            ));
+        };
+        for (field, found) in [("rgb", of_rgb), ("mask", size_of("mask", &bytes.mask)?)] {
+            same_size(field, found.unwrap_or(size), size)?;
         }
         let lens = file.for_image(size.0, size.1, camera_name).map_err(|e| ApiError::of_camera(&e))?;
-        let mask = bytes.mask.as_deref().map(|b| {
-            ImageFile::of_bytes(Path::new("mask"), b).mask().map_err(|e| ApiError::of_image("mask", &e))
-        });
-        let mask = mask.transpose()?;
-        if let Some(mask) = &mask {
-            same_size("mask", mask.size(), size)?;
-        }
+        let depth = bytes.depth.as_deref().map(|b| depth(b, depth_scale.or(file.depth_scale))).transpose()?;
+        let rgb = bytes.rgb.as_deref();
+        let rgb = rgb.map(|b| image("rgb", b).rgb()).transpose();
+        let rgb = rgb.map_err(|e| ApiError::of_image("rgb", &e))?;
+        let mask = bytes.mask.as_deref();
+        let mask = mask.map(|b| image("mask", b).mask()).transpose();
+        let mask = mask.map_err(|e| ApiError::of_image("mask", &e))?;
         let lens_fault = |e: &dyn std::fmt::Display| {
             ApiError::about("camera", e, "a distortion that can be undone", "calibrate the camera again")
         };
@@ -184,8 +181,12 @@ fn depth(bytes: &[u8], scale: Option<f64>) -> Answer<DepthImage> {
     if !(scale > 0.0 && scale.is_finite()) {
         return Err(ApiError::field("depth_scale", scale.to_string(), expected, "correct the value"));
     }
-    let file = ImageFile::of_bytes(Path::new("depth"), bytes);
-    file.depth(scale / 1000.0).map_err(|e| ApiError::of_image("depth", &e))
+    image("depth", bytes).depth(scale / 1000.0).map_err(|e| ApiError::of_image("depth", &e))
+}
+
+/// An image that messages call by its field.
+fn image<'a>(field: &'a str, bytes: &'a [u8]) -> ImageFile<'a> {
+    ImageFile::of_bytes(Path::new(field), bytes)
 }
 
 fn same_size(field: &str, found: (usize, usize), expected: (usize, usize)) -> Answer<()> {

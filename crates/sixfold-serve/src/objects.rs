@@ -25,6 +25,8 @@ use crate::methods::Stamp;
 const SIDE: usize = 320;
 /// The colour behind it: the pages' ground.
 const GROUND: [u8; 3] = [244, 245, 247];
+/// The fraction of a thumbnail's side that the object fills.
+const FILLED: f64 = 0.86;
 /// Thumbnails that are kept, some 30 kB each.
 const MAX_THUMBNAILS: usize = 500;
 /// Fewest faces that a mesh is reduced to.
@@ -235,9 +237,14 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), 120f64.to_radians());
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
     let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
-    // So far away that a ball around the box fits.
-    let distance = 0.5 * (high - low).norm() * (1.0 + 2.0 * focal / SIDE as f64);
-    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, distance) - rotation * ((low + high) * 0.5));
+    let middle = rotation * ((low + high) * 0.5);
+    // So near that it just fits: each vertex says how far away it has to be.
+    let half = FILLED * 0.5 * SIDE as f64;
+    let far_enough = mesh.vertices().iter().map(|v| {
+        let v = rotation * v - middle;
+        focal / half * v.x.abs().max(v.y.abs()) - v.z
+    });
+    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, far_enough.fold(0.0, f64::max)) - middle);
     let objects = [SceneObject { mesh, camera_from_object: pose }];
     let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
@@ -258,6 +265,7 @@ fn png(image: &RgbImage) -> Answer<Vec<u8>> {
 
 /// How fine a mesh is sent.
 #[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
 pub(crate) struct MeshDetail {
     /// At most about this many faces (default: all).
     faces: Option<usize>,

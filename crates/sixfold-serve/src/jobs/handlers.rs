@@ -146,6 +146,7 @@ pub(crate) async fn cancel_job(State(app): Shared, Path(id): Path<String>) -> An
 
 /// How long to wait for a result.
 #[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
 pub(crate) struct Waiting {
     /// Wait at most this many seconds for the job to end, 0 to 60.
     wait: Option<f64>,

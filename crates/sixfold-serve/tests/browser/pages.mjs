@@ -51,6 +51,7 @@ async function store(address, name, id) {
 async function shot(page, name) {
   for (const [size, viewport] of Object.entries(SIZES)) {
     await page.setViewportSize(viewport);
+    await page.evaluate(() => window.scrollTo(0, 0));
     await page.waitForTimeout(250);
     const wide = await page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
     assert.equal(wide, 0, `${name}, ${size}: the page is wider than its window`);
@@ -76,7 +77,7 @@ const canvas = (page) => page.evaluate(() => {
 async function objects(page, address) {
   await page.goto(address);
   await page.getByText("There are no objects yet").waitFor();
-  await page.getByLabel("Name").fill("duck");
+  await page.getByRole("textbox", { name: "Name" }).fill("duck");
   await page.locator('input[name="mesh"]').setInputFiles(join(demo, "models/obj_000009.ply"));
   await page.getByRole("button", { name: "Add", exact: true }).click();
   await page.getByText("duck is stored.").waitFor({ timeout: 60000 });
@@ -95,7 +96,7 @@ async function objects(page, address) {
   await shot(page, "objects");
   // A name that cannot be is refused with advice.
   await page.locator("#add-panel summary").click();
-  await page.getByLabel("Name").fill("my duck");
+  await page.getByRole("textbox", { name: "Name" }).fill("my duck");
   await page.locator('input[name="mesh"]').setInputFiles(join(demo, "models/obj_000009.ply"));
   await page.getByRole("button", { name: "Add", exact: true }).click();
   await page.locator("#add-status .problem").waitFor();

@@ -243,10 +243,13 @@ fn found_without_a_server() -> Value {
     let query = Query { depth: Some(&prepared), min_confidence, ..Query::new(&camera) };
     let run = sixfold_runner::ImageRun { estimator: &estimator, query };
     let store = ObjectStore::new(folder.path());
+    // Numbers that were written and read again, as those of the server.
+    let written =
+        |report: &_| -> Value { serde_json::from_slice(&serde_json::to_vec(report).unwrap()).unwrap() };
     let mut poses = serde_json::Map::new();
     for (name, _) in OBJECTS {
         let found = run.find(&store.load(name).unwrap()).unwrap();
-        let report = serde_json::to_value(run.report(&[found])).unwrap();
+        let report = written(&run.report(&[found]));
         poses.insert(name.to_owned(), report["poses"][0]["camera_from_object"].clone());
     }
     poses.into()
