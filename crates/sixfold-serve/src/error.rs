@@ -80,7 +80,7 @@ pub(crate) struct Problem {
 #[derive(Debug, Clone)]
 pub(crate) struct ApiError {
     pub status: StatusCode,
-    pub problem: Problem,
+    pub problem: Box<Problem>,
 }
 
 /// What handlers return.
@@ -104,7 +104,7 @@ impl ApiError {
             found: Some(found),
             advice: Some(advice),
         };
-        ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem }
+        ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem: Box::new(problem) }
     }
 
     /// A message of a library about a field; `expected` and `advice` are what such a field should be.
@@ -124,7 +124,7 @@ impl ApiError {
             found: Some(found),
             advice: Some(advice.into()),
         };
-        ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem }
+        ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem: Box::new(problem) }
     }
 
     /// A message that is about no field.
@@ -136,7 +136,7 @@ impl ApiError {
             found: None,
             advice: Some(advice.into()),
         };
-        ApiError { status, problem }
+        ApiError { status, problem: Box::new(problem) }
     }
 
     /// The server's own fault: what the system said.

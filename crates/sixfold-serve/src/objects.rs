@@ -176,9 +176,12 @@ pub(crate) async fn delete_object(State(app): Shared, Path(name): Path<String>) 
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Thumbnails by name, each of one state of its object.
+/// The bytes of a thumbnail, of one state of its object.
+type Thumbnail = (Stamp, Arc<Vec<u8>>);
+
+/// Thumbnails by the names of their objects.
 #[derive(Default)]
-pub(crate) struct Thumbnails(Mutex<HashMap<String, (Stamp, Arc<Vec<u8>>)>>);
+pub(crate) struct Thumbnails(Mutex<HashMap<String, Thumbnail>>);
 
 impl Thumbnails {
     fn get(&self, name: &str, stamp: &Stamp) -> Option<Arc<Vec<u8>>> {

@@ -183,11 +183,13 @@ pub(crate) async fn job_result(
         )),
         JobState::Failed => {
             let status = record.error_status.and_then(|s| StatusCode::from_u16(s).ok());
-            let problem = record.error.unwrap_or_else(|| {
-                ApiError::plain(StatusCode::INTERNAL_SERVER_ERROR, "the job failed", "send the request again")
-                    .problem
-            });
-            Err(ApiError { status: status.unwrap_or(StatusCode::INTERNAL_SERVER_ERROR), problem })
+            let unknown = ApiError::plain(
+                StatusCode::INTERNAL_SERVER_ERROR,
+                "the job failed",
+                "send the request again",
+            );
+            let problem = record.error.map_or(unknown.problem, Box::new);
+            Err(ApiError { status: status.unwrap_or(unknown.status), problem })
         }
     }
 }

@@ -289,7 +289,7 @@ impl Jobs {
                 Err(Stopped::Failed(error)) => {
                     record.state = JobState::Failed;
                     record.error_status = Some(error.status.as_u16());
-                    record.error = Some(error.problem);
+                    record.error = Some(*error.problem);
                 }
             }
         });
@@ -338,7 +338,7 @@ fn fail(record: &mut JobRecord, error: String, advice: &str) {
     record.finished = Some(now());
     let error = ApiError::plain(StatusCode::INTERNAL_SERVER_ERROR, error, advice);
     record.error_status = Some(error.status.as_u16());
-    record.error = Some(error.problem);
+    record.error = Some(*error.problem);
 }
 
 /// 16 random bytes in hexadecimal.

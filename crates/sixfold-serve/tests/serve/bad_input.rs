@@ -141,7 +141,7 @@ fn of_choices() -> Vec<Case> {
         plain(422, "form", "favourite", duck("favourite", "yes")),
         plain(422, "method", "2 values", duck("method", "ppf").text("method", "mttm")),
         plain(422, "depth", "several files", frame().file("depth", "again.png", &depth())),
-        plain(422, "method", "64", duck("method", &"x".repeat(70_000)).text("instances", "1")),
+        plain(422, "method", "70000 bytes", duck("method", &"x".repeat(70_000))),
         plain(400, "rgb", "../../x.jpg", Form::default().file("rgb", "../../x.jpg", &rgb())),
         plain(400, "rgb", "without /", Form::default().file("rgb", "a\\b.jpg", &rgb())),
         plain(400, "depth", "without /", Form::default().file("depth", "/etc/passwd", &depth())),
