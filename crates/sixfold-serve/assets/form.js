@@ -112,6 +112,8 @@ export async function work(path, form, table) {
   byId("notes").replaceChildren();
   parts.status.replaceChildren("Sending ...");
   parts.go.disabled = true;
+  // On a narrow screen the result lies below the form.
+  if (window.matchMedia("(max-width: 899px)").matches) byId("result").scrollIntoView({ block: "nearest" });
   const cancel = byId("cancel");
   try {
     const { job, result } = await run(path, form, (now) => {

@@ -171,7 +171,7 @@ mod tests {
     #[test]
     fn hosts_of_this_machine() {
         let local: IpAddr = "127.0.0.1".parse().unwrap();
-        for host in ["localhost", "LOCALHOST:8640", "127.0.0.1:8640", "127.0.0.1", "[::1]:8640", "::1"] {
+        for host in ["localhost", "LOCALHOST:8640", "127.0.0.1:8640", "127.0.0.1", "[::1]:8640", "[::1]"] {
             assert!(is_own(host, local), "{host}");
         }
         for host in ["example.org", "example.org:8640", "127.0.0.1.example.org", "192.168.0.7:8640", ""] {
