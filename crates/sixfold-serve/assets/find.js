@@ -29,7 +29,7 @@ function found(result) {
       pose.probability === undefined ? pose.confidence.toFixed(2) : `${(100 * pose.probability).toFixed(0)} %`,
       pose.visibility === null ? "" : `${(100 * pose.visibility).toFixed(0)} %`,
       at.join("  "),
-      pose.seconds.toFixed(2),
+      pose.search_seconds.toFixed(2),
     ];
   });
   const sure = result.poses.some((pose) => pose.probability !== undefined) ? "Probability" : "Confidence";

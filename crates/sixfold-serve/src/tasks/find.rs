@@ -359,6 +359,8 @@ fn report(image: &ImageRun<'_>, found: &[FoundObject], camera: &Camera) -> Answe
         let [r, g, b] = overlay::color(number);
         value["color"] = json!(format!("#{r:02x}{g:02x}{b:02x}"));
         value["visibility"] = json!(pose.visibility());
+        // `seconds` is the method's own: a number, or one for each of its steps.
+        value["search_seconds"] = json!(pose.elapsed);
         poses.push(value);
     }
     Ok(json!({

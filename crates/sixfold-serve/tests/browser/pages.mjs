@@ -121,6 +121,14 @@ async function find(page, address) {
   const result = JSON.parse(await readFile(await download.path(), "utf8"));
   assert.equal(result.poses.length, 2);
   await shot(page, "find");
+  // Another method, whose result has other keys.
+  await page.getByLabel("Method").selectOption("mttm");
+  await page.locator(".choice", { hasText: "driller" }).click();
+  await page.getByRole("button", { name: "Find", exact: true }).click();
+  await page.locator("#job-row").waitFor({ state: "visible" });
+  await page.locator("#job-row").waitFor({ state: "hidden", timeout: 120000 });
+  assert.equal(await page.locator("#status").innerText(), "");
+  assert.match(await page.locator("#table").innerText(), /duck|Nothing was found/);
   // Without a camera, the message says what to do.
   await page.goto(`${address}/find?object=duck`);
   await page.locator("#any").setInputFiles(frame);

@@ -24,7 +24,9 @@ fn objects_are_found_as_without_a_server() {
     for pose in poses {
         let name = pose["object"].as_str().unwrap();
         assert_eq!(pose["camera_from_object"], expected(name), "{name}");
-        assert!(pose["confidence"].as_f64().unwrap() > 0.25 && pose["seconds"].as_f64().unwrap() > 0.0);
+        assert!(
+            pose["confidence"].as_f64().unwrap() > 0.25 && pose["search_seconds"].as_f64().unwrap() > 0.0
+        );
     }
     assert_eq!(result["camera"]["width"], 640);
     let overlay = server.get(all.last().unwrap()["links"]["overlay"].as_str().unwrap()).expect(200);
@@ -100,4 +102,28 @@ fn waiting_and_running_jobs_are_cancelled_and_finished_ones_removed() {
     remove(&first).expect(204);
     server.get(&format!("/v1/jobs/{first}")).expect(404);
     remove(&first).expect(404);
+}
+
+#[test]
+fn every_method_that_there_is_answers() {
+    let server = TestServer::new();
+    let methods = server.get("/v1/methods").expect(200).json();
+    let names: Vec<&str> =
+        methods["methods"].as_array().unwrap().iter().map(|m| m["name"].as_str().unwrap()).collect();
+    let of_networks: &[&str] = if cfg!(feature = "networks") { &["views", "auto"] } else { &[] };
+    assert_eq!(names, [&["ppf", "mttm"], of_networks].concat());
+    let pose = expected("driller");
+    let t = |row: usize| pose[row][3].as_f64().unwrap();
+    let at = [572.4114 * t(0) / t(2) + 325.2611, 573.57043 * t(1) / t(2) + 242.04899];
+    let near = format!("{},{},140,160", at[0] - 70.0, at[1] - 80.0);
+    for name in names {
+        let form = frame().text("objects", "driller").text("method", name).text("box", &near);
+        let result = server.result_of("/v1/find", &form).expect(200).json();
+        let found = &result["poses"][0];
+        assert_eq!(found["object"], "driller", "{name}: {result}");
+        let moved: f64 =
+            (0..3).map(|i| (found["camera_from_object"][i][3].as_f64().unwrap() - t(i)).powi(2)).sum();
+        assert!(moved.sqrt() < 0.03, "{name}: {result}");
+        assert_eq!(found["probability"].is_number(), name == "auto", "{name}: {result}");
+    }
 }
