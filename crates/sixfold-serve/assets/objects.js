@@ -37,7 +37,10 @@ function facts(object) {
   const symmetries = [];
   if (object.symmetries_discrete) symmetries.push(`${object.symmetries_discrete + 1} poses look the same`);
   if (object.symmetries_continuous) symmetries.push("rotates freely about an axis");
-  const bytes = (n) => (n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : `${(n / 1e6).toFixed(1)} MB`);
+  const bytes = (n) => {
+    if (n < 1e3) return `${n} B`;
+    return n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : `${(n / 1e6).toFixed(1)} MB`;
+  };
   const pairs = [
     ["Diameter", millimetres(object.diameter)],
     ["Mesh", object.without_mesh ? "none" : `${object.vertices.toLocaleString("en")} vertices, ${object.faces.toLocaleString("en")} faces`],
