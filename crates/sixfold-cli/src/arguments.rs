@@ -19,6 +19,7 @@ use crate::commands::experiments::Forwarded;
 use crate::commands::grasp::arguments::GraspArguments;
 use crate::commands::object::arguments::ObjectArguments;
 use crate::commands::render::RenderArguments;
+use crate::commands::serve::ServeArguments;
 use crate::commands::simulate::SimulateArguments;
 use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
 use crate::commands::teach::{AFTER_HELP as TEACH_HELP, TeachArguments};
@@ -111,6 +112,9 @@ pub(crate) enum Command {
     /// Learn a new object from photographs of it on the printed board: mesh, symmetries, a record to find it by
     #[command(hide = !NETWORKS, after_help = TEACH_HELP)]
     Teach(Box<TeachArguments>),
+    /// Serve web pages and an HTTP API on this machine: objects, poses, grasps
+    #[command(hide = !crate::commands::serve::IS_BUILT_IN, after_help = crate::commands::serve::AFTER_HELP)]
+    Serve(Box<ServeArguments>),
     /// Print shell completions
     #[command(
         after_help = "Example:\n  sixfold completions bash > ~/.local/share/bash-completion/completions/sixfold"

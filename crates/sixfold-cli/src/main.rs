@@ -44,6 +44,7 @@ fn main() -> ExitCode {
         Command::Board(a) => commands::board::run(a),
         Command::Calibrate(a) => commands::calibrate::run(a),
         Command::Teach(a) => commands::teach::run(a),
+        Command::Serve(a) => commands::serve::run(a),
         Command::Completions(a) => commands::completions::run(a, Arguments::command()),
     })
 }

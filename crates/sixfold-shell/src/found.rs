@@ -79,7 +79,7 @@ impl SearchedImage<'_> {
     }
 
     /// The poses over the image; where an object has no mesh, its mask.
-    fn overlay(&self) -> RgbImage {
+    pub fn overlay(&self) -> RgbImage {
         let background = match (self.rgb, self.depth) {
             (Some(rgb), _) => rgb.clone(),
             (None, Some(depth)) => overlay::depth_picture(depth),

@@ -14,6 +14,7 @@ pub(crate) mod experiments;
 pub(crate) mod grasp;
 pub(crate) mod object;
 pub(crate) mod render;
+pub(crate) mod serve;
 pub(crate) mod simulate;
 #[cfg(feature = "physics")]
 pub(crate) mod simulate_scenes;

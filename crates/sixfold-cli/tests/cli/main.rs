@@ -24,6 +24,7 @@ mod pix2pose;
 mod printing;
 #[cfg(feature = "networks")]
 mod published;
+mod serve;
 #[cfg(feature = "networks")]
 mod shipped;
 mod simulate;

@@ -64,11 +64,18 @@ impl CameraFile {
     /// ([`Camera::check_whole_image`], where the file says the image's size).
     pub fn read(path: &Path) -> Result<CameraFile, CameraFileError> {
         let read = |source| CameraFileError::Read { path: path.into(), source };
+        CameraFile::parse(&crate::read_regular(path, MAX_BYTES).map_err(read)?, path)
+    }
+
+    /// The same of a file's bytes; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`CameraFile::read`].
+    pub fn parse(bytes: &[u8], path: &Path) -> Result<CameraFile, CameraFileError> {
         let wrong = |message: String| CameraFileError::Content { path: path.into(), message };
-        let bytes = crate::read_regular(path, MAX_BYTES).map_err(read)?;
-        let text = String::from_utf8(bytes)
+        let text = str::from_utf8(bytes)
             .map_err(|_| wrong("found no text, expected JSON, YAML or XML".to_owned()))?;
-        let file = fields::camera(&content(&text, path)?).map_err(wrong)?;
+        let file = fields::camera(&content(text, path)?).map_err(wrong)?;
         if file.sized {
             let (width, height) = (file.camera.width, file.camera.height);
             check_pixels(width, height, max_pixels())

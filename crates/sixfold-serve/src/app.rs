@@ -1,0 +1,63 @@
+//! What all requests share: the store, the queue of jobs, methods and objects that are kept warm.
+
+use std::sync::Arc;
+
+use sixfold_estimator::ObjectStore;
+use tokio::sync::Semaphore;
+
+use crate::error::{Answer, ApiError, ServeError};
+use crate::jobs::{Jobs, Stopped, Work};
+use crate::methods::Methods;
+use crate::objects::Thumbnails;
+use crate::options::ServerOptions;
+
+/// Uploads that are held in memory at once, and images that are decoded at once to be checked.
+const UPLOADS: usize = 8;
+const DECODERS: usize = 2;
+
+/// The server's state.
+pub(crate) struct App {
+    pub options: ServerOptions,
+    pub store: ObjectStore,
+    pub jobs: Arc<Jobs>,
+    pub methods: Methods,
+    pub thumbnails: Thumbnails,
+    pub uploads: Semaphore,
+    decoders: Semaphore,
+}
+
+/// What handlers are given.
+pub(crate) type Shared = axum::extract::State<Arc<App>>;
+
+impl App {
+    pub fn new(options: ServerOptions) -> Result<App, ServeError> {
+        let store = ObjectStore::new(&options.objects);
+        Ok(App {
+            jobs: Arc::new(Jobs::open(&options)?),
+            methods: Methods::new(store.clone(), options.objects.clone(), options.pix2pose.clone())?,
+            store,
+            thumbnails: Thumbnails::default(),
+            uploads: Semaphore::new(UPLOADS),
+            decoders: Semaphore::new(DECODERS),
+            options,
+        })
+    }
+
+    /// Works on one job.
+    pub fn run(&self, work: &mut Work<'_>) -> Result<serde_json::Value, Stopped> {
+        crate::tasks::run(self, work)
+    }
+
+    /// Runs what computes or reads files beside the threads that answer, a few at a time.
+    pub async fn blocking<T: Send + 'static>(
+        self: &Arc<App>,
+        work: impl FnOnce(&App) -> Answer<T> + Send + 'static,
+    ) -> Answer<T> {
+        let fault = |e: &dyn std::fmt::Display| ApiError::system("the request met a fault of the program", e);
+        let permit = self.decoders.acquire().await.map_err(|e| fault(&e))?;
+        let app = self.clone();
+        let result = tokio::task::spawn_blocking(move || work(&app)).await;
+        drop(permit);
+        result.map_err(|e| fault(&e))?
+    }
+}

@@ -1,0 +1,164 @@
+//! The server: one address, a limited number of connections, and an end at which nothing is lost.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::http::StatusCode;
+use axum::routing::{get, post};
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Runtime;
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
+
+use crate::app::App;
+use crate::error::{ApiError, ServeError};
+use crate::options::ServerOptions;
+use crate::{access, health, jobs, objects, openapi, pages, tasks};
+
+/// Longest time for the head of a request to arrive.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(15);
+/// So long the server waits at its end for answers that are being sent.
+const LAST_ANSWERS: Duration = Duration::from_secs(3);
+/// How often the caller's wish to stop is looked at.
+const POLL: Duration = Duration::from_millis(50);
+/// A pause after the system refused a connection, for lack of file descriptors say.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// A server that listens. It answers until it is stopped or dropped.
+pub struct Server {
+    address: SocketAddr,
+    app: Arc<App>,
+    workers: Vec<JoinHandle<()>>,
+    runtime: Option<Runtime>,
+    stop: Arc<Notify>,
+}
+
+impl Server {
+    /// Starts listening and working on what waits in the data folder.
+    ///
+    /// # Errors
+    /// [`ServeError`].
+    pub fn start(options: ServerOptions) -> Result<Server, ServeError> {
+        options.check()?;
+        let wanted = SocketAddr::new(options.host, options.port);
+        let bind = |source| ServeError::Bind { address: wanted, source };
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()
+            .map_err(|source| ServeError::Io { path: options.data.clone(), source })?;
+        // Before anything is worked on: a second server on the same port does nothing.
+        let listener = runtime.block_on(TcpListener::bind(wanted)).map_err(bind)?;
+        let address = listener.local_addr().map_err(bind)?;
+        let (number, connections) = (options.workers.get(), options.max_connections);
+        let app = Arc::new(App::new(options)?);
+        let worker = app.clone();
+        let workers = app.jobs.start(number, Arc::new(move |work| worker.run(work)));
+        let stop = Arc::new(Notify::new());
+        runtime.spawn(accept(listener, router(app.clone()), connections, stop.clone()));
+        Ok(Server { address, app, workers, runtime: Some(runtime), stop })
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Answers until `stop` is set, then ends: a job that is worked on waits for the next server.
+    pub fn run_until(self, stop: &AtomicBool) {
+        while !stop.load(Ordering::SeqCst) {
+            std::thread::sleep(POLL);
+        }
+    }
+
+    fn end(&mut self) {
+        self.app.jobs.end();
+        self.stop.notify_one();
+        for worker in self.workers.drain(..) {
+            // A worker catches the panics of its jobs; what else there is concerns nobody any more.
+            let _ = worker.join();
+        }
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_timeout(LAST_ANSWERS);
+        }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// Accepts connections, as many at once as there may be, until it is told to stop.
+async fn accept(listener: TcpListener, router: Router, connections: usize, stop: Arc<Notify>) {
+    let slots = Arc::new(Semaphore::new(connections));
+    loop {
+        let Ok(slot) = slots.clone().acquire_owned().await else { return };
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = stop.notified() => return,
+        };
+        match accepted {
+            Ok((stream, _)) => {
+                tokio::spawn(connection(stream, router.clone(), slot));
+            }
+            Err(_) => tokio::time::sleep(PAUSE).await,
+        }
+    }
+}
+
+/// Answers the requests of one connection.
+async fn connection(stream: TcpStream, router: Router, slot: OwnedSemaphorePermit) {
+    // Small answers go at once.
+    let _ = stream.set_nodelay(true);
+    let mut builder = http1::Builder::new();
+    builder.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
+    // Clients that go away in the middle of a request end with an error that is nobody's.
+    let _ = builder.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router)).await;
+    drop(slot);
+}
+
+fn router(app: Arc<App>) -> Router {
+    let max_upload = app.options.max_upload;
+    Router::new()
+        .route("/v1/health", get(health::health))
+        .route("/v1/methods", get(health::methods))
+        .route("/v1/openapi.json", get(openapi::openapi))
+        .route("/v1/session", post(access::session))
+        .route("/v1/objects", get(objects::list_objects).post(tasks::object::add_object))
+        .route("/v1/objects/{name}", get(objects::get_object).delete(objects::delete_object))
+        .route("/v1/objects/{name}/thumbnail.png", get(objects::object_thumbnail))
+        .route("/v1/objects/{name}/mesh.ply", get(objects::object_mesh))
+        .route("/v1/find", post(tasks::find::find))
+        .route("/v1/grasps", post(tasks::grasps::grasps))
+        .route("/v1/jobs", get(jobs::list_jobs))
+        .route("/v1/jobs/{id}", get(jobs::get_job).delete(jobs::delete_job))
+        .route("/v1/jobs/{id}/cancel", post(jobs::cancel_job))
+        .route("/v1/jobs/{id}/result", get(jobs::job_result))
+        .route("/v1/jobs/{id}/overlay.png", get(jobs::job_overlay))
+        .route("/v1/jobs/{id}/events", get(jobs::job_events))
+        .merge(pages::routes())
+        .fallback(not_there)
+        .method_not_allowed_fallback(not_allowed)
+        .layer(DefaultBodyLimit::max(max_upload))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), access::guard))
+        .with_state(app)
+}
+
+async fn not_there() -> ApiError {
+    let advice = "the pages begin at /, the API is described in /v1/openapi.json";
+    ApiError::plain(StatusCode::NOT_FOUND, "there is nothing at this path", advice)
+}
+
+async fn not_allowed() -> ApiError {
+    let advice = "look at /v1/openapi.json for the methods of this path";
+    ApiError::plain(StatusCode::METHOD_NOT_ALLOWED, "this path does not take this method", advice)
+}

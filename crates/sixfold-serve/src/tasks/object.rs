@@ -1,0 +1,259 @@
+//! Adding an object to the store from an uploaded mesh, as `sixfold object add` does.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use axum::extract::{Request as HttpRequest, State};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use sixfold_estimator::{NewObject, ObjectRecord, PoseEstimator, StoreError};
+use sixfold_geometry::Vec3;
+use sixfold_io::{limits, read_regular};
+use sixfold_mesh::{
+    ContinuousSymmetry, Mesh, ModelInfo, Unit, check_size, parse_gltf, parse_obj, parse_ply, parse_stl,
+    parse_xyz,
+};
+use sixfold_ppf::PpfEstimator;
+
+use super::Request;
+use crate::app::{App, Shared};
+use crate::error::{Answer, ApiError, Problem};
+use crate::form::{Form, FormRule, UploadedFile};
+use crate::jobs::{Accepted, JobView, Stopped, Work};
+
+/// Most files beside a mesh: materials and textures.
+const MAX_RESOURCES: usize = 50;
+
+const RULE: FormRule = FormRule {
+    files: &["mesh"],
+    many_files: &["resource"],
+    texts: &["name", "unit", "turns_about", "replace"],
+};
+
+/// What is to be stored, beside the files.
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct ObjectRequest {
+    name: String,
+    /// What the client calls the mesh file; for messages and the record.
+    file_name: String,
+    format: Format,
+    unit: Unit,
+    turns_about: Option<Axis>,
+    replace: bool,
+    /// What the client calls the files beside the mesh; file `i` is `resource-i` in the job's folder.
+    resources: Vec<String>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Format {
+    Ply,
+    Obj,
+    Stl,
+    Gltf,
+    Xyz,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Axis {
+    X,
+    Y,
+    Z,
+}
+
+/// The form of `POST /v1/objects`.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code)]
+pub(crate) struct ObjectForm {
+    /// The object's name: up to 100 letters, digits, - and _.
+    name: String,
+    /// Mesh file: PLY, OBJ, STL, glTF, GLB or XYZ.
+    #[schema(value_type = String, format = Binary)]
+    mesh: Vec<u8>,
+    /// Unit of the mesh file: m, cm, mm or in.
+    unit: String,
+    /// Files that the mesh names (materials, textures, buffers), under the names that it has for them.
+    #[schema(value_type = Option<Vec<String>>, format = Binary)]
+    resource: Option<Vec<Vec<u8>>>,
+    /// The object looks the same however it is rotated about this axis of its own frame: x, y or z.
+    turns_about: Option<String>,
+    /// Replace an object of the same name (default: false).
+    replace: Option<bool>,
+}
+
+/// Stores an object from a mesh: a job whose result is its record.
+#[utoipa::path(post, path = "/v1/objects", tag = "objects",
+    request_body(content = ObjectForm, content_type = "multipart/form-data"),
+    responses(
+        (status = 202, description = "The job waits for a worker", body = JobView),
+        (status = 400, description = "No form, a bad name, or a path in a name", body = Problem),
+        (status = 409, description = "There is an object of this name", body = Problem),
+        (status = 413, description = "More bytes than the server takes", body = Problem),
+        (status = 415, description = "Another content type", body = Problem),
+        (status = 422, description = "A field that is not what it should be", body = Problem),
+        (status = 429, description = "Too many jobs wait", body = Problem),
+    ))]
+pub(crate) async fn add_object(State(app): Shared, request: HttpRequest) -> Answer<Accepted> {
+    let form = Form::read(&app, request, &RULE).await?;
+    app.blocking(move |app| {
+        let mesh = form.needed_file("mesh", "a mesh file")?;
+        let request = ObjectRequest::of_form(&form, mesh)?;
+        request.check_name(app)?;
+        let resources = form.files("resource");
+        request.mesh(&mesh.bytes, &|i| Ok(resources[i].bytes.to_vec()))?;
+        let names: Vec<String> = (0..resources.len()).map(|i| format!("resource-{i}")).collect();
+        let beside = names.iter().map(String::as_str).zip(resources.iter().map(|r| r.bytes.as_ref()));
+        let files: Vec<(&str, &[u8])> = [("mesh", mesh.bytes.as_ref())].into_iter().chain(beside).collect();
+        let job = Request::Object(request).lay_down(app, &files)?;
+        Ok(Accepted(JobView::of(app, &job)))
+    })
+    .await
+}
+
+impl ObjectRequest {
+    fn of_form(form: &Form, mesh: &UploadedFile) -> Answer<ObjectRequest> {
+        let name = form.text("name")?.ok_or_else(|| {
+            ApiError::field("name", "nothing", "up to 100 letters, digits, - and _", "give the object a name")
+        })?;
+        let units = "one of m, cm, mm, in";
+        let unit = form.parsed::<Unit>("unit", units)?.ok_or_else(|| {
+            ApiError::field("unit", "nothing", units, "a mesh file does not say its unit: give it")
+        })?;
+        let turns_about = match form.text("turns_about")? {
+            None => None,
+            Some("x") => Some(Axis::X),
+            Some("y") => Some(Axis::Y),
+            Some("z") => Some(Axis::Z),
+            Some(other) => {
+                let found = format!("{other:?}");
+                return Err(ApiError::field("turns_about", found, "x, y or z", "correct the value"));
+            }
+        };
+        let resources = form.files("resource");
+        if resources.len() > MAX_RESOURCES {
+            return Err(ApiError::field(
+                "resource",
+                format!("{} files", resources.len()),
+                format!("at most {MAX_RESOURCES}"),
+                "join the textures, or send a GLB file",
+            ));
+        }
+        Ok(ObjectRequest {
+            name: name.to_owned(),
+            file_name: mesh.name.clone(),
+            format: Format::of(&mesh.name)?,
+            unit,
+            turns_about,
+            replace: form.parsed("replace", "true or false")?.unwrap_or(false),
+            resources: resources.iter().map(|r| r.name.clone()).collect(),
+        })
+    }
+
+    /// Whether the object could be stored under its name now.
+    fn check_name(&self, app: &App) -> Answer<()> {
+        match app.store.record(&self.name) {
+            Err(error @ StoreError::Name(_)) => Err(ApiError::of_store("name", &error)),
+            Ok(_) if !self.replace => {
+                let folder = app.options.objects.clone();
+                Err(ApiError::of_store("name", &StoreError::Exists { name: self.name.clone(), folder }))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The mesh in metres. What it names beside itself is looked for among the uploaded files, by `resource`, and nowhere else.
+    fn mesh(&self, bytes: &[u8], resource: &dyn Fn(usize) -> std::io::Result<Vec<u8>>) -> Answer<Mesh> {
+        let parse = match self.format {
+            Format::Ply => parse_ply,
+            Format::Obj => parse_obj,
+            Format::Stl => parse_stl,
+            Format::Gltf => parse_gltf,
+            Format::Xyz => parse_xyz,
+        };
+        let numbers: HashMap<&str, usize> =
+            self.resources.iter().enumerate().map(|(i, name)| (name.as_str(), i)).collect();
+        let beside = |name: &str| match numbers.get(name) {
+            Some(&i) => resource(i),
+            None => Err(std::io::Error::new(
+                std::io::ErrorKind::NotFound,
+                "not among the uploaded files: send it as a field `resource`",
+            )),
+        };
+        let wrong = |e: &dyn std::fmt::Display| {
+            ApiError::about(
+                "mesh",
+                e,
+                "a mesh of an object of 5 mm to 5 m",
+                "repair or convert the file, and check its unit",
+            )
+        };
+        let mesh = parse(bytes, "mesh", self.unit, &beside).map_err(|e| wrong(&e))?;
+        check_size(&mesh, "mesh", self.unit).map_err(|e| wrong(&e))?;
+        Ok(mesh)
+    }
+
+    fn info(&self, mesh: &Mesh) -> ModelInfo {
+        let mut info = ModelInfo::of_mesh(mesh);
+        if let Some(axis) = self.turns_about {
+            let axis = match axis {
+                Axis::X => Vec3::x(),
+                Axis::Y => Vec3::y(),
+                Axis::Z => Vec3::z(),
+            };
+            // The axis runs through the centre of the bounding box: a file's origin may be anywhere.
+            let offset = info.min + info.size * 0.5;
+            info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
+        }
+        info
+    }
+}
+
+impl Format {
+    /// By the ending of a file's name.
+    fn of(name: &str) -> Answer<Format> {
+        let ending = name.rsplit_once('.').map(|(_, ending)| ending.to_ascii_lowercase());
+        Ok(match ending.as_deref() {
+            Some("ply") => Format::Ply,
+            Some("obj") => Format::Obj,
+            Some("stl") => Format::Stl,
+            Some("gltf" | "glb") => Format::Gltf,
+            Some("xyz") => Format::Xyz,
+            _ => {
+                return Err(ApiError::field(
+                    "mesh",
+                    format!("a file named {name:?}"),
+                    "a name that ends in .ply, .obj, .stl, .gltf, .glb or .xyz",
+                    "convert the mesh to one of them; the ending says the format",
+                ));
+            }
+        })
+    }
+}
+
+/// Works on a request.
+pub(super) fn run(app: &App, request: &ObjectRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
+    let folder = work.folder().to_owned();
+    let read = |name: &str| read_regular(&folder.join(name), limits::MESH);
+    let bytes = read("mesh").map_err(|e| ApiError::system("the job's mesh", e))?;
+    let mesh = request.mesh(&bytes, &|i| read(&format!("resource-{i}")))?;
+    work.step(0, 1, "describing the object")?;
+    let source = if request.file_name.is_empty() { "upload" } else { &request.file_name };
+    let record = ObjectRecord::of_mesh(Path::new(source), request.unit, &mesh, &request.info(&mesh));
+    let new = NewObject { mesh: Some(&mesh), record: &record, replace: request.replace };
+    let stored = app.store.add(&request.name, new, |object| {
+        PpfEstimator::default().prepare(object)?;
+        Ok(())
+    });
+    match stored {
+        // Stored by this job before the server ended, which began it again.
+        Err(StoreError::Exists { .. }) if is_stored(app, request, &record) => {}
+        other => other.map_err(|e| ApiError::of_store("name", &e))?,
+    }
+    Ok(json!({ "name": request.name, "object": format!("/v1/objects/{}", request.name), "record": record }))
+}
+
+fn is_stored(app: &App, request: &ObjectRequest, record: &ObjectRecord) -> bool {
+    let text = |record: &ObjectRecord| serde_json::to_string(record).ok();
+    app.store.record(&request.name).is_ok_and(|stored| text(&stored) == text(record))
+}

@@ -1,0 +1,9 @@
+//! The real server on a free port of this machine, driven over HTTP.
+
+mod access;
+mod bad_input;
+mod clients;
+mod find;
+mod objects;
+mod restart;
+mod support;
