@@ -137,7 +137,7 @@ mod tests {
     fn parts_are_found_by_size() {
         let volume = Volume { low: Vec3::repeat(-1.0), high: Vec3::repeat(1.0) };
         let away = Vec3::repeat(0.7);
-        let grid = Grid::new(&volume, 20, |p| ((p.norm() - 0.5).min((p - away).norm() - 0.2)) as f32);
+        let grid = Grid::new(&volume, 20, |p| ((p.norm() - 0.5).min((p - away).norm() - 0.22)) as f32);
         let parts = grid.components();
         assert_eq!(parts.len(), 2);
         assert!(parts[0].len() > 4 * parts[1].len());

@@ -47,11 +47,10 @@ impl Teaching {
 }
 
 fn tile(image: &RgbImage, mask: &Mask, outline: &Mask) -> RgbImage {
-    let [x0, y0, x1, y1] = outline.bounding_box().unwrap_or([0, 0, image.width(), image.height()]);
-    let margin = (x1 - x0).max(y1 - y0) / 5 + 8;
-    let side = (x1 - x0).max(y1 - y0) + 2 * margin;
-    let left = ((x0 + x1) / 2).saturating_sub(side / 2);
-    let top = ((y0 + y1) / 2).saturating_sub(side / 2);
+    let [x, y, width, height] = outline.bounding_box().unwrap_or([0, 0, image.width(), image.height()]);
+    let side = width.max(height) * 7 / 5 + 16;
+    let left = (x + width / 2).saturating_sub(side / 2);
+    let top = (y + height / 2).saturating_sub(side / 2);
     let scale = side as f64 / WIDTH as f64;
     let at = |x: usize, y: usize| {
         let (u, v) = (left + (x as f64 * scale) as usize, top + (y as f64 * scale) as usize);

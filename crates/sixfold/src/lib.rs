@@ -28,6 +28,8 @@ pub use sixfold_nol as nol;
 #[cfg(feature = "networks")]
 pub use sixfold_pix2pose as pix2pose;
 #[cfg(feature = "networks")]
+pub use sixfold_teach as teach;
+#[cfg(feature = "networks")]
 pub use sixfold_views as views;
 
 #[cfg(feature = "grasp")]

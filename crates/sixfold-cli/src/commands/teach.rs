@@ -6,7 +6,7 @@ use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 use sixfold_board::{Board, Paper};
-use sixfold_estimator::{Object, ObjectRecord, ObjectStore, PoseEstimator};
+use sixfold_estimator::{Object, ObjectRecord, ObjectStore, PoseEstimator, StoreError};
 use sixfold_io::{CameraFile, limits, read_regular, write_rgb};
 use sixfold_mesh::{FoundSymmetry, Verdict};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
@@ -84,6 +84,9 @@ struct LeftOut {
 
 pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     let store = ObjectStore::new(&a.store);
+    if let Err(error @ StoreError::Name(_)) = store.record(&a.name) {
+        return Err(error.into());
+    }
     if store.contains(&a.name) && !a.replace {
         bail!(
             "there is an object named {:?} in {} already: give --replace or another name",
@@ -151,6 +154,12 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
             teaching.add_depth(number, &bytes, scale / 1000.0)?;
         }
     }
+    // Photographs of an earlier run in this folder that are not given again are not used.
+    let given: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
+    for number in 0..teaching.photographs().len() {
+        let left_out = !given.contains(&teaching.photographs()[number].name);
+        teaching.set_left_out(number, left_out)?;
+    }
     Ok(teaching)
 }
 
@@ -167,7 +176,7 @@ fn prepare(object: &Object) -> Result<(), Box<dyn std::error::Error + Send + Syn
 
 fn left_out(teaching: &Teaching) -> Vec<LeftOut> {
     let of = |p: &sixfold_teach::Photograph| {
-        let by_person = p.left_out_by_person.then(|| "left out by hand".to_owned());
+        let by_person = p.left_out_by_person.then(|| "not given this time".to_owned());
         let reason = by_person.or_else(|| p.left_out.clone().filter(|_| p.pose_by != Some(By::Person)))?;
         Some(LeftOut { photograph: p.name.clone(), reason })
     };

@@ -34,6 +34,8 @@ mod support;
 #[cfg(feature = "networks")]
 mod synthesize;
 #[cfg(feature = "networks")]
+mod teach;
+#[cfg(feature = "networks")]
 mod trainings;
 #[cfg(not(feature = "networks"))]
 mod without_networks;

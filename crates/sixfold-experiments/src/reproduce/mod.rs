@@ -6,6 +6,7 @@ mod kept;
 mod mttm;
 mod nol;
 mod pix2pose;
+mod teach;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
@@ -38,6 +39,9 @@ pub(crate) enum ReproduceCommand {
     /// Poses and views of Neural Object Learning beside truth and real pixels, wrong meshes, another lamp, and times
     #[command(after_help = nol::arguments::AFTER_HELP)]
     Nol(nol::arguments::ReproduceNolArguments),
+    /// Objects taught from simulated photographs: poses, meshes and symmetries beside the truth, found again in new images
+    #[command(after_help = teach::AFTER_HELP)]
+    Teach(teach::ReproduceTeachArguments),
     /// Grasps from experience: table 6.2, figure 6.7, learning from nothing, handles
     #[command(after_help = "Example:\n  \
         sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
@@ -51,6 +55,7 @@ pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
         ReproduceCommand::Pix2pose(arguments) => pix2pose::run(arguments, &a.json),
         ReproduceCommand::Mttm(arguments) => mttm::run(arguments, &a.json),
         ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),
+        ReproduceCommand::Teach(arguments) => teach::run(arguments, &a.json),
         ReproduceCommand::Dgcm(arguments) => dgcm::run(arguments, &a.json),
     }
 }

@@ -1,0 +1,408 @@
+//! `sixfold reproduce teach`: objects taught from simulated photographs, held against their truth: poses of the camera, mesh,
+//! symmetries, and the taught object found again among others in new depth images.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use sixfold_align::PreparedDepth;
+use sixfold_board::{Board, Paper};
+use sixfold_bop::{ModelPoints, add_s};
+use sixfold_estimator::{Object, PoseEstimator, Query};
+use sixfold_geometry::nalgebra::UnitQuaternion;
+use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, RgbImage, Vec3, stats::median};
+use sixfold_io::read_rgb;
+use sixfold_mesh::{Mesh, ModelInfo, SymmetryOptions, Unit, find_symmetries, read_mesh, sure_symmetries};
+use sixfold_ppf::PpfEstimator;
+use sixfold_render::{DepthSensor, SceneObject, VisibilityBuffer, simulate_depth};
+use sixfold_shell::Outcome;
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, ground_of};
+use sixfold_teach::{SalientSegmenter, ShapeOptions, TeachOptions, Teaching};
+
+pub(super) const AFTER_HELP: &str = "Example:\n  \
+    sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
+    Every object is kept; interrupted, it continues when the same command is given again.";
+
+/// Distance of colours between neighbouring places of a mesh without colours, 1/m: patches of a few centimetres.
+const PATCHES: f64 = 90.0;
+/// New images of each object.
+const NEW_IMAGES: usize = 5;
+/// A pose is right within this fraction of the diameter.
+const RIGHT: f64 = 0.1;
+
+#[derive(Debug, Args)]
+pub(crate) struct ReproduceTeachArguments {
+    /// JSON list of {name, mesh, unit}; z of each mesh points up
+    #[arg(long, value_name = "FILE")]
+    list: PathBuf,
+    /// Folder of the meshes
+    #[arg(long, value_name = "DIR")]
+    meshes: PathBuf,
+    /// A photograph: what the table looks like
+    #[arg(long, value_name = "FILE")]
+    ground: PathBuf,
+    /// Photographs of each object
+    #[arg(long, value_name = "N", default_value_t = 20)]
+    photographs: usize,
+    /// Seed of the photographs
+    #[arg(long, value_name = "SEED", default_value_t = 7)]
+    seed: u64,
+    /// Folder for the results
+    #[arg(long, value_name = "DIR", default_value = "out/reproduce-teach")]
+    out: PathBuf,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    name: String,
+    mesh: PathBuf,
+    unit: Unit,
+}
+
+/// One object; lengths in millimetres, angles in degrees.
+#[derive(Debug, Serialize, Deserialize)]
+struct Row {
+    name: String,
+    photographs: usize,
+    seed: u64,
+    diameter_mm: f64,
+    camera_mm: f64,
+    camera_deg: f64,
+    mask_iou: f64,
+    /// Mean distance of the mesh to the truth, and of what the photographs show of the truth to the mesh.
+    mesh_mm: f64,
+    truth_mm: f64,
+    with_depth: f64,
+    /// Axes and rotations that are sure, found and true.
+    symmetries: [usize; 2],
+    symmetries_true: [usize; 2],
+    found: usize,
+    images: usize,
+    /// The same with the true mesh.
+    found_with_true_mesh: usize,
+    seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Report {
+    objects: Vec<Row>,
+    camera_mm_median: f64,
+    camera_deg_median: f64,
+    mesh_mm_mean: f64,
+    truth_mm_mean: f64,
+    found: usize,
+    images: usize,
+    found_with_true_mesh: usize,
+}
+
+pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<Outcome> {
+    let text = std::fs::read_to_string(&a.list).with_context(|| a.list.display().to_string())?;
+    let entries: Vec<Entry> = serde_json::from_str(&text).with_context(|| a.list.display().to_string())?;
+    if entries.is_empty() || a.photographs < 8 {
+        bail!("expected at least one object and 8 photographs of it");
+    }
+    let ground = ground_of(&read_rgb(&a.ground)?, 1024);
+    let meshes: Vec<Mesh> = entries
+        .iter()
+        .map(|e| Ok(colored(read_mesh(a.meshes.join(&e.mesh), e.unit)?)))
+        .collect::<Result<_>>()?;
+    let mut progress = Progress::new("objects", entries.len());
+    let mut objects = vec![];
+    for (i, entry) in entries.iter().enumerate() {
+        check_interrupt("finished objects are kept; give the same command to continue")?;
+        let file = a.out.join(format!("{}.json", entry.name));
+        let row = match kept(&file, a) {
+            Some(row) => row,
+            None => {
+                let others: Vec<&Mesh> = (1..3).map(|k| &meshes[(i + k) % meshes.len()]).collect();
+                let row = measured(a, &entry.name, &meshes[i], &others, &ground)?;
+                write_atomically(&file, serde_json::to_string_pretty(&row)?.as_bytes())?;
+                row
+            }
+        };
+        progress.step(entry.name.clone());
+        objects.push(row);
+    }
+    progress.finish();
+    let of = |f: fn(&Row) -> f64| objects.iter().map(f).collect::<Vec<f64>>();
+    let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len() as f64;
+    let sum = |f: fn(&Row) -> usize| objects.iter().map(f).sum();
+    let all = Report {
+        camera_mm_median: median(&mut of(|r| r.camera_mm)).unwrap_or(f64::NAN),
+        camera_deg_median: median(&mut of(|r| r.camera_deg)).unwrap_or(f64::NAN),
+        mesh_mm_mean: mean(of(|r| r.mesh_mm)),
+        truth_mm_mean: mean(of(|r| r.truth_mm)),
+        found: sum(|r| r.found),
+        images: sum(|r| r.images),
+        found_with_true_mesh: sum(|r| r.found_with_true_mesh),
+        objects,
+    };
+    write_atomically(&a.out.join("teach.json"), serde_json::to_string_pretty(&all)?.as_bytes())?;
+    report(json, &all, || print(&all))?;
+    Ok(Outcome::Found)
+}
+
+fn kept(file: &Path, a: &ReproduceTeachArguments) -> Option<Row> {
+    let row: Row = serde_json::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
+    (row.photographs == a.photographs && row.seed == a.seed).then_some(row)
+}
+
+/// A mesh with colours: smooth patches where it has none.
+fn colored(mesh: Mesh) -> Mesh {
+    if mesh.texture().is_some() || mesh.colors().is_some() {
+        return mesh;
+    }
+    let wave = |v: &Vec3, f: f64, p: f64| {
+        ((v.x * f * 1.3 + p).sin() + (v.y * f + 2.0 * p).sin() + (v.z * f * 0.9 - p).sin()) / 3.0
+    };
+    let color = |v: &Vec3| {
+        let level = |base: f64, range: f64, f: f64, p: f64| (base + range * wave(v, f * PATCHES, p)) as u8;
+        [level(150.0, 90.0, 1.0, 0.3), level(95.0, 75.0, 1.4, 1.1), level(75.0, 60.0, 0.8, 2.0)]
+    };
+    let colors = mesh.vertices().iter().map(color).collect();
+    mesh.clone().with_colors(colors).unwrap_or(mesh)
+}
+
+fn measured(
+    a: &ReproduceTeachArguments,
+    name: &str,
+    mesh: &Mesh,
+    others: &[&Mesh],
+    ground: &RgbImage,
+) -> Result<Row> {
+    let options = SimulationOptions { photographs: a.photographs, ..SimulationOptions::default() };
+    let board = Board::new(Paper::A4);
+    let capture = SimulatedCapture::new(mesh, &board, ground, &options, a.seed);
+    let files = a.out.join(name);
+    for i in 0..a.photographs {
+        let Some(image) = capture.photograph(i) else { break };
+        let file = files.join("photographs").join(format!("{i:02}.jpg"));
+        write_atomically(&file, &jpeg(&image)?)?;
+    }
+    let start = Instant::now();
+    let mut teaching = Teaching::open(files.join("teaching"), &TeachOptions::default())?;
+    for i in 0..a.photographs {
+        let file = files.join("photographs").join(format!("{i:02}.jpg"));
+        teaching.add_photograph(&format!("{i:02}.jpg"), &std::fs::read(&file)?)?;
+    }
+    let shape = ShapeOptions::default();
+    teaching.locate(&())?;
+    teaching.find_masks(&SalientSegmenter::shipped()?, &shape, &())?;
+    teaching.reconstruct(&shape, &())?;
+    sixfold_io::write_rgb(&files.join("photographs.png"), &teaching.picture()?)?;
+    let taught = teaching.mesh()?;
+    let noise = SymmetryOptions { noise: 0.004 * taught.diameter(), ..SymmetryOptions::default() };
+    let sure = sure_symmetries(&find_symmetries(&taught, &noise)?, true);
+    let seconds = start.elapsed().as_secs_f64();
+    let of_truth = sure_symmetries(&find_symmetries(mesh, &SymmetryOptions::default())?, true);
+    let facts = teaching.shape().context("no mesh was made")?;
+    let rows = facts.board_from_object;
+    let board_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
+    let (mut shifts, mut rotations, mut ious) = (vec![], vec![], vec![]);
+    for (i, truth) in capture.camera_from_board.iter().enumerate() {
+        let Some(found) = teaching.camera_from_board(i) else { continue };
+        shifts.push(1000.0 * (found.inverse().translation() - truth.inverse().translation()).norm());
+        rotations.push(found.rotation_angle_to(truth).to_degrees());
+        if let (Some(mask), Some(there)) = (teaching.mask(i)?, capture.mask(i)) {
+            let pairs = || mask.as_slice().iter().zip(there.as_slice());
+            let both = pairs().filter(|(a, b)| **a && **b).count();
+            ious.push(both as f64 / pairs().filter(|(a, b)| **a || **b).count() as f64);
+        }
+    }
+    let there = mesh.transformed(&capture.board_from_object);
+    let seen = seen_points(&there, &capture, &options.camera);
+    let [mesh_mm, truth_mm] = distances(&taught.transformed(&board_from_taught), &there, &seen);
+    let taught_from_true = compose(&board_from_taught.inverse(), &capture.board_from_object);
+    let scene = NewScenes { mesh, others, seed: a.seed };
+    let mut info = ModelInfo::of_mesh(&taught);
+    (info.symmetries_discrete, info.symmetries_continuous) = sure.clone();
+    let symmetric = !(of_truth.0.is_empty() && of_truth.1.is_empty());
+    let found = scene.found(&Object::of_mesh(name, taught, info), &taught_from_true, symmetric)?;
+    let known = Object::of_mesh(name, mesh.clone(), ModelInfo::of_mesh(mesh));
+    let found_with_true_mesh = scene.found(&known, &Pose::identity(), symmetric)?;
+    Ok(Row {
+        name: name.to_owned(),
+        photographs: a.photographs,
+        seed: a.seed,
+        diameter_mm: 1000.0 * mesh.diameter(),
+        camera_mm: median(&mut shifts).unwrap_or(f64::NAN),
+        camera_deg: median(&mut rotations).unwrap_or(f64::NAN),
+        mask_iou: median(&mut ious).unwrap_or(f64::NAN),
+        mesh_mm,
+        truth_mm,
+        with_depth: facts.with_depth,
+        symmetries: [sure.1.len(), sure.0.len()],
+        symmetries_true: [of_truth.1.len(), of_truth.0.len()],
+        found,
+        images: NEW_IMAGES,
+        found_with_true_mesh,
+        seconds,
+    })
+}
+
+fn compose(a: &Pose, b: &Pose) -> Pose {
+    Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
+}
+
+fn jpeg(image: &RgbImage) -> Result<Vec<u8>> {
+    let (w, h) = image.size();
+    let copy =
+        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
+    let mut bytes = vec![];
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 90).encode_image(&copy)?;
+    Ok(bytes)
+}
+
+/// Points of the true surface that a photograph shows.
+fn seen_points(there: &Mesh, capture: &SimulatedCapture<'_>, camera: &Camera) -> Vec<Vec3> {
+    let points = there.sample_surface(30_000, 2).points;
+    let camera = camera.without_distortion();
+    let mut seen = vec![false; points.len()];
+    for pose in &capture.camera_from_board {
+        let depth = sixfold_render::render_depth(there, pose, &camera);
+        for (point, seen) in points.iter().zip(&mut seen) {
+            let p = pose.transform_point(point);
+            let Some(pixel) = camera.project(&p) else { continue };
+            let front = depth.get(pixel.x.round().max(0.0) as usize, pixel.y.round().max(0.0) as usize);
+            *seen |= front.is_some_and(|d| *d > 0.0 && p.z < f64::from(*d) + 0.0015);
+        }
+    }
+    points.into_iter().zip(seen).filter(|(_, seen)| *seen).map(|(p, _)| p).collect()
+}
+
+/// Mean distances in millimetres: of the mesh where it is above the sheet to the truth, and of the truth where it is seen to the mesh.
+fn distances(found: &Mesh, there: &Mesh, seen: &[Vec3]) -> [f64; 2] {
+    let (found, truth) = (found.sample_surface(100_000, 1).points, there.sample_surface(100_000, 3).points);
+    let mean = |from: &[Vec3], to: &[Vec3]| {
+        let tree = KdTree::new(to);
+        let all: Vec<f64> =
+            from.iter().filter(|p| p.z > 0.003).filter_map(|p| tree.nearest(p)).map(|n| n.distance).collect();
+        1000.0 * all.iter().sum::<f64>() / all.len().max(1) as f64
+    };
+    [mean(&found, &truth), mean(seen, &found)]
+}
+
+/// New depth images of an object that stands among others.
+struct NewScenes<'a> {
+    mesh: &'a Mesh,
+    others: &'a [&'a Mesh],
+    seed: u64,
+}
+
+impl NewScenes<'_> {
+    /// In how many of them an object is found. `known_from_true` takes points of the true mesh to the known object's frame.
+    fn found(&self, known: &Object, known_from_true: &Pose, symmetric: bool) -> Result<usize> {
+        let estimator = PpfEstimator::default();
+        let prepared = estimator.prepare(known)?;
+        let points = ModelPoints::new(&self.mesh.sample_surface(2000, 5).points).context("no points")?;
+        let mut right = 0;
+        for number in 0..NEW_IMAGES {
+            let (camera, depth, truth) = self.image(number);
+            let depth = Arc::new(PreparedDepth::new(&depth, &camera, &estimator.depth_options())?);
+            let query = Query { depth: Some(&depth), ..Query::new(&camera) };
+            let estimates = estimator.estimate(prepared.as_ref(), &query)?;
+            let Some(best) = estimates.first() else { continue };
+            let camera_from_true = compose(&best.camera_from_object, known_from_true);
+            let error = add_s(&points, symmetric, &camera_from_true, &truth);
+            right += usize::from(error < RIGHT * self.mesh.diameter());
+        }
+        Ok(right)
+    }
+
+    /// A simulated depth image and the object's pose in it.
+    fn image(&self, number: usize) -> (Camera, DepthImage, Pose) {
+        let camera =
+            Camera { fx: 570.0, fy: 570.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
+        let upright = |angle: f64, x: f64, y: f64, mesh: &Mesh| {
+            let (low, high) = mesh.bounding_box();
+            let rotation = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), angle);
+            let foot = Vec3::new(0.5 * (low.x + high.x), 0.5 * (low.y + high.y), low.z);
+            Pose::new(rotation, Vec3::new(x, y, 0.0) - rotation * foot)
+        };
+        let turn = 1.3 * number as f64 + self.seed as f64;
+        let radius = |mesh: &Mesh| {
+            let (low, high) = mesh.bounding_box();
+            0.5 * (high - low).xy().norm()
+        };
+        let mut placed = vec![(self.mesh, upright(turn, 0.0, 0.0, self.mesh))];
+        for (k, other) in self.others.iter().enumerate() {
+            // Beside the object, nearly touching: one before it, one behind.
+            let apart = 0.85 * (radius(self.mesh) + radius(other));
+            let angle = turn * 0.7 + if k == 0 { 0.4 } else { 3.6 };
+            placed.push((*other, upright(2.0 * turn, apart * angle.cos(), apart * angle.sin(), other)));
+        }
+        let table = [[-0.6, -0.6], [0.6, -0.6], [0.6, 0.6], [-0.6, 0.6]].map(|[x, y]| Vec3::new(x, y, 0.0));
+        let table = Mesh::new(table.to_vec(), vec![[0, 1, 2], [0, 2, 3]]);
+        let tilt = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), 2.2 + 0.1 * (number % 3) as f64);
+        let camera_from_table = Pose::new(tilt, Vec3::new(0.02 * number as f64 - 0.04, 0.03, 0.75));
+        let mut objects: Vec<SceneObject<'_>> = placed
+            .iter()
+            .map(|(mesh, pose)| SceneObject { mesh, camera_from_object: compose(&camera_from_table, pose) })
+            .collect();
+        let truth = objects[0].camera_from_object;
+        if let Ok(table) = &table {
+            objects.push(SceneObject { mesh: table, camera_from_object: camera_from_table });
+        }
+        let mut buffer = VisibilityBuffer::new(&camera);
+        buffer.render(&objects, &Default::default());
+        let (depth, normals) = (buffer.depth(), buffer.normals(&objects));
+        let noisy = simulate_depth(&depth, &normals, &DepthSensor::realsense(), self.seed + number as u64);
+        (camera, noisy, truth)
+    }
+}
+
+fn print(all: &Report) {
+    println!(
+        "{:<14} {:>8} {:>8} {:>7} {:>6} {:>8} {:>8} {:>6} {:>10} {:>8} {:>9} {:>5}",
+        "object",
+        "diam mm",
+        "cam mm",
+        "cam deg",
+        "IoU",
+        "mesh mm",
+        "truth mm",
+        "depth",
+        "symmetries",
+        "found",
+        "true mesh",
+        "s"
+    );
+    for r in &all.objects {
+        println!(
+            "{:<14} {:>8.1} {:>8.3} {:>7.3} {:>6.3} {:>8.2} {:>8.2} {:>6.2} {:>4}+{} of {}+{} {:>5}/{} {:>7}/{} {:>5.0}",
+            r.name,
+            r.diameter_mm,
+            r.camera_mm,
+            r.camera_deg,
+            r.mask_iou,
+            r.mesh_mm,
+            r.truth_mm,
+            r.with_depth,
+            r.symmetries[0],
+            r.symmetries[1],
+            r.symmetries_true[0],
+            r.symmetries_true[1],
+            r.found,
+            r.images,
+            r.found_with_true_mesh,
+            r.images,
+            r.seconds
+        );
+    }
+    println!(
+        "median camera {:.3} mm, {:.3} degrees; mean mesh {:.2} mm, truth {:.2} mm; found {} of {}, with the true mesh {}",
+        all.camera_mm_median,
+        all.camera_deg_median,
+        all.mesh_mm_mean,
+        all.truth_mm_mean,
+        all.found,
+        all.images,
+        all.found_with_true_mesh
+    );
+}

@@ -1,0 +1,336 @@
+//! Objects taught from simulated photographs with exact truth, and photographs that cannot teach any.
+
+use std::sync::{Arc, OnceLock};
+
+use sixfold_board::{Board, Paper};
+use sixfold_estimator::ObjectStore;
+use sixfold_geometry::{Camera, Image, KdTree, Mask, Pose, RgbImage, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
+use sixfold_teach::{
+    By, Capture, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, TeachError, TeachOptions,
+    Teaching, export_bop, photographs_of, reconstruct, segment,
+};
+
+/// A body with a step: a wide foot and a narrow head beside its middle; no rotation maps it onto itself.
+fn body() -> Mesh {
+    let cuboid = |low: [f64; 3], high: [f64; 3]| {
+        let corner = |i: usize| {
+            let pick = |k: usize| if i >> k & 1 == 0 { low[k] } else { high[k] };
+            Vec3::new(pick(0), pick(1), pick(2))
+        };
+        let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
+        Mesh::new((0..8).map(corner).collect(), faces).unwrap()
+    };
+    let parts = [
+        cuboid([-0.045, -0.03, 0.0], [0.045, 0.03, 0.045]),
+        cuboid([-0.01, -0.02, 0.045], [0.04, 0.02, 0.1]),
+    ];
+    let colors = [[190, 60, 40], [40, 110, 170]];
+    let painted = parts
+        .iter()
+        .zip(colors)
+        .map(|(mesh, color)| mesh.clone().with_colors(vec![color; mesh.vertices().len()]).unwrap());
+    Mesh::merged(&painted.collect::<Vec<_>>()).unwrap()
+}
+
+fn options() -> SimulationOptions {
+    let camera =
+        Camera { fx: 620.0, fy: 618.0, cx: 322.0, cy: 238.0, width: 640, height: 480, distortion: None };
+    SimulationOptions { photographs: 10, camera, motion: 0.5, blur: 0.5, ..SimulationOptions::default() }
+}
+
+fn ground() -> RgbImage {
+    Image::from_fn(64, 64, |x, y| [90 + 30 * ((x / 8 + y / 8) % 2) as u8, 85, 70])
+}
+
+/// The photographs of all tests, as PNG files, and the truth.
+struct Photographs {
+    files: Vec<Vec<u8>>,
+    images: Vec<RgbImage>,
+    camera_from_board: Vec<Pose>,
+    board_from_object: Pose,
+    masks: Vec<Mask>,
+}
+
+fn photographs() -> &'static Photographs {
+    static ONCE: OnceLock<Photographs> = OnceLock::new();
+    ONCE.get_or_init(|| {
+        let (mesh, ground, options) = (body(), ground(), options());
+        let capture = SimulatedCapture::new(&mesh, &Board::new(Paper::A4), &ground, &options, 3);
+        let images: Vec<RgbImage> = (0..10).map(|i| capture.photograph(i).unwrap()).collect();
+        assert!(capture.photograph(10).is_none());
+        Photographs {
+            files: images.iter().map(png).collect(),
+            images,
+            camera_from_board: capture.camera_from_board.clone(),
+            board_from_object: capture.board_from_object,
+            masks: (0..10).map(|i| capture.mask(i).unwrap()).collect(),
+        }
+    })
+}
+
+fn png(image: &RgbImage) -> Vec<u8> {
+    let (w, h) = image.size();
+    let copy =
+        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
+    let mut bytes = std::io::Cursor::new(vec![]);
+    copy.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    bytes.into_inner()
+}
+
+/// The network that the program carries, with a count of its calls.
+struct Salient(SalientSegmenter, std::sync::atomic::AtomicUsize);
+
+impl Salient {
+    fn new() -> Salient {
+        Salient(SalientSegmenter::shipped().unwrap(), Default::default())
+    }
+
+    fn calls(&self) -> usize {
+        self.1.load(std::sync::atomic::Ordering::Relaxed)
+    }
+}
+
+impl Segmenter for Salient {
+    fn foreground(&self, image: &RgbImage) -> Result<Image<f32>, Box<dyn std::error::Error + Send + Sync>> {
+        self.1.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        self.0.foreground(image)
+    }
+}
+
+fn coarse() -> ShapeOptions {
+    ShapeOptions { fine_side: 320, coarse_cells: 72, fine_cells: 90, faces: 6000, ..ShapeOptions::default() }
+}
+
+/// Mean distances in metres, both ways, of what is above the board by a few millimetres.
+fn distances(found: &Mesh, truth: &Mesh) -> [f64; 2] {
+    let points = |mesh: &Mesh, seed: u64| mesh.sample_surface(20_000, seed).points;
+    let (a, b) = (points(found, 1), points(truth, 2));
+    let mean = |from: &[Vec3], to: &[Vec3]| {
+        let tree = KdTree::new(to);
+        let above: Vec<&Vec3> = from.iter().filter(|p| p.z > 0.004).collect();
+        above.iter().filter_map(|p| tree.nearest(p)).map(|n| n.distance).sum::<f64>() / above.len() as f64
+    };
+    [mean(&a, &b), mean(&b, &a)]
+}
+
+fn teach(folder: &std::path::Path, salient: &Salient) -> Teaching {
+    let camera = Some(options().camera);
+    let mut teaching = Teaching::open(folder, &TeachOptions { camera, ..TeachOptions::default() }).unwrap();
+    for (i, file) in photographs().files.iter().enumerate() {
+        assert_eq!(teaching.add_photograph(&format!("p{i}.png"), file).unwrap(), i);
+    }
+    teaching.locate(&()).unwrap();
+    teaching.find_masks(salient, &coarse(), &()).unwrap();
+    teaching.reconstruct(&coarse(), &()).unwrap();
+    teaching
+}
+
+#[test]
+fn a_body_is_taught_stored_and_exported_and_a_second_run_does_nothing_again() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let salient = Salient::new();
+    let teaching = teach(&dir.path().join("work"), &salient);
+    for (i, pose) in truth.camera_from_board.iter().enumerate() {
+        let found = teaching.camera_from_board(i).unwrap();
+        let centre = |p: &Pose| p.inverse().translation();
+        assert!((centre(&found) - centre(pose)).norm() < 1.5e-3, "photograph {i}");
+        let mask = teaching.mask(i).unwrap().unwrap();
+        let pairs = || mask.as_slice().iter().zip(truth.masks[i].as_slice());
+        let (both, either) =
+            (pairs().filter(|(a, b)| **a && **b).count(), pairs().filter(|(a, b)| **a || **b).count());
+        assert!(both as f64 > 0.93 * either as f64, "photograph {i}: {both} of {either}");
+    }
+    let mesh = teaching.mesh().unwrap();
+    let rows = teaching.shape().unwrap().board_from_object;
+    let origin = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
+    let there = body().transformed(&truth.board_from_object);
+    let [found, missing] = distances(&mesh.transformed(&origin), &there);
+    // Ten silhouettes leave something in the corner between foot and head; the truth has faces inside, where the two touch.
+    assert!(found < 4e-3 && missing < 5.5e-3, "{found} {missing}");
+    // The head is blue, the foot red.
+    let (low, high) = mesh.bounding_box();
+    let colors = mesh.colors().unwrap();
+    for (vertex, [r, _, b]) in mesh.vertices().iter().zip(colors) {
+        let height = (vertex.z - low.z) / (high.z - low.z);
+        assert!(height > 0.4 || r > b, "{height} {r} {b}");
+        assert!(height < 0.7 || b > r, "{height} {r} {b}");
+    }
+    let unseen = teaching.shape().unwrap().unseen;
+    assert!(unseen > 0.05 && unseen < 0.4, "the bottom is in no photograph: {unseen}");
+    let store = ObjectStore::new(dir.path().join("store"));
+    let stored = teaching.store(&store, "body", false, |_| Ok(())).unwrap();
+    assert_eq!((stored.photographs, stored.record.symmetries_discrete.len()), (10, 0));
+    assert!(matches!(teaching.store(&store, "body", false, |_| Ok(())), Err(TeachError::Store(_))));
+    let picture = teaching.picture().unwrap();
+    let blue = picture.as_slice().iter().filter(|c| **c == [0, 220, 255]).count();
+    assert!(blue > 2000, "the outline of the mesh in ten photographs: {blue} pixels");
+    let object = store.load("body").unwrap();
+    assert!(photographs_of(&object).is_some());
+    assert_eq!(export_bop(&object, 7, &dir.path().join("bop")).unwrap(), 10);
+    let dataset = sixfold_bop::BopDataset::open(&dir.path().join("bop"), "train_real").unwrap();
+    let scene = dataset.scene(1).unwrap();
+    let pose = scene.image(4).unwrap().ground_truth[0].camera_from_object;
+    let expected = truth.camera_from_board[4].transform_point(&origin.translation());
+    assert!((pose.translation() - expected).norm() < 2e-3);
+    drop(teaching);
+    // Once more: everything is there.
+    let calls = salient.calls();
+    let again = teach(&dir.path().join("work"), &salient);
+    assert_eq!(salient.calls(), calls);
+    assert_eq!(again.mesh().unwrap(), mesh);
+}
+
+#[test]
+fn corrections_are_kept_and_what_they_change_is_made_again() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let mut teaching =
+        Teaching::open(dir.path(), &TeachOptions { camera: Some(options().camera), ruler: None }).unwrap();
+    for (i, file) in truth.files.iter().enumerate() {
+        teaching.add_photograph(&format!("p{i}.png"), file).unwrap();
+    }
+    assert!(matches!(teaching.mesh(), Err(TeachError::Order { .. })));
+    assert!(matches!(teaching.find_masks(&Salient::new(), &coarse(), &()), Err(TeachError::Order { .. })));
+    teaching.locate(&()).unwrap();
+    for (i, mask) in truth.masks.iter().enumerate() {
+        teaching.set_mask(i, mask).unwrap();
+    }
+    let small = Image::filled(3, 3, true);
+    assert!(matches!(teaching.set_mask(0, &small), Err(TeachError::MaskSize { .. })));
+    assert!(matches!(teaching.set_mask(99, &small), Err(TeachError::NoPhotograph { index: 99, .. })));
+    teaching.set_left_out(9, true).unwrap();
+    // With masks of all photographs nobody has to look for them.
+    let salient = Salient::new();
+    teaching.find_masks(&salient, &coarse(), &()).unwrap();
+    assert_eq!(salient.calls(), 0);
+    teaching.reconstruct(&coarse(), &()).unwrap();
+    drop(teaching);
+    let mut teaching = Teaching::open(dir.path(), &TeachOptions::default()).unwrap();
+    assert!(teaching.shape().is_some() && teaching.photographs()[9].left_out_by_person);
+    assert_eq!(teaching.photographs()[0].mask_by, Some(By::Person));
+    let pose = teaching.camera_from_board(0).unwrap();
+    teaching.set_pose(0, &pose).unwrap();
+    assert!(teaching.shape().is_none(), "the mesh is of the old pose");
+    assert_eq!(teaching.mask(0).unwrap().as_ref(), Some(&truth.masks[0]));
+    // Another photograph: poses that were found are found again, the given one stays.
+    teaching.add_photograph("p1.png", &truth.files[2]).unwrap();
+    assert_eq!(teaching.photographs()[0].pose_by, Some(By::Person));
+    assert_eq!(teaching.photographs()[2].pose_by, None);
+}
+
+/// What a capture says of its photographs with poses that are known.
+fn failure(photographs: Vec<PosedPhotograph>) -> TeachError {
+    let capture = Capture::on_board(photographs, Board::new(Paper::A4));
+    segment(&capture, &Salient::new(), &coarse(), &()).unwrap_err()
+}
+
+fn posed(images: &[RgbImage], poses: &[Pose]) -> Vec<PosedPhotograph> {
+    let of = |(image, pose): (&RgbImage, &Pose)| PosedPhotograph {
+        name: "photograph".to_owned(),
+        image: Arc::new(image.clone()),
+        depth: None,
+        mask: None,
+        camera: options().camera,
+        camera_from_world: *pose,
+    };
+    images.iter().zip(poses).map(of).collect()
+}
+
+#[test]
+fn photographs_that_teach_nothing_are_refused_with_what_to_do() {
+    let truth = photographs();
+    let few = failure(posed(&truth.images[..3], &truth.camera_from_board));
+    assert!(few.to_string().contains("found 3 photographs"), "{few}");
+    let one_side = vec![truth.images[0].clone(); 5];
+    let error = failure(posed(&one_side, &[truth.camera_from_board[0]; 5]));
+    assert!(error.to_string().contains("walk around"), "{error}");
+    // An empty board.
+    let speck =
+        Mesh::new(vec![Vec3::zeros(), Vec3::new(1e-4, 0.0, 0.0), Vec3::new(0.0, 1e-4, 0.0)], vec![[0, 1, 2]])
+            .unwrap();
+    let (ground, options) = (ground(), SimulationOptions { photographs: 6, ..options() });
+    let empty = SimulatedCapture::new(&speck, &Board::new(Paper::A4), &ground, &options, 5);
+    let images: Vec<RgbImage> = (0..6).map(|i| empty.photograph(i).unwrap()).collect();
+    let error = failure(posed(&images, &empty.camera_from_board));
+    assert!(matches!(error, TeachError::NoObject { .. }), "{error}");
+}
+
+#[test]
+fn two_objects_are_counted() {
+    let apart = |x: f64| body().scaled(0.6).transformed(&Pose::from_translation(Vec3::new(x, 0.0, 0.0)));
+    let both = Mesh::merged(&[apart(-0.055), apart(0.055)]).unwrap();
+    let (ground, options) = (ground(), SimulationOptions { photographs: 8, ..options() });
+    let capture = SimulatedCapture::new(&both, &Board::new(Paper::A4), &ground, &options, 5);
+    let images: Vec<RgbImage> = (0..8).map(|i| capture.photograph(i).unwrap()).collect();
+    let error = failure(posed(&images, &capture.camera_from_board));
+    assert!(matches!(error, TeachError::SeveralObjects { found: 2, .. }), "{error}");
+}
+
+#[test]
+fn files_that_are_no_photographs_are_refused_before_anything_is_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut teaching = Teaching::open(dir.path(), &TeachOptions::default()).unwrap();
+    let error = teaching.add_photograph("../../etc/passwd.jpg", b"text").unwrap_err();
+    assert!(error.to_string().contains("passwd.jpg"), "{error}");
+    assert!(teaching.photographs().is_empty() && !dir.path().join("photographs").exists());
+    // A path in a name leads nowhere: files have numbers.
+    teaching.add_photograph("../../p.png", &photographs().files[0]).unwrap();
+    assert!(dir.path().join("photographs/000000.png").is_file());
+    let depth = teaching.add_depth(0, &photographs().files[0], 1e-3).unwrap_err();
+    assert!(depth.to_string().contains("depth of"), "{depth}");
+    assert!(Teaching::open(dir.path(), &TeachOptions::default()).is_err(), "one process at a time");
+    drop(teaching);
+    std::fs::write(dir.path().join("teaching.json"), "{\"version\": 9}").unwrap();
+    let error = Teaching::open(dir.path(), &TeachOptions::default()).unwrap_err();
+    assert!(error.to_string().contains("teaching.json"), "{error}");
+}
+
+#[test]
+fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
+    // A box without a lid, from outside and above; its inside is seen by depth alone.
+    let wall = |low: [f64; 3], high: [f64; 3]| {
+        let corner = |i: usize| {
+            let pick = |k: usize| if i >> k & 1 == 0 { low[k] } else { high[k] };
+            Vec3::new(pick(0), pick(1), pick(2))
+        };
+        let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
+        Mesh::new((0..8).map(corner).collect(), faces).unwrap()
+    };
+    let (r, t, h) = (0.04, 0.008, 0.06);
+    let tub = Mesh::merged(&[
+        wall([-r, -r, 0.0], [r, r, t]),
+        wall([-r, -r, t], [-r + t, r, h]),
+        wall([r - t, -r, t], [r, r, h]),
+        wall([-r + t, -r, t], [r - t, -r + t, h]),
+        wall([-r + t, r - t, t], [r - t, r, h]),
+    ])
+    .unwrap();
+    let (ground, options) = (ground(), options());
+    let capture = SimulatedCapture::new(&tub, &Board::new(Paper::A4), &ground, &options, 8);
+    let there = tub.transformed(&capture.board_from_object);
+    let photographs: Vec<PosedPhotograph> = (0..10)
+        .map(|i| {
+            let pose = capture.camera_from_board[i];
+            PosedPhotograph {
+                name: format!("{i}"),
+                image: Arc::new(Image::filled(640, 480, [90; 3])),
+                depth: Some(Arc::new(sixfold_render::render_depth(&there, &pose, &options.camera))),
+                mask: Some(Arc::new(capture.mask(i).unwrap())),
+                camera: options.camera,
+                camera_from_world: pose,
+            }
+        })
+        .collect();
+    let capture = Capture::on_board(photographs, Board::new(Paper::A4));
+    let found = segment(&capture, &Salient::new(), &coarse(), &()).unwrap();
+    let shape = reconstruct(&capture, &found, &coarse(), &()).unwrap();
+    let mesh = shape.mesh.transformed(&shape.world_from_object);
+    let [found, missing] = distances(&mesh, &there);
+    assert!(found < 1.5e-3 && missing < 1.5e-3, "{found} {missing}");
+    assert!(shape.with_depth > 0.95);
+}
