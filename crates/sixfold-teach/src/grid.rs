@@ -106,7 +106,7 @@ impl Grid {
         let total: f32 = kernel.iter().sum();
         let mut values = self.values.clone();
         let strides = [1, self.size[0], self.size[0] * self.size[1]];
-        for k in 0..3 {
+        for (k, stride) in strides.into_iter().enumerate() {
             let source = values.clone();
             values.par_iter_mut().enumerate().for_each(|(index, value)| {
                 let here = self.place(index)[k] as isize;
@@ -114,7 +114,7 @@ impl Grid {
                 let mut sum = 0.0;
                 for (weight, offset) in kernel.iter().zip(-reach..=reach) {
                     let there = (here + offset).clamp(0, last) - here;
-                    let at = index.wrapping_add_signed(there * strides[k] as isize);
+                    let at = index.wrapping_add_signed(there * stride as isize);
                     sum += weight * source[at];
                 }
                 *value = sum / total;

@@ -170,7 +170,7 @@ fn write_model(mesh: &Mesh, info: ModelInfo, id: u32, dataset: &Path) -> Result<
     let folder = dataset.join("models");
     std::fs::create_dir_all(&folder)?;
     for (file, bytes) in ply_files(
-        &folder.join(format!("obj_{id:06}.ply")),
+        folder.join(format!("obj_{id:06}.ply")),
         mesh,
         Unit::Millimetre,
         PlyFormat::BinaryLittleEndian,

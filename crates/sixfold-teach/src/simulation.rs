@@ -74,7 +74,7 @@ impl<'a> SimulatedCapture<'a> {
     ) -> SimulatedCapture<'a> {
         let (low, high) = mesh.bounding_box();
         let mut random = stream(seed, 0);
-        let angle = f64::from(uniform(&mut random, [0.0, 6.28]));
+        let angle = f64::from(uniform(&mut random, [0.0, std::f32::consts::TAU]));
         let rotation = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), angle);
         let middle = Vec3::new(0.5 * (low.x + high.x), 0.5 * (low.y + high.y), low.z);
         let board_from_object = Pose::new(rotation, -(rotation * middle));
@@ -266,7 +266,7 @@ impl Shadow {
 /// The way of half the motion in the finer image, pixels.
 fn motion_step(most: f64, random: &mut sixfold_geometry::random::Random) -> Vec2 {
     let length = most * f64::from(uniform(random, [0.0, 1.0]));
-    let angle = f64::from(uniform(random, [0.0, 6.28]));
+    let angle = f64::from(uniform(random, [0.0, std::f32::consts::TAU]));
     Vec2::new(length * angle.cos(), length * angle.sin())
 }
 

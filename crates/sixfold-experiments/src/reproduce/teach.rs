@@ -309,7 +309,7 @@ impl NewScenes<'_> {
             let estimates = estimator.estimate(prepared.as_ref(), &query)?;
             let Some(best) = estimates.first() else { continue };
             let camera_from_true = compose(&best.camera_from_object, known_from_true);
-            let error = add_s(&points, symmetric, &camera_from_true, &truth);
+            let error = add_s(&points, symmetric, camera_from_true, truth);
             right += usize::from(error < RIGHT * self.mesh.diameter());
         }
         Ok(right)
