@@ -66,6 +66,15 @@ pub fn depth_scale(text: &str) -> Result<f64, String> {
     scale.ok_or_else(|| format!("found {text}, expected millimetres above 0, at most 1000"))
 }
 
+/// Parses the noise of a surface in millimetres.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn surface_noise(text: &str) -> Result<f64, String> {
+    let noise = text.parse().ok().filter(|noise: &f64| (0.0..=100.0).contains(noise));
+    noise.ok_or_else(|| format!("found {text}, expected millimetres, 0 to 100"))
+}
+
 /// Parses the name of a folder within another, such as a split of a dataset.
 ///
 /// # Errors

@@ -96,7 +96,7 @@ pub(crate) struct AddArguments {
         conflicts_with_all = ["turns_about", "depth"])]
     pub find_symmetries: Option<Evidence>,
     /// Noise of the mesh's surface, standard deviation in millimetres, for --find-symmetries
-    #[arg(long, value_name = "MM", default_value_t = 0.0, requires = "find_symmetries")]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, requires = "find_symmetries", conflicts_with = "depth", value_parser = ranges::surface_noise)]
     pub noise: f64,
     /// Replace an object of the same name
     #[arg(long)]

@@ -13,7 +13,7 @@ use sixfold_mesh::{
 };
 use sixfold_plot::{Canvas, INK};
 use sixfold_shell::output::{JsonArguments, pose_rows, report};
-use sixfold_shell::{Outcome, objects};
+use sixfold_shell::{Outcome, objects, ranges};
 
 use super::arguments::AddArguments;
 use sixfold_render::portrait;
@@ -37,7 +37,7 @@ pub(crate) struct SymmetriesArguments {
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
     /// Noise of the mesh's surface, standard deviation in millimetres: 1 for a mesh from photographs or depth images
-    #[arg(long, value_name = "MM", default_value_t = 0.0)]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = ranges::surface_noise)]
     pub noise: f64,
     /// Image to write: the object beside itself, rotated by each symmetry
     #[arg(long, value_name = "FILE.png")]
