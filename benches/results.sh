@@ -8,7 +8,7 @@
 # SIXFOLD is the program, DATA the folder with lmo/, meshes/, tabletop_objects/ (DIR in the commands that are written).
 # A part whose file exists is kept, and so is each command that is done (in WORK): stopped, the same line goes on.
 #
-#   --parts A,B      only these parts (default: all but dgcm, see PARTS below)
+#   --parts A,B      only these parts (default: all but dgcm and teach, see PARTS below)
 #   --threads N      threads of the program (default: 1; the values are the same for any number)
 #   --work DIR       folder for what the commands write (OUT in the commands; default: out/results)
 #   --commit NAME    what to write as the commit (default: git's HEAD); a work folder belongs to one commit
@@ -17,8 +17,8 @@
 set -euo pipefail
 
 PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose views auto detector grasp experience nol)
-# Asked for by name only: chapter 6 in small, about eight minutes more.
-MORE=(dgcm)
+# Asked for by name only: chapter 6 in small, about eight minutes more; twelve objects taught, about fifteen.
+MORE=(dgcm teach)
 
 usage() {
     sed -n '2,/^set /{/^# \{0,1\}/s///p}' "${BASH_SOURCE[0]}"
@@ -336,6 +336,12 @@ part_auto() {
     typed "sixfold reproduce auto --dataset $scenes --absent 6 --disturb --given depth --out OUT/auto-depth --json OUT/auto-depth.json"
     typed "sixfold reproduce auto --dataset data/demo --given depth both --out OUT/auto-demo --json OUT/auto-demo.json"
     freeze auto 202 simulated=auto-depth.json samples=auto-demo.json
+}
+
+# Objects taught from simulated photographs.
+part_teach() {
+    typed "sixfold reproduce teach --list benches/teach-objects.json --meshes DIR/meshes --ground DIR/backgrounds/103041.jpg --out OUT/teach --json OUT/teach.json"
+    freeze teach 7 taught=teach.json
 }
 
 # Poses from colour in ground-truth boxes and in a detector's.

@@ -4,26 +4,35 @@ use sixfold_geometry::{Image, Mask, Vec3};
 
 use crate::distance::signed_distance;
 use crate::grid::Grid;
+use crate::silhouette::without_holes;
 use crate::view::{View, Volume, bilinear};
 
-/// From this many photographs on, one of them may be wrong anywhere.
+/// From this many photographs on, a hole in one mask alone is none.
 const ONE_MAY_BE_WRONG: usize = 12;
 
 /// A view with the signed distance to its mask's border.
 pub(crate) struct Outlined<'a> {
-    pub view: &'a View,
-    pub distance: Image<f32>,
+    view: &'a View,
+    /// To the outer border: holes count as inside.
+    outer: Image<f32>,
+    /// To any border; `None` where the mask has no hole.
+    any: Option<Image<f32>>,
 }
 
 impl<'a> Outlined<'a> {
     pub fn new(view: &'a View, mask: &Mask) -> Outlined<'a> {
-        Outlined { view, distance: signed_distance(mask) }
+        let filled = without_holes(mask);
+        let any = (filled != *mask).then(|| signed_distance(mask));
+        Outlined { view, outer: signed_distance(&filled), any }
     }
 
-    /// How far a point is outside the cone of the mask, metres; `None` where the view does not show it.
-    fn outside(&self, point: &Vec3) -> Option<f32> {
+    /// How far a point is outside the cones of the outer border and of the mask, metres; `None` where the view does not show it.
+    fn outside(&self, point: &Vec3) -> Option<[f32; 2]> {
         let (pixel, depth) = self.view.project(point)?;
-        Some(bilinear(&self.distance, pixel.x, pixel.y) * (depth / self.view.camera.fx) as f32)
+        let scale = (depth / self.view.camera.fx) as f32;
+        let outer = bilinear(&self.outer, pixel.x, pixel.y) * scale;
+        let any = self.any.as_ref().map_or(outer, |any| bilinear(any, pixel.x, pixel.y) * scale);
+        Some([outer, any])
     }
 }
 
@@ -32,16 +41,17 @@ impl<'a> Outlined<'a> {
 pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor: Option<f64>) -> Grid {
     let ignored = usize::from(views.len() >= ONE_MAY_BE_WRONG);
     Grid::new(volume, cells, |point| {
-        // The two largest distances.
-        let mut largest = [f32::NEG_INFINITY; 2];
-        for distance in views.iter().filter_map(|view| view.outside(point)) {
+        // Beyond the outer border of one mask is outside; a hole has to be seen in two, lest one wrong mask drills through.
+        let (mut outer, mut largest) = (f32::NEG_INFINITY, [f32::NEG_INFINITY; 2]);
+        for [beyond, distance] in views.iter().filter_map(|view| view.outside(point)) {
+            outer = outer.max(beyond);
             if distance > largest[0] {
                 largest = [distance, largest[0]];
             } else if distance > largest[1] {
                 largest[1] = distance;
             }
         }
-        let distance = if largest[ignored].is_finite() { largest[ignored] } else { largest[0] };
+        let distance = outer.max(largest[ignored]);
         let distance = if distance.is_finite() { distance } else { volume.size().max() as f32 };
         floor.map_or(distance, |floor| distance.max((floor - point.z) as f32))
     })

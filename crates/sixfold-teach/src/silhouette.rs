@@ -420,6 +420,17 @@ fn without_specks(mask: &Mask) -> Mask {
     out
 }
 
+/// A mask with everything that it encloses.
+pub(crate) fn without_holes(mask: &Mask) -> Mask {
+    let (w, h) = mask.size();
+    let mut filled = mask.clone();
+    let at_border = |i: &usize| i % w == 0 || i % w == w - 1 || i / w == 0 || i / w == h - 1;
+    for hole in parts(mask, false).iter().filter(|hole| !hole.iter().any(at_border)) {
+        hole.iter().for_each(|i| filled.as_mut_slice()[*i] = true);
+    }
+    filled
+}
+
 /// Connected pixels of a value, largest part first.
 fn parts(mask: &Mask, of: bool) -> Vec<Vec<usize>> {
     let (w, h) = mask.size();
