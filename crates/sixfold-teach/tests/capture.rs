@@ -12,17 +12,18 @@ use sixfold_teach::{
     Teaching, export_bop, photographs_of, reconstruct, segment,
 };
 
+fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
+    let corner = |i: usize| {
+        let pick = |k: usize| if (i >> k) & 1 == 0 { low[k] } else { high[k] };
+        Vec3::new(pick(0), pick(1), pick(2))
+    };
+    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
+    Mesh::new((0..8).map(corner).collect(), faces).unwrap()
+}
+
 /// A body with a step: a wide foot and a narrow head beside its middle; no rotation maps it onto itself.
 fn body() -> Mesh {
-    let cuboid = |low: [f64; 3], high: [f64; 3]| {
-        let corner = |i: usize| {
-            let pick = |k: usize| if i >> k & 1 == 0 { low[k] } else { high[k] };
-            Vec3::new(pick(0), pick(1), pick(2))
-        };
-        let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-        let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
-        Mesh::new((0..8).map(corner).collect(), faces).unwrap()
-    };
     let parts = [
         cuboid([-0.045, -0.03, 0.0], [0.045, 0.03, 0.045]),
         cuboid([-0.01, -0.02, 0.045], [0.04, 0.02, 0.1]),
@@ -292,22 +293,13 @@ fn files_that_are_no_photographs_are_refused_before_anything_is_kept() {
 #[test]
 fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
     // A box without a lid, from outside and above; its inside is seen by depth alone.
-    let wall = |low: [f64; 3], high: [f64; 3]| {
-        let corner = |i: usize| {
-            let pick = |k: usize| if i >> k & 1 == 0 { low[k] } else { high[k] };
-            Vec3::new(pick(0), pick(1), pick(2))
-        };
-        let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-        let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
-        Mesh::new((0..8).map(corner).collect(), faces).unwrap()
-    };
     let (r, t, h) = (0.04, 0.008, 0.06);
     let tub = Mesh::merged(&[
-        wall([-r, -r, 0.0], [r, r, t]),
-        wall([-r, -r, t], [-r + t, r, h]),
-        wall([r - t, -r, t], [r, r, h]),
-        wall([-r + t, -r, t], [r - t, -r + t, h]),
-        wall([-r + t, r - t, t], [r - t, r, h]),
+        cuboid([-r, -r, 0.0], [r, r, t]),
+        cuboid([-r, -r, t], [-r + t, r, h]),
+        cuboid([r - t, -r, t], [r, r, h]),
+        cuboid([-r + t, -r, t], [r - t, -r + t, h]),
+        cuboid([-r + t, r - t, t], [r - t, r, h]),
     ])
     .unwrap();
     let (ground, options) = (ground(), options());
