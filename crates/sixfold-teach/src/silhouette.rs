@@ -424,7 +424,7 @@ fn without_specks(mask: &Mask) -> Mask {
 pub(crate) fn without_holes(mask: &Mask) -> Mask {
     let (w, h) = mask.size();
     let mut filled = mask.clone();
-    let at_border = |i: &usize| i % w == 0 || i % w == w - 1 || i / w == 0 || i / w == h - 1;
+    let at_border = |i: &usize| [0, w - 1].contains(&(i % w)) || [0, h - 1].contains(&(i / w));
     for hole in parts(mask, false).iter().filter(|hole| !hole.iter().any(at_border)) {
         hole.iter().for_each(|i| filled.as_mut_slice()[*i] = true);
     }
