@@ -1,4 +1,4 @@
-// The page Objects: what is stored, a mesh that can be turned, adding and removing.
+// The page Objects: what is stored, a mesh that can be rotated, adding and removing.
 
 import { ask, byId, element, json, run, showProblem } from "/static/api.js";
 
@@ -89,7 +89,7 @@ async function view(object) {
     viewer = null;
     byId("viewer").replaceChildren(
       element("img", { src: object.links.thumbnail, alt: "" }),
-      element("p", {}, [`It cannot be turned here: ${problem.message}`]),
+      element("p", {}, [`It cannot be rotated here: ${problem.message}`]),
     );
   }
 }

@@ -1,4 +1,4 @@
-// A mesh that can be turned. The mesh is the server's binary PLY: float positions, perhaps normals and colours; triangles.
+// A mesh that can be rotated. The mesh is the server's binary PLY: float positions, perhaps normals and colours; triangles.
 
 import {
   AmbientLight, BufferAttribute, BufferGeometry, DirectionalLight, DoubleSide, Mesh, MeshLambertMaterial, PerspectiveCamera,
@@ -55,7 +55,7 @@ export function parsePly(buffer) {
   return geometry;
 }
 
-/** A view of one mesh in a place of the page: turned by dragging and arrow keys, zoomed by wheel and pinch. */
+/** A view of one mesh in a place of the page: rotated by dragging and arrow keys, zoomed by wheel and pinch. */
 export class Viewer {
   constructor(place) {
     this.place = place;
@@ -63,7 +63,7 @@ export class Viewer {
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(35, 1, 0.001, 100);
     this.scene.add(new AmbientLight(0xffffff, 1.6));
-    // From the camera, so that what faces it is bright however the object is turned.
+    // From the camera, so that what faces it is bright in any orientation of the object.
     const light = new DirectionalLight(0xffffff, 2.2);
     light.position.set(0.4, 0.6, 1);
     this.scene.add(light);

@@ -16,7 +16,7 @@ use utoipa::ToSchema;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// Whoever reaches another address than this machine's own needs to be told apart.
+    /// Whoever reaches another address than this machine's own needs to be distinguished.
     #[error(
         "--host {host}: any machine of the network could use this server, and no token is set; give --token TOKEN (16 characters or \
          more: `openssl rand -hex 16` prints one) or set SIXFOLD_TOKEN, or leave --host at 127.0.0.1"

@@ -26,7 +26,7 @@ use crate::{access, health, jobs, objects, openapi, pages, tasks};
 const HEAD_TIMEOUT: Duration = Duration::from_secs(15);
 /// So long the server waits at its end for answers that are being sent.
 const LAST_ANSWERS: Duration = Duration::from_secs(3);
-/// How often the caller's wish to stop is looked at.
+/// How often the caller's wish to stop is checked.
 const POLL: Duration = Duration::from_millis(50);
 /// A pause after the system refused a connection, for lack of file descriptors say.
 const PAUSE: Duration = Duration::from_millis(100);

@@ -56,3 +56,47 @@ pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor:
         floor.map_or(distance, |floor| distance.max((floor - point.z) as f32))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, Pose};
+
+    use super::*;
+
+    /// A view along z from half a metre, whose mask is a square of 40 pixels (40 mm) or narrower, with or without a hole.
+    fn view() -> View {
+        let camera =
+            Camera { fx: 500.0, fy: 500.0, cx: 39.5, cy: 39.5, width: 80, height: 80, distortion: None };
+        let pose = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
+        let eye = pose.inverse().translation();
+        let image = Image::filled(80, 80, [0; 3]);
+        View { image, camera, camera_from_world: pose, eye, depth: None, mask: None }
+    }
+
+    fn square(half: f64, hole: bool) -> Mask {
+        Image::from_fn(80, 80, |x, y| {
+            let far = (x as f64 - 39.5).abs().max((y as f64 - 39.5).abs());
+            far < half && !(hole && far < 6.0)
+        })
+    }
+
+    fn at(masks: &[Mask], point: Vec3) -> f32 {
+        let view = view();
+        let outlined: Vec<Outlined<'_>> = masks.iter().map(|mask| Outlined::new(&view, mask)).collect();
+        let volume = Volume { low: point, high: point + Vec3::repeat(1e-3) };
+        hull(&outlined, &volume, 1, None).values[0]
+    }
+
+    #[test]
+    fn one_narrow_mask_cuts_and_one_hole_alone_does_not() {
+        let mut masks = vec![square(20.0, false); ONE_MAY_BE_WRONG];
+        let (beside, middle) = (Vec3::new(0.015, 0.0, 0.0), Vec3::zeros());
+        assert!(at(&masks, beside) < -0.003 && at(&masks, middle) < -0.015);
+        masks[3] = square(10.0, false);
+        assert!(at(&masks, beside) > 0.003, "15 mm from the middle is 5 mm outside the narrow mask");
+        masks[3] = square(20.0, true);
+        assert!(at(&masks, middle) < -0.015, "a hole in one mask is none");
+        masks[7] = square(20.0, true);
+        assert!(at(&masks, middle) > 0.003, "a hole in two masks is one");
+    }
+}

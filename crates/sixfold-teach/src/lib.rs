@@ -2,7 +2,7 @@
 //!
 //! [`locate`] finds camera and poses from the board, [`segment`] the object in every photograph (what stands out, what hides the
 //! print of the board, and what all photographs agree on), [`reconstruct`] a closed, coloured mesh: the visual hull, cut where
-//! photographs or measured depth show it to be hollow. [`Teaching`] keeps all steps in a folder, so that each can be looked at,
+//! photographs or measured depth show it to be hollow. [`Teaching`] keeps all steps in a folder, so that each can be inspected,
 //! corrected and resumed, and stores the object for all methods. [`simulation`] takes such photographs with exact truth.
 //!
 //! The world's frame is the board's: origin in the middle of the tags, z out of the sheet; metres. The object's frame has its

@@ -29,7 +29,7 @@ const NOISE: f64 = 0.004;
 pub struct Stored {
     /// Its record.
     pub record: ObjectRecord,
-    /// Symmetries that were looked at, with evidence; the sure ones are stored.
+    /// Symmetries that were examined, with evidence; the sure ones are stored.
     pub symmetries: Vec<FoundSymmetry>,
     /// How many photographs are kept.
     pub photographs: usize,

@@ -1,5 +1,5 @@
-//! A folder in which an object is taught: photographs go in, and every step's result is kept, so that a run that was killed goes on
-//! where it was, and a person can look at each step and correct it.
+//! A folder in which an object is taught: photographs go in, every step's result is kept, so that a killed run resumes, and a person can
+//! inspect and correct each step.
 //!
 //! | file | what it holds |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! An axis and how it is moved until rotations about it leave the least between an object and itself.
+//! An axis and how it is moved until rotations about it minimise the distance between an object and itself.
 //!
 //! As in iterative closest points (Chen and Medioni 1992): a residual is the distance of a rotated point to the surface, along
 //! the normal there. The unknowns are those that matter: two rotations of the axis across itself and two shifts across it.

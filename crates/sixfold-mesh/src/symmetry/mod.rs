@@ -2,7 +2,7 @@
 //!
 //! Axes are proposed by a scan of all directions (`scan.rs`), refined on the surface (`axis.rs`), tested for every order and for
 //! any angle, and completed to a group (`search.rs`). Each comes with its evidence: how far rotated points are from the
-//! surface, and how much colours differ. Reflections are no rotations and are not looked for: no object can be turned into
+//! surface, and how much colours differ. Reflections are no rotations and are not searched: no object can be rotated into
 //! its mirror image.
 //!
 //! Candidates by moments: after Martinet et al. 2006; proposals that are verified on the surface: after Mitra et al. 2006. What
@@ -29,7 +29,7 @@ const SURE_MAX: f64 = 0.04;
 /// A likely symmetry: 95 of 100 points. LM-O's egg box and glue, which its `models_info.json` calls symmetric, reach 0.02.
 const LIKELY_P95: f64 = 0.03;
 /// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2020, within which every object was
-/// then looked at; their 15 mm for small objects would take any object of 5 cm for symmetric.
+/// then inspected; their 15 mm for small objects would take any object of 5 cm for symmetric.
 const LIKELY_MAX: f64 = 0.1;
 /// What expected noise adds, in standard deviations and as squares. Both the moved point and the surface have it, but the nearest
 /// point is taken: boxes with independent noise on their vertices reach 1.7 and 3.3 (`noise_of_a_millimetre` in the tests).
@@ -74,7 +74,7 @@ impl SymmetryOptions {
 pub enum Verdict {
     /// It is none.
     None,
-    /// Proposed: to be looked at.
+    /// Proposed: to be inspected.
     Likely,
     /// The deviation is within what meshes of symmetric objects have.
     Sure,

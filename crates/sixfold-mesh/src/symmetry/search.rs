@@ -92,13 +92,13 @@ impl<'a> Search<'a> {
         }
         // Of all half turns across the axis, that which keeps the colours best.
         let Some(flip) = self.tested(&across, Some(2)) else { return };
-        let turned = |k: usize| {
+        let rotated = |k: usize| {
             let turn = axis.rotation(k as f64 * std::f64::consts::PI / FLIPS as f64);
             Axis { direction: turn.transform_direction(&flip.axis.direction), ..flip.axis }
         };
         let colors =
             |axis: &Axis| self.body.color_difference(axis, &angles_of_order(2)).map_or(0.0, |c| c.p95);
-        let best = (0..FLIPS).map(turned).min_by(|a, b| colors(a).total_cmp(&colors(b)));
+        let best = (0..FLIPS).map(rotated).min_by(|a, b| colors(a).total_cmp(&colors(b)));
         let best = best.and_then(|axis| self.tested(&axis, Some(2)));
         self.found.push(best.unwrap_or(flip));
     }

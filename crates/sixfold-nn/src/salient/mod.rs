@@ -60,7 +60,7 @@ pub enum SalientError {
 /// How salient the pixels of an image are.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Salience {
-    /// The network's answer for each pixel, 0 to 1, of the image's size. Where it looked at a rectangle, 0 around it.
+    /// The network's answer for each pixel, 0 to 1, of the image's size. For a rectangle of the image, 0 around it.
     pub probability: Image<f32>,
     /// The smallest answer at the network's resolution.
     pub lowest: f32,
