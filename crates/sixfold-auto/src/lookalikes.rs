@@ -135,3 +135,103 @@ fn agreement(evidence: &Evidence) -> Option<f64> {
     let color = evidence.color.as_ref()?;
     Some(color.correlation - color.tint.unwrap_or(0.0))
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_align::{ColorGradients, DepthOptions, PreparedDepth};
+    use sixfold_geometry::{Camera, Image, RgbImage, Vec3};
+    use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
+
+    use super::*;
+
+    const CAMERA: Camera =
+        Camera { fx: 500.0, fy: 500.0, cx: 160.0, cy: 120.0, width: 320, height: 240, distortion: None };
+
+    /// A surface of many small faces between rings of points: `point(u, v)`, u all around and v from bottom to top.
+    fn lathe(point: impl Fn(f64, f64) -> Vec3, color: impl Fn(f64, f64) -> [u8; 3]) -> Mesh {
+        const AROUND: u32 = 72;
+        const UP: u32 = 12;
+        let (mut vertices, mut colors, mut faces) = (vec![], vec![], vec![]);
+        for j in 0..=UP {
+            for i in 0..AROUND {
+                let (u, v) = (f64::from(i) / f64::from(AROUND), f64::from(j) / f64::from(UP));
+                vertices.push(point(u, v));
+                colors.push(color(u, v));
+            }
+        }
+        for j in 0..UP {
+            for i in 0..AROUND {
+                let [a, b] = [j * AROUND + i, j * AROUND + (i + 1) % AROUND];
+                faces.extend([[a, b, b + AROUND], [a, b + AROUND, a + AROUND]]);
+            }
+        }
+        Mesh::new(vertices, faces).unwrap().with_colors(colors).unwrap()
+    }
+
+    /// A label: one colour on one side of the can, others elsewhere.
+    fn can() -> Mesh {
+        let point = |u: f64, v: f64| {
+            let angle = TAU * u;
+            Vec3::new(0.035 * angle.cos(), 0.035 * angle.sin(), 0.11 * (v - 0.5))
+        };
+        let level = |x: f64| (128.0 + 100.0 * x) as u8;
+        let color = |u: f64, v: f64| {
+            let angle = TAU * u;
+            [level(angle.cos()), level((2.0 * angle).sin()), level((angle + 5.0 * v).sin())]
+        };
+        lathe(point, color)
+    }
+
+    /// What of the pose `tilted` about the view and `turned` about the can's axis comes of asking for the best look-alike.
+    fn best(mesh: &Mesh, turned: f64) -> Option<Pose> {
+        let truth = truth();
+        let objects = [SceneObject { mesh, camera_from_object: truth }];
+        let mut frame = VisibilityBuffer::new(&CAMERA);
+        frame.render(&objects, &RenderOptions::default());
+        let depth = frame.depth().map(|z| if *z > 0.0 { *z } else { 0.9 });
+        let grey: RgbImage = Image::filled(320, 240, [120; 3]);
+        let rgb = shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&grey));
+        let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+        let prepared = PreparedDepth::new(&depth, &CAMERA, &options).unwrap();
+        let gradients = ColorGradients::new(&rgb);
+        let scene = Scene { camera: &CAMERA, depth: Some(&prepared), color: Some((&rgb, &gradients)) };
+        let shape = Shape { mesh, colored: mesh, threshold: 0.008 };
+        let known = LookAlikes::of(mesh, mesh.diameter(), &[Pose::identity()]);
+        let axis = ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::zeros() };
+        let given = truth * axis.rotation(turned);
+        let evidence =
+            EvidenceCollector::default().collect(&scene, &shape, &given, &VerificationOptions::default());
+        known.best(&scene, &shape, mesh.diameter(), (&given, &evidence)).map(|(pose, _)| pose)
+    }
+
+    fn truth() -> Pose {
+        let twist = sixfold_geometry::nalgebra::Vector6::new(0.0, 0.0, 0.0, 1.1, 0.2, 0.1);
+        Pose::new(Pose::exp(&twist).rotation(), Vec3::new(0.01, 0.0, 0.5))
+    }
+
+    #[test]
+    fn the_label_of_a_can_says_how_it_is_rotated() {
+        for degrees in [40.0f64, 100.0, 180.0, 290.0] {
+            let pose = best(&can(), degrees.to_radians()).expect("another rotation agrees better");
+            let off = pose.rotation_angle_to(&truth()).to_degrees();
+            assert!(off < 4.0, "given {degrees} degrees off, found {off}");
+        }
+    }
+
+    #[test]
+    fn a_pose_whose_colours_agree_stays() {
+        assert!(best(&can(), 0.0).is_none());
+    }
+
+    #[test]
+    fn a_mesh_without_colours_or_with_known_symmetries_has_no_look_alikes() {
+        let can = can();
+        let plain = Mesh::new(can.vertices().to_vec(), can.faces().to_vec()).unwrap();
+        assert!(LookAlikes::of(&plain, plain.diameter(), &[Pose::identity()]).discrete.is_empty());
+        assert!(!LookAlikes::of(&can, can.diameter(), &[Pose::identity()]).axes.is_empty());
+        let mut info = sixfold_mesh::ModelInfo::of_mesh(&can);
+        info.rotates_freely_about(Vec3::z());
+        let known = LookAlikes::of(&can, can.diameter(), &info.symmetry_poses(0.05));
+        assert!(known.axes.is_empty(), "{known:?}");
+    }
+}
