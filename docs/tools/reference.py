@@ -65,6 +65,12 @@ Written by `docs/tools/reference.py` from the program's `--help`; do not edit. [
 
 
 def signature(node, name=""):
+    """A function with the first line of what its stub says about it."""
+    said = ast.get_docstring(node)
+    return plain_signature(node, name) + (f"\n    # {said.splitlines()[0]}" if said else "")
+
+
+def plain_signature(node, name):
     """A function as one line, or one argument a line where that is too long."""
     returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
     arguments = ast.unparse(node.args)

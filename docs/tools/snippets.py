@@ -40,7 +40,7 @@ def texts(named):
 
 def compare(code, file):
     """Lines of an example that its file does not have."""
-    there = {line.strip() for line in (ROOT / file).read_text().splitlines()}
+    there = {re.sub(r"^//[!/] ?", "", line.strip()).strip() for line in (ROOT / file).read_text().splitlines()}
     return [line for line in code.splitlines() if line.strip() and line.strip() not in there]
 
 
