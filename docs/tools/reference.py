@@ -130,7 +130,7 @@ example: `help(sixfold.estimate_ppf)`. `python/README.md` says what belongs toge
         text += f"\n## {module}\n"
         functions = [signature(node) for node in tree.body if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")]
         if functions:
-            text += "\n```python\n" + "\n".join(functions) + "\n```\n"
+            text += "\n```python\n" + "\n\n".join(functions) + "\n```\n"
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 bases = [ast.unparse(base) for base in node.bases]
