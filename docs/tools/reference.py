@@ -54,7 +54,7 @@ def command_line(programs):
     return f"""# Command line
 
 Written by `docs/tools/reference.py` from the program's `--help`; do not edit. [Commands](../commands.md) explains them with examples.
-`sixfold serve` is in programs built with the feature `serve` ([serve.md](../serve.md)).
+`sixfold serve` is in programs built with the feature `serve` ([Pages and HTTP API](../serve.md)).
 
 {contents}
 

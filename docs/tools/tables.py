@@ -29,6 +29,8 @@ class Literal(str):
 def load(name):
     """A file of results, by name. Numbers of files by hand keep their digits."""
     path = RESULTS / f"{name}.json"
+    if path.exists() and by_hand(name):
+        raise SystemExit(f"tables.py: results/{name}.json and results/by-hand/{name}.json have one name: remove one of them")
     if path.exists():
         return json.loads(path.read_text())
     path = BY_HAND / f"{name}.json"
