@@ -8,6 +8,9 @@ A line `<!-- run -->` above a code block marks an example that runs on the repos
 text run one after the other in one empty folder, with `data`, `weights` and the other folders of the repository beside them; the
 first that ends with another status than 0 is shown with its output, and the exit status is 1. A line `<!-- from: FILE -->` above a
 block says that each of its lines stands in FILE, whose own checks compile it.
+
+With SIXFOLD, every other `sh` example is read too: each option that it gives `sixfold` stands in that command's help, as
+docs/reference/cli.md has it.
 """
 
 import os
@@ -44,6 +47,28 @@ def compare(code, file):
     return [line for line in code.splitlines() if line.strip() and line.strip() not in there]
 
 
+def known_options():
+    """The options of each command, from the reference page."""
+    page = (ROOT / "docs/reference/cli.md").read_text()
+    sections = re.findall(r"(?ms)^## (sixfold[^\n]*)\n\n```text\n(.*?)^```", page)
+    return {name: set(re.findall(r"(?m)^ +(?:-\w, )?(--[a-z][\w-]*)", text)) for name, text in sections}
+
+
+def unknown_options(path, commands):
+    """Where the examples of a text give a command an option that it does not have."""
+    text = path.read_text()
+    for block in re.finditer(r"(?m)^([ ]*)```sh\n(.*?)^\1```", text, re.DOTALL):
+        first = text.count("\n", 0, block.start()) + 2
+        for line, code in enumerate(re.sub(r"\\\n", "  ", block.group(2)).split("\n"), first):
+            for words in (part.split() for part in re.split(r"&&|;|\|", code.split(" #")[0])):
+                if words[:1] != ["sixfold"] or words[1:2] == ["serve"]:
+                    continue
+                name = next(" ".join(words[:n]) for n in range(len(words), 0, -1) if " ".join(words[:n]) in commands)
+                for option in (word.split("=")[0].strip("[]") for word in words if word.lstrip("[").startswith("--")):
+                    if option not in commands[name] | commands["sixfold"]:
+                        yield f"{path.relative_to(ROOT)}, near line {line}: {name} has no option {option}"
+
+
 def main():
     arguments = sys.argv[1:]
     python = arguments[:1] == ["--python"]
@@ -57,6 +82,11 @@ def main():
         print(f"snippets.py: there is no program {program}", file=sys.stderr)
         return 2
     ran, started = 0, time.monotonic()
+    commands = known_options()
+    wrong = [] if python else [line for path in texts(named) for line in unknown_options(path, commands)]
+    if wrong:
+        print("\n".join(wrong))
+        return 1
     for path in texts(named):
         with tempfile.TemporaryDirectory() as folder:
             tools = Path(folder) / "bin"
