@@ -4,7 +4,7 @@ use sixfold_geometry::{Image, Mask, RgbImage};
 use sixfold_render::render_depth;
 
 use crate::error::TeachError;
-use crate::teaching::Teaching;
+use crate::snapshot::Snapshot;
 
 /// Width of a photograph in the picture, pixels.
 const WIDTH: usize = 400;
@@ -15,7 +15,7 @@ const MOST: usize = 40;
 const MASK: [u8; 3] = [255, 200, 0];
 const MESH: [u8; 3] = [0, 220, 255];
 
-impl Teaching {
+impl Snapshot {
     /// The photographs that are used, cut to the object and its surroundings: the border of the mask in yellow, the outline of the
     /// mesh in blue.
     ///
@@ -65,5 +65,22 @@ fn tile(image: &RgbImage, mask: &Mask, outline: &Mask) -> RgbImage {
         _ if border(mask, x, y) => MASK,
         Some(p) => image[p],
         None => [30; 3],
+    })
+}
+
+/// An image with the border of a mask in yellow and that of an outline in blue, two pixels wide where the image is large.
+pub(crate) fn outlined(image: &RgbImage, mask: Option<&Mask>, outline: Option<&Mask>) -> RgbImage {
+    let (width, height) = image.size();
+    let reach = 1 + width.max(height) / 800;
+    let border = |mask: Option<&Mask>, x: usize, y: usize| {
+        let Some(mask) = mask else { return false };
+        let here = mask[(x, y)];
+        let differs = |u: usize, v: usize| mask.get(u, v).is_some_and(|there| *there != here);
+        (1..=reach).any(|d| differs(x + d, y) || differs(x, y + d))
+    };
+    Image::from_fn(width, height, |x, y| match (x, y) {
+        _ if border(outline, x, y) => MESH,
+        _ if border(mask, x, y) => MASK,
+        at => image[at],
     })
 }
