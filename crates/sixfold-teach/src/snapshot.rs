@@ -16,7 +16,7 @@ use crate::error::TeachError;
 use crate::record::Posed;
 use crate::reduce::reduced_photograph;
 use crate::shape::Capture;
-use crate::teaching::{By, Photograph, ShapeFacts};
+use crate::teaching::{By, Photograph, ShapeFacts, TeachOptions};
 use crate::view::PosedPhotograph;
 
 /// The only version of `teaching.json` there is.
@@ -33,6 +33,9 @@ pub(crate) struct State {
     /// A camera that was given.
     pub given_camera: Option<Camera>,
     pub photographs: Vec<Photograph>,
+    /// How often something was changed.
+    #[serde(default)]
+    pub revision: u64,
     /// What was found: paper, camera, error in pixels.
     pub located: Option<(Paper, Camera, f64)>,
     /// The space that holds the object: least and largest coordinates.
@@ -219,13 +222,28 @@ impl Snapshot {
         })
     }
 
+    /// What is known of the mesh that was made last, also one that corrections have outdated.
+    pub fn last_shape(&self) -> Option<&ShapeFacts> {
+        self.state.shape.as_ref().or(self.state.outdated.as_ref())
+    }
+
     /// The mesh that was made last, and where it stands on the board; also one that corrections have outdated.
     ///
     /// # Errors
     /// [`TeachError`].
     pub fn last_mesh(&self) -> Result<Option<(Mesh, Pose)>, TeachError> {
-        let Some(shape) = self.state.shape.as_ref().or(self.state.outdated.as_ref()) else { return Ok(None) };
+        let Some(shape) = self.last_shape() else { return Ok(None) };
         Ok(Some((self.mesh_file()?, self.pose_of(shape)?)))
+    }
+
+    /// What it was begun with.
+    pub fn options(&self) -> TeachOptions {
+        TeachOptions { ruler: self.state.ruler, camera: self.state.given_camera }
+    }
+
+    /// A number that is another one after each change.
+    pub fn revision(&self) -> u64 {
+        self.state.revision
     }
 
     /// Root of the mean squared distance of the tags' corners from where the board has them, pixels; once poses are found.

@@ -138,6 +138,7 @@ impl Teaching {
                 ruler: options.ruler,
                 given_camera: options.camera,
                 photographs: vec![],
+                revision: 0,
                 located: None,
                 volume: None,
                 shape: None,
@@ -158,7 +159,8 @@ impl Teaching {
         Ok(teaching)
     }
 
-    fn save(&self) -> Result<(), TeachError> {
+    fn save(&mut self) -> Result<(), TeachError> {
+        self.known.state.revision += 1;
         let path = self.known.folder.join("teaching.json");
         let text = serde_json::to_string_pretty(&self.known.state)
             .map_err(|e| TeachError::File { path: path.clone(), what: e.to_string() })?;
