@@ -55,8 +55,9 @@ pub(crate) async fn add_teaching(
 ) -> Answer<(StatusCode, Json<TeachingView>)> {
     let form = Form::read(&app, request, &NEW).await?;
     app.blocking(move |app| {
+        let starts = form.parsed("start", "true or false")?.unwrap_or(true);
         let entry = laid_down(app, &form)?;
-        if form.parsed("start", "true or false")?.unwrap_or(true) {
+        if starts {
             // Where too many jobs wait, it is run later: the photographs are kept.
             if let Err(error) = entry.start(app, TeachRequest::run(&entry.id)) {
                 entry.note(|record| record.problem = Some(*error.problem))?;
