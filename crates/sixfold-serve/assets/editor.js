@@ -7,6 +7,7 @@ import { apply, cameraOf, identity, inverse, product, project, ray, rotationAbou
 const SIDE = 1280;
 const MESH = "rgb(0, 200, 255)";
 const MASK = "rgb(255, 200, 0)";
+const MARK = "rgb(225, 20, 130)";
 /** Radians for a pixel of dragging. */
 const ROTATION = 0.006;
 /** Strokes that can be undone. */
@@ -99,18 +100,24 @@ class Pane {
     const c = this.context;
     const r = (7 * this.canvas.width) / Math.max(this.canvas.clientWidth, 300) / this.scale;
     const [x, y] = [pixel[0] + 0.5, pixel[1] + 0.5];
-    c.lineWidth = r / 4;
-    c.strokeStyle = color;
     c.beginPath();
     c.arc(x, y, r, 0, 2 * Math.PI);
     c.moveTo(x - 0.5 * r, y);
     c.lineTo(x + 0.5 * r, y);
     c.moveTo(x, y - 0.5 * r);
     c.lineTo(x, y + 0.5 * r);
+    const label = [String(number), x + 1.2 * r, y - 0.6 * r];
+    c.font = `bold ${2 * r}px sans-serif`;
+    c.lineJoin = "round";
+    // On white before its colour: it is seen on every ground.
+    c.strokeStyle = "#fff";
+    c.lineWidth = r / 1.6;
     c.stroke();
-    c.font = `${2 * r}px sans-serif`;
-    c.fillStyle = color;
-    c.fillText(String(number), x + 1.2 * r, y - 0.6 * r);
+    c.strokeText(...label);
+    c.strokeStyle = c.fillStyle = color;
+    c.lineWidth = r / 4;
+    c.stroke();
+    c.fillText(...label);
   }
 }
 
@@ -180,6 +187,7 @@ export class Editor {
     }
     byId("editor-hint").textContent = HINTS[name];
     byId("reference").hidden = name !== "points";
+    byId("whole").parentElement.hidden = name === "points";
     this.dialog.classList.toggle("two", name === "points");
     if (name === "points") this.showOther().catch((problem) => showProblem(byId("editor-status"), problem));
     this.frame();
@@ -220,12 +228,12 @@ export class Editor {
       } else if (this.pose) {
         this.pane.outlined(this.outline(this.pose, this.camera), MESH);
       }
-      if (this.tool === "points") this.pairs.forEach((pair, i) => this.pane.mark(pair.pixel, i + 1, MASK));
+      if (this.tool === "points") this.pairs.forEach((pair, i) => this.pane.mark(pair.pixel, i + 1, MARK));
     });
     if (this.tool === "points" && this.otherCamera) {
       this.other.draw(() => {
         const marks = [...this.pairs.map((pair) => pair.seen), ...(this.point ? [this.point.seen] : [])];
-        marks.forEach((pixel, i) => this.other.mark(pixel, i + 1, MASK));
+        marks.forEach((pixel, i) => this.other.mark(pixel, i + 1, MARK));
       });
     }
     byId("points-save").disabled = this.pairs.length < 3;

@@ -29,7 +29,7 @@ impl Snapshot {
             let pinhole = camera.without_distortion();
             let image = sixfold_geometry::undistort_rgb(image, camera).unwrap_or_else(|_| image.clone());
             let outline = render_depth(&mesh, pose, &pinhole).map(|d| *d > 0.0);
-            tiles.push(tile(&image, mask, &outline));
+            tiles.push(close_up(&image, Some(mask), Some(&outline), WIDTH));
         }
         let height = tiles.iter().map(Image::height).max().unwrap_or(1);
         let rows = tiles.len().div_ceil(COLUMNS).max(1);
@@ -46,21 +46,29 @@ impl Snapshot {
     }
 }
 
-fn tile(image: &RgbImage, mask: &Mask, outline: &Mask) -> RgbImage {
-    let [x, y, width, height] = outline.bounding_box().unwrap_or([0, 0, image.width(), image.height()]);
+/// The surroundings of an outline, or of a mask where there is none, in a square image; both as lines.
+pub(crate) fn close_up(
+    image: &RgbImage,
+    mask: Option<&Mask>,
+    outline: Option<&Mask>,
+    size: usize,
+) -> RgbImage {
+    let around = outline.and_then(Image::bounding_box).or_else(|| mask.and_then(Image::bounding_box));
+    let [x, y, width, height] = around.unwrap_or([0, 0, image.width(), image.height()]);
     let side = width.max(height) * 7 / 5 + 16;
     let left = (x + width / 2).saturating_sub(side / 2);
     let top = (y + height / 2).saturating_sub(side / 2);
-    let scale = side as f64 / WIDTH as f64;
+    let scale = side as f64 / size as f64;
     let at = |x: usize, y: usize| {
         let (u, v) = (left + (x as f64 * scale) as usize, top + (y as f64 * scale) as usize);
         (u < image.width() && v < image.height()).then_some((u, v))
     };
-    let border = |mask: &Mask, x: usize, y: usize| {
+    let border = |mask: Option<&Mask>, x: usize, y: usize| {
+        let Some(mask) = mask else { return false };
         let inside = |x: usize, y: usize| at(x, y).is_some_and(|p| mask[p]);
         inside(x, y) != inside(x + 1, y) || inside(x, y) != inside(x, y + 1)
     };
-    Image::from_fn(WIDTH, WIDTH, |x, y| match at(x, y) {
+    Image::from_fn(size, size, |x, y| match at(x, y) {
         _ if border(outline, x, y) => MESH,
         _ if border(mask, x, y) => MASK,
         Some(p) => image[p],

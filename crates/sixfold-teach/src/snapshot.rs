@@ -53,6 +53,8 @@ pub struct Snapshot {
     pub(crate) state: State,
 }
 
+type Outlines = (RgbImage, Option<Mask>, Option<Mask>);
+
 pub(crate) fn composed(a: &Pose, b: &Pose) -> Pose {
     Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
 }
@@ -267,6 +269,21 @@ impl Snapshot {
     /// # Errors
     /// [`TeachError`].
     pub fn overlay(&self, number: usize, side: usize) -> Result<RgbImage, TeachError> {
+        let (image, mask, outline) = self.outlines(number, side)?;
+        Ok(crate::pictures::outlined(&image, mask.as_ref(), outline.as_ref()))
+    }
+
+    /// The same of the object and its surroundings alone, `side` pixels wide and high.
+    ///
+    /// # Errors
+    /// [`TeachError`].
+    pub fn close_up(&self, number: usize, side: usize) -> Result<RgbImage, TeachError> {
+        let (image, mask, outline) = self.outlines(number, SIDE)?;
+        Ok(crate::pictures::close_up(&image, mask.as_ref(), outline.as_ref(), side))
+    }
+
+    /// A photograph as [`Snapshot::image`] has it, its mask, and the pixels that the mesh covers.
+    fn outlines(&self, number: usize, side: usize) -> Result<Outlines, TeachError> {
         let (image, camera) = self.image(number, side)?;
         let mask = self.mask(number)?.map(|mask| crate::reduce::of_size(&mask, image.size()));
         let outline = match (camera, self.camera_from_board(number), self.last_mesh()?) {
@@ -276,6 +293,6 @@ impl Snapshot {
             }
             _ => None,
         };
-        Ok(crate::pictures::outlined(&image, mask.as_ref(), outline.as_ref()))
+        Ok((image, mask, outline))
     }
 }

@@ -29,6 +29,8 @@ const QUALITY: u8 = 88;
 pub(crate) struct Detail {
     /// At most this many pixels wide and high, 64 to 2048 (default: 1280).
     side: Option<usize>,
+    /// Of overlays: the object and its surroundings alone, a square.
+    close_up: Option<bool>,
     /// The state that is asked for, as links name it: such an image may be kept by the browser.
     revision: Option<u64>,
 }
@@ -53,19 +55,19 @@ async fn sent(
     (id, text): (String, String),
     asked: Asked,
     content_type: &'static str,
-    make: impl FnOnce(&Snapshot, usize, usize) -> Answer<Vec<u8>> + Send + 'static,
+    make: impl FnOnce(&Snapshot, usize, usize, bool) -> Answer<Vec<u8>> + Send + 'static,
 ) -> Answer<Response> {
     app.blocking(move |app| {
         let known = app.teachings.get(&id)?.snapshot()?;
         let number = number(&text)?;
         let expected = format!("a whole number, {} to {}", SIDES.start(), SIDES.end());
         let wrong = |found: String| ApiError::field("side", found, &*expected, "correct the value");
-        let Detail { side, revision } = asked.map_err(|e| wrong(e.body_text()))?.0;
+        let Detail { side, close_up, revision } = asked.map_err(|e| wrong(e.body_text()))?.0;
         let side = side.unwrap_or(SIDE);
         if !SIDES.contains(&side) {
             return Err(wrong(side.to_string()));
         }
-        let bytes = make(&known, number, side)?;
+        let bytes = make(&known, number, side, close_up.unwrap_or(false))?;
         Ok(kept_while(revision == Some(known.revision()), content_type, bytes))
     })
     .await
@@ -102,7 +104,7 @@ pub(crate) async fn photograph_image(
     Path(path): Path<(String, String)>,
     asked: Asked,
 ) -> Answer<Response> {
-    sent(app, path, asked, "image/jpeg", |known, number, side| {
+    sent(app, path, asked, "image/jpeg", |known, number, side, _| {
         jpeg(&known.image(number, side).map_err(|e| of_teach(&e))?.0)
     })
     .await
@@ -121,8 +123,9 @@ pub(crate) async fn photograph_overlay(
     Path(path): Path<(String, String)>,
     asked: Asked,
 ) -> Answer<Response> {
-    sent(app, path, asked, "image/jpeg", |known, number, side| {
-        jpeg(&known.overlay(number, side).map_err(|e| of_teach(&e))?)
+    sent(app, path, asked, "image/jpeg", |known, number, side, close_up| {
+        let image = if close_up { known.close_up(number, side) } else { known.overlay(number, side) };
+        jpeg(&image.map_err(|e| of_teach(&e))?)
     })
     .await
 }
@@ -140,7 +143,7 @@ pub(crate) async fn photograph_mask(
     Path(path): Path<(String, String)>,
     asked: Asked,
 ) -> Answer<Response> {
-    sent(app, path, asked, "image/png", |known, number, _| {
+    sent(app, path, asked, "image/png", |known, number, _, _| {
         let mask = known.mask(number).map_err(|e| of_teach(&e))?.ok_or_else(|| {
             ApiError::field(
                 "number",
