@@ -1,11 +1,11 @@
-// What Find and Grasp share: files that are recognised by their content, and a job with its progress and result.
+// What Find, Grasp and Teach share: files that are recognised by their content, and a job with its progress and result.
 
 import { byId, element, json, run, showProblem } from "/static/api.js";
 
 const KINDS = { rgb: "colour", depth: "depth", camera: "camera", mask: "mask" };
 
 /** What a file is: a camera file is text, a depth image is a PNG with one channel of 16 bits. */
-async function kindOf(file) {
+export async function kindOf(file) {
   const head = new Uint8Array(await file.slice(0, 32).arrayBuffer());
   const isPng = head[0] === 0x89 && head[1] === 0x50 && head[2] === 0x4e && head[3] === 0x47;
   // IHDR: bit depth and colour type.
@@ -16,38 +16,43 @@ async function kindOf(file) {
   return "rgb";
 }
 
+/** Files that are dropped on the page, or chosen; `add` is called with each lot. */
+export function dropZone(add) {
+  const [drop, any] = [byId("drop"), byId("any")];
+  drop.addEventListener("click", () => any.click());
+  drop.addEventListener("keydown", (event) => {
+    if (event.key === "Enter" || event.key === " ") {
+      event.preventDefault();
+      any.click();
+    }
+  });
+  any.addEventListener("click", (event) => event.stopPropagation());
+  any.addEventListener("change", async () => {
+    const files = [...any.files];
+    any.value = "";
+    await add(files);
+  });
+  for (const name of ["dragenter", "dragover"]) {
+    document.addEventListener(name, (event) => {
+      event.preventDefault();
+      drop.classList.add("over");
+    });
+  }
+  document.addEventListener("dragleave", (event) => {
+    if (!event.relatedTarget) drop.classList.remove("over");
+  });
+  document.addEventListener("drop", async (event) => {
+    event.preventDefault();
+    drop.classList.remove("over");
+    await add([...event.dataTransfer.files]);
+  });
+}
+
 /** The files of a form: dropped or chosen, one of each kind. */
 export class Files {
   constructor() {
     this.chosen = new Map();
-    const [drop, any] = [byId("drop"), byId("any")];
-    drop.addEventListener("click", () => any.click());
-    drop.addEventListener("keydown", (event) => {
-      if (event.key === "Enter" || event.key === " ") {
-        event.preventDefault();
-        any.click();
-      }
-    });
-    any.addEventListener("click", (event) => event.stopPropagation());
-    any.addEventListener("change", async () => {
-      const files = [...any.files];
-      any.value = "";
-      await this.add(files);
-    });
-    for (const name of ["dragenter", "dragover"]) {
-      document.addEventListener(name, (event) => {
-        event.preventDefault();
-        drop.classList.add("over");
-      });
-    }
-    document.addEventListener("dragleave", (event) => {
-      if (!event.relatedTarget) drop.classList.remove("over");
-    });
-    document.addEventListener("drop", async (event) => {
-      event.preventDefault();
-      drop.classList.remove("over");
-      await this.add([...event.dataTransfer.files]);
-    });
+    dropZone((files) => this.add(files));
   }
 
   async add(files) {
@@ -103,9 +108,15 @@ export function fields(form, names) {
   }
 }
 
+/** The parts of a page that show a job. */
+export function jobParts() {
+  const parts = { status: byId("status"), progress: byId("progress"), row: byId("job-row"), go: byId("go") };
+  return { ...parts, cancel: byId("cancel") };
+}
+
 /** Sends a form, shows progress, overlay, downloads; `table` makes the rest of the result. */
 export async function work(path, form, table) {
-  const parts = { status: byId("status"), progress: byId("progress"), row: byId("job-row"), go: byId("go") };
+  const parts = jobParts();
   byId("hint").hidden = true;
   for (const id of ["figure", "downloads"]) byId(id).hidden = true;
   byId("table").replaceChildren();
@@ -114,13 +125,8 @@ export async function work(path, form, table) {
   parts.go.disabled = true;
   // On a narrow screen the result lies below the form.
   if (window.matchMedia("(max-width: 899px)").matches) byId("result").scrollIntoView({ block: "nearest" });
-  const cancel = byId("cancel");
   try {
-    const { job, result } = await run(path, form, (now) => {
-      parts.progress.hidden = parts.row.hidden = false;
-      cancel.onclick = () => json(`${now.links.job}/cancel`, { method: "POST" });
-      showState(parts, now);
-    });
+    const { job, result } = await run(path, form, (now) => showState(parts, now));
     parts.status.replaceChildren();
     showResult(job, result, table);
   } catch (problem) {
@@ -131,8 +137,11 @@ export async function work(path, form, table) {
   }
 }
 
-function showState(parts, job) {
+/** Shows how far a job is. */
+export function showState(parts, job) {
   const { done, total, step } = job.progress;
+  parts.progress.hidden = parts.row.hidden = false;
+  parts.cancel.onclick = () => json(`${job.links.job}/cancel`, { method: "POST" });
   const waiting = job.ahead ? `Waiting for ${job.ahead} other ${job.ahead === 1 ? "job" : "jobs"}` : "Waiting";
   parts.status.textContent = job.state === "queued" ? waiting : `Working: ${step} (${Math.min(done + 1, total)} of ${total})`;
   const part = job.state === "queued" || !total ? 0.04 : Math.max(0.08, done / total);

@@ -10,6 +10,8 @@ use crate::jobs::{Jobs, Stopped, Work};
 use crate::methods::Methods;
 use crate::objects::Thumbnails;
 use crate::options::ServerOptions;
+#[cfg(feature = "networks")]
+use crate::teachings::Teachings;
 
 /// Uploads that are held in memory at once, and images that are decoded at once to be checked.
 const UPLOADS: usize = 8;
@@ -20,6 +22,8 @@ pub(crate) struct App {
     pub options: ServerOptions,
     pub store: ObjectStore,
     pub jobs: Arc<Jobs>,
+    #[cfg(feature = "networks")]
+    pub teachings: Teachings,
     pub methods: Methods,
     pub thumbnails: Thumbnails,
     pub uploads: Semaphore,
@@ -34,6 +38,8 @@ impl App {
         let store = ObjectStore::new(&options.objects);
         Ok(App {
             jobs: Arc::new(Jobs::open(&options)?),
+            #[cfg(feature = "networks")]
+            teachings: Teachings::open(&options)?,
             methods: Methods::new(store.clone(), options.objects.clone(), options.pix2pose.clone())?,
             store,
             thumbnails: Thumbnails::default(),

@@ -1,5 +1,6 @@
 //! The images of a request with their camera: checked as they arrive, read again by the worker, never trusted in between.
 
+use std::io::Cursor;
 use std::path::Path;
 
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage, undistort_depth, undistort_rgb};
@@ -199,4 +200,15 @@ fn same_size(field: &str, found: (usize, usize), expected: (usize, usize)) -> An
         format!("{}x{}, as the other image has", expected.0, expected.1),
         "send images of one camera that belong together",
     ))
+}
+
+/// An image as the bytes of a PNG.
+pub(crate) fn png(image: &RgbImage) -> Answer<Vec<u8>> {
+    let data: Vec<u8> = image.as_slice().iter().flatten().copied().collect();
+    let buffer = ::image::RgbImage::from_raw(image.width() as u32, image.height() as u32, data);
+    let buffer = buffer.ok_or_else(|| ApiError::system("an image", "too large for a PNG"))?;
+    let mut bytes = Cursor::new(vec![]);
+    let written = buffer.write_to(&mut bytes, ::image::ImageFormat::Png);
+    written.map_err(|e| ApiError::system("an image", e))?;
+    Ok(bytes.into_inner())
 }

@@ -23,6 +23,8 @@ mod options;
 mod pages;
 mod server;
 mod tasks;
+#[cfg(feature = "networks")]
+mod teachings;
 
 pub use error::ServeError;
 pub use options::{ServerOptions, check_address};

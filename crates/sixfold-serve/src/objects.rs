@@ -1,7 +1,6 @@
 //! Stored objects as clients see them: listed, rendered, their meshes, removed. They are added by a job (`tasks/object.rs`).
 
 use std::collections::HashMap;
-use std::io::Cursor;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use axum::Json;
@@ -13,12 +12,13 @@ use serde::{Deserialize, Serialize};
 use sixfold_estimator::{ObjectRecord, StoreError};
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
-use sixfold_mesh::{Mesh, PlyFormat, Unit, ply_bytes, simplify};
+use sixfold_mesh::{FoundSymmetry, Mesh, PlyFormat, Unit, Verdict, ply_bytes, simplify};
 use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use utoipa::{IntoParams, ToSchema};
 
 use crate::app::{App, Shared};
 use crate::error::{Answer, ApiError, Problem};
+use crate::images::png;
 use crate::methods::Stamp;
 
 /// Side of a thumbnail, pixels.
@@ -255,15 +255,28 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&ground))
 }
 
-/// An image as the bytes of a PNG.
-fn png(image: &RgbImage) -> Answer<Vec<u8>> {
-    let data: Vec<u8> = image.as_slice().iter().flatten().copied().collect();
-    let buffer = image::RgbImage::from_raw(image.width() as u32, image.height() as u32, data);
-    let buffer = buffer.ok_or_else(|| ApiError::system("an image", "too large for a PNG"))?;
-    let mut bytes = Cursor::new(vec![]);
-    let written = buffer.write_to(&mut bytes, image::ImageFormat::Png);
-    written.map_err(|e| ApiError::system("an image", e))?;
-    Ok(bytes.into_inner())
+/// A rotation that maps the mesh onto itself, or nearly.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub(crate) struct SymmetryView {
+    /// Direction in the object's frame.
+    axis: [f64; 3],
+    /// Rotations by multiples of a full turn over this; null: all rotations.
+    order: Option<u32>,
+    /// 95 of 100 points stay this near to the surface, metres.
+    deviation: f64,
+    /// It is stored with the object; others are to be inspected.
+    sure: bool,
+}
+
+impl SymmetryView {
+    pub fn of(found: &FoundSymmetry, by_color: bool) -> SymmetryView {
+        SymmetryView {
+            axis: found.axis.into(),
+            order: found.order,
+            deviation: found.deviation.p95,
+            sure: found.verdict(by_color) == Verdict::Sure,
+        }
+    }
 }
 
 /// How fine a mesh is sent.
@@ -272,6 +285,25 @@ fn png(image: &RgbImage) -> Answer<Vec<u8>> {
 pub(crate) struct MeshDetail {
     /// At most about this many faces (default: all).
     faces: Option<usize>,
+    /// The state that is asked for, as links of teachings name it.
+    revision: Option<u64>,
+}
+
+/// Most faces that a request asks for, and which state.
+pub(crate) fn faces_of(
+    detail: Result<Query<MeshDetail>, axum::extract::rejection::QueryRejection>,
+) -> Answer<(usize, Option<u64>)> {
+    let expected = format!("a whole number, {MIN_FACES} or more");
+    let wrong = |found: String| ApiError::field("faces", found, &*expected, "correct the value");
+    let MeshDetail { faces, revision } = detail.map_err(|e| wrong(e.body_text()))?.0;
+    let faces = faces.unwrap_or(usize::MAX);
+    if faces < MIN_FACES { Err(wrong(faces.to_string())) } else { Ok((faces, revision)) }
+}
+
+/// A mesh of at most about so many faces as the bytes of a PLY file in metres, with the colours of its texture.
+pub(crate) fn mesh_ply(mesh: &Mesh, faces: usize) -> Answer<Vec<u8>> {
+    let mesh = coloured(&simplify(mesh, faces))?;
+    Ok(ply_bytes(&mesh, Unit::Metre, PlyFormat::BinaryLittleEndian, None))
 }
 
 /// The mesh of a stored object: binary PLY in metres with colours, a texture's too.
@@ -286,18 +318,12 @@ pub(crate) async fn object_mesh(
     Path(name): Path<String>,
     detail: Result<Query<MeshDetail>, axum::extract::rejection::QueryRejection>,
 ) -> Answer<Response> {
-    let expected = format!("a whole number, {MIN_FACES} or more");
-    let wrong = |found: String| ApiError::field("faces", found, &*expected, "correct the value");
-    let faces = detail.map_err(|e| wrong(e.body_text()))?.0.faces.unwrap_or(usize::MAX);
-    if faces < MIN_FACES {
-        return Err(wrong(faces.to_string()));
-    }
+    let (faces, _) = faces_of(detail)?;
     let bytes = app
         .blocking(move |app| {
             let (object, _) = app.methods.object(&name).map_err(|e| ApiError::of_store("name", &e))?;
             let mesh = object.mesh.as_ref().ok_or_else(|| no_mesh(&name))?;
-            let mesh = coloured(&simplify(mesh, faces))?;
-            Ok(ply_bytes(&mesh, Unit::Metre, PlyFormat::BinaryLittleEndian, None))
+            mesh_ply(mesh, faces)
         })
         .await?;
     Ok(([(CONTENT_TYPE, "model/ply"), (CACHE_CONTROL, "no-cache")], bytes).into_response())

@@ -5,6 +5,8 @@ use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
 use utoipa::{Modify, OpenApi};
 
 use crate::error::Problem;
+#[cfg(feature = "networks")]
+use crate::teachings;
 use crate::{access, health, jobs, objects, tasks};
 
 #[derive(OpenApi)]
@@ -49,6 +51,43 @@ use crate::{access, health, jobs, objects, tasks};
 )]
 struct Description;
 
+/// What there is only where networks are built in.
+#[cfg(feature = "networks")]
+#[derive(OpenApi)]
+#[openapi(
+    paths(
+        teachings::list_teachings,
+        teachings::add_teaching,
+        teachings::get_teaching,
+        teachings::delete_teaching,
+        teachings::add_photographs,
+        teachings::run_teaching,
+        teachings::accept_teaching,
+        teachings::teaching_mesh,
+        teachings::photograph_image,
+        teachings::photograph_overlay,
+        teachings::photograph_mask,
+        teachings::set_pose,
+        teachings::set_mask,
+        teachings::set_left_out,
+        teachings::forget_corrections,
+    ),
+    tags((name = "teachings", description = "Objects that are learnt from photographs on the printed board"))
+)]
+struct WithNetworks;
+
+#[cfg(feature = "networks")]
+fn description() -> utoipa::openapi::OpenApi {
+    let mut all = Description::openapi();
+    all.merge(WithNetworks::openapi());
+    all
+}
+
+#[cfg(not(feature = "networks"))]
+fn description() -> utoipa::openapi::OpenApi {
+    Description::openapi()
+}
+
 struct Security;
 
 impl Modify for Security {
@@ -63,7 +102,7 @@ impl Modify for Security {
     (status = 200, description = "OpenAPI 3.1", body = serde_json::Value),
 ))]
 pub(crate) async fn openapi() -> Json<utoipa::openapi::OpenApi> {
-    Json(Description::openapi())
+    Json(description())
 }
 
 #[cfg(test)]
@@ -72,7 +111,7 @@ mod tests {
 
     #[test]
     fn every_path_is_described_with_its_problems() {
-        let text = Description::openapi().to_json().unwrap();
+        let text = description().to_json().unwrap();
         for path in ["/v1/find", "/v1/grasps", "/v1/objects/{name}/mesh.ply", "/v1/jobs/{id}/events"] {
             assert!(text.contains(path), "{path}");
         }

@@ -24,6 +24,7 @@ const ASSETS: &[(&str, &str, &[u8])] = assets! {
     "/", HTML, "index.html";
     "/find", HTML, "find.html";
     "/grasp", HTML, "grasp.html";
+    "/teach", HTML, "teach.html";
     "/static/app.css", "text/css; charset=utf-8", "app.css";
     "/static/icon.svg", "image/svg+xml", "icon.svg";
     "/static/api.js", SCRIPT, "api.js";
@@ -31,6 +32,9 @@ const ASSETS: &[(&str, &str, &[u8])] = assets! {
     "/static/objects.js", SCRIPT, "objects.js";
     "/static/find.js", SCRIPT, "find.js";
     "/static/grasp.js", SCRIPT, "grasp.js";
+    "/static/teach.js", SCRIPT, "teach.js";
+    "/static/editor.js", SCRIPT, "editor.js";
+    "/static/pose.js", SCRIPT, "pose.js";
     "/static/viewer.js", SCRIPT, "viewer.js";
     "/static/vendor/three.min.js", SCRIPT, "vendor/three.min.js";
     "/static/vendor/three.LICENSE.txt", "text/plain; charset=utf-8", "vendor/three.LICENSE.txt";

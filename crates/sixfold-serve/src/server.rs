@@ -145,12 +145,41 @@ fn router(app: Arc<App>) -> Router {
         .route("/v1/jobs/{id}/result", get(jobs::job_result))
         .route("/v1/jobs/{id}/overlay.png", get(jobs::job_overlay))
         .route("/v1/jobs/{id}/events", get(jobs::job_events))
+        .merge(teaching_routes())
         .merge(pages::routes())
         .fallback(not_there)
         .method_not_allowed_fallback(not_allowed)
         .layer(DefaultBodyLimit::max(max_upload))
         .layer(axum::middleware::from_fn_with_state(app.clone(), access::guard))
         .with_state(app)
+}
+
+#[cfg(feature = "networks")]
+fn teaching_routes() -> Router<Arc<App>> {
+    use axum::routing::{delete, put};
+
+    use crate::teachings as t;
+    let photograph = Router::new()
+        .route("/image.jpg", get(t::photograph_image))
+        .route("/overlay.jpg", get(t::photograph_overlay))
+        .route("/mask.png", get(t::photograph_mask))
+        .route("/pose", put(t::set_pose))
+        .route("/mask", put(t::set_mask))
+        .route("/left_out", put(t::set_left_out))
+        .route("/corrections", delete(t::forget_corrections));
+    Router::new()
+        .route("/v1/teachings", get(t::list_teachings).post(t::add_teaching))
+        .route("/v1/teachings/{id}", get(t::get_teaching).delete(t::delete_teaching))
+        .route("/v1/teachings/{id}/photographs", post(t::add_photographs))
+        .route("/v1/teachings/{id}/run", post(t::run_teaching))
+        .route("/v1/teachings/{id}/accept", post(t::accept_teaching))
+        .route("/v1/teachings/{id}/mesh.ply", get(t::teaching_mesh))
+        .nest("/v1/teachings/{id}/photographs/{number}", photograph)
+}
+
+#[cfg(not(feature = "networks"))]
+fn teaching_routes() -> Router<Arc<App>> {
+    Router::new()
 }
 
 async fn not_there() -> ApiError {

@@ -121,6 +121,12 @@ pub enum TeachError {
         /// Of the photograph.
         photograph_height: usize,
     },
+    /// Marked points that give no pose.
+    #[error("pose from points: {what}")]
+    Pairs {
+        /// What was found and expected.
+        what: String,
+    },
     /// A step before one that it needs.
     #[error("{missing} first")]
     Order {

@@ -16,22 +16,26 @@ mod grid;
 mod hull;
 mod located;
 mod paint;
+mod pairs;
 mod pictures;
 mod record;
 mod reduce;
 mod shape;
 mod silhouette;
 pub mod simulation;
+mod snapshot;
 mod stereo;
 mod surface;
 mod teaching;
 mod view;
 pub use error::TeachError;
 pub use located::{Located, SeenTags, locate};
+pub use pairs::pose_of_points;
 pub use record::{Stored, export_bop, photographs_of};
 pub use shape::{
     Capture, FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Segmentation, Shape, ShapeOptions, reconstruct, segment,
 };
 pub use silhouette::{SalientSegmenter, Segmenter};
+pub use snapshot::Snapshot;
 pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching};
 pub use view::{PosedPhotograph, Volume};

@@ -4,7 +4,7 @@ use sixfold_geometry::{Image, Mask, RgbImage};
 use sixfold_render::render_depth;
 
 use crate::error::TeachError;
-use crate::teaching::Teaching;
+use crate::snapshot::Snapshot;
 
 /// Width of a photograph in the picture, pixels.
 const WIDTH: usize = 400;
@@ -15,7 +15,7 @@ const MOST: usize = 40;
 const MASK: [u8; 3] = [255, 200, 0];
 const MESH: [u8; 3] = [0, 220, 255];
 
-impl Teaching {
+impl Snapshot {
     /// The photographs that are used, cut to the object and its surroundings: the border of the mask in yellow, the outline of the
     /// mesh in blue.
     ///
@@ -29,7 +29,7 @@ impl Teaching {
             let pinhole = camera.without_distortion();
             let image = sixfold_geometry::undistort_rgb(image, camera).unwrap_or_else(|_| image.clone());
             let outline = render_depth(&mesh, pose, &pinhole).map(|d| *d > 0.0);
-            tiles.push(tile(&image, mask, &outline));
+            tiles.push(close_up(&image, Some(mask), Some(&outline), WIDTH));
         }
         let height = tiles.iter().map(Image::height).max().unwrap_or(1);
         let rows = tiles.len().div_ceil(COLUMNS).max(1);
@@ -46,24 +46,49 @@ impl Teaching {
     }
 }
 
-fn tile(image: &RgbImage, mask: &Mask, outline: &Mask) -> RgbImage {
-    let [x, y, width, height] = outline.bounding_box().unwrap_or([0, 0, image.width(), image.height()]);
+/// The surroundings of an outline, or of a mask where there is none, in a square image; both as lines.
+pub(crate) fn close_up(
+    image: &RgbImage,
+    mask: Option<&Mask>,
+    outline: Option<&Mask>,
+    size: usize,
+) -> RgbImage {
+    let around = outline.and_then(Image::bounding_box).or_else(|| mask.and_then(Image::bounding_box));
+    let [x, y, width, height] = around.unwrap_or([0, 0, image.width(), image.height()]);
     let side = width.max(height) * 7 / 5 + 16;
     let left = (x + width / 2).saturating_sub(side / 2);
     let top = (y + height / 2).saturating_sub(side / 2);
-    let scale = side as f64 / WIDTH as f64;
+    let scale = side as f64 / size as f64;
     let at = |x: usize, y: usize| {
         let (u, v) = (left + (x as f64 * scale) as usize, top + (y as f64 * scale) as usize);
         (u < image.width() && v < image.height()).then_some((u, v))
     };
-    let border = |mask: &Mask, x: usize, y: usize| {
+    let border = |mask: Option<&Mask>, x: usize, y: usize| {
+        let Some(mask) = mask else { return false };
         let inside = |x: usize, y: usize| at(x, y).is_some_and(|p| mask[p]);
         inside(x, y) != inside(x + 1, y) || inside(x, y) != inside(x, y + 1)
     };
-    Image::from_fn(WIDTH, WIDTH, |x, y| match at(x, y) {
+    Image::from_fn(size, size, |x, y| match at(x, y) {
         _ if border(outline, x, y) => MESH,
         _ if border(mask, x, y) => MASK,
         Some(p) => image[p],
         None => [30; 3],
+    })
+}
+
+/// An image with the border of a mask in yellow and that of an outline in blue, two pixels wide where the image is large.
+pub(crate) fn outlined(image: &RgbImage, mask: Option<&Mask>, outline: Option<&Mask>) -> RgbImage {
+    let (width, height) = image.size();
+    let reach = 1 + width.max(height) / 800;
+    let border = |mask: Option<&Mask>, x: usize, y: usize| {
+        let Some(mask) = mask else { return false };
+        let here = mask[(x, y)];
+        let differs = |u: usize, v: usize| mask.get(u, v).is_some_and(|there| *there != here);
+        (1..=reach).any(|d| differs(x + d, y) || differs(x, y + d))
+    };
+    Image::from_fn(width, height, |x, y| match (x, y) {
+        _ if border(outline, x, y) => MESH,
+        _ if border(mask, x, y) => MASK,
+        at => image[at],
     })
 }

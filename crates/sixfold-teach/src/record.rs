@@ -17,7 +17,7 @@ use sixfold_mesh::{
 };
 
 use crate::error::TeachError;
-use crate::teaching::Teaching;
+use crate::snapshot::Snapshot;
 
 /// Folder of the photographs in an object's folder.
 const PHOTOGRAPHS: &str = "photographs";
@@ -54,7 +54,16 @@ struct PhotographFile {
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
-impl Teaching {
+impl Snapshot {
+    /// Symmetries of the mesh with evidence; those that are sure by shape and colours will be stored.
+    ///
+    /// # Errors
+    /// [`TeachError::Order`] before the mesh is made.
+    pub fn symmetries(&self) -> Result<Vec<FoundSymmetry>, TeachError> {
+        let mesh = self.mesh()?;
+        Ok(symmetries_of(&mesh, ModelInfo::of_mesh(&mesh).diameter))
+    }
+
     /// Stores the object under a name. `derive` makes what methods derive from it, as in [`ObjectStore::add`].
     ///
     /// # Errors
@@ -68,8 +77,7 @@ impl Teaching {
     ) -> Result<Stored, TeachError> {
         let mesh = self.mesh()?;
         let mut info = ModelInfo::of_mesh(&mesh);
-        let options = SymmetryOptions { noise: NOISE * info.diameter, ..SymmetryOptions::default() };
-        let symmetries = find_symmetries(&mesh, &options).unwrap_or_default();
+        let symmetries = symmetries_of(&mesh, info.diameter);
         (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&symmetries, true);
         let source = self.folder().join("mesh.ply");
         let record = ObjectRecord::of_mesh(&source, Unit::Metre, &mesh, &info);
@@ -83,6 +91,11 @@ impl Teaching {
         })?;
         Ok(Stored { record, symmetries, photographs: posed.len() })
     }
+}
+
+fn symmetries_of(mesh: &Mesh, diameter: f64) -> Vec<FoundSymmetry> {
+    let options = SymmetryOptions { noise: NOISE * diameter, ..SymmetryOptions::default() };
+    find_symmetries(mesh, &options).unwrap_or_default()
 }
 
 pub(crate) type Posed = (String, RgbImage, Camera, Pose, sixfold_geometry::Mask);

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use sixfold_geometry::{Camera, Image, Mask, Vec2};
+use sixfold_geometry::{Camera, Image, Mask, RgbImage, Vec2};
 
 use crate::view::{PosedPhotograph, reduced};
 
@@ -28,6 +28,26 @@ pub(crate) fn reduced_photograph(photograph: PosedPhotograph, side: usize) -> Po
     PosedPhotograph { image, depth, mask, camera, ..photograph }
 }
 
+/// A photograph with at most `side` pixels along its longer side and, where its lens is known, without distortion, with the camera that
+/// would have taken that.
+pub(crate) fn undistorted(
+    image: &RgbImage,
+    lens: Option<&Camera>,
+    side: usize,
+) -> (RgbImage, Option<Camera>) {
+    let (width, height) = image.size();
+    let scale = (width.max(height) as f64 / side as f64).max(1.0);
+    let shorter = |length: usize| ((length as f64 / scale).round() as usize).max(1);
+    let size = (shorter(width), shorter(height));
+    let (sx, sy) = (width as f64 / size.0 as f64, height as f64 / size.1 as f64);
+    let source = |x: f64, y: f64| {
+        let pixel = Vec2::new((x + 0.5) * sx - 0.5, (y + 0.5) * sy - 0.5);
+        lens.map_or(pixel, |lens| lens.distort_point(&pixel))
+    };
+    let camera = lens.map(|lens| lens.without_distortion().resize(size.0, size.1));
+    (reduced(image, size, sx, &source), camera)
+}
+
 /// A mask of the whole photograph in the pixels of the reduced one.
 pub(crate) fn reduced_mask(mask: &Mask, photograph: &PosedPhotograph) -> Mask {
     of_size(mask, photograph.image.size())
@@ -39,7 +59,7 @@ pub(crate) fn enlarged_mask(mask: &Mask, photograph: &PosedPhotograph, camera: O
     of_size(mask, size)
 }
 
-fn of_size(mask: &Mask, (width, height): (usize, usize)) -> Mask {
+pub(crate) fn of_size(mask: &Mask, (width, height): (usize, usize)) -> Mask {
     if mask.size() == (width, height) {
         return mask.clone();
     }

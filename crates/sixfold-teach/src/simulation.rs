@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use sixfold_board::Board;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::random::{normal, stream, uniform};
-use sixfold_geometry::{BrownConrady, Camera, Image, Mask, Mat3, Pose, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{BrownConrady, Camera, DepthImage, Image, Mask, Mat3, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{Light, Material, SceneObject, VisibilityBuffer, shade};
 
@@ -101,6 +101,14 @@ impl<'a> SimulatedCapture<'a> {
         Some(self.scene.photograph(pose, self.options, stream(self.seed, 1000 + number as u64)))
     }
 
+    /// Depth from the same place, metres, without lens distortion and noise; `None` beyond the last.
+    pub fn depth(&self, number: usize) -> Option<DepthImage> {
+        let pose = self.camera_from_board.get(number)?;
+        let mut buffer = VisibilityBuffer::new(&self.options.camera.without_distortion());
+        buffer.render(&self.scene.objects(pose), &Default::default());
+        Some(buffer.depth())
+    }
+
     /// Where it shows the object, without lens distortion; `None` beyond the last.
     pub fn mask(&self, number: usize) -> Option<Mask> {
         let camera_from_object = compose(self.camera_from_board.get(number)?, &self.board_from_object);
@@ -155,6 +163,16 @@ impl<'a> Scene<'a> {
         Scene { object, sheet, table, board_from_object: *board_from_object, ground }
     }
 
+    /// All that is rendered, the object first.
+    fn objects(&self, camera_from_board: &Pose) -> [SceneObject<'_>; 3] {
+        let camera_from_object = compose(camera_from_board, &self.board_from_object);
+        [
+            SceneObject { mesh: self.object, camera_from_object },
+            SceneObject { mesh: &self.sheet, camera_from_object: *camera_from_board },
+            SceneObject { mesh: &self.table, camera_from_object: *camera_from_board },
+        ]
+    }
+
     fn photograph(
         &self,
         camera_from_board: &Pose,
@@ -185,14 +203,7 @@ impl<'a> Scene<'a> {
             Light::Ambient { color: [uniform(&mut random, [0.25, 0.4]); 3] },
             Light::Directional { direction: camera_from_board.transform_direction(&sun), color },
         ];
-        let objects = [
-            SceneObject {
-                mesh: self.object,
-                camera_from_object: compose(camera_from_board, &self.board_from_object),
-            },
-            SceneObject { mesh: &self.sheet, camera_from_object: *camera_from_board },
-            SceneObject { mesh: &self.table, camera_from_object: *camera_from_board },
-        ];
+        let objects = self.objects(camera_from_board);
         let mut buffer = VisibilityBuffer::new(&pinhole);
         buffer.render(&objects, &Default::default());
         let far = Image::from_fn(pinhole.width, pinhole.height, |x, y| {

@@ -65,6 +65,16 @@ impl Volume {
         Volume { low: self.low.sup(&other.low), high: self.high.inf(&other.high) }
     }
 
+    /// The least and largest pixels that a pinhole camera sees of it; `None` where a part lies behind the camera.
+    pub(crate) fn seen_by(&self, pinhole: &Camera, camera_from_world: &Pose) -> Option<[Vec2; 2]> {
+        let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+        for corner in self.corners() {
+            let pixel = pinhole.project(&camera_from_world.transform_point(&corner))?;
+            (low, high) = (low.inf(&pixel), high.sup(&pixel));
+        }
+        Some([low, high])
+    }
+
     fn corners(&self) -> [Vec3; 8] {
         std::array::from_fn(|i| {
             let pick =
@@ -92,11 +102,7 @@ impl View {
     /// What a photograph shows of a volume, at most `side` pixels wide and high; `None` where it is not in sight.
     pub fn new(photograph: &PosedPhotograph, volume: &Volume, side: usize) -> Option<View> {
         let pinhole = photograph.camera.without_distortion();
-        let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
-        for corner in volume.corners() {
-            let pixel = pinhole.project(&photograph.camera_from_world.transform_point(&corner))?;
-            (low, high) = (low.inf(&pixel), high.sup(&pixel));
-        }
+        let [low, high] = volume.seen_by(&pinhole, &photograph.camera_from_world)?;
         let most = Vec2::new(pinhole.width as f64 - 0.5, pinhole.height as f64 - 0.5);
         let (low, high) = (low.sup(&Vec2::repeat(-0.5)), high.inf(&most));
         let size = high - low;

@@ -8,8 +8,8 @@ use sixfold_geometry::{Camera, Image, KdTree, Mask, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
 use sixfold_teach::{
-    By, Capture, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, TeachError, TeachOptions,
-    Teaching, export_bop, photographs_of, reconstruct, segment,
+    By, Capture, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, Snapshot, TeachError,
+    TeachOptions, Teaching, export_bop, photographs_of, reconstruct, segment,
 };
 
 fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
@@ -221,6 +221,44 @@ fn corrections_are_kept_and_what_they_change_is_made_again() {
     teaching.add_photograph("p1.png", &truth.files[2]).unwrap();
     assert_eq!(teaching.photographs()[0].pose_by, Some(By::Person));
     assert_eq!(teaching.photographs()[2].pose_by, None);
+    teaching.forget_corrections(0).unwrap();
+    assert_eq!((teaching.photographs()[0].pose_by, teaching.photographs()[0].mask_by), (None, None));
+}
+
+#[test]
+fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_time() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let salient = Salient::new();
+    let mut teaching = teach(dir.path(), &salient);
+    let calls = salient.calls();
+    let snapshot = Snapshot::read(dir.path()).unwrap();
+    assert_eq!(snapshot.photographs().len(), 10);
+    let red = |image: &RgbImage| image.as_slice().iter().filter(|c| **c == [255, 200, 0]).count();
+    assert!(red(&snapshot.overlay(3, 320).unwrap()) > 50);
+    assert_eq!(snapshot.image(3, 320).unwrap().0.size(), (320, 240));
+    // A mask changes the mesh alone; the old mesh stays to be shown.
+    teaching.set_mask(3, &truth.masks[3]).unwrap();
+    let snapshot = Snapshot::read(dir.path()).unwrap();
+    assert!(snapshot.shape().is_none() && snapshot.last_mesh().unwrap().is_some());
+    assert_eq!(snapshot.photographs()[3].mask_by, Some(By::Person));
+    teaching.find_masks(&salient, &coarse(), &()).unwrap();
+    teaching.set_left_out(5, true).unwrap();
+    teaching.find_masks(&salient, &coarse(), &()).unwrap();
+    assert_eq!(salient.calls(), calls);
+    teaching.reconstruct(&coarse(), &()).unwrap();
+    assert!(Snapshot::read(dir.path()).unwrap().shape().is_some());
+    // One that reaches beyond the space of the object is looked at by all.
+    let everywhere = Image::filled(640, 480, true);
+    teaching.set_mask(4, &everywhere).unwrap();
+    assert!(teaching.photographs()[0].mask_by.is_none());
+    teaching.forget_corrections(4).unwrap();
+    assert_eq!(teaching.photographs()[4].mask_by, None);
+    for number in 0..7 {
+        teaching.set_left_out(number, true).unwrap();
+    }
+    let error = teaching.find_masks(&salient, &coarse(), &()).unwrap_err();
+    assert!(matches!(error, TeachError::TooFewPhotographs { found: 3, .. }), "{error}");
 }
 
 /// What a capture says of its photographs with poses that are known.

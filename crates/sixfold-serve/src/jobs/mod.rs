@@ -11,5 +11,9 @@ mod work;
 
 pub(crate) use handlers::*;
 pub(crate) use queue::Jobs;
+#[cfg(feature = "networks")]
+pub(crate) use queue::{is_id, new_id};
+#[cfg(feature = "networks")]
+pub(crate) use record::now;
 pub(crate) use record::{Job, JobKind, JobState};
 pub(crate) use work::{Stopped, Work};

@@ -342,14 +342,14 @@ fn fail(record: &mut JobRecord, error: String, advice: &str) {
 }
 
 /// 16 random bytes in hexadecimal.
-fn new_id() -> Result<String, getrandom::Error> {
+pub(crate) fn new_id() -> Result<String, getrandom::Error> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes)?;
     Ok(bytes.iter().map(|b| format!("{b:02x}")).collect())
 }
 
 /// Whether a folder's name is one that [`new_id`] makes.
-fn is_id(name: &str) -> bool {
+pub(crate) fn is_id(name: &str) -> bool {
     name.len() == 32 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
 }
 

@@ -24,6 +24,8 @@ pub(crate) enum JobKind {
     Grasps,
     /// Adds an object to the store.
     Object,
+    /// Teaches an object from photographs, or stores a taught one.
+    Teach,
 }
 
 /// How far a job is.

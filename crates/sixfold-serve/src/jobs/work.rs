@@ -37,6 +37,12 @@ pub(crate) struct Work<'a> {
 }
 
 impl Work<'_> {
+    /// The job's id.
+    #[cfg(feature = "networks")]
+    pub fn id(&self) -> &str {
+        &self.job.id
+    }
+
     /// The job's folder.
     pub fn folder(&self) -> &Path {
         &self.job.folder

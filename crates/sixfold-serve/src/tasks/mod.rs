@@ -20,6 +20,8 @@ pub(crate) enum Request {
     Find(find::FindRequest),
     Grasps(grasps::GraspRequest),
     Object(object::ObjectRequest),
+    #[cfg(feature = "networks")]
+    Teach(crate::teachings::TeachRequest),
 }
 
 impl Request {
@@ -29,6 +31,8 @@ impl Request {
             Request::Find(_) => JobKind::Find,
             Request::Grasps(_) => JobKind::Grasps,
             Request::Object(_) => JobKind::Object,
+            #[cfg(feature = "networks")]
+            Request::Teach(_) => JobKind::Teach,
         };
         let bytes = serde_json::to_vec_pretty(self).map_err(|e| ApiError::system("the request", e))?;
         app.jobs.add(kind, &bytes, files)
@@ -46,5 +50,7 @@ pub(crate) fn run(app: &App, work: &mut Work<'_>) -> Result<serde_json::Value, S
         Request::Find(request) => find::run(app, &request, work),
         Request::Grasps(request) => grasps::run(&request, work),
         Request::Object(request) => object::run(app, &request, work),
+        #[cfg(feature = "networks")]
+        Request::Teach(request) => crate::teachings::run(app, &request, work),
     }
 }

@@ -10,8 +10,8 @@ use sixfold_estimator::{NewObject, ObjectRecord, PoseEstimator, StoreError};
 use sixfold_geometry::Vec3;
 use sixfold_io::{limits, read_regular};
 use sixfold_mesh::{
-    ContinuousSymmetry, Mesh, ModelInfo, Unit, check_size, parse_gltf, parse_obj, parse_ply, parse_stl,
-    parse_xyz,
+    ContinuousSymmetry, FoundSymmetry, Mesh, ModelInfo, SymmetryOptions, Unit, check_size, find_symmetries,
+    parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz, sure_symmetries,
 };
 use sixfold_ppf::PpfEstimator;
 
@@ -20,6 +20,7 @@ use crate::app::{App, Shared};
 use crate::error::{Answer, ApiError, Problem};
 use crate::form::{Form, FormRule, UploadedFile};
 use crate::jobs::{Accepted, JobView, Stopped, Work};
+use crate::objects::SymmetryView;
 
 /// Most files beside a mesh: materials and textures.
 const MAX_RESOURCES: usize = 50;
@@ -27,7 +28,7 @@ const MAX_RESOURCES: usize = 50;
 const RULE: FormRule = FormRule {
     files: &["mesh"],
     many_files: &["resource"],
-    texts: &["name", "unit", "turns_about", "replace"],
+    texts: &["name", "unit", "turns_about", "find_symmetries", "noise", "replace"],
 };
 
 /// What is to be stored, beside the files.
@@ -39,6 +40,12 @@ pub(crate) struct ObjectRequest {
     format: Format,
     unit: Unit,
     turns_about: Option<Axis>,
+    /// By which evidence symmetries are found and stored.
+    #[serde(default)]
+    find_symmetries: Option<Evidence>,
+    /// Noise of the surface, standard deviation in metres.
+    #[serde(default)]
+    noise: f64,
     replace: bool,
     /// What the client calls the files beside the mesh; file `i` is `resource-i` in the job's folder.
     resources: Vec<String>,
@@ -62,6 +69,13 @@ enum Axis {
     Z,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Evidence {
+    Shape,
+    Colors,
+}
+
 /// The form of `POST /v1/objects`.
 #[derive(utoipa::ToSchema)]
 #[allow(dead_code)]
@@ -78,6 +92,10 @@ pub(crate) struct ObjectForm {
     resource: Option<Vec<Vec<u8>>>,
     /// The object looks the same however it is rotated about this axis of its own frame: x, y or z.
     turns_about: Option<String>,
+    /// Find the mesh's symmetries and store those that are sure, by `shape` or by shape and `colors`. The job's result lists all.
+    find_symmetries: Option<String>,
+    /// Noise of the mesh's surface, standard deviation in millimetres, for find_symmetries (default: 0).
+    noise: Option<f64>,
     /// Replace an object of the same name (default: false).
     replace: Option<bool>,
 }
@@ -99,7 +117,7 @@ pub(crate) async fn add_object(State(app): Shared, request: HttpRequest) -> Answ
     app.blocking(move |app| {
         let mesh = form.needed_file("mesh", "a mesh file")?;
         let request = ObjectRequest::of_form(&form, mesh)?;
-        request.check_name(app)?;
+        check_new_name(app, &request.name, request.replace)?;
         let resources = form.files("resource");
         request.mesh(&mesh.bytes, &|i| Ok(resources[i].bytes.to_vec()))?;
         let names: Vec<String> = (0..resources.len()).map(|i| format!("resource-{i}")).collect();
@@ -120,16 +138,15 @@ impl ObjectRequest {
         let unit = form.parsed::<Unit>("unit", units)?.ok_or_else(|| {
             ApiError::field("unit", "nothing", units, "a mesh file does not say its unit: give it")
         })?;
-        let turns_about = match form.text("turns_about")? {
-            None => None,
-            Some("x") => Some(Axis::X),
-            Some("y") => Some(Axis::Y),
-            Some("z") => Some(Axis::Z),
-            Some(other) => {
-                let found = format!("{other:?}");
-                return Err(ApiError::field("turns_about", found, "x, y or z", "correct the value"));
-            }
-        };
+        let axes = [("x", Axis::X), ("y", Axis::Y), ("z", Axis::Z)];
+        let turns_about = one_of(form, "turns_about", &axes, "x, y or z")?;
+        let kinds = [("shape", Evidence::Shape), ("colors", Evidence::Colors)];
+        let find_symmetries = one_of(form, "find_symmetries", &kinds, "shape or colors")?;
+        if find_symmetries.is_some() && turns_about.is_some() {
+            let advice = "leave out one of the two";
+            return Err(ApiError::field("find_symmetries", "it and turns_about", "one of them", advice));
+        }
+        let noise = form.number("noise", "millimetres, 0 to 100", |mm| (0.0..=100.0).contains(&mm))?;
         let resources = form.files("resource");
         if resources.len() > MAX_RESOURCES {
             return Err(ApiError::field(
@@ -145,21 +162,11 @@ impl ObjectRequest {
             format: Format::of(&mesh.name)?,
             unit,
             turns_about,
+            find_symmetries,
+            noise: noise.unwrap_or(0.0) / 1000.0,
             replace: form.parsed("replace", "true or false")?.unwrap_or(false),
             resources: resources.iter().map(|r| r.name.clone()).collect(),
         })
-    }
-
-    /// Whether the object could be stored under its name now.
-    fn check_name(&self, app: &App) -> Answer<()> {
-        match app.store.record(&self.name) {
-            Err(error @ StoreError::Name(_)) => Err(ApiError::of_store("name", &error)),
-            Ok(_) if !self.replace => {
-                let folder = app.options.objects.clone();
-                Err(ApiError::of_store("name", &StoreError::Exists { name: self.name.clone(), folder }))
-            }
-            _ => Ok(()),
-        }
     }
 
     /// The mesh in metres. What it names beside itself is looked for among the uploaded files, by `resource`, and nowhere else.
@@ -193,8 +200,18 @@ impl ObjectRequest {
         Ok(mesh)
     }
 
-    fn info(&self, mesh: &Mesh) -> ModelInfo {
+    /// What is stored of the mesh, and all symmetries that were found in it.
+    fn info(&self, mesh: &Mesh) -> Answer<(ModelInfo, Vec<FoundSymmetry>)> {
         let mut info = ModelInfo::of_mesh(mesh);
+        let mut found = vec![];
+        if let Some(evidence) = self.find_symmetries {
+            let options = SymmetryOptions { noise: self.noise, ..SymmetryOptions::default() };
+            found = find_symmetries(mesh, &options).map_err(|e| {
+                ApiError::about("noise", e, "noise of a few percent of the object's size", "give less noise")
+            })?;
+            let by_color = evidence == Evidence::Colors;
+            (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&found, by_color);
+        }
         if let Some(axis) = self.turns_about {
             let axis = match axis {
                 Axis::X => Vec3::x(),
@@ -205,7 +222,28 @@ impl ObjectRequest {
             let offset = info.min + info.size * 0.5;
             info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
         }
-        info
+        Ok((info, found))
+    }
+}
+
+/// A text that is one of a few, if it was sent.
+fn one_of<T: Copy>(form: &Form, name: &str, all: &[(&str, T)], expected: &str) -> Answer<Option<T>> {
+    let Some(text) = form.text(name)? else { return Ok(None) };
+    match all.iter().find(|(word, _)| *word == text) {
+        Some((_, value)) => Ok(Some(*value)),
+        None => Err(ApiError::field(name, format!("{text:?}"), expected, "correct the value")),
+    }
+}
+
+/// Whether an object could be stored under a name now.
+pub(crate) fn check_new_name(app: &App, name: &str, replace: bool) -> Answer<()> {
+    match app.store.record(name) {
+        Err(error @ StoreError::Name(_)) => Err(ApiError::of_store("name", &error)),
+        Ok(_) if !replace => {
+            let folder = app.options.objects.clone();
+            Err(ApiError::of_store("name", &StoreError::Exists { name: name.to_owned(), folder }))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -239,7 +277,8 @@ pub(super) fn run(app: &App, request: &ObjectRequest, work: &mut Work<'_>) -> Re
     let mesh = request.mesh(&bytes, &|i| read(&format!("resource-{i}")))?;
     work.step(0, 1, "describing the object")?;
     let source = if request.file_name.is_empty() { "upload" } else { &request.file_name };
-    let record = ObjectRecord::of_mesh(Path::new(source), request.unit, &mesh, &request.info(&mesh));
+    let (info, symmetries) = request.info(&mesh)?;
+    let record = ObjectRecord::of_mesh(Path::new(source), request.unit, &mesh, &info);
     let new = NewObject { mesh: Some(&mesh), record: &record, replace: request.replace };
     let stored = app.store.add(&request.name, new, |object| {
         PpfEstimator::default().prepare(object)?;
@@ -250,7 +289,10 @@ pub(super) fn run(app: &App, request: &ObjectRequest, work: &mut Work<'_>) -> Re
         Err(StoreError::Exists { .. }) if is_stored(app, request, &record) => {}
         other => other.map_err(|e| ApiError::of_store("name", &e))?,
     }
-    Ok(json!({ "name": request.name, "object": format!("/v1/objects/{}", request.name), "record": record }))
+    let by_color = request.find_symmetries != Some(Evidence::Shape);
+    let symmetries: Vec<SymmetryView> = symmetries.iter().map(|s| SymmetryView::of(s, by_color)).collect();
+    let object = format!("/v1/objects/{}", request.name);
+    Ok(json!({ "name": request.name, "object": object, "record": record, "symmetries": symmetries }))
 }
 
 fn is_stored(app: &App, request: &ObjectRequest, record: &ObjectRecord) -> bool {

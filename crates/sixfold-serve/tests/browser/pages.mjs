@@ -1,20 +1,23 @@
 // Drives the pages of `sixfold serve` in a real browser, as a user would: adds an object, turns it, finds it in the demo's frame,
-// downloads the result, proposes grasps; at a wide and a narrow size, with an image of each page.
+// downloads the result, proposes grasps; teaches an object from photographs, corrects a pose and a mask, accepts it, finds it in
+// another image; at a wide and a narrow size, with an image of each page.
 //
 //   npm install                                       (in this folder or a copy of it)
-//   node pages.mjs SIXFOLD DEMO OUT [CHROMIUM]        the program, the folder data/demo, a folder for images
+//   cargo run --release -p sixfold-teach --example photographs -- data/demo/models/obj_000009.ply mm PHOTOGRAPHS
+//   node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS [CHROMIUM]
 //
+// SIXFOLD is the program built with the feature `serve`, DEMO the folder data/demo, OUT a folder for images.
 // Exits with 1 and a message at the first thing that is not as it should be.
 
 import assert from "node:assert/strict";
 import { spawn } from "node:child_process";
-import { mkdtemp, mkdir, readFile, rm } from "node:fs/promises";
+import { mkdtemp, mkdir, readFile, readdir, rm } from "node:fs/promises";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { chromium } from "playwright-core";
 
-const [program, demo, out, browserPath = "/usr/bin/chromium"] = process.argv.slice(2);
-assert(program && demo && out, "usage: node pages.mjs SIXFOLD DEMO OUT [CHROMIUM]");
+const [program, demo, out, photographs, browserPath = "/usr/bin/chromium"] = process.argv.slice(2);
+assert(program && demo && out && photographs, "usage: node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS [CHROMIUM]");
 
 const SIZES = { wide: { width: 1280, height: 860 }, narrow: { width: 390, height: 844 } };
 const frame = ["depth/000003.png", "rgb/000003.png"].map((file) => join(demo, "test/000002", file));
@@ -147,6 +150,167 @@ async function grasp(page, address) {
   await shot(page, "grasp");
 }
 
+/** The mean distance of two poses' images of the object's surroundings, metres: a correction by hand is not exact. */
+function apart(a, b) {
+  const at = (m, p) => [0, 1, 2].map((i) => m[i][0] * p[0] + m[i][1] * p[1] + m[i][2] * p[2] + m[i][3]);
+  const points = [[0.05, 0, 0], [-0.05, 0, 0], [0, 0.05, 0], [0, -0.05, 0], [0, 0, 0.08]];
+  return points.reduce((sum, p) => sum + Math.hypot(...at(a, p).map((v, k) => v - at(b, p)[k])), 0) / points.length;
+}
+
+const teachingOf = async (page, address) => {
+  const id = new URL(page.url()).searchParams.get("id");
+  return (await fetch(`${address}/v1/teachings/${id}`)).json();
+};
+
+/** Drags on the editor's canvas, from its middle, by some pixels of the screen. */
+async function dragged(page, dx, dy, options = {}) {
+  const box = await page.locator("#canvas").boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  if (options.key) await page.keyboard.down(options.key);
+  await page.mouse.move(x, y);
+  await page.mouse.down({ button: options.button || "left" });
+  await page.mouse.move(x + dx, y + dy, { steps: 6 });
+  await page.mouse.up({ button: options.button || "left" });
+  if (options.key) await page.keyboard.up(options.key);
+}
+
+async function opened(page, number) {
+  await page.locator("#editor").evaluate((dialog) => delete dialog.dataset.shown);
+  await page.locator(`.tile[data-number="${number}"]`).click();
+  await page.locator(`#editor[data-shown="${number}"]`).waitFor({ timeout: 30000 });
+}
+
+/** Corrects a pose with the mouse: away and back, then by a little that is kept. */
+async function poseCorrected(page, address) {
+  const before = (await teachingOf(page, address)).photographs[3].camera_from_board;
+  await opened(page, 3);
+  await dragged(page, 40, 25);
+  await dragged(page, 60, -20, { button: "right" });
+  await dragged(page, 30, 0, { key: "Alt" });
+  await page.mouse.wheel(0, 240);
+  await page.locator("#canvas").evaluate((canvas) => canvas.focus());
+  await shot(page, "teach-pose");
+  await page.locator("#pose-save").click();
+  await page.getByText("The pose is kept.").waitFor();
+  const moved = (await teachingOf(page, address)).photographs[3];
+  assert.equal(moved.pose_by, "person");
+  assert(apart(moved.camera_from_board, before) > 0.01, "dragging, rotating and the wheel change the pose");
+  await pointsMarked(page, address, before);
+}
+
+/** Brings the pose back by four points that are marked in another photograph and in this one. */
+async function pointsMarked(page, address, before) {
+  await page.locator("#tab-points").click();
+  await page.locator("#reference").waitFor();
+  await page.waitForTimeout(300);
+  const { camera, photographs: all } = await teachingOf(page, address);
+  const other = Number(await page.locator("#other").inputValue());
+  const from = all.find((p) => p.number === other).camera_from_board;
+  const seen = (m, p) => {
+    const [x, y, z] = [0, 1, 2].map((i) => m[i][0] * p[0] + m[i][1] * p[1] + m[i][2] * p[2] + m[i][3]);
+    return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy];
+  };
+  const click = async (id, [u, v]) => {
+    const box = await page.locator(id).boundingBox();
+    const k = box.width / camera.width;
+    await page.mouse.click(box.x + (u + 0.5) * k, box.y + (v + 0.5) * k);
+  };
+  // Points of the board beside the object, which both photographs show.
+  const inside = ([u, v]) => u > 8 && v > 8 && u < camera.width - 8 && v < camera.height - 8;
+  const around = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => [0.085 * Math.cos(i * Math.PI / 4), 0.085 * Math.sin(i * Math.PI / 4), 0]);
+  const good = around.filter((p) => inside(seen(from, p)) && inside(seen(before, p)));
+  assert(good.length >= 4, `${good.length} points in both photographs`);
+  await page.locator("#editor").evaluate((dialog) => dialog.scrollTo(0, dialog.scrollHeight));
+  for (const p of good) {
+    await click("#reference", seen(from, p));
+    await click("#canvas", seen(before, p));
+  }
+  await shot(page, "teach-points");
+  await page.locator("#points-save").click();
+  await page.getByText("The pose is kept: look").waitFor();
+  const back = (await teachingOf(page, address)).photographs[3].camera_from_board;
+  const far = apart(back, before);
+  assert(far < 0.02, `marked points give the pose: ${(1000 * far).toFixed(1)} mm`);
+  console.log(`teach: pose by ${good.length} marked points, ${(1000 * far).toFixed(1)} mm from the one before`);
+  await page.locator("#editor-close").click();
+}
+
+/** Paints in a mask, undoes, takes the mesh's silhouette. */
+async function maskCorrected(page, address) {
+  await opened(page, 5);
+  await page.locator("#tab-mask").click();
+  // Pixels of the canvas that differ from what was there at first; once it is read often the browser draws it in another way, not
+  // to the last bit.
+  const changed = () => page.locator("#canvas").evaluate((canvas) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    window.first ??= data;
+    let count = 0;
+    for (let i = 0; i < data.length; i++) if (Math.abs(data[i] - window.first[i]) > 40) count += 1;
+    return count;
+  });
+  await changed();
+  await dragged(page, 260, 0);
+  const painted = await changed();
+  assert(painted > 1000, `the brush adds to the mask: ${painted}`);
+  await page.locator("#mask-undo").click();
+  const left = await changed();
+  assert(left < 0.05 * painted, `a stroke is undone: ${left} of ${painted}`);
+  await page.locator("#mask-mesh").click();
+  await shot(page, "teach-mask");
+  await page.locator("#mask-save").click();
+  await page.getByText("The mask is kept.").waitFor();
+  assert.equal((await teachingOf(page, address)).photographs[5].mask_by, "person");
+  await page.locator("#editor-close").click();
+}
+
+async function teach(page, address) {
+  await page.goto(`${address}/teach`);
+  // Without the name, and with too few photographs, the page says what to do.
+  const names = (await readdir(join(photographs, "photographs"))).sort();
+  const files = names.map((name) => join(photographs, "photographs", name));
+  await page.locator("#any").setInputFiles(files.slice(0, 2));
+  await page.getByRole("button", { name: "Teach", exact: true }).click();
+  await page.locator("#status .problem").waitFor();
+  assert.match(await page.locator("#status").innerText(), /name/);
+  await page.getByLabel("Name of the object").fill("taught");
+  await page.getByRole("button", { name: "Teach", exact: true }).click();
+  await page.getByText("found 2 photographs").waitFor({ timeout: 60000 });
+  await page.locator("#any").setInputFiles([...files.slice(2), join(photographs, "camera.json")]);
+  await page.getByRole("button", { name: "Add the chosen files" }).click();
+  await page.getByText(/Working: finding the object/).waitFor({ timeout: 60000 });
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 300000 });
+  assert.equal(await page.locator(".tile").count(), files.length);
+  for (const tile of await page.locator(".tile img").all()) {
+    await tile.scrollIntoViewIfNeeded();
+    await tile.evaluate((image) => image.decode());
+  }
+  await page.locator("#viewer canvas").waitFor({ timeout: 30000 });
+  await shot(page, "teach");
+  await poseCorrected(page, address);
+  await maskCorrected(page, address);
+  await page.getByRole("button", { name: "Continue" }).click();
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 300000 });
+  await page.getByRole("button", { name: "Accept and store" }).click();
+  await page.getByText("taught is stored.").waitFor({ timeout: 120000 });
+  await page.getByRole("link", { name: "Find it in an image" }).click();
+  await page.locator('input[value="taught"]').waitFor();
+  assert(await page.locator('input[value="taught"]').isChecked());
+  const scene = ["scene/depth.png", "scene/rgb.jpg", "camera.json"].map((name) => join(photographs, name));
+  await page.locator("#any").setInputFiles(scene);
+  await page.locator("#files li").nth(2).waitFor();
+  await page.getByRole("button", { name: "Find", exact: true }).click();
+  await page.locator("#table tbody tr").first().waitFor({ timeout: 120000 });
+  const [download] = await Promise.all([page.waitForEvent("download"), page.locator("#json").click()]);
+  const [pose] = JSON.parse(await readFile(await download.path(), "utf8")).poses;
+  const truth = JSON.parse(await readFile(join(photographs, "truth.json"), "utf8")).scene_camera_from_board;
+  // The object stands where the board's origin is, its middle above it.
+  const expected = [0, 1, 2].map((i) => truth[i][2] * 0.043 + truth[i][3]);
+  const far = Math.hypot(...expected.map((v, i) => v - pose.camera_from_object[i][3]));
+  assert(far < 0.015, `found ${(1000 * far).toFixed(1)} mm from where it stands`);
+  console.log(`teach: found in another image ${(1000 * far).toFixed(1)} mm from where it stands`);
+  await shot(page, "teach-found");
+}
+
 const folder = await mkdtemp(join(tmpdir(), "sixfold-pages-"));
 await mkdir(out, { recursive: true });
 let server, browser;
@@ -172,11 +336,12 @@ try {
     const url = request.url();
     if (!url.startsWith(started.address) && !/^(blob|data):/.test(url)) faults.push(`asked for ${url}`);
   });
-  await objects(page, started.address);
-  await find(page, started.address);
-  await grasp(page, started.address);
+  page.setDefaultTimeout(30000);
+  const pages = { objects, find, grasp, teach };
+  const wanted = (process.env.PAGES || Object.keys(pages).join()).split(",");
+  for (const name of wanted) await pages[name](page, started.address);
   assert.deepEqual(faults, []);
-  console.log("pages: objects, find, grasp work at both sizes");
+  console.log(`pages: ${wanted.join(", ")} work at both sizes`);
 } finally {
   await browser?.close();
   server?.kill("SIGINT");

@@ -7,3 +7,5 @@ mod find;
 mod objects;
 mod restart;
 mod support;
+#[cfg(feature = "networks")]
+mod teach;

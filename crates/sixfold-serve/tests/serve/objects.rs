@@ -62,6 +62,30 @@ fn an_uploaded_mesh_is_stored_found_replaced_and_removed() {
 }
 
 #[test]
+fn sure_symmetries_of_an_uploaded_mesh_are_stored() {
+    let server = TestServer::new();
+    // A cuboid of three different sides: three half turns map it onto itself.
+    let corner = |i: usize| format!("v {} {} {}\n", 40 * (i & 1), 60 * (i >> 1 & 1), 100 * (i >> 2));
+    let faces = "f 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\nf 2 4 8 6\n";
+    let mesh = (0..8).map(corner).collect::<String>() + faces;
+    let form = |name: &str| {
+        Form::default().text("name", name).text("unit", "mm").file("mesh", "box.obj", mesh.as_bytes())
+    };
+    let stored = |form: &Form| server.result_of("/v1/objects", form).expect(200).json();
+    let plain = stored(&form("plain"));
+    assert_eq!(plain["record"]["symmetries_discrete"], json!([]));
+    let found = stored(&form("found").text("find_symmetries", "colors").text("noise", "0.1"));
+    assert_eq!(found["record"]["symmetries_discrete"].as_array().unwrap().len(), 3, "{found}");
+    assert!(found["symmetries"].as_array().unwrap().iter().all(|s| s["sure"] == true), "{found}");
+    for (name, value) in [("find_symmetries", "guess"), ("noise", "-1")] {
+        let problem = server.post("/v1/objects", &form("other").text(name, value)).expect(422).json();
+        assert_eq!(problem["field"], name);
+    }
+    let both = form("other").text("find_symmetries", "shape").text("turns_about", "z");
+    assert_eq!(server.post("/v1/objects", &both).expect(422).json()["field"], "find_symmetries");
+}
+
+#[test]
 fn materials_and_textures_come_as_resources_and_from_nowhere_else() {
     let server = TestServer::new();
     let obj = "mtllib my.mtl\nusemtl a\nv 0 0 0\nv 100 0 0\nv 0 100 0\nv 0 0 50\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";

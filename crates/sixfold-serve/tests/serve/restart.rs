@@ -1,7 +1,9 @@
 //! A server that is killed: results stay, what ran or waited is worked on by the next one.
 
 use std::io::{BufRead, BufReader};
-use std::process::{Command, Stdio};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::AtomicBool;
 
 use crate::support::{TestServer, events, expected, fill, frame, options, result};
@@ -19,20 +21,25 @@ fn serve_until_killed() {
     server.run_until(&AtomicBool::new(false));
 }
 
-#[test]
-fn what_was_asked_for_survives_a_kill() {
-    let folder = tempfile::tempdir().unwrap();
-    fill(&folder.path().join("objects"));
+/// A server in a process of its own, and its address.
+pub fn to_be_killed(folder: &Path) -> (Child, SocketAddr) {
     let mut process = Command::new(std::env::current_exe().unwrap())
         .args(["restart::serve_until_killed", "--exact", "--ignored", "--nocapture"])
-        .env(FOLDER, folder.path())
+        .env(FOLDER, folder)
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
     let lines = BufReader::new(process.stdout.take().unwrap()).lines().map_while(Result::ok);
     // The harness may have begun the line.
     let address = lines.filter_map(|l| l.split_once("address ").map(|(_, a)| a.parse().unwrap())).next();
-    let address = address.expect("the server prints its address");
+    (process, address.expect("the server prints its address"))
+}
+
+#[test]
+fn what_was_asked_for_survives_a_kill() {
+    let folder = tempfile::tempdir().unwrap();
+    fill(&folder.path().join("objects"));
+    let (mut process, address) = to_be_killed(folder.path());
     let post = |objects: &str| {
         let job = frame().text("objects", objects).post(address, "/v1/find").expect(202).json();
         job["id"].as_str().unwrap().to_owned()

@@ -1,0 +1,284 @@
+// The page Teach: photographs on the board in, a stored object out, with every step to be inspected and corrected.
+
+import { ask, byId, element, follow, json, Problem, showProblem } from "/static/api.js";
+import { Editor, shapeOf } from "/static/editor.js";
+import { dropZone, jobParts, kindOf, showState } from "/static/form.js";
+
+/** Faces of the mesh as it is dragged, and as it is shown. */
+const DRAGGED_FACES = 3000;
+const SHOWN_FACES = 20000;
+/** Photographs of one request. */
+const MOST_AT_ONCE = 60;
+
+const chosen = { rgb: new Map(), depth: new Map(), camera: new Map() };
+const NAMES = { rgb: ["photograph", "photographs"], depth: ["depth image", "depth images"], camera: ["camera file", "camera files"] };
+const STATES = {
+  ready: "to be continued", queued: "waiting", running: "working", failed: "stopped", taught: "to be inspected", accepted: "stored",
+};
+const parts = jobParts();
+let shown = null;
+let viewer = null;
+let viewed = "";
+
+const editor = new Editor((teaching) => show(teaching));
+
+function showChosen() {
+  const rows = Object.entries(chosen).filter(([, files]) => files.size).map(([kind, files]) => {
+    const remove = element("button", { type: "button", className: "quiet", "aria-label": "Leave out" }, ["\u00d7"]);
+    remove.addEventListener("click", () => {
+      files.clear();
+      showChosen();
+    });
+    const text = `${files.size} ${NAMES[kind][files.size === 1 ? 0 : 1]}`;
+    return element("li", {}, [element("span", { className: "name", title: [...files.keys()].join(", ") }, [text]), remove]);
+  });
+  byId("files").replaceChildren(...rows);
+  showActions();
+}
+
+dropZone(async (files) => {
+  for (const file of files) {
+    const kind = await kindOf(file);
+    const place = chosen[kind === "mask" ? "rgb" : kind];
+    if (kind === "camera") place.clear();
+    place.set(file.name, file);
+  }
+  showChosen();
+});
+
+const input = (name) => document.forms[0].elements[name];
+
+/** The chosen files in requests that the server takes, photographs with their depth. */
+async function batches() {
+  const { max_upload: most } = await json("/v1/health");
+  const sorted = (files) => [...files.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
+  const [photographs, depth] = [sorted(chosen.rgb), sorted(chosen.depth)];
+  if (depth.length && depth.length !== photographs.length) {
+    const error = `There are ${photographs.length} photographs and ${depth.length} depth images.`;
+    throw new Problem({ error, advice: "Choose a depth image for every photograph." }, 0);
+  }
+  const all = [new FormData()];
+  let [bytes, count] = [0, 0];
+  photographs.forEach((file, i) => {
+    const size = file.size + (depth[i] ? depth[i].size : 0) + 1000;
+    if (count && (count >= MOST_AT_ONCE || bytes + size > 0.9 * most)) {
+      all.push(new FormData());
+      [bytes, count] = [0, 0];
+    }
+    const form = all[all.length - 1];
+    form.append("photographs", file, file.name);
+    if (depth[i]) form.append("depth", depth[i], depth[i].name);
+    [bytes, count] = [bytes + size, count + 1];
+  });
+  for (const file of chosen.camera.values()) all[0].append("camera", file, file.name);
+  for (const form of all) {
+    const scale = input("depth_scale").value.trim() || "1";
+    if (depth.length) form.append("depth_scale", scale);
+  }
+  if (input("ruler").value.trim()) all[0].append("ruler", input("ruler").value.trim());
+  return all;
+}
+
+async function sendMore(teaching, forms) {
+  for (const body of forms) await json(teaching.links.photographs, { method: "POST", body });
+  for (const files of Object.values(chosen)) files.clear();
+  showChosen();
+}
+
+byId("form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  byId("hint").hidden = true;
+  parts.status.replaceChildren("Sending ...");
+  parts.go.disabled = true;
+  try {
+    const [first, ...more] = await batches();
+    first.append("name", input("name").value.trim());
+    for (const name of ["hull_only", "replace"]) if (input(name).checked) first.append(name, "true");
+    first.append("start", "false");
+    const teaching = await json("/v1/teachings", { method: "POST", body: first });
+    history.pushState(null, "", `?id=${teaching.id}`);
+    await sendMore(teaching, more);
+    await run(teaching);
+  } catch (problem) {
+    showProblem(parts.status, problem);
+  } finally {
+    parts.go.disabled = false;
+    listEarlier();
+  }
+});
+
+/** Starts a job of a teaching and follows it. */
+async function run(teaching) {
+  await started(teaching, await json(teaching.links.run, { method: "POST" }));
+}
+
+/** Follows a job; what is known is shown again with each of its steps. */
+async function started(teaching, job) {
+  const path = teaching.links.teaching;
+  show(await json(path));
+  if (window.matchMedia("(max-width: 899px)").matches) byId("result").scrollIntoView({ block: "start" });
+  let step = "";
+  try {
+    const ended = await follow(job, (now) => {
+      showState(parts, now);
+      if (now.state !== "running" || now.progress.step === step) return;
+      step = now.progress.step;
+      json(path).then(show, () => {});
+    });
+    parts.status.replaceChildren(ended.state === "cancelled" ? "Cancelled; what was finished is kept." : "");
+  } finally {
+    parts.progress.hidden = parts.row.hidden = true;
+  }
+  const after = await json(path);
+  show(after);
+  if (after.problem) showProblem(parts.status, new Problem(after.problem, 422));
+}
+
+/** Runs what a button does; a problem is shown. */
+function on(id, work) {
+  byId(id).addEventListener("click", async () => {
+    byId(id).disabled = true;
+    parts.status.replaceChildren();
+    try {
+      await work(shown);
+    } catch (problem) {
+      showProblem(parts.status, problem);
+    } finally {
+      byId(id).disabled = false;
+      listEarlier();
+    }
+  });
+}
+
+on("run", run);
+on("more", async (teaching) => {
+  await sendMore(teaching, await batches());
+  await run(teaching);
+});
+on("accept", async (teaching) => {
+  const job = await json(teaching.links.accept, { method: "POST" });
+  await started(teaching, job);
+  if (shown.state === "accepted") {
+    parts.status.replaceChildren(element("span", { className: "good" }, [`${shown.object} is stored.`]));
+  }
+});
+on("remove", async (teaching) => {
+  if (!confirm(`Remove the photographs and corrections of ${teaching.name}? A stored object stays.`)) return;
+  await ask(teaching.links.teaching, { method: "DELETE" });
+  location.href = "/teach";
+});
+
+const millimetres = (metres) => (1000 * metres).toFixed(metres < 0.1 ? 1 : 0);
+const percent = (fraction) => `${(100 * fraction).toFixed(0)} %`;
+
+function symmetryText(symmetries) {
+  const text = (s) => `${s.order ? `${s.order}-fold` : "any rotation"} about (${s.axis.map((v) => v.toFixed(2)).join(" ")})`;
+  const sure = symmetries.filter((s) => s.sure).map(text);
+  const perhaps = symmetries.filter((s) => !s.sure).map((s) => `perhaps ${text(s)}`);
+  return [...sure, ...perhaps].join("; ") || "none";
+}
+
+function facts(teaching) {
+  const used = teaching.photographs.filter((p) => !p.state.startsWith("left_out")).length;
+  const pairs = [["Photographs", `${used} used of ${teaching.photographs.length}`]];
+  if (teaching.rms !== null) pairs.push(["Tags", `${teaching.rms.toFixed(2)} pixels from where the board has them`]);
+  const { mesh } = teaching;
+  if (mesh) {
+    const size = mesh.size.map(millimetres).join(" x ");
+    pairs.push(["Size", `${size} mm, diameter ${millimetres(mesh.diameter)} mm`]);
+    pairs.push(["Mesh", `${mesh.faces.toLocaleString("en")} faces${mesh.is_current ? "" : ", made before the corrections"}`]);
+    pairs.push(["In no photograph", `${percent(mesh.unseen)} of the surface`]);
+    pairs.push(["Symmetries", symmetryText(teaching.symmetries)]);
+  }
+  return pairs.flatMap(([term, text]) => [element("dt", {}, [term]), element("dd", {}, [text])]);
+}
+
+function tile(teaching, photograph) {
+  const text = photograph.state.startsWith("left_out") ? photograph.reason || "left out" : "";
+  const byPerson = ["pose", "mask"].filter((what) => photograph[`${what}_by`] === "person");
+  const caption = text ? `left out: ${text}` : byPerson.length ? `${byPerson.join(" and ")} corrected` : "";
+  const made = element("button", { type: "button", className: "tile" }, [
+    element("img", { src: `${photograph.links.overlay}&side=400&close_up=true`, alt: "", loading: "lazy" }),
+    element("span", { className: "name" }, [photograph.name]),
+    element("span", { className: text ? "reason" : "muted small" }, [caption]),
+  ]);
+  made.dataset.number = photograph.number;
+  made.classList.toggle("out", Boolean(text));
+  made.addEventListener("click", async () => {
+    try {
+      await editor.open(shown, photograph.number, await shapeOf(shown, DRAGGED_FACES));
+    } catch (problem) {
+      showProblem(byId("editor-status"), problem);
+    }
+  });
+  return made;
+}
+
+function showActions() {
+  if (!shown) return;
+  const busy = ["queued", "running"].includes(shown.state);
+  const photographs = chosen.rgb.size + chosen.camera.size > 0;
+  byId("actions").hidden = busy;
+  byId("accept").hidden = shown.state !== "taught";
+  byId("run").hidden = !["ready", "failed"].includes(shown.state);
+  byId("run").textContent = shown.mesh || shown.camera ? "Continue" : "Begin";
+  byId("more").hidden = busy || !photographs;
+  byId("find-link").hidden = !shown.object;
+  byId("find-link").href = `/find?object=${encodeURIComponent(shown.object || "")}`;
+}
+
+function show(teaching) {
+  shown = teaching;
+  byId("hint").hidden = true;
+  byId("teaching").hidden = false;
+  byId("name").textContent = teaching.name;
+  byId("state").textContent = STATES[teaching.state];
+  byId("state").dataset.state = teaching.state;
+  byId("facts").replaceChildren(...facts(teaching));
+  byId("legend").hidden = !teaching.mesh;
+  byId("tiles").replaceChildren(...teaching.photographs.map((photograph) => tile(teaching, photograph)));
+  showActions();
+  view(teaching);
+}
+
+/** The mesh, where it is another one than the one that is shown. */
+async function view(teaching) {
+  const place = byId("viewer");
+  place.hidden = !teaching.mesh;
+  const key = teaching.mesh && teaching.mesh.is_current ? teaching.mesh.link : viewed;
+  if (!teaching.mesh || key === viewed) return;
+  viewed = key;
+  try {
+    const { Viewer, parsePly } = await import("/static/viewer.js");
+    const response = await ask(`${teaching.mesh.link}&faces=${SHOWN_FACES}`);
+    const geometry = parsePly(await response.arrayBuffer());
+    viewer ??= new Viewer(place);
+    viewer.show(geometry);
+  } catch (problem) {
+    viewer = null;
+    place.replaceChildren(element("p", {}, [`The mesh cannot be shown here: ${problem.message}`]));
+  }
+}
+
+async function listEarlier() {
+  const { teachings } = await json("/v1/teachings");
+  const rows = teachings.map((teaching) => {
+    const state = element("span", { className: "muted small" }, [`${teaching.photographs} photographs, ${STATES[teaching.state]}`]);
+    return element("li", {}, [element("a", { href: `/teach?id=${teaching.id}` }, [teaching.name]), " ", state]);
+  });
+  byId("earlier").replaceChildren(...rows);
+  byId("earlier-part").hidden = rows.length === 0;
+}
+
+async function start() {
+  const id = new URLSearchParams(location.search).get("id");
+  if (id) {
+    const teaching = await json(`/v1/teachings/${encodeURIComponent(id)}`);
+    show(teaching);
+    if (teaching.problem) showProblem(parts.status, new Problem(teaching.problem, 422));
+    if (["queued", "running"].includes(teaching.state)) started(teaching, teaching.job).catch((e) => showProblem(parts.status, e));
+  }
+  await listEarlier();
+}
+
+start().catch((problem) => showProblem(parts.status, problem));

@@ -1,0 +1,165 @@
+//! Works on a teaching: tags, masks, mesh, as `sixfold teach` does; then, once somebody has accepted it, stores the object.
+
+use std::sync::{Mutex, PoisonError};
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use sixfold_estimator::{Object, PoseEstimator};
+use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
+use sixfold_ppf::PpfEstimator;
+use sixfold_teach::{
+    FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, ShapeOptions, TeachError, TeachOptions, Teaching,
+};
+use sixfold_views::estimator::ViewsEstimator;
+
+use super::views::MeshFacts;
+use super::{Entry, locked, of_teach};
+use crate::app::App;
+use crate::jobs::{Stopped, Work};
+use crate::objects::SymmetryView;
+
+/// What a job does with a teaching.
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct TeachRequest {
+    teaching: String,
+    accept: Option<AcceptedAs>,
+}
+
+/// What the object is stored as.
+#[derive(Debug, Serialize, Deserialize)]
+struct AcceptedAs {
+    name: String,
+    replace: bool,
+}
+
+impl TeachRequest {
+    pub fn run(teaching: &str) -> TeachRequest {
+        TeachRequest { teaching: teaching.to_owned(), accept: None }
+    }
+
+    pub fn accept(teaching: &str, name: String, replace: bool) -> TeachRequest {
+        TeachRequest { teaching: teaching.to_owned(), accept: Some(AcceptedAs { name, replace }) }
+    }
+}
+
+/// Works on a request. What failed is kept with the teaching, also after the job is gone.
+pub(crate) fn run(app: &App, request: &TeachRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
+    let entry = app.teachings.get(&request.teaching)?;
+    let _held = locked(&entry.changing);
+    let id = work.id().to_owned();
+    entry.note(|record| (record.job, record.problem) = (Some(id), None))?;
+    let result = match &request.accept {
+        None => teach(app, &entry, work),
+        Some(accepted) => accept(app, &entry, accepted, work),
+    };
+    if let Err(Stopped::Failed(error)) = &result {
+        entry.note(|record| record.problem = Some((*error.problem).clone()))?;
+    }
+    result
+}
+
+/// Runs a step that reports how far it is; it ends where nobody waits for the job any more.
+fn step(
+    work: &Work<'_>,
+    name: &str,
+    step: impl FnOnce(&dyn sixfold_geometry::Progress) -> Result<(), TeachError>,
+) -> Result<(), Stopped> {
+    let stopped = Mutex::new(None);
+    let report = |done: usize, total: usize| match work.step(done, total, name) {
+        Ok(()) => true,
+        Err(reason) => {
+            *stopped.lock().unwrap_or_else(PoisonError::into_inner) = Some(reason);
+            false
+        }
+    };
+    match step(&report) {
+        Ok(()) => work.check(),
+        Err(TeachError::Stopped) => {
+            let reason = stopped.into_inner().unwrap_or_else(PoisonError::into_inner);
+            Err(reason.unwrap_or(Stopped::Cancelled))
+        }
+        Err(error) => Err(of_teach(&error).into()),
+    }
+}
+
+/// Too few photographs are told before anything is looked for in them.
+fn check_number(teaching: &Teaching) -> Result<(), TeachError> {
+    let used = || teaching.photographs().iter().filter(|p| !p.left_out_by_person);
+    let least = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
+    let found = used().count();
+    if found < least {
+        return Err(TeachError::TooFewPhotographs { found, least, reasons: String::new() });
+    }
+    Ok(())
+}
+
+fn teach(app: &App, entry: &Entry, work: &mut Work<'_>) -> Result<Value, Stopped> {
+    let fault = |e: TeachError| Stopped::from(of_teach(&e));
+    let mut teaching = Teaching::open(&entry.folder, &TeachOptions::default()).map_err(fault)?;
+    check_number(&teaching).map_err(fault)?;
+    let options = ShapeOptions { stereo: !entry.record().hull_only, ..ShapeOptions::default() };
+    let segmenter = app.teachings.segmenter()?;
+    step(work, "finding tags", |progress| teaching.locate(progress))?;
+    step(work, "finding the object", |progress| teaching.find_masks(segmenter.as_ref(), &options, progress))?;
+    step(work, "making the mesh", |progress| teaching.reconstruct(&options, progress))?;
+    work.step(0, 2, "finding symmetries")?;
+    let mesh = teaching.mesh().map_err(fault)?;
+    let symmetries = teaching.symmetries().map_err(fault)?;
+    let symmetries: Vec<SymmetryView> = symmetries.iter().map(|s| SymmetryView::of(s, true)).collect();
+    let facts = MeshFacts::of(&mesh);
+    entry.note(|record| (record.mesh, record.symmetries) = (Some(facts.clone()), symmetries.clone()))?;
+    work.step(1, 2, "drawing")?;
+    work.overlay(&teaching.picture().map_err(fault)?)?;
+    let left_out: Vec<Value> = teaching
+        .photographs()
+        .iter()
+        .filter(|p| p.left_out_by_person || p.left_out.is_some())
+        .map(|p| json!({ "photograph": p.name, "reason": p.left_out.as_deref().unwrap_or("by request") }))
+        .collect();
+    let shape = teaching.shape();
+    Ok(json!({
+        "teaching": format!("/v1/teachings/{}", entry.id),
+        "photographs": teaching.photographs().len() - left_out.len(),
+        "left_out": left_out,
+        "mesh": facts,
+        "unseen": shape.map(|s| s.unseen),
+        "with_depth": shape.map(|s| s.with_depth),
+        "symmetries": symmetries,
+    }))
+}
+
+fn accept(app: &App, entry: &Entry, accepted: &AcceptedAs, work: &mut Work<'_>) -> Result<Value, Stopped> {
+    let known = entry.snapshot()?;
+    work.step(0, 1, "storing the object")?;
+    // Stored by this job before the server ended, which began it again.
+    let own = entry.record().object.as_ref() == Some(&accepted.name);
+    let replace = accepted.replace || own;
+    let name = &accepted.name;
+    let before = entry.record().object;
+    entry.note(|record| record.object = Some(name.clone()))?;
+    let stored = match known.store(&app.store, name, replace, prepare) {
+        Ok(stored) => stored,
+        Err(error) => {
+            entry.note(|record| record.object = before)?;
+            return Err(of_teach(&error).into());
+        }
+    };
+    entry.note(|record| record.accepted = true)?;
+    Ok(json!({
+        "name": name,
+        "object": format!("/v1/objects/{name}"),
+        "record": stored.record,
+        "photographs": stored.photographs,
+    }))
+}
+
+/// What methods derive from an object: now, not at the first search.
+fn prepare(object: &Object) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    PpfEstimator::default().prepare(object)?;
+    if let (Some(mesh), Some(file)) = (&object.mesh, object.file(TEMPLATES_FILE)) {
+        ObjectTemplates::from_mesh(mesh, &TemplateOptions::default())?.write(&file)?;
+        MttmEstimator::default().prepare(object)?;
+    }
+    ViewsEstimator::shipped()?.prepare(object)?;
+    Ok(())
+}
