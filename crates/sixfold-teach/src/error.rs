@@ -121,6 +121,26 @@ pub enum TeachError {
         /// Of the photograph.
         photograph_height: usize,
     },
+    /// A given mesh of another size than the object in the photographs.
+    #[error(
+        "--mesh: found a mesh of {mesh_mm:.1} mm diameter, the object in the photographs has about {found_mm:.1} mm: check the unit of the \
+         mesh, the ruler, and whether it is the same object"
+    )]
+    MeshSize {
+        /// Diameter of the mesh, millimetres.
+        mesh_mm: f64,
+        /// Diameter of the object in the photographs, millimetres.
+        found_mm: f64,
+    },
+    /// A given mesh that is not the object in the photographs.
+    #[error(
+        "--mesh: its outlines cover the masks of the photographs to {percent:.0} % at best, expected at least 80 %: check whether it is the \
+         same object, with all its parts"
+    )]
+    MeshDoesNotFit {
+        /// Mean intersection over union, percent.
+        percent: f64,
+    },
     /// Marked points that give no pose.
     #[error("pose from points: {what}")]
     Pairs {

@@ -18,6 +18,7 @@ mod located;
 mod paint;
 mod pairs;
 mod pictures;
+mod placed;
 mod record;
 mod reduce;
 mod shape;

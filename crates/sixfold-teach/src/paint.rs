@@ -18,6 +18,29 @@ pub(crate) struct Painted {
     pub unseen: f64,
 }
 
+/// The same surface with faces cut in four, again and again while there are not more than `most`: colours stand at vertices.
+pub(crate) fn finer(mesh: &Mesh, most: usize) -> Mesh {
+    let mut mesh = mesh.clone();
+    while !mesh.faces().is_empty() && 4 * mesh.faces().len() <= most {
+        let mut vertices = mesh.vertices().to_vec();
+        let mut middles = std::collections::BTreeMap::new();
+        let mut middle = |a: u32, b: u32| {
+            *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
+                vertices.push(0.5 * (vertices[a as usize] + vertices[b as usize]));
+                vertices.len() as u32 - 1
+            })
+        };
+        let mut faces = Vec::with_capacity(4 * mesh.faces().len());
+        for &[a, b, c] in mesh.faces() {
+            let [ab, bc, ca] = [middle(a, b), middle(b, c), middle(c, a)];
+            faces.extend([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]);
+        }
+        let Ok(cut) = Mesh::new(vertices, faces) else { return mesh };
+        mesh = cut;
+    }
+    mesh
+}
+
 pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
     let depths: Vec<_> =
         views.par_iter().map(|v| render_depth(mesh, &v.camera_from_world, &v.camera)).collect();

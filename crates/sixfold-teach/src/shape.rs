@@ -10,7 +10,8 @@ use crate::error::TeachError;
 use crate::fusion::carved;
 use crate::grid::Grid;
 use crate::hull::{Outlined, hull};
-use crate::paint::{centre, painted};
+use crate::paint::{centre, finer, painted};
+use crate::placed::{PLACING_STEPS, placed};
 use crate::silhouette::{Cues, Segmenter, consensus, masks};
 use crate::stereo::{Reach, StereoOptions, depths};
 use crate::surface::surface;
@@ -34,6 +35,9 @@ const HEIGHT: f64 = 1.0;
 const SHAPE_STEPS: usize = 4;
 /// What touches the board within this height belongs to the table: flat shadows, the sheet's own thickness; metres.
 const TABLE: f64 = 0.0005;
+
+/// Longer side of a view while a mesh is laid into it, pixels.
+const LAID_SIDE: usize = 220;
 
 /// How far before and behind the hull depth is searched, metres.
 const BEYOND: f32 = 0.003;
@@ -402,6 +406,54 @@ pub fn reconstruct(
     let mesh = mesh.clone().with_colors(paint.colors).unwrap_or(mesh);
     step(progress, 4, SHAPE_STEPS)?;
     Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth })
+}
+
+/// One part of several: counts from where the part before ended.
+struct Part<'a> {
+    whole: &'a dyn Progress,
+    before: usize,
+    total: usize,
+}
+
+impl Progress for Part<'_> {
+    fn report(&self, done: usize, _: usize) -> bool {
+        self.whole.report(self.before + done, self.total)
+    }
+}
+
+/// Lays a mesh that is known already into photographs with masks; it keeps its frame, and its colours if it has any.
+///
+/// # Errors
+/// [`TeachError`].
+pub(crate) fn lay(
+    capture: &Capture,
+    found: &Segmentation,
+    given: &Mesh,
+    options: &ShapeOptions,
+    progress: &dyn Progress,
+) -> Result<Shape, TeachError> {
+    let rough = ShapeOptions { stereo: false, ..*options };
+    let total = SHAPE_STEPS + PLACING_STEPS;
+    let hull = reconstruct(capture, found, &rough, &Part { whole: progress, before: 0, total })?;
+    let hull_in_world = hull.mesh.transformed(&hull.world_from_object);
+    let used: Vec<usize> = (0..found.masks.len()).filter(|i| found.masks[*i].is_some()).collect();
+    let (low, high) = hull_in_world.bounding_box();
+    let volume = Volume { low, high }.scaled(1.2);
+    let numbered = views_of(capture, &volume, LAID_SIDE, &used);
+    let masks: Vec<Mask> = numbered
+        .iter()
+        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
+        .collect();
+    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let part = Part { whole: progress, before: SHAPE_STEPS, total };
+    let world_from_object = placed(given, &hull_in_world, &views, &masks, &part)?;
+    let has_colors = given.colors().is_some() || given.texture().is_some();
+    let mesh = if has_colors { given.clone() } else { finer(given, options.faces) };
+    let views: Vec<View> =
+        views_of(capture, &volume, options.fine_side, &used).into_iter().map(|(_, view)| view).collect();
+    let paint = painted(&mesh.transformed(&world_from_object), &views);
+    let mesh = if has_colors { mesh } else { mesh.clone().with_colors(paint.colors).unwrap_or(mesh) };
+    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth: hull.with_depth })
 }
 
 /// Depth of views, measured or found by comparison.

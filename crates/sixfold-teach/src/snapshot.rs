@@ -44,6 +44,9 @@ pub(crate) struct State {
     /// That of the mesh which lies in the folder but was made before a correction: to correct more by.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub outdated: Option<ShapeFacts>,
+    /// Hash of a mesh that was given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub given_mesh: Option<u64>,
 }
 
 /// What is known of a teaching at one moment.

@@ -7,6 +7,7 @@
 //! | `photographs/000000.jpg` | the photographs as they were given, under numbers |
 //! | `depth/000000.png` | measured depth |
 //! | `masks/000000.png` | where each shows the object, without lens distortion |
+//! | `given.ply` | a mesh that was given, metres |
 //! | `mesh.ply` | the mesh, metres |
 
 use std::ops::Deref;
@@ -16,12 +17,12 @@ use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Mask, Pose, Progress, Vec3};
 use sixfold_io::{ImageFile, WriteLock, read_mask, read_rgb, write_atomically, write_mask};
-use sixfold_mesh::{PlyFormat, Unit, write_ply};
+use sixfold_mesh::{Mesh, PlyFormat, Unit, read_mesh, write_ply};
 
 use crate::error::TeachError;
 use crate::located::{Located, SeenTags, locate};
 use crate::shape::{
-    FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Segmentation, Shape, ShapeOptions, reconstruct, segment, step,
+    FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, Segmentation, Shape, ShapeOptions, lay, reconstruct, segment, step,
 };
 use crate::silhouette::Segmenter;
 use crate::snapshot::{Snapshot, State, VERSION};
@@ -29,6 +30,8 @@ use crate::view::Volume;
 
 /// Most photographs.
 pub const MOST_PHOTOGRAPHS: usize = 200;
+/// The file of a mesh that was given.
+const GIVEN_MESH: &str = "given.ply";
 
 /// Who gave a pose or a mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -143,6 +146,7 @@ impl Teaching {
                 volume: None,
                 shape: None,
                 outdated: None,
+                given_mesh: None,
             };
             Snapshot { folder, state }
         };
@@ -371,7 +375,10 @@ impl Teaching {
         }
         let volume = Volume { low: low.into(), high: high.into() };
         let found = Segmentation { volume, masks, left_out: vec![] };
-        let shape = reconstruct(&capture, &found, options, progress)?;
+        let shape = match self.given_mesh()? {
+            Some(given) => lay(&capture, &found, &given, options, progress)?,
+            None => reconstruct(&capture, &found, options, progress)?,
+        };
         self.keep_shape(&shape)
     }
 
@@ -386,6 +393,33 @@ impl Teaching {
         });
         self.known.state.outdated = None;
         self.save()
+    }
+
+    /// Gives the object's mesh, metres: it is laid into the photographs in place of one that is made of them. `None` takes it back.
+    ///
+    /// # Errors
+    /// [`TeachError::File`], [`TeachError::Io`].
+    pub fn set_mesh(&mut self, mesh: Option<&Mesh>) -> Result<(), TeachError> {
+        let hash = mesh.map(Mesh::contents_hash);
+        if hash == self.known.state.given_mesh {
+            return Ok(());
+        }
+        if let Some(mesh) = mesh {
+            let path = self.known.folder.join(GIVEN_MESH);
+            write_ply(&path, mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)
+                .map_err(|e| TeachError::File { path, what: e.to_string() })?;
+        }
+        self.known.state.given_mesh = hash;
+        self.forget_from(Step::Mesh);
+        self.save()
+    }
+
+    fn given_mesh(&self) -> Result<Option<Mesh>, TeachError> {
+        if self.known.state.given_mesh.is_none() {
+            return Ok(None);
+        }
+        let path = self.known.folder.join(GIVEN_MESH);
+        read_mesh(&path, Unit::Metre).map(Some).map_err(|e| TeachError::File { path, what: e.to_string() })
     }
 
     /// Corrects a pose: where the camera was. Masks and mesh are made again.

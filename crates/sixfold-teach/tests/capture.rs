@@ -364,3 +364,62 @@ fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
     assert!(found < 1.5e-3 && missing < 1.5e-3, "{found} {missing}");
     assert!(shape.with_depth > 0.95);
 }
+
+/// The body without colours, in another frame: as somebody's CAD file has it.
+fn untextured(file_from_body: &Pose) -> Mesh {
+    let body = body();
+    Mesh::new(body.vertices().to_vec(), body.faces().to_vec()).unwrap().transformed(file_from_body)
+}
+
+#[test]
+fn a_mesh_that_is_there_already_is_laid_into_the_photographs_and_coloured_by_them() {
+    let photographs = photographs();
+    let folder = tempfile::tempdir().unwrap();
+    let twist = sixfold_geometry::nalgebra::Vector6::new(0.3, -0.1, 0.2, 0.9, -1.7, 0.4);
+    let file_from_body = Pose::exp(&twist);
+    let given = untextured(&file_from_body);
+    let mut teaching = Teaching::open(folder.path(), &TeachOptions::default()).unwrap();
+    for (i, file) in photographs.files.iter().enumerate() {
+        teaching.add_photograph(&format!("{i}.png"), file).unwrap();
+    }
+    teaching.set_mesh(Some(&given)).unwrap();
+    let salient = Salient::new();
+    teaching.locate(&()).unwrap();
+    teaching.find_masks(&salient, &coarse(), &()).unwrap();
+    teaching.reconstruct(&coarse(), &()).unwrap();
+    let rows = teaching.shape().unwrap().board_from_object;
+    let matrix = sixfold_geometry::nalgebra::Matrix4::from_fn(|i, j| rows[i][j]);
+    let board_from_file = Pose::from_matrix(&matrix).unwrap();
+    let off = given.vertices().iter().map(|v| {
+        let truth =
+            photographs.board_from_object.transform_point(&file_from_body.inverse().transform_point(v));
+        (board_from_file.transform_point(v) - truth).norm()
+    });
+    let largest = off.fold(0.0, f64::max);
+    assert!(largest < 0.0025, "a corner is {:.2} mm off", 1000.0 * largest);
+    // The mesh keeps its frame and its shape, and gets the colours of foot and head.
+    let mesh = teaching.mesh().unwrap();
+    assert!((mesh.diameter() - given.diameter()).abs() < 1e-6 && mesh.vertices().len() > 500);
+    let mut right = [0, 0];
+    let body_from_file = file_from_body.inverse();
+    for (vertex, color) in mesh.vertices().iter().zip(mesh.colors().unwrap()) {
+        let z = body_from_file.transform_point(vertex).z;
+        let reddish = color[0] > color[2];
+        if z > 0.01 && (z - 0.045).abs() > 0.006 {
+            right[usize::from(reddish == (z < 0.045))] += 1;
+        }
+    }
+    assert!(right[1] > 20 * right[0], "{right:?}");
+
+    // Another mesh begins the last step again; one of another size is refused, and so is another object.
+    let twice =
+        Mesh::new(given.vertices().iter().map(|v| v * 2.0).collect(), given.faces().to_vec()).unwrap();
+    teaching.set_mesh(Some(&twice)).unwrap();
+    assert!(teaching.shape().is_none());
+    let error = teaching.reconstruct(&coarse(), &()).unwrap_err();
+    assert!(matches!(error, TeachError::MeshSize { .. }), "{error}");
+    let rod = cuboid([-0.06, -0.008, 0.0], [0.06, 0.008, 0.016]);
+    teaching.set_mesh(Some(&rod)).unwrap();
+    let error = teaching.reconstruct(&coarse(), &()).unwrap_err();
+    assert!(matches!(error, TeachError::MeshDoesNotFit { .. }), "{error}");
+}

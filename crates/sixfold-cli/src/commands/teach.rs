@@ -7,7 +7,7 @@ use clap::Args;
 use serde::Serialize;
 use sixfold_estimator::{Object, ObjectRecord, ObjectStore, PoseEstimator, StoreError};
 use sixfold_io::{CameraFile, limits, read_regular, write_rgb};
-use sixfold_mesh::Verdict;
+use sixfold_mesh::{Unit, Verdict, read_mesh};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
 use sixfold_shell::Outcome;
@@ -44,6 +44,12 @@ pub(crate) struct TeachArguments {
     /// What the ruler on the printed board measures, millimetres (default: 100)
     #[arg(long, value_name = "MM")]
     pub ruler: Option<f64>,
+    /// Mesh of the object: it is laid into the photographs, and coloured by them if it has no colours
+    #[arg(long, value_name = "FILE", requires = "unit", conflicts_with = "hull_only")]
+    pub mesh: Option<PathBuf>,
+    /// Unit of the mesh file: m, cm, mm, in
+    #[arg(long, value_name = "UNIT", requires = "mesh")]
+    pub unit: Option<Unit>,
     /// Do not look for hollows by comparing photographs
     #[arg(long)]
     pub hull_only: bool,
@@ -139,7 +145,9 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         }
         _ => None,
     };
+    let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
     let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera })?;
+    teaching.set_mesh(mesh.as_ref())?;
     for (i, file) in files.iter().enumerate() {
         let bytes = read_regular(file, limits::IMAGE).with_context(|| file.display().to_string())?;
         let number = teaching.add_photograph(&file.display().to_string(), &bytes)?;
