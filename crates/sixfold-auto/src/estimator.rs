@@ -15,6 +15,7 @@ use sixfold_mesh::Mesh;
 
 use crate::calibration::{Calibration, CalibrationError};
 use crate::hypotheses::{Hypothesis, Pool};
+use crate::lookalikes::LookAlikes;
 use crate::numbers::NAMES;
 
 const METHOD: &str = "auto";
@@ -95,11 +96,14 @@ impl AutoEstimator {
             (image, kept)
         });
         let color = gradients.as_ref().and_then(|(image, kept)| kept.get().map(|g| (*image, g)));
+        let none = LookAlikes::default();
+        let look_alikes = if color.is_some() && query.depth.is_some() { object.look_alikes() } else { &none };
         let mut pool = Pool {
             scene: Scene { camera: query.camera, depth: query.depth.map(|d| d.as_ref()), color },
             shape: Shape { mesh: &object.rendered, colored: &object.mesh, threshold: object.threshold },
             diameter: object.diameter,
             symmetries: &object.symmetries,
+            look_alikes,
             calibration: &self.calibration,
             one_instance: query.max_instances == 1,
             hypotheses: vec![],
@@ -166,6 +170,8 @@ pub struct AutoObject {
     diameter: f64,
     threshold: f64,
     symmetries: Vec<Pose>,
+    /// Found when they are first needed.
+    look_alikes: OnceLock<LookAlikes>,
     members: Vec<Prepared>,
     notes: Vec<String>,
 }
@@ -176,6 +182,10 @@ type Known = Result<Arc<Box<dyn PreparedObject>>, String>;
 type Prepared = Mutex<Option<Known>>;
 
 impl AutoObject {
+    fn look_alikes(&self) -> &LookAlikes {
+        self.look_alikes.get_or_init(|| LookAlikes::of(&self.mesh, self.diameter, &self.symmetries))
+    }
+
     /// The object as method number `number` knows it, or why it cannot be asked.
     fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<Known, EstimatorError> {
         let Some(place) = self.members.get(number) else {
@@ -240,6 +250,7 @@ impl PoseEstimator for AutoEstimator {
             diameter,
             threshold: VerificationOptions::default().threshold_for(diameter),
             symmetries: object.info.as_ref().map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
+            look_alikes: OnceLock::new(),
             members: self.members.iter().map(|_| Prepared::default()).collect(),
             notes: kept.note.map(note).into_iter().collect(),
             object: object.clone(),

@@ -8,6 +8,7 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::calibration::Calibration;
+use crate::lookalikes::LookAlikes;
 use crate::numbers::{Numbers, add_others, of_evidence, strength};
 
 /// Poses whose points lie apart by less than this fraction of the diameter are the same; of methods on colour alone, which err along
@@ -42,6 +43,8 @@ pub(crate) struct Pool<'a> {
     pub shape: Shape<'a>,
     pub diameter: f64,
     pub symmetries: &'a [Pose],
+    /// What depth alone takes for the same.
+    pub look_alikes: &'a LookAlikes,
     pub calibration: &'a Calibration,
     pub one_instance: bool,
     pub hypotheses: Vec<Hypothesis>,
@@ -54,6 +57,7 @@ impl Pool<'_> {
         self.asked += 1;
         let by_depth = method.needs().depth != Need::Unused;
         let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
+        let look_alikes = self.look_alikes;
         let options = VerificationOptions::default();
         let judged: Vec<Option<Hypothesis>> = found
             .into_par_iter()
@@ -69,6 +73,12 @@ impl Pool<'_> {
                     if ranking(&after) > ranking(&evidence) {
                         (estimate.camera_from_object, evidence) = (moved, after);
                     }
+                }
+                if by_depth
+                    && let Some(other) =
+                        look_alikes.best(scene, shape, diameter, (&estimate.camera_from_object, &evidence))
+                {
+                    (estimate.camera_from_object, evidence) = other;
                 }
                 let similarity = estimate.details.get("similarity").and_then(serde_json::Value::as_f64);
                 let name = method.name();
@@ -166,12 +176,17 @@ fn is_before_camera(pose: &Pose, mesh: &Mesh, diameter: f64) -> bool {
     centre.iter().all(|v| v.is_finite()) && centre.z > AGAINST_LENS * diameter
 }
 
-fn ranking(evidence: &Evidence) -> f64 {
+pub(crate) fn ranking(evidence: &Evidence) -> f64 {
     evidence.depth.map_or(0.0, |d| d.score.ranking())
 }
 
 /// A pose from colour where the measured surface has it.
-fn moved_to_depth(scene: &Scene<'_>, shape: &Shape<'_>, diameter: f64, pose: &Pose) -> Option<Pose> {
+pub(crate) fn moved_to_depth(
+    scene: &Scene<'_>,
+    shape: &Shape<'_>,
+    diameter: f64,
+    pose: &Pose,
+) -> Option<Pose> {
     let image = scene.depth?;
     let aligned = align_to_depth(image, shape.mesh, diameter, pose, &|_, _| true).ok()?;
     Some(refine(&mut Verifier::default(), image, shape.mesh, &aligned.camera_from_object, shape.threshold))

@@ -10,6 +10,7 @@
 mod calibration;
 mod estimator;
 mod hypotheses;
+mod lookalikes;
 mod members;
 mod numbers;
 mod regression;

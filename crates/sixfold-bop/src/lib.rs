@@ -21,6 +21,7 @@ mod results;
 mod rle;
 mod scene_files;
 mod score;
+mod simulate;
 mod table;
 mod visibility;
 mod write;
@@ -54,6 +55,7 @@ pub use scene_files::{
     parse_scene_gt_info, parse_targets,
 };
 pub use score::{area_under_accuracy, average_precision, recall_below};
+pub use simulate::DepthSimulation;
 pub use table::{detection_score_table, score_table};
 pub use visibility::{ObjectVisibility, VISIBILITY_DELTA, ground_truth_visibility};
 pub use write::{NewImage, SceneWriter, write_camera, write_targets};

@@ -69,6 +69,13 @@ impl ModelInfo {
         }
     }
 
+    /// Adds a symmetry: the object may rotate freely about this axis of its frame, through the middle of its box (a file's origin
+    /// may be anywhere).
+    pub fn rotates_freely_about(&mut self, axis: Vec3) {
+        let offset = self.min + self.size * 0.5;
+        self.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
+    }
+
     /// Whether there is any symmetry.
     pub fn is_symmetric(&self) -> bool {
         !self.symmetries_discrete.is_empty() || !self.symmetries_continuous.is_empty()

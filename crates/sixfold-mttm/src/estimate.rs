@@ -157,7 +157,7 @@ impl MttmOptions {
     /// templates and the published form stay.
     ///
     /// ADD(-S) on 90 instances in simulated piles, with the number of verified hypotheses: .58 (16), .68 (48), .74 (120), .79 (400,
-    /// from twice as many regions); by point pair features .89 (docs/commands.md has the commands).
+    /// from twice as many regions); by point pair features .89 (docs/measured.md has the commands).
     #[must_use]
     pub fn for_templates(self, templates: &ObjectTemplates) -> MttmOptions {
         let around = templates.source == Source::Mesh && templates.options.coverage == ViewCoverage::Around;

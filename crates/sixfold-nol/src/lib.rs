@@ -16,6 +16,7 @@ pub mod loss;
 mod maps;
 pub mod model;
 pub mod network;
+mod outlines;
 pub mod pose_file;
 mod preview;
 mod projection;

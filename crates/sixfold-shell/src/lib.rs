@@ -8,6 +8,7 @@
 pub mod screen;
 
 pub mod board;
+pub mod depth_views;
 pub mod folder;
 pub mod found;
 pub mod frames;
@@ -24,6 +25,7 @@ pub mod ranges;
 #[cfg(feature = "physics")]
 pub mod scenes;
 pub mod sheets;
+pub mod symmetries;
 #[cfg(feature = "networks")]
 pub mod training;
 

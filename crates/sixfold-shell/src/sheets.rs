@@ -1,8 +1,11 @@
 //! Several images on one sheet, for people.
 
+use std::path::Path;
+
 use anyhow::Result;
 use sixfold_bop::BopDataset;
 use sixfold_geometry::RgbImage;
+use sixfold_io::write_rgb;
 
 use crate::overlay;
 
@@ -15,7 +18,7 @@ const WIDTH: usize = 320;
 const EMPTY: [u8; 3] = [24; 3];
 
 /// Puts an image into a larger one.
-pub fn paste(sheet: &mut RgbImage, image: &RgbImage, left: usize, top: usize) {
+fn paste(sheet: &mut RgbImage, image: &RgbImage, left: usize, top: usize) {
     for y in 0..image.height() {
         for x in 0..image.width() {
             sheet[(left + x, top + y)] = image[(x, y)];
@@ -40,6 +43,18 @@ pub fn sheet(rows: &[Vec<(RgbImage, String)>], (width, height): (usize, usize)) 
         }
     }
     Some(sheet)
+}
+
+/// Writes square images row by row, each with a text; nothing where there is no image.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_sheet(path: &Path, rows: &[Vec<(RgbImage, String)>]) -> Result<()> {
+    let side = rows.iter().flatten().map(|(image, _)| image.width()).max().unwrap_or(0);
+    match sheet(rows, (side, side)) {
+        Some(sheet) => Ok(write_rgb(path, &sheet)?),
+        None => Ok(()),
+    }
 }
 
 /// The first scenes of a dataset: a row per scene, its first views in colour, then the depth of the first. None without images.

@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, anyhow};
+use anyhow::Result;
 use clap::Args;
-use sixfold_board::{Board, CalibrationOptions, Paper};
+use sixfold_board::CalibrationOptions;
 use sixfold_io::CameraFile;
 use sixfold_shell::Outcome;
-use sixfold_shell::board::{Calibrated, photograph_files, read_photographs};
+use sixfold_shell::board::{Calibrated, photograph_files, read_photographs, ruler_in_metres};
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::{JsonArguments, report};
 
@@ -36,11 +36,7 @@ pub(crate) struct CalibrateArguments {
 }
 
 pub(crate) fn run(a: &CalibrateArguments) -> Result<Outcome> {
-    let ruler = a.ruler.map(|mm| {
-        let board = Board::new(Paper::A4).with_ruler(mm / 1000.0).map(|_| mm / 1000.0);
-        board.ok_or_else(|| anyhow!("--ruler: found {mm}, expected 10 to 1000 millimetres"))
-    });
-    let ruler = ruler.transpose()?;
+    let ruler = ruler_in_metres(a.ruler)?;
     let known = a.camera.as_deref().map(CameraFile::read).transpose()?;
     let files = photograph_files(&a.photographs)?;
     let mut folder = OutputFolder::take(&a.out)?;

@@ -1,18 +1,12 @@
 //! `sixfold simulate-depth`: what a depth camera would have measured in a dataset that has poses but no depth.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use sixfold_bop::{
-    BopDataset, Models, NewImage, SceneWriter, Target, VISIBILITY_DELTA, ground_truth_visibility,
-    write_camera, write_targets,
-};
-use sixfold_geometry::Pose;
-use sixfold_mesh::Mesh;
-use sixfold_render::{DepthSensor, depth_on_table};
+use sixfold_bop::{BopDataset, DepthSimulation, Models, SceneWriter, Target, write_camera, write_targets};
+use sixfold_render::DepthSensor;
 
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::{Contents, DatasetFolder, OutputFolder, copy_files};
@@ -102,10 +96,10 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     folder.begin(&Contents::default())?;
     let mut pictures = Pictures::of(a.pictures.as_deref().map(OutputFolder::take).transpose()?);
     let wanted = |im_id: u32| a.images.is_empty() || a.images.contains(&im_id);
-    let mut meshes: BTreeMap<u32, Mesh> = BTreeMap::new();
-    let mut images = 0;
-    let mut without_table = vec![];
-    let mut first_camera = None;
+    let (mut images, mut without_table, mut first_camera) = (0, vec![], None);
+    let mut simulation = DepthSimulation::new(&dataset);
+    simulation.sensor = a.sensor.model();
+    (simulation.with_table, simulation.with_rgb, simulation.seed) = (!a.no_table, a.rgb, a.seed);
     for scene_id in dataset.scene_ids() {
         let scene = dataset.scene(scene_id)?;
         let ids: Vec<u32> = scene.image_ids().into_iter().filter(|i| wanted(*i)).collect();
@@ -113,37 +107,17 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
         let mut progress = Progress::new("images", ids.len());
         for im_id in ids {
             check_interrupt("run the same command again to make all of it")?;
-            let image = scene.image(im_id)?;
-            for g in &image.ground_truth {
-                if let std::collections::btree_map::Entry::Vacant(place) = meshes.entry(g.obj_id) {
-                    place.insert(dataset.model(g.obj_id, Models::Rendering)?);
-                }
-            }
-            let camera = scene.camera(im_id)?;
-            let posed: Vec<(&Mesh, Pose)> =
-                image.ground_truth.iter().map(|g| (&meshes[&g.obj_id], g.camera_from_object)).collect();
-            let seed = a.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
-            let sensor = a.sensor.model();
-            let seen = depth_on_table(&posed, &camera, !a.no_table, sensor.as_ref().map(|s| (s, seed)));
-            let depth = seen.measured;
+            let seen = simulation.image(&scene, im_id, &mut writer)?;
             if !seen.has_table && !a.no_table {
                 without_table.push(format!("{scene_id}/{im_id}"));
             }
             if a.pictures.is_some() {
-                let picture = overlay::side_by_side(&seen.ideal, &depth);
+                let picture = overlay::side_by_side(&seen.ideal, &seen.measured);
                 pictures.write(&format!("{scene_id:06}_{im_id:06}.png"), &picture);
             }
-            let visible = ground_truth_visibility(&posed, &camera, Some(&depth), VISIBILITY_DELTA);
-            let infos: Vec<_> = visible.into_iter().map(|v| v.info).collect();
-            let rgb = if a.rgb { scene.rgb(im_id)? } else { None };
-            writer.add(&NewImage {
-                depth: Some(&depth),
-                rgb: rgb.as_ref(),
-                ground_truth: &image.ground_truth,
-                info: Some(&infos),
-                ..NewImage::new(im_id, &camera)
-            })?;
-            first_camera.get_or_insert(camera);
+            if first_camera.is_none() {
+                first_camera = Some(scene.camera(im_id)?);
+            }
             images += 1;
             progress.step(format!("{scene_id}/{im_id}"));
         }

@@ -5,17 +5,17 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
-use sixfold_board::{Board, Paper};
 use sixfold_estimator::{Object, ObjectRecord, ObjectStore, PoseEstimator, StoreError};
 use sixfold_io::{CameraFile, limits, read_regular, write_rgb};
-use sixfold_mesh::{FoundSymmetry, Verdict};
+use sixfold_mesh::Verdict;
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
 use sixfold_shell::Outcome;
-use sixfold_shell::board::photograph_files;
+use sixfold_shell::board::{photograph_files, ruler_in_metres};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Bar;
 use sixfold_shell::ranges;
+use sixfold_shell::symmetries::described;
 use sixfold_teach::{By, SalientSegmenter, ShapeOptions, TeachOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
 
@@ -109,8 +109,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     write_rgb(&out.join("photographs.png"), &teaching.picture()?)?;
     let stored = teaching.store(&store, &a.name, a.replace, prepare)?;
     let facts = teaching.shape().ok_or_else(|| anyhow!("{}: no mesh was made", out.display()))?;
-    let proposed =
-        stored.symmetries.iter().filter(|s| s.verdict(true) != Verdict::Sure).map(in_words).collect();
+    let proposed = stored.symmetries.iter().filter(|s| s.verdict(true) != Verdict::Sure);
     let taught = Taught {
         name: &a.name,
         record: &stored.record,
@@ -118,7 +117,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
         left_out: left_out(&teaching),
         unseen: facts.unseen,
         with_depth: facts.with_depth,
-        symmetries_proposed: proposed,
+        symmetries_proposed: proposed.map(described).collect(),
         folder: &out,
     };
     report(&a.json, &taught, || print(&taught))?;
@@ -127,12 +126,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
 
 /// The folder with all that was given.
 fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
-    let ruler = a.ruler.map(|mm| {
-        let board = Board::new(Paper::A4).with_ruler(mm / 1000.0);
-        board
-            .map(|_| mm / 1000.0)
-            .ok_or_else(|| anyhow!("--ruler: found {mm}, expected 10 to 1000 millimetres"))
-    });
+    let ruler = ruler_in_metres(a.ruler)?;
     let files = photograph_files(&a.photographs)?;
     let depth = if a.depth.is_empty() { vec![] } else { photograph_files(&a.depth)? };
     if !depth.is_empty() && depth.len() != files.len() {
@@ -145,7 +139,7 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         }
         _ => None,
     };
-    let mut teaching = Teaching::open(out, &TeachOptions { ruler: ruler.transpose()?, camera })?;
+    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera })?;
     for (i, file) in files.iter().enumerate() {
         let bytes = read_regular(file, limits::IMAGE).with_context(|| file.display().to_string())?;
         let number = teaching.add_photograph(&file.display().to_string(), &bytes)?;
@@ -181,15 +175,6 @@ fn left_out(teaching: &Teaching) -> Vec<LeftOut> {
         Some(LeftOut { photograph: p.name.clone(), reason })
     };
     teaching.photographs().iter().filter_map(of).collect()
-}
-
-fn in_words(s: &FoundSymmetry) -> String {
-    let order = s.order.map_or("any angle".to_owned(), |n| format!("{n}-fold"));
-    let [x, y, z]: [f64; 3] = s.axis.into();
-    format!(
-        "{order} about ({x:.2} {y:.2} {z:.2}), 95 % of the surface within {:.1} mm",
-        1000.0 * s.deviation.p95
-    )
 }
 
 fn print(t: &Taught<'_>) {

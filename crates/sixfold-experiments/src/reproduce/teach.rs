@@ -9,6 +9,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
 use sixfold_align::PreparedDepth;
+use sixfold_auto::AutoMembers;
 use sixfold_board::{Board, Paper};
 use sixfold_bop::{ModelPoints, add_s};
 use sixfold_estimator::{Object, PoseEstimator, Query};
@@ -17,7 +18,7 @@ use sixfold_geometry::{Camera, DepthImage, KdTree, Pose, RgbImage, Vec3, stats::
 use sixfold_io::read_rgb;
 use sixfold_mesh::{Mesh, ModelInfo, SymmetryOptions, Unit, find_symmetries, read_mesh, sure_symmetries};
 use sixfold_ppf::PpfEstimator;
-use sixfold_render::{DepthSensor, SceneObject, VisibilityBuffer, simulate_depth};
+use sixfold_render::{DepthSensor, Light, Material, SceneObject, VisibilityBuffer, shade, simulate_depth};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -82,10 +83,16 @@ struct Row {
     /// Axes and rotations that are sure, found and true.
     symmetries: [usize; 2],
     symmetries_true: [usize; 2],
+    /// By point pair features in depth alone.
     found: usize,
     images: usize,
     /// The same with the true mesh.
     found_with_true_mesh: usize,
+    /// By `auto` with depth and colour.
+    found_auto: usize,
+    found_auto_with_true_mesh: usize,
+    /// Wrong poses among those that `auto` reports at probability 0.5.
+    wrong_auto: usize,
     seconds: f64,
 }
 
@@ -99,6 +106,9 @@ struct Report {
     found: usize,
     images: usize,
     found_with_true_mesh: usize,
+    found_auto: usize,
+    found_auto_with_true_mesh: usize,
+    wrong_auto: usize,
 }
 
 pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<Outcome> {
@@ -141,6 +151,9 @@ pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<O
         found: sum(|r| r.found),
         images: sum(|r| r.images),
         found_with_true_mesh: sum(|r| r.found_with_true_mesh),
+        found_auto: sum(|r| r.found_auto),
+        found_auto_with_true_mesh: sum(|r| r.found_auto_with_true_mesh),
+        wrong_auto: sum(|r| r.wrong_auto),
         objects,
     };
     write_atomically(&a.out.join("teach.json"), serde_json::to_string_pretty(&all)?.as_bytes())?;
@@ -219,13 +232,17 @@ fn measured(
     let seen = seen_points(&there, &capture, &options.camera);
     let [mesh_mm, truth_mm] = distances(&taught.transformed(&board_from_taught), &there, &seen);
     let taught_from_true = compose(&board_from_taught.inverse(), &capture.board_from_object);
-    let scene = NewScenes { mesh, others, seed: a.seed };
+    let scene = NewScenes { mesh, others, ground, seed: a.seed };
     let mut info = ModelInfo::of_mesh(&taught);
     (info.symmetries_discrete, info.symmetries_continuous) = sure.clone();
     let symmetric = !(of_truth.0.is_empty() && of_truth.1.is_empty());
-    let found = scene.found(&Object::of_mesh(name, taught, info), &taught_from_true, symmetric)?;
+    let taught = Object::of_mesh(name, taught, info);
     let known = Object::of_mesh(name, mesh.clone(), ModelInfo::of_mesh(mesh));
-    let found_with_true_mesh = scene.found(&known, &Pose::identity(), symmetric)?;
+    let (ppf, auto) = (PpfEstimator::default(), AutoMembers::default().estimator()?);
+    let [found, _] = scene.found(&ppf, &taught, &taught_from_true, symmetric)?;
+    let [found_with_true_mesh, _] = scene.found(&ppf, &known, &Pose::identity(), symmetric)?;
+    let [found_auto, wrong_auto] = scene.found(&auto, &taught, &taught_from_true, symmetric)?;
+    let [found_auto_with_true_mesh, _] = scene.found(&auto, &known, &Pose::identity(), symmetric)?;
     Ok(Row {
         name: name.to_owned(),
         photographs: a.photographs,
@@ -242,6 +259,9 @@ fn measured(
         found,
         images: NEW_IMAGES,
         found_with_true_mesh,
+        found_auto,
+        found_auto_with_true_mesh,
+        wrong_auto,
         seconds,
     })
 }
@@ -288,35 +308,44 @@ fn distances(found: &Mesh, there: &Mesh, seen: &[Vec3]) -> [f64; 2] {
     [mean(&found, &truth), mean(seen, &found)]
 }
 
-/// New depth images of an object that stands among others.
+/// New images of an object that stands among others.
 struct NewScenes<'a> {
     mesh: &'a Mesh,
     others: &'a [&'a Mesh],
+    ground: &'a RgbImage,
     seed: u64,
 }
 
 impl NewScenes<'_> {
-    /// In how many of them an object is found. `known_from_true` takes points of the true mesh to the known object's frame.
-    fn found(&self, known: &Object, known_from_true: &Pose, symmetric: bool) -> Result<usize> {
-        let estimator = PpfEstimator::default();
+    /// In how many of them a method's best pose of an object is right, and in how many wrong although its confidence is 0.5 or more.
+    /// `known_from_true` takes points of the true mesh to the known object's frame.
+    fn found(
+        &self,
+        estimator: &dyn PoseEstimator,
+        known: &Object,
+        known_from_true: &Pose,
+        symmetric: bool,
+    ) -> Result<[usize; 2]> {
         let prepared = estimator.prepare(known)?;
         let points = ModelPoints::new(&self.mesh.sample_surface(2000, 5).points).context("no points")?;
-        let mut right = 0;
+        let (mut right, mut wrong) = (0, 0);
         for number in 0..NEW_IMAGES {
-            let (camera, depth, truth) = self.image(number);
-            let depth = Arc::new(PreparedDepth::new(&depth, &camera, &estimator.depth_options())?);
-            let query = Query { depth: Some(&depth), ..Query::new(&camera) };
+            let new = self.image(number);
+            let depth = Arc::new(PreparedDepth::new(&new.depth, &new.camera, &estimator.depth_options())?);
+            let query = Query { depth: Some(&depth), rgb: Some(&new.rgb), ..Query::new(&new.camera) };
             let estimates = estimator.estimate(prepared.as_ref(), &query)?;
             let Some(best) = estimates.first() else { continue };
             let camera_from_true = compose(&best.camera_from_object, known_from_true);
-            let error = add_s(&points, symmetric, camera_from_true, truth);
-            right += usize::from(error < RIGHT * self.mesh.diameter());
+            let error = add_s(&points, symmetric, camera_from_true, new.truth);
+            let is_right = error < RIGHT * self.mesh.diameter();
+            right += usize::from(is_right);
+            wrong += usize::from(!is_right && best.confidence >= 0.5);
         }
-        Ok(right)
+        Ok([right, wrong])
     }
 
-    /// A simulated depth image and the object's pose in it.
-    fn image(&self, number: usize) -> (Camera, DepthImage, Pose) {
+    /// A simulated pair of images and the object's pose in it.
+    fn image(&self, number: usize) -> NewImage {
         let camera =
             Camera { fx: 570.0, fy: 570.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
         let upright = |angle: f64, x: f64, y: f64, mesh: &Mesh| {
@@ -338,7 +367,9 @@ impl NewScenes<'_> {
             placed.push((*other, upright(2.0 * turn, apart * angle.cos(), apart * angle.sin(), other)));
         }
         let table = [[-0.6, -0.6], [0.6, -0.6], [0.6, 0.6], [-0.6, 0.6]].map(|[x, y]| Vec3::new(x, y, 0.0));
-        let table = Mesh::new(table.to_vec(), vec![[0, 1, 2], [0, 2, 3]]);
+        let corners = vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+        let table = Mesh::new(table.to_vec(), vec![[0, 1, 2], [0, 2, 3]])
+            .and_then(|table| table.with_texture(corners, self.ground.clone()));
         let tilt = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), 2.2 + 0.1 * (number % 3) as f64);
         let camera_from_table = Pose::new(tilt, Vec3::new(0.02 * number as f64 - 0.04, 0.03, 0.75));
         let mut objects: Vec<SceneObject<'_>> = placed
@@ -353,13 +384,28 @@ impl NewScenes<'_> {
         buffer.render(&objects, &Default::default());
         let (depth, normals) = (buffer.depth(), buffer.normals(&objects));
         let noisy = simulate_depth(&depth, &normals, &DepthSensor::realsense(), self.seed + number as u64);
-        (camera, noisy, truth)
+        let lamp = Light::Directional {
+            direction: Vec3::new(0.4 - 0.2 * number as f64, 0.5, 1.0),
+            color: [0.8, 0.76, 0.7],
+        };
+        let lights = [Light::Ambient { color: [0.3; 3] }, lamp];
+        let rgb = shade(&buffer, &objects, &lights, &Material::default(), None);
+        NewImage { camera, depth: noisy, rgb, truth }
     }
+}
+
+/// An image of a scene.
+struct NewImage {
+    camera: Camera,
+    depth: DepthImage,
+    rgb: RgbImage,
+    /// Of the object.
+    truth: Pose,
 }
 
 fn print(all: &Report) {
     println!(
-        "{:<14} {:>8} {:>8} {:>7} {:>6} {:>8} {:>8} {:>6} {:>10} {:>8} {:>9} {:>5}",
+        "{:<14} {:>8} {:>8} {:>7} {:>6} {:>8} {:>8} {:>6} {:>10} {:>8} {:>9} {:>6} {:>9} {:>5} {:>5}",
         "object",
         "diam mm",
         "cam mm",
@@ -371,11 +417,14 @@ fn print(all: &Report) {
         "symmetries",
         "found",
         "true mesh",
+        "auto",
+        "true mesh",
+        "wrong",
         "s"
     );
     for r in &all.objects {
         println!(
-            "{:<14} {:>8.1} {:>8.3} {:>7.3} {:>6.3} {:>8.2} {:>8.2} {:>6.2} {:>4}+{} of {}+{} {:>5}/{} {:>7}/{} {:>5.0}",
+            "{:<14} {:>8.1} {:>8.3} {:>7.3} {:>6.3} {:>8.2} {:>8.2} {:>6.2} {:>4}+{} of {}+{} {:>5}/{} {:>7}/{} {:>4}/{} {:>7}/{} {:>5} {:>5.0}",
             r.name,
             r.diameter_mm,
             r.camera_mm,
@@ -392,17 +441,25 @@ fn print(all: &Report) {
             r.images,
             r.found_with_true_mesh,
             r.images,
+            r.found_auto,
+            r.images,
+            r.found_auto_with_true_mesh,
+            r.images,
+            r.wrong_auto,
             r.seconds
         );
     }
     println!(
-        "median camera {:.3} mm, {:.3} degrees; mean mesh {:.2} mm, truth {:.2} mm; found {} of {}, with the true mesh {}",
+        "median camera {:.3} mm, {:.3} degrees; mean mesh {:.2} mm, truth {:.2} mm; found {} of {}, with the true mesh {}; by auto {}, with the true mesh {}, wrong {}",
         all.camera_mm_median,
         all.camera_deg_median,
         all.mesh_mm_mean,
         all.truth_mm_mean,
         all.found,
         all.images,
-        all.found_with_true_mesh
+        all.found_with_true_mesh,
+        all.found_auto,
+        all.found_auto_with_true_mesh,
+        all.wrong_auto
     );
 }

@@ -17,6 +17,19 @@ use crate::output::pose_rows;
 use self::photographs::leave_out_other_sizes;
 pub use self::photographs::{Photograph, photograph_files, read_photographs};
 
+/// What `--ruler` says, millimetres, in metres.
+///
+/// # Errors
+/// When it is no length that a ruler on a sheet of paper can have.
+pub fn ruler_in_metres(ruler: Option<f64>) -> Result<Option<f64>> {
+    let Some(millimetres) = ruler else { return Ok(None) };
+    let metres = millimetres / 1000.0;
+    match Board::new(Paper::A4).with_ruler(metres) {
+        Some(_) => Ok(Some(metres)),
+        None => bail!("--ruler: found {millimetres}, expected 10 to 1000 millimetres"),
+    }
+}
+
 /// The camera and all photographs, as `photographs.json` lists them.
 #[derive(Serialize)]
 pub struct Calibrated {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use sixfold_mesh::Unit;
 use sixfold_mttm::ViewCoverage;
+use sixfold_shell::depth_views::DepthViewArguments;
 use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges;
 
@@ -127,29 +128,4 @@ impl TemplateViews {
             TemplateViews::Around => ViewCoverage::Around,
         }
     }
-}
-
-/// An object known from depth images, for `sixfold object add`.
-#[derive(Debug, Args)]
-pub(crate) struct DepthViewArguments {
-    /// Depth images of an object that has no mesh: its templates for `estimate --method mttm`
-    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
-    pub depth: Vec<PathBuf>,
-    /// Where the object is in each of them (PNG, above zero inside), in the same order
-    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth", conflicts_with = "mesh")]
-    pub masks: Vec<PathBuf>,
-    /// Take masks as they are, without holding them against depth: by default what lies on the table around the object or beyond
-    /// a depth edge is left out, and a mask that is more than a third too large is refused
-    #[arg(long, requires = "depth", conflicts_with = "mesh")]
-    pub mask_as_is: bool,
-    /// Camera of the depth images: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale
-    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
-    pub camera: Option<PathBuf>,
-    /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
-    #[arg(long, value_name = "MM", requires = "depth", conflicts_with = "mesh", value_parser = ranges::depth_scale)]
-    pub depth_scale: Option<f64>,
-    /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
-    /// metres (default: every view has a frame of its own)
-    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
-    pub poses: Option<PathBuf>,
 }

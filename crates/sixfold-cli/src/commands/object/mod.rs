@@ -2,7 +2,6 @@
 
 pub(crate) mod arguments;
 mod symmetries;
-mod templates;
 
 use std::path::Path;
 
@@ -11,11 +10,12 @@ use serde::Serialize;
 use sixfold_estimator::{NewObject, ObjectRecord, ObjectStore, PoseEstimator};
 use sixfold_geometry::Vec3;
 use sixfold_io::write_rgb;
-use sixfold_mesh::{ContinuousSymmetry, Mesh, ModelInfo, ModelsInfo, read_mesh};
+use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, read_mesh};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
 use sixfold_render::portrait;
 use sixfold_shell::Outcome;
+use sixfold_shell::depth_views::{LeftOut, templates_of};
 #[cfg(feature = "networks")]
 use sixfold_shell::folder::{Contents, DatasetFolder};
 use sixfold_shell::output::{JsonArguments, report};
@@ -35,7 +35,7 @@ struct Added<'a> {
     #[serde(flatten)]
     listed: &'a Listed,
     /// What its masks held besides, one for each; empty with --mask-as-is.
-    left_out: Vec<templates::LeftOut>,
+    left_out: Vec<LeftOut>,
 }
 
 pub(crate) fn run(a: &ObjectArguments) -> Result<Outcome> {
@@ -78,7 +78,7 @@ fn export(store: &ObjectStore, name: &str, bop: &Path, id: u32, json: &JsonArgum
 
 /// Stores an object that is known from depth images.
 fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
-    let (templates, left_out) = templates::of_depth(&a.views)?;
+    let (templates, left_out) = templates_of(&a.views)?;
     let record = ObjectRecord::of_views(&a.views.depth, templates.diameter);
     let new = NewObject { mesh: None, record: &record, replace: a.replace };
     store.add(&a.name, new, |object| keep(&templates, object.file(TEMPLATES_FILE)))?;
@@ -152,15 +152,11 @@ fn info(a: &AddArguments, mesh: &Mesh) -> Result<ModelInfo> {
         info.symmetries_discrete = found.symmetries_discrete.clone();
         info.symmetries_continuous = found.symmetries_continuous.clone();
     }
-    if let Some(axis) = a.turns_about {
-        let axis = match axis {
-            Axis::X => Vec3::x(),
-            Axis::Y => Vec3::y(),
-            Axis::Z => Vec3::z(),
-        };
-        // The axis runs through the centre of the bounding box: a file's origin may be anywhere.
-        let offset = info.min + info.size * 0.5;
-        info.symmetries_continuous.push(ContinuousSymmetry { axis, offset });
+    match a.turns_about {
+        Some(Axis::X) => info.rotates_freely_about(Vec3::x()),
+        Some(Axis::Y) => info.rotates_freely_about(Vec3::y()),
+        Some(Axis::Z) => info.rotates_freely_about(Vec3::z()),
+        None => {}
     }
     Ok(info)
 }

@@ -3,7 +3,6 @@
 
 pub(crate) mod arguments;
 mod input;
-mod pictures;
 
 use std::path::Path;
 use std::sync::Mutex;
@@ -30,6 +29,7 @@ use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Bar, Progress, interrupted};
+use sixfold_shell::sheets::write_sheet;
 
 /// Side of the crops that new views take their colours from, pixels.
 const CROP: usize = 256;
@@ -104,7 +104,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         first_camera = first_camera.or(written.camera);
     }
     progress.finish();
-    sheets.did(pictures::preview(&a.out.join("preview.png"), &rows));
+    sheets.did(write_sheet(&a.out.join("preview.png"), &rows));
     // BOP has one such file a dataset, for tools that need any camera: that of the first image. Each image's own intrinsics are
     // in scene_camera.json.
     if let Some(camera) = first_camera {
@@ -145,7 +145,7 @@ fn refined_poses(
     };
     bar.finish();
     let Some(poses) = poses else { bail!("interrupted; give the same command again") };
-    sheets.did(pictures::refinement(&a.out.join("poses.png"), images, &poses));
+    sheets.did(write_sheet(&a.out.join("poses.png"), &poses.outlines(images, &file)?));
     poses.apply(images, &file)?.iter().for_each(|note| eprintln!("note: {note}"));
     Ok(poses)
 }

@@ -1,8 +1,9 @@
-//! Objects added from depth images alone: `sixfold object add --depth`.
+//! Objects that are known from depth images alone: the files, and templates of them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
+use clap::Args;
 use serde::Serialize;
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
@@ -10,7 +11,32 @@ use sixfold_io::{CameraFile, read_depth, read_mask};
 use sixfold_mttm::mask_check::{CheckedMask, WORTH_A_WARNING, check_mask};
 use sixfold_mttm::{DepthView, ObjectTemplates, TemplateOptions};
 
-use super::arguments::DepthViewArguments;
+use crate::ranges;
+
+/// An object known from depth images, for `sixfold object add`.
+#[derive(Debug, Args)]
+pub struct DepthViewArguments {
+    /// Depth images of an object that has no mesh: its templates for `estimate --method mttm`
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
+    pub depth: Vec<PathBuf>,
+    /// Where the object is in each of them (PNG, above zero inside), in the same order
+    #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth", conflicts_with = "mesh")]
+    pub masks: Vec<PathBuf>,
+    /// Take masks as they are, without holding them against depth: by default what lies on the table around the object or beyond
+    /// a depth edge is left out, and a mask that is more than a third too large is refused
+    #[arg(long, requires = "depth", conflicts_with = "mesh")]
+    pub mask_as_is: bool,
+    /// Camera of the depth images: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale
+    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
+    pub camera: Option<PathBuf>,
+    /// Millimetres per unit of the depth images, in place of the camera file's depth_scale
+    #[arg(long, value_name = "MM", requires = "depth", conflicts_with = "mesh", value_parser = ranges::depth_scale)]
+    pub depth_scale: Option<f64>,
+    /// The object's pose in each image, if known: a JSON file with a list of 4x4 matrices camera_from_object, row by row, in
+    /// metres (default: every view has a frame of its own)
+    #[arg(long, value_name = "FILE", requires = "depth", conflicts_with = "mesh")]
+    pub poses: Option<PathBuf>,
+}
 
 struct Read {
     depth: DepthImage,
@@ -21,7 +47,7 @@ struct Read {
 
 /// What was left out of a mask, as fractions of its pixels with depth.
 #[derive(Debug, Serialize)]
-pub(crate) struct LeftOut {
+pub struct LeftOut {
     mask: String,
     /// On the plane around the object.
     on_plane: f64,
@@ -47,7 +73,10 @@ fn checked(path: &Path, depth: &DepthImage, camera: &Camera, mask: &Mask) -> Res
 }
 
 /// The templates of an object in depth images, and what was left out of its masks.
-pub(crate) fn of_depth(a: &DepthViewArguments) -> Result<(ObjectTemplates, Vec<LeftOut>)> {
+///
+/// # Errors
+/// When a file is missing or does not fit the others; the message names option or file.
+pub fn templates_of(a: &DepthViewArguments) -> Result<(ObjectTemplates, Vec<LeftOut>)> {
     let camera_path = a.camera.as_deref().ok_or_else(|| anyhow!("--camera FILE is missing"))?;
     let file = CameraFile::read(camera_path)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {

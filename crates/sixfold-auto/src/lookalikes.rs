@@ -1,0 +1,237 @@
+//! Rotations that an object's shape hardly shows and its colours do: a box with print, a can with a label. A method on depth takes
+//! one of them by chance; with a colour image the pool takes the one whose colours agree.
+
+use std::f64::consts::TAU;
+
+use rayon::prelude::*;
+use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
+use sixfold_align::{Evidence, VerificationOptions};
+use sixfold_geometry::Pose;
+use sixfold_mesh::{ContinuousSymmetry, Mesh, SymmetryOptions, find_symmetries};
+
+use crate::hypotheses::{moved_to_depth, ranking};
+
+/// Noise of the mesh's surface as a fraction of its diameter: what is alike for depth need not be a symmetry. Chosen by hand; not
+/// swept.
+const NOISE: f64 = 0.005;
+/// A rotation that is off a known symmetry by less is that symmetry, radians; chosen by hand, not swept.
+const KNOWN: f64 = 0.1;
+/// Most discrete rotations that are tried.
+const MOST: usize = 24;
+/// Steps of a full turn about a continuous axis; chosen by hand, not swept.
+const STEPS: usize = 16;
+/// Halvings of that step around the best one.
+const HALVINGS: usize = 4;
+/// By how much colours have to agree better; chosen by hand, not swept.
+const BETTER: f64 = 0.03;
+/// Depth has to agree nearly as well; chosen by hand, not swept.
+const NEARLY: f64 = 0.9;
+
+/// The rotations of an object, in its frame.
+#[derive(Debug, Default)]
+pub(crate) struct LookAlikes {
+    /// The identity first.
+    discrete: Vec<Pose>,
+    axes: Vec<ContinuousSymmetry>,
+}
+
+impl LookAlikes {
+    /// Those of a mesh that are not among its known symmetries. None for a mesh without colours.
+    pub(crate) fn of(mesh: &Mesh, diameter: f64, symmetries: &[Pose]) -> LookAlikes {
+        if mesh.colors().is_none() && mesh.texture().is_none() {
+            return LookAlikes::default();
+        }
+        let options = SymmetryOptions { noise: NOISE * diameter, ..SymmetryOptions::default() };
+        // An object of no size, or of several metres, has none.
+        let found = find_symmetries(mesh, &options).unwrap_or_default();
+        let is_new = |pose: &Pose| symmetries.iter().all(|known| known.rotation_angle_to(pose) > KNOWN);
+        let mut discrete = vec![Pose::identity()];
+        for pose in found.iter().flat_map(|s| s.poses()).filter(is_new) {
+            if discrete.iter().all(|d| d.rotation_angle_to(&pose) > KNOWN) {
+                discrete.push(pose);
+            }
+        }
+        discrete.truncate(MOST);
+        let axes: Vec<ContinuousSymmetry> = found
+            .iter()
+            .filter_map(|s| s.continuous())
+            // A quarter turn and one more: a known symmetry of order 4 is not all rotations.
+            .filter(|axis| is_new(&axis.rotation(0.25 * TAU)) || is_new(&axis.rotation(0.15 * TAU)))
+            .collect();
+        LookAlikes { discrete, axes }
+    }
+
+    /// The pose among its look-alikes whose colours agree best with the image, if another than this one.
+    pub(crate) fn best(
+        &self,
+        scene: &Scene<'_>,
+        shape: &Shape<'_>,
+        diameter: f64,
+        (pose, evidence): (&Pose, &Evidence),
+    ) -> Option<(Pose, Evidence)> {
+        if self.discrete.len() <= 1 && self.axes.is_empty() {
+            return None;
+        }
+        let options = VerificationOptions::default();
+        let judge = |pose: Pose| {
+            let evidence = EvidenceCollector::default().collect(scene, shape, &pose, &options);
+            (agreement(&evidence), pose, evidence)
+        };
+        let mut best = (agreement(evidence)?, *pose, evidence.clone());
+        let needed = best.0 + BETTER;
+        let tried: Vec<(Option<f64>, Pose, Evidence)> = self
+            .discrete
+            .par_iter()
+            .flat_map_iter(|discrete| self.around(discrete))
+            .map(|rotation| judge(*pose * rotation))
+            .collect();
+        let better = |a: &(f64, Pose, Evidence), b: &(Option<f64>, Pose, Evidence)| {
+            b.0.is_some_and(|agreement| agreement > a.0)
+        };
+        let mut take = |candidate: (Option<f64>, Pose, Evidence)| {
+            if better(&best, &candidate)
+                && let (Some(agreement), pose, evidence) = candidate
+            {
+                best = (agreement, pose, evidence);
+            }
+            best.1
+        };
+        for candidate in tried {
+            take(candidate);
+        }
+        for axis in &self.axes {
+            let mut step = TAU / STEPS as f64;
+            for _ in 0..HALVINGS {
+                step *= 0.5;
+                let from = take((None, *pose, evidence.clone()));
+                for angle in [-step, step] {
+                    take(judge(from * axis.rotation(angle)));
+                }
+            }
+        }
+        if best.0 < needed {
+            return None;
+        }
+        // A look-alike differs a little: depth moves it to its place.
+        if let Some(moved) = moved_to_depth(scene, shape, diameter, &best.1) {
+            let (agreement, moved, after) = judge(moved);
+            if agreement.is_some_and(|agreement| agreement >= needed) && ranking(&after) > ranking(&best.2) {
+                best = (best.0, moved, after);
+            }
+        }
+        (ranking(&best.2) >= NEARLY * ranking(evidence)).then_some((best.1, best.2))
+    }
+
+    /// A discrete rotation, and with it all steps about every axis.
+    fn around(&self, discrete: &Pose) -> Vec<Pose> {
+        let steps = (1..STEPS).map(|k| TAU * k as f64 / STEPS as f64);
+        let turned = self.axes.iter().flat_map(|axis| steps.clone().map(|angle| axis.rotation(angle)));
+        std::iter::once(*discrete).chain(turned.map(|rotation| *discrete * rotation)).collect()
+    }
+}
+
+/// How well the colours of a pose agree with the image.
+fn agreement(evidence: &Evidence) -> Option<f64> {
+    let color = evidence.color.as_ref()?;
+    Some(color.correlation - color.tint.unwrap_or(0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_align::{ColorGradients, DepthOptions, PreparedDepth};
+    use sixfold_geometry::{Camera, Image, RgbImage, Vec3};
+    use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
+
+    use super::*;
+
+    const CAMERA: Camera =
+        Camera { fx: 500.0, fy: 500.0, cx: 160.0, cy: 120.0, width: 320, height: 240, distortion: None };
+
+    /// A surface of many small faces between rings of points: `point(u, v)`, u all around and v from bottom to top.
+    fn lathe(point: impl Fn(f64, f64) -> Vec3, color: impl Fn(f64, f64) -> [u8; 3]) -> Mesh {
+        const AROUND: u32 = 72;
+        const UP: u32 = 12;
+        let (mut vertices, mut colors, mut faces) = (vec![], vec![], vec![]);
+        for j in 0..=UP {
+            for i in 0..AROUND {
+                let (u, v) = (f64::from(i) / f64::from(AROUND), f64::from(j) / f64::from(UP));
+                vertices.push(point(u, v));
+                colors.push(color(u, v));
+            }
+        }
+        for j in 0..UP {
+            for i in 0..AROUND {
+                let [a, b] = [j * AROUND + i, j * AROUND + (i + 1) % AROUND];
+                faces.extend([[a, b, b + AROUND], [a, b + AROUND, a + AROUND]]);
+            }
+        }
+        Mesh::new(vertices, faces).unwrap().with_colors(colors).unwrap()
+    }
+
+    /// A label: one colour on one side of the can, others elsewhere.
+    fn can() -> Mesh {
+        let point = |u: f64, v: f64| {
+            let angle = TAU * u;
+            Vec3::new(0.035 * angle.cos(), 0.035 * angle.sin(), 0.11 * (v - 0.5))
+        };
+        let level = |x: f64| (128.0 + 100.0 * x) as u8;
+        let color = |u: f64, v: f64| {
+            let angle = TAU * u;
+            [level(angle.cos()), level((2.0 * angle).sin()), level((angle + 5.0 * v).sin())]
+        };
+        lathe(point, color)
+    }
+
+    /// What of the pose `tilted` about the view and `turned` about the can's axis comes of asking for the best look-alike.
+    fn best(mesh: &Mesh, turned: f64) -> Option<Pose> {
+        let truth = truth();
+        let objects = [SceneObject { mesh, camera_from_object: truth }];
+        let mut frame = VisibilityBuffer::new(&CAMERA);
+        frame.render(&objects, &RenderOptions::default());
+        let depth = frame.depth().map(|z| if *z > 0.0 { *z } else { 0.9 });
+        let grey: RgbImage = Image::filled(320, 240, [120; 3]);
+        let rgb = shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&grey));
+        let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+        let prepared = PreparedDepth::new(&depth, &CAMERA, &options).unwrap();
+        let gradients = ColorGradients::new(&rgb);
+        let scene = Scene { camera: &CAMERA, depth: Some(&prepared), color: Some((&rgb, &gradients)) };
+        let shape = Shape { mesh, colored: mesh, threshold: 0.008 };
+        let known = LookAlikes::of(mesh, mesh.diameter(), &[Pose::identity()]);
+        let axis = ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::zeros() };
+        let given = truth * axis.rotation(turned);
+        let evidence =
+            EvidenceCollector::default().collect(&scene, &shape, &given, &VerificationOptions::default());
+        known.best(&scene, &shape, mesh.diameter(), (&given, &evidence)).map(|(pose, _)| pose)
+    }
+
+    fn truth() -> Pose {
+        let twist = sixfold_geometry::nalgebra::Vector6::new(0.0, 0.0, 0.0, 1.1, 0.2, 0.1);
+        Pose::new(Pose::exp(&twist).rotation(), Vec3::new(0.01, 0.0, 0.5))
+    }
+
+    #[test]
+    fn the_label_of_a_can_says_how_it_is_rotated() {
+        for degrees in [40.0f64, 100.0, 180.0, 290.0] {
+            let pose = best(&can(), degrees.to_radians()).expect("another rotation agrees better");
+            let off = pose.rotation_angle_to(&truth()).to_degrees();
+            assert!(off < 4.0, "given {degrees} degrees off, found {off}");
+        }
+    }
+
+    #[test]
+    fn a_pose_whose_colours_agree_stays() {
+        assert!(best(&can(), 0.0).is_none());
+    }
+
+    #[test]
+    fn a_mesh_without_colours_or_with_known_symmetries_has_no_look_alikes() {
+        let can = can();
+        let plain = Mesh::new(can.vertices().to_vec(), can.faces().to_vec()).unwrap();
+        assert!(LookAlikes::of(&plain, plain.diameter(), &[Pose::identity()]).discrete.is_empty());
+        assert!(!LookAlikes::of(&can, can.diameter(), &[Pose::identity()]).axes.is_empty());
+        let mut info = sixfold_mesh::ModelInfo::of_mesh(&can);
+        info.rotates_freely_about(Vec3::z());
+        let known = LookAlikes::of(&can, can.diameter(), &info.symmetry_poses(0.05));
+        assert!(known.axes.is_empty(), "{known:?}");
+    }
+}
