@@ -6,7 +6,7 @@ import { apply, cameraOf, identity, inverse, product, project, ray, rotationAbou
 /** Images of at most this many pixels are corrected; masks are sent in this size. */
 const SIDE = 1280;
 const MESH = "rgb(0, 200, 255)";
-const MASK = "rgb(255, 200, 0)";
+/** Marks and masks: a colour that few objects have. */
 const MARK = "rgb(225, 20, 130)";
 /** Radians for a pixel of dragging. */
 const ROTATION = 0.006;
@@ -168,7 +168,7 @@ export class Editor {
     const data = this.paint.getImageData(0, 0, width, height);
     for (let i = 0; i < data.data.length; i += 4) {
       data.data[i + 3] = data.data[i] > 127 ? 255 : 0;
-      [data.data[i], data.data[i + 1], data.data[i + 2]] = [255, 200, 0];
+      [data.data[i], data.data[i + 1], data.data[i + 2]] = [225, 20, 130];
     }
     this.paint.putImageData(data, 0, 0);
   }
@@ -336,7 +336,7 @@ export class Editor {
     byId("mask-mesh").addEventListener("click", () => {
       this.keepStroke();
       this.paint.clearRect(0, 0, this.mask.width, this.mask.height);
-      this.paint.fillStyle = MASK;
+      this.paint.fillStyle = MARK;
       this.paint.save();
       this.paint.translate(0.5, 0.5);
       this.paint.fill(this.outline(this.pose, this.camera));
@@ -387,7 +387,7 @@ export class Editor {
     const erases = event.shiftKey || event.buttons & 2 || this.brush === "erase";
     const c = this.paint;
     c.globalCompositeOperation = erases ? "destination-out" : "source-over";
-    c.strokeStyle = MASK;
+    c.strokeStyle = MARK;
     c.lineCap = "round";
     c.lineWidth = (Number(byId("brush-size").value) * this.pane.part[2]) / this.pane.canvas.getBoundingClientRect().width;
     c.beginPath();

@@ -198,7 +198,7 @@ function tile(teaching, photograph) {
   const byPerson = ["pose", "mask"].filter((what) => photograph[`${what}_by`] === "person");
   const caption = text ? `left out: ${text}` : byPerson.length ? `${byPerson.join(" and ")} corrected` : "";
   const made = element("button", { type: "button", className: "tile" }, [
-    element("img", { src: `${photograph.links.overlay}&side=400&close_up=true`, alt: "", loading: "lazy" }),
+    element("img", { src: `${photograph.links.overlay}&side=220&close_up=true`, alt: "", loading: "lazy" }),
     element("span", { className: "name" }, [photograph.name]),
     element("span", { className: text ? "reason" : "muted small" }, [caption]),
   ]);

@@ -1,6 +1,7 @@
 //! The web pages: plain HTML, CSS and ES modules, built into the program. They ask nothing of any other machine.
 
 use axum::Router;
+use axum::body::Bytes;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::http::{HeaderName, HeaderValue};
 use axum::response::IntoResponse;
@@ -13,6 +14,23 @@ const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; object-src
 const HTML: &str = "text/html; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
+/// A page: where it is, what it and its link are called, its script and what it holds.
+type Page = (&'static str, &'static str, &'static str, &'static str);
+
+const PAGES: [Page; 4] = [
+    ("/", "Objects", "objects.js", include_str!("../assets/index.html")),
+    ("/teach", "Teach", "teach.js", include_str!("../assets/teach.html")),
+    ("/find", "Find", "find.js", include_str!("../assets/find.html")),
+    ("/grasp", "Grasp", "grasp.js", include_str!("../assets/grasp.html")),
+];
+
+/// What pages share, by the name that stands for it in double braces.
+const PARTS: [(&str, &str); 3] = [
+    ("inputs", include_str!("../assets/parts/inputs.html")),
+    ("job", include_str!("../assets/parts/job.html")),
+    ("result", include_str!("../assets/parts/result.html")),
+];
+
 /// Path, content type and content of each file.
 macro_rules! assets {
     ($($path:literal, $kind:expr, $file:literal;)*) => {
@@ -21,10 +39,6 @@ macro_rules! assets {
 }
 
 const ASSETS: &[(&str, &str, &[u8])] = assets! {
-    "/", HTML, "index.html";
-    "/find", HTML, "find.html";
-    "/grasp", HTML, "grasp.html";
-    "/teach", HTML, "teach.html";
     "/static/app.css", "text/css; charset=utf-8", "app.css";
     "/static/icon.svg", "image/svg+xml", "icon.svg";
     "/static/api.js", SCRIPT, "api.js";
@@ -42,12 +56,26 @@ const ASSETS: &[(&str, &str, &[u8])] = assets! {
 
 /// Routes to all pages and what they load.
 pub(crate) fn routes<S: Clone + Send + Sync + 'static>() -> Router<S> {
-    ASSETS.iter().fold(Router::new(), |router, &(path, kind, bytes)| {
-        router.route(path, get(move || async move { page(kind, bytes) }))
+    let pages = PAGES.iter().map(|page| (page.0, HTML, Bytes::from(html(page))));
+    let files = ASSETS.iter().map(|&(path, kind, bytes)| (path, kind, Bytes::from_static(bytes)));
+    pages.chain(files).fold(Router::new(), |router, (path, kind, bytes)| {
+        router.route(path, get(move || async move { sent(kind, bytes) }))
     })
 }
 
-fn page(kind: &'static str, bytes: &'static [u8]) -> impl IntoResponse {
+/// A whole page.
+fn html((path, title, script, body): &Page) -> String {
+    let link = |(to, name, ..): &Page| {
+        let current = if to == path { " aria-current=\"page\"" } else { "" };
+        format!("    <a href=\"{to}\"{current}>{name}</a>\n")
+    };
+    let nav: String = PAGES.iter().map(link).collect();
+    let whole = include_str!("../assets/parts/page.html").replace("{{body}}", body);
+    let parts = PARTS.iter().fold(whole, |text, (name, part)| text.replace(&format!("{{{{{name}}}}}"), part));
+    parts.replace("{{title}}", title).replace("{{script}}", script).replace("{{nav}}", &nav)
+}
+
+fn sent(kind: &'static str, bytes: Bytes) -> impl IntoResponse {
     let headers: [(HeaderName, HeaderValue); 5] = [
         (CONTENT_TYPE, HeaderValue::from_static(kind)),
         // Another version of the program has other pages under the same names.
@@ -65,12 +93,11 @@ mod tests {
 
     #[test]
     fn pages_load_only_what_is_here() {
-        for (path, kind, bytes) in ASSETS.iter().filter(|a| a.1 == HTML || a.1 == SCRIPT) {
-            if path.contains("vendor") {
-                continue;
-            }
-            let text = std::str::from_utf8(bytes).unwrap();
-            assert!(!text.contains("https://") && !text.contains("http://"), "{path} ({kind})");
+        let scripts = ASSETS.iter().filter(|a| a.1 == SCRIPT && !a.0.contains("vendor"));
+        let scripts = scripts.map(|(path, _, bytes)| (*path, String::from_utf8(bytes.to_vec()).unwrap()));
+        for (path, text) in PAGES.iter().map(|page| (page.0, html(page))).chain(scripts) {
+            assert!(!text.contains("https://") && !text.contains("http://"), "{path}");
+            assert!(!text.contains("{{") || path.ends_with(".js"), "{path}");
             let quoted = text.split('"').filter(|part| part.starts_with("/static/"));
             for file in quoted {
                 assert!(ASSETS.iter().any(|a| a.0 == file), "{path}: {file}");

@@ -180,16 +180,29 @@ async function opened(page, number) {
   await page.locator(`#editor[data-shown="${number}"]`).waitFor({ timeout: 30000 });
 }
 
-/** Corrects a pose with the mouse: away and back, then by a little that is kept. */
+/** Corrects a pose with the mouse: dragged away and back; then away in every other way, and back by points. */
 async function poseCorrected(page, address) {
-  const before = (await teachingOf(page, address)).photographs[3].camera_from_board;
+  const pose = async () => (await teachingOf(page, address)).photographs[3].camera_from_board;
+  const before = await pose();
   await opened(page, 3);
+  const draggedAndSaved = async (dx, dy) => {
+    await page.locator("#editor-status").evaluate((status) => status.replaceChildren());
+    await dragged(page, dx, dy);
+    await page.locator("#pose-save").click();
+    await page.getByText("The pose is kept.").waitFor();
+    return apart(await pose(), before);
+  };
+  const away = await draggedAndSaved(36, -22);
+  const back = await draggedAndSaved(-36, 22);
+  assert(away > 0.005 && back < 0.001, `dragged ${(1000 * away).toFixed(1)} mm away, and back to ${(1000 * back).toFixed(2)} mm`);
+  console.log(`teach: a pose that was ${(1000 * away).toFixed(1)} mm off, corrected by the mouse to ${(1000 * back).toFixed(2)} mm`);
   await dragged(page, 40, 25);
   await dragged(page, 60, -20, { button: "right" });
   await dragged(page, 30, 0, { key: "Alt" });
   await page.mouse.wheel(0, 240);
   await page.locator("#canvas").evaluate((canvas) => canvas.focus());
   await shot(page, "teach-pose");
+  await page.locator("#editor-status").evaluate((status) => status.replaceChildren());
   await page.locator("#pose-save").click();
   await page.getByText("The pose is kept.").waitFor();
   const moved = (await teachingOf(page, address)).photographs[3];

@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use serde_json::{Value, json};
 use sixfold_board::{Board, Paper};
-use sixfold_geometry::{Camera, Image, Mask, Pose, RgbImage, Vec3};
+use sixfold_geometry::{Camera, DepthImage, Image, Mask, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
 
@@ -37,6 +37,7 @@ fn camera() -> Camera {
 
 struct Photographs {
     files: Vec<Vec<u8>>,
+    depth: Vec<Vec<u8>>,
     masks: Vec<Mask>,
     camera_from_board: Vec<Pose>,
 }
@@ -56,6 +57,7 @@ fn photographs() -> &'static Photographs {
         let capture = SimulatedCapture::new(&mesh, &Board::new(Paper::A4), &ground, &options, 3);
         Photographs {
             files: (0..COUNT).map(|i| png(&capture.photograph(i).unwrap())).collect(),
+            depth: (0..COUNT).map(|i| depth_png(&capture.depth(i).unwrap())).collect(),
             masks: (0..COUNT).map(|i| capture.mask(i).unwrap()).collect(),
             camera_from_board: capture.camera_from_board.clone(),
         }
@@ -72,6 +74,10 @@ fn written(write: impl FnOnce(&std::path::Path)) -> Vec<u8> {
 
 fn png(image: &RgbImage) -> Vec<u8> {
     written(|path| sixfold_io::write_rgb(path, image).unwrap())
+}
+
+fn depth_png(depth: &DepthImage) -> Vec<u8> {
+    written(|path| sixfold_io::write_depth(path, depth, 1e-3).unwrap())
 }
 
 fn mask_png(mask: &Mask) -> Vec<u8> {
@@ -248,6 +254,33 @@ fn a_pose_is_given_by_a_matrix_or_by_points() {
     assert!((found - truth.camera_from_board[3].translation().z).abs() < 1e-6);
     let after = send(server.address, "DELETE", &format!("{path}/photographs/3/corrections"), &[], b"");
     assert_eq!(after.expect(200).json()["photographs"][3]["pose_by"], Value::Null);
+}
+
+#[test]
+fn depth_images_belong_to_the_photographs_by_their_names() {
+    let truth = photographs();
+    let server = TestServer::new();
+    // Sent in another order than that of their names.
+    let all = (0..3).rev().fold(with_camera(Form::default().text("name", "deep")), |form, i| {
+        form.file("photographs", &format!("{i}.png"), &truth.files[i])
+    });
+    let all = all.text("start", "false").text("depth_scale", "1");
+    let files = [1, 0, 2].into_iter();
+    let whole = files.fold(all.clone(), |form, i| form.file("depth", &format!("d{i}.png"), &truth.depth[i]));
+    let few = all.file("depth", "d0.png", &truth.depth[0]);
+    assert_eq!(server.post("/v1/teachings", &few).expect(422).json()["field"], "depth");
+    let teaching = server.post("/v1/teachings", &whole).expect(201).json();
+    assert!(teaching["photographs"].as_array().unwrap().iter().all(|p| p["has_depth"] == true), "{teaching}");
+    let path = format!("/v1/teachings/{}", id_of(&teaching));
+    for (i, mask) in truth.masks.iter().take(3).enumerate() {
+        put(&server, &format!("{path}/photographs/{i}/mask"), &mask_png(mask)).expect(200);
+    }
+    let job = post(&server, &format!("{path}/run")).expect(202).json();
+    let done = server.result(&id_of(&job)).expect(200).json();
+    assert!(done["with_depth"].as_f64().unwrap() > 0.9, "{done}");
+    // Depth of another photograph would contradict the masks and cut the object away.
+    let diameter = done["mesh"]["diameter"].as_f64().unwrap();
+    assert!((diameter - 0.147).abs() < 0.02, "{done}");
 }
 
 #[test]
