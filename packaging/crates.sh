@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Makes the packages of all crates that are meant for a registry, checks them and lists their sizes.
 #
-#   packaging/crates.sh            no network, nothing compiled: seconds
-#   packaging/crates.sh --build    builds the program from the unpacked packages too, and runs the demo with it. What is compiled
-#                                  already in CARGO_TARGET_DIR (default: target) is used again, our own crates are compiled
+#   packaging/crates.sh            nothing compiled: seconds
+#   packaging/crates.sh --build    builds the program from the unpacked packages too, and runs the demo with it. Compiles everything;
+#                                  where CARGO_TARGET_DIR names a copy of target, our own crates alone
 set -euo pipefail
 case ${1:-} in
 '' | --build) ;;
@@ -14,9 +14,12 @@ cd "$root"
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 
-# --allow-dirty: a change is checked before it is committed.
-if ! CARGO_TARGET_DIR=$scratch/target cargo package --workspace --exclude sixfold-fuzz --exclude sixfold-python \
-    --no-verify --offline --locked --allow-dirty >"$scratch/log" 2>&1; then
+# --allow-dirty: a change is checked before it is committed. Without network first: the index is at hand where the program was built.
+package() {
+    CARGO_TARGET_DIR=$scratch/target cargo package --workspace --exclude sixfold-fuzz --exclude sixfold-python \
+        --no-verify --locked --allow-dirty "$@" >"$scratch/log" 2>&1
+}
+if ! package --offline && ! package; then
     cat "$scratch/log"
     exit 1
 fi
@@ -81,7 +84,7 @@ done
     sed -n '/^\[profile/,$p' Cargo.toml
 } >"$made/Cargo.toml"
 cp Cargo.lock "$made/Cargo.lock"
-export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
+export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$scratch/build}
 version=$(sed -n '/^\[workspace.package\]/,/^$/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 (cd "$made" && cargo install --offline --path "sixfold-cli-$version" --root "$scratch/installed" --no-track)
 rm -rf "$made"
