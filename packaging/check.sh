@@ -21,9 +21,8 @@ tar -xzf "${programs[0]}" -C "$scratch"
 prefix=("$scratch"/sixfold-*)
 clean() { (cd "$scratch/here" && env -i HOME="$scratch/home" PATH=/usr/bin:/bin "$@"); }
 
-# All of it: poses from depth and, with the weights, from colour.
-clean "$prefix/bin/sixfold" demo --out demo --json demo.json >"$scratch/table.txt" || fail "the demo ended with $?"
-# The colour half says why it is empty.
+# The whole demo: poses from depth and, with the weights, from colour.
+clean "$prefix/bin/sixfold" demo --out demo --json demo.json >"$scratch/said" 2>&1 || fail "the demo ended with $?: $(tail -3 "$scratch/said")"
 python3 - "$scratch/here/demo.json" "$prefix" <<'PY' || exit 1
 import json
 import sys
@@ -49,13 +48,17 @@ if command -v man >/dev/null; then
 fi
 echo "man pages: ${#pages[@]}"
 
-# A program without its share finds the archive of data in the user's folder, and says what to do before that is there.
-cp "$prefix/bin/sixfold" "$scratch/alone/sixfold"
-rm -rf "$prefix"
+# A program without its share looks in the user's folder, where the archive of data is unpacked: a file that is spoilt there is named.
+mkdir "$scratch/alone/bin"
+cp "$prefix/bin/sixfold" "$scratch/alone/bin/sixfold"
 mkdir -p "$scratch/home/.local/share"
 tar -xzf "$out"/sixfold-data-*.tar.gz -C "$scratch/home/.local/share"
-clean "$scratch/alone/sixfold" demo --out again --json again.json >/dev/null || fail "the demo with the archive of data ended with $?"
-grep -q "$scratch/home/.local/share/sixfold/weights" "$scratch/here/again.json" || fail "the demo did not use the archive of data"
-said=$(clean env SIXFOLD_SHARE="$scratch/nowhere" "$scratch/alone/sixfold" demo --out none 2>&1) && fail "a demo without samples ended well"
+diff -r "$prefix/share/sixfold" "$scratch/home/.local/share/sixfold" || fail "the archives hold different data"
+spoilt=$scratch/home/.local/share/sixfold/demo/test_targets_bop19.json
+echo spoilt >"$spoilt"
+said=$(clean "$scratch/alone/bin/sixfold" demo --out again 2>&1) && fail "a demo on a spoilt file ended well"
+[[ $said == *"$spoilt"* ]] || fail "the archive of data was not found in the user's folder: $said"
+# Where nothing is, the message says where it looked.
+said=$(clean env SIXFOLD_SHARE="$scratch/nowhere" "$scratch/alone/bin/sixfold" demo --out none 2>&1) && fail "a demo without samples ended well"
 [[ $said == *"$scratch/nowhere/demo"* ]] || fail "a demo without samples does not say where it looked: $said"
-echo "data archive: found in the user's folder"
+echo "data archive: found in the user's folder; without it: ${said##*error: }"
