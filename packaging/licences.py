@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Prints the crates that the programs are linked with, and the texts of their licences, each once.
+"""Prints the crates that programs are linked with, and the texts of their licences, each once.
 
-    python3 packaging/licences.py TARGET > THIRD-PARTY.txt
+    python3 packaging/licences.py TARGET CRATE... > THIRD-PARTY.txt
 
-TARGET is the triple that the programs were built for. The texts are those in the crates' own packages; which crates there are
+TARGET is the triple that the programs were built for, CRATE the crates of ours that they are built from. The texts are those in the crates' own packages; which crates there are
 says `cargo metadata`, without network.
 """
 
@@ -13,18 +13,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-PROGRAMS = ("sixfold-cli", "sixfold-experiments")
 TEXT = re.compile(r"(?i)^(licen[cs]e|copying|copyright|notice|unlicense)")
 
 
-def linked(target):
+def linked(target, programs):
     """The packages below the programs by normal dependencies, by name and version."""
     command = ["cargo", "metadata", "--format-version", "1", "--offline", "--locked", "--filter-platform", target]
     told = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     # `cargo tree` knows which of them the programs' features ask for.
     edges = ["cargo", "tree", "--offline", "--locked", "--target", target, "-e", "normal,no-proc-macro", "--prefix", "none", "-f", "{p}"]
     tree = "".join(
-        subprocess.run([*edges, "-p", program], check=True, capture_output=True, text=True).stdout for program in PROGRAMS
+        subprocess.run([*edges, "-p", program], check=True, capture_output=True, text=True).stdout for program in programs
     )
     named = {tuple(line.split()[:2]) for line in tree.splitlines() if line.strip()}
     found = [p for p in told["packages"] if p["source"] and (p["name"], f"v{p['version']}") in named]
@@ -32,12 +31,12 @@ def linked(target):
 
 
 def main():
-    if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+    if len(sys.argv) < 3 or sys.argv[1].startswith("-"):
         print(__doc__, file=sys.stderr)
         return 2
-    packages = linked(sys.argv[1])
+    packages = linked(sys.argv[1], sys.argv[2:])
     texts = {}
-    print("The programs sixfold and sixfold-experiments are linked with these crates:\n")
+    print(f"What is built from {' and '.join(sys.argv[2:])} is linked with these crates:\n")
     for package in packages:
         print(f"    {package['name']} {package['version']}: {package['license'] or 'see its text below'}")
         for file in sorted(Path(package["manifest_path"]).parent.iterdir()):

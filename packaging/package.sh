@@ -56,7 +56,7 @@ python3 packaging/man.py "$programs/sixfold" "$programs/sixfold-experiments" "$s
 gzip -9n "$stage"/share/man/man1/*
 data "$stage/share/sixfold"
 cp README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE "$stage"
-python3 packaging/licences.py "$target" >"$stage/THIRD-PARTY.txt"
+python3 packaging/licences.py "$target" sixfold-cli sixfold-experiments >"$stage/THIRD-PARTY.txt"
 pack "$name" >"$out/$name.tar.gz"
 
 data "$scratch/sixfold"

@@ -19,6 +19,7 @@ rm -rf "$share"
 mkdir -p "$share"
 cp -r ../data/demo "$share/demo"
 cp -r ../weights "$share/weights"
+python3 ../packaging/licences.py "$(rustc -vV | sed -n 's/^host: //p')" sixfold-python >"$share/THIRD-PARTY.txt"
 
 python3 -m venv "$scratch/venv"
 "$scratch/venv/bin/pip" install --quiet 'maturin>=1.9,<2'
