@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Estimate poses in the sample frames of this repository, score them and draw them
+    /// Estimate poses in the sample frames that come with Sixfold, score them and draw them
     #[command(after_help = "Example:\n  sixfold demo --out out/demo")]
     Demo(DemoArguments),
     /// Estimate the 6D pose of known objects, in one image or in a whole dataset

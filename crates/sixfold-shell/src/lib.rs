@@ -25,6 +25,7 @@ pub mod ranges;
 #[cfg(feature = "physics")]
 pub mod scenes;
 pub mod sheets;
+pub mod shipped;
 pub mod symmetries;
 #[cfg(feature = "networks")]
 pub mod training;

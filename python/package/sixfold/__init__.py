@@ -88,6 +88,7 @@ from ._sixfold import (
     undistort_rgb,
     voxel_downsample,
 )
+from ._shipped import shipped
 
 __version__ = _sixfold.__version__
 
@@ -154,6 +155,7 @@ __all__ = [
     "render",
     "render_depth",
     "render_scene",
+    "shipped",
     "simulate_depth",
     "sphere_directions",
     "support_plane",

@@ -9,12 +9,15 @@ use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::Memory;
 use sixfold_experience::{ExperienceStore, StoreError, StorePlace};
 
+use crate::shipped::DGCM;
+
 /// Which network encodes objects.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// Trained network for experience: a file that `sixfold train dgcm` wrote
-    #[arg(long, value_name = "FILE", env = "SIXFOLD_DGCM", default_value = "weights/dgcm.safetensors")]
-    pub weights: PathBuf,
+    /// Trained network for experience: a file that `sixfold train dgcm` wrote (default: the one that comes with Sixfold,
+    /// docs/install.md)
+    #[arg(long, value_name = "FILE", env = "SIXFOLD_DGCM")]
+    pub weights: Option<PathBuf>,
 }
 
 /// Where experiences wait for a server.
@@ -28,13 +31,16 @@ pub struct OutboxArguments {
 
 /// Reads the network.
 pub fn model(a: &NetworkArguments) -> Result<DgcmModel> {
-    if !a.weights.exists() {
+    let Some(weights) = &a.weights else {
+        return Ok(DgcmModel::load(&DGCM.find()?)?);
+    };
+    if !weights.exists() {
         bail!(
-            "--weights: {} is not there; give a file that `sixfold train dgcm` wrote (the one that comes with Sixfold is weights/dgcm.safetensors in its folder)",
-            a.weights.display()
+            "--weights: {} is not there; give a file that `sixfold train dgcm` wrote, or leave --weights out for the one that comes with Sixfold",
+            weights.display()
         );
     }
-    DgcmModel::load(&a.weights).context("--weights")
+    DgcmModel::load(weights).context("--weights")
 }
 
 /// Parses a store's place on the command line.

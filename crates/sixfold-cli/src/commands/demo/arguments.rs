@@ -10,13 +10,13 @@ pub(crate) struct DemoArguments {
     /// Folder for results and images
     #[arg(long, default_value = "out/demo", value_name = "DIR")]
     pub out: PathBuf,
-    /// Folder of the sample data (default: data/demo of this repository)
+    /// Folder of the sample data (default: the one that comes with Sixfold, docs/install.md)
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
-    /// Weights for poses from colour (default: weights/pix2pose-lmo.safetensors of this repository)
+    /// Weights for poses from colour (default: those that come with Sixfold)
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: Option<PathBuf>,
-    /// Weights of the detector (default: weights/detector-lmo.safetensors of this repository)
+    /// Weights of the detector (default: those that come with Sixfold)
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
     #[command(flatten)]

@@ -13,16 +13,12 @@ use sixfold_runner::RegionSource;
 
 use super::arguments::DemoArguments;
 use super::colour::{Colour, Row};
-use super::samples::{Known, add_s, found_upwards};
+use super::samples::{Known, add_s};
 use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
+use sixfold_shell::shipped::{DETECTOR, PIX2POSE};
 use sixfold_shell::training::was_trained_on;
-
-/// Weights of the sample objects, relative to the repository.
-const WEIGHTS: &str = "weights/pix2pose-lmo.safetensors";
-/// The detector of the sample objects.
-const DETECTOR: &str = "weights/detector-lmo.safetensors";
 
 pub(super) fn run(
     a: &DemoArguments,
@@ -31,14 +27,12 @@ pub(super) fn run(
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
-    let Some(weights) = a.weights.clone().or_else(|| found_upwards(Path::new(WEIGHTS))) else {
-        return Ok(Colour::none(
-            None,
-            format!("no {WEIGHTS}; `sixfold train pix2pose` makes weights, --weights FILE takes them"),
-        ));
+    let weights = match a.weights.clone().map_or_else(|| PIX2POSE.find(), Ok) {
+        Ok(weights) => weights,
+        Err(error) => return Ok(Colour::none(None, error.to_string())),
     };
     // What was asked for has to be right.
-    let detector = match a.detector.clone().or_else(|| found_upwards(Path::new(DETECTOR))) {
+    let detector = match a.detector.clone().or_else(|| DETECTOR.find().ok()) {
         None => None,
         Some(file) => match TrainedDetector::load(&file) {
             Ok(detector) => Some((detector, file)),

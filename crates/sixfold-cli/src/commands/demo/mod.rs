@@ -23,13 +23,14 @@ use sixfold_ppf::{PpfOptions, estimate};
 
 use self::arguments::DemoArguments;
 use self::colour::Colour;
-use self::samples::{Known, add_s, sample_folder};
+use self::samples::{Known, add_s};
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::overlay::{self, Drawn};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Progress;
+use sixfold_shell::shipped::DEMO;
 
 #[derive(Serialize)]
 struct Row {
@@ -59,7 +60,7 @@ struct Whole {
 pub(crate) fn run(a: &DemoArguments) -> Result<Outcome> {
     let start = Instant::now();
     let mut out = Pictures::of(Some(OutputFolder::take(&a.out)?));
-    let folder = sample_folder(a.data.as_deref())?;
+    let folder = a.data.clone().map_or_else(|| DEMO.find(), Ok)?;
     let dataset = BopDataset::open(&folder, "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
     let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();

@@ -1,8 +1,8 @@
-//! The samples: where they are, and what is known of their objects.
+//! The samples: what is known of their objects.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, anyhow};
 use sixfold_bop::{BopDataset, GroundTruth, ModelPoints, Models};
 use sixfold_geometry::Pose;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
@@ -38,25 +38,6 @@ impl Known {
     /// Its surface.
     pub fn mesh(&self) -> Option<&Mesh> {
         self.object.mesh.as_deref()
-    }
-}
-
-/// A file or folder of the repository, found from where the program was started or built.
-pub(super) fn found_upwards(name: &Path) -> Option<PathBuf> {
-    let here = std::env::current_dir().unwrap_or_default();
-    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let found =
-        here.ancestors().map(Path::to_path_buf).chain([built]).map(|p| p.join(name)).find(|p| p.exists());
-    found.map(|path| path.canonicalize().unwrap_or(path))
-}
-
-/// The samples: given, or found.
-pub(super) fn sample_folder(given: Option<&Path>) -> Result<PathBuf> {
-    match given.map(Path::to_owned).or_else(|| found_upwards(Path::new("data/demo"))) {
-        Some(folder) => Ok(folder),
-        None => bail!(
-            "the sample data (folder data/demo of the repository) is not here: run inside the repository or give --data DIR"
-        ),
     }
 }
 
