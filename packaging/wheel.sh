@@ -13,7 +13,7 @@ out=$(cd "${1:-$root/out/packages}" && pwd)
 cd "$root/python"
 scratch=$(mktemp -d)
 # The folder is in no commit: it is here while the wheel is built.
-share=package/sixfold/share
+share=$root/python/package/sixfold/share
 trap 'rm -rf "$scratch" "$share"' EXIT
 rm -rf "$share"
 mkdir -p "$share"
