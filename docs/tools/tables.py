@@ -237,8 +237,24 @@ def headline():
     return ["what", "measure", "value", "time (s)", "command"], [[*row[:4], f"`{row[4]}`"] for row in rows], files
 
 
+def teach():
+    taught = value("teach", "taught")
+
+    def hundredths(number):
+        return Literal(f"{number:.2f}")
+
+    found = ("found", "found_with_true_mesh", "found_auto", "found_auto_with_true_mesh", "wrong_auto")
+    body = [[row["name"].replace("_", " "), row["diameter_mm"], hundredths(row["camera_mm"]), Literal(f"{row['camera_deg']:.3f}"),
+             row["mask_iou"], hundredths(row["mesh_mm"]), hundredths(row["truth_mm"]), *(row[key] for key in found)]
+            for row in taught["objects"]]
+    body.append(["all", None, hundredths(taught["camera_mm_median"]), Literal(f"{taught['camera_deg_median']:.3f}"), None,
+                 hundredths(taught["mesh_mm_mean"]), hundredths(taught["truth_mm_mean"]), *(taught[key] for key in found)])
+    return ["object", "diameter (mm)", "camera (mm)", "camera (degrees)", "mask IoU", "mesh to truth (mm)", "truth to mesh (mm)",
+            "depth: found of 5", "with the true mesh", "auto: found of 5", "with the true mesh", "reported, wrong"], body, ["teach"]
+
+
 TABLES = {table.__name__: table for table in
-          (depth, demo, templates, piles, colour, evaluator, detection, probability, new_poses, new_views, grasps, times, headline)}
+          (depth, demo, templates, piles, colour, evaluator, detection, probability, new_poses, new_views, grasps, teach, times, headline)}
 
 
 def rendered(name):
