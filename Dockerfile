@@ -1,4 +1,4 @@
-# The programs with weights and samples: docker build -t sixfold . && docker run --rm -v "$PWD:/work" sixfold demo --out /work/out
+# The programs with weights and samples: docker build -t sixfold . && docker run --rm -v "$PWD:/data" sixfold demo --out /data/out
 FROM rust:1.95-slim-bookworm AS build
 RUN apt-get update && apt-get install -y --no-install-recommends gcc libc6-dev && rm -rf /var/lib/apt/lists/*
 COPY . /sixfold
@@ -11,5 +11,5 @@ COPY --from=build /sixfold/target/release/sixfold /sixfold/target/release/sixfol
 COPY weights /usr/local/share/sixfold/weights
 COPY data/demo /usr/local/share/sixfold/demo
 COPY LICENSE-MIT LICENSE-APACHE /usr/local/share/doc/sixfold/
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["sixfold"]

@@ -27,7 +27,7 @@ def escaped(text):
 
 
 def unwrapped(lines):
-    """Lines that help broke at its width, whole again: a line goes on where the next has its indent and its first word had no room."""
+    """Lines that help broke at its width, whole again: a line continues where the next has its indent and its first word had no room."""
     out, room, before = [], 0, None
     for line in lines:
         indent, words = len(line) - len(line.lstrip()), line.split()

@@ -131,8 +131,8 @@ impl LookAlikes {
     /// A discrete rotation, and with it all steps about every axis.
     fn around(&self, discrete: &Pose) -> Vec<Pose> {
         let steps = (1..STEPS).map(|k| TAU * k as f64 / STEPS as f64);
-        let turned = self.axes.iter().flat_map(|axis| steps.clone().map(|angle| axis.rotation(angle)));
-        std::iter::once(*discrete).chain(turned.map(|rotation| *discrete * rotation)).collect()
+        let rotations = self.axes.iter().flat_map(|axis| steps.clone().map(|angle| axis.rotation(angle)));
+        std::iter::once(*discrete).chain(rotations.map(|rotation| *discrete * rotation)).collect()
     }
 }
 
@@ -188,8 +188,8 @@ mod tests {
         lathe(point, color)
     }
 
-    /// What of the pose `tilted` about the view and `turned` about the can's axis comes of asking for the best look-alike.
-    fn best(mesh: &Mesh, turned: f64) -> Option<Pose> {
+    /// The best look-alike of the true pose rotated by an angle about the can's axis.
+    fn best(mesh: &Mesh, angle: f64) -> Option<Pose> {
         let truth = truth();
         let objects = [SceneObject { mesh, camera_from_object: truth }];
         let mut frame = VisibilityBuffer::new(&CAMERA);
@@ -204,7 +204,7 @@ mod tests {
         let shape = Shape { mesh, colored: mesh, threshold: 0.008 };
         let known = LookAlikes::of(mesh, mesh.diameter(), &[Pose::identity()]);
         let axis = ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::zeros() };
-        let given = truth * axis.rotation(turned);
+        let given = truth * axis.rotation(angle);
         let evidence =
             EvidenceCollector::default().collect(&scene, &shape, &given, &VerificationOptions::default());
         known.best(&scene, &shape, mesh.diameter(), (&given, &evidence)).map(|(pose, _)| pose)

@@ -248,7 +248,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     assert_eq!(salient.calls(), calls);
     teaching.reconstruct(&coarse(), &()).unwrap();
     assert!(Snapshot::read(dir.path()).unwrap().shape().is_some());
-    // One that reaches beyond the space of the object is looked at by all.
+    // One that reaches beyond the space of the object is seen by all photographs.
     let everywhere = Image::filled(640, 480, true);
     teaching.set_mask(4, &everywhere).unwrap();
     assert!(teaching.photographs()[0].mask_by.is_none());
