@@ -69,19 +69,64 @@ impl AutoEstimator {
     /// Everything that is known of an object in an image: all poses of all methods that were asked, the most probable first.
     ///
     /// # Errors
-    /// [`EstimatorError`], as that of the method that it comes from.
+    /// [`EstimatorError`], as that of the method that it comes from; [`EstimatorError::Lacks`] for an object without a mesh.
     pub fn hypotheses(
         &self,
         object: &AutoObject,
         query: &Query<'_>,
     ) -> Result<Vec<Hypothesis>, EstimatorError> {
-        self.pool(object, query, |pool, _| Ok(pool.hypotheses))
+        let Some(surface) = &object.surface else {
+            return Err(lacks_mesh(object));
+        };
+        self.pool((object, surface), query, |pool, _| Ok(pool.hypotheses))
+    }
+
+    /// The first method that knows an object without a mesh, with what it knows.
+    fn without_mesh(
+        &self,
+        object: &AutoObject,
+    ) -> Result<Option<(&dyn PoseEstimator, Arc<Box<dyn PreparedObject>>)>, EstimatorError> {
+        for (number, member) in self.members.iter().enumerate() {
+            if let Ok(prepared) = object.prepared(number, member.as_ref())? {
+                return Ok(Some((member.as_ref(), prepared)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Poses of an object without a mesh: nothing can be rendered, so that one method answers and its confidence is no probability.
+    fn answer_of_one(
+        &self,
+        object: &AutoObject,
+        query: &Query<'_>,
+    ) -> Result<Vec<PoseEstimate>, EstimatorError> {
+        let Some((member, prepared)) = self.without_mesh(object)? else {
+            return Err(lacks_mesh(object));
+        };
+        if !can_answer(member, query) {
+            return Err(EstimatorError::Input {
+                what: "depth image",
+                method: METHOD,
+                advice: "the object has no mesh and is known by depth images alone: give --depth FILE",
+            });
+        }
+        let mut found = member.estimate(prepared.as_ref().as_ref(), query)?;
+        for pose in &mut found {
+            pose.details.entry("method").or_insert_with(|| member.name().into());
+        }
+        if let Some(first) = found.first_mut() {
+            let (name, method) = (&object.object.name, member.name());
+            first.notes.push(format!(
+                "{name} has no mesh: --method {method} answered alone, and its confidence is no probability"
+            ));
+        }
+        Ok(found)
     }
 
     /// Fills a pool and hands it on, with what was left out.
     fn pool<T>(
         &self,
-        object: &AutoObject,
+        (object, surface): (&AutoObject, &Surface),
         query: &Query<'_>,
         done: impl FnOnce(Pool<'_>, Vec<String>) -> Result<T, EstimatorError>,
     ) -> Result<T, EstimatorError> {
@@ -97,12 +142,13 @@ impl AutoEstimator {
         });
         let color = gradients.as_ref().and_then(|(image, kept)| kept.get().map(|g| (*image, g)));
         let none = LookAlikes::default();
-        let look_alikes = if color.is_some() && query.depth.is_some() { object.look_alikes() } else { &none };
+        let look_alikes =
+            if color.is_some() && query.depth.is_some() { surface.look_alikes() } else { &none };
         let mut pool = Pool {
             scene: Scene { camera: query.camera, depth: query.depth.map(|d| d.as_ref()), color },
-            shape: Shape { mesh: &object.rendered, colored: &object.mesh, threshold: object.threshold },
-            diameter: object.diameter,
-            symmetries: &object.symmetries,
+            shape: Shape { mesh: &surface.rendered, colored: &surface.mesh, threshold: surface.threshold },
+            diameter: surface.diameter,
+            symmetries: &surface.symmetries,
             look_alikes,
             calibration: &self.calibration,
             one_instance: query.max_instances == 1,
@@ -153,6 +199,16 @@ impl AutoEstimator {
     }
 }
 
+/// The error for an object that no method can look for.
+fn lacks_mesh(object: &AutoObject) -> EstimatorError {
+    EstimatorError::Lacks {
+        object: object.object.name.clone(),
+        what: "mesh",
+        method: METHOD,
+        advice: "add it with a mesh, or from depth images and look for it with --method mttm",
+    }
+}
+
 /// Whether a query has what a method needs.
 fn can_answer(method: &dyn PoseEstimator, query: &Query<'_>) -> bool {
     let needs = method.needs();
@@ -165,6 +221,14 @@ fn can_answer(method: &dyn PoseEstimator, query: &Query<'_>) -> bool {
 /// An object as all methods know it.
 pub struct AutoObject {
     object: Object,
+    /// `None` for an object that is known by depth images alone.
+    surface: Option<Surface>,
+    members: Vec<Prepared>,
+    notes: Vec<String>,
+}
+
+/// What poses are judged by.
+struct Surface {
     mesh: Arc<Mesh>,
     rendered: Mesh,
     diameter: f64,
@@ -172,8 +236,6 @@ pub struct AutoObject {
     symmetries: Vec<Pose>,
     /// Found when they are first needed.
     look_alikes: OnceLock<LookAlikes>,
-    members: Vec<Prepared>,
-    notes: Vec<String>,
 }
 
 /// An object as one method knows it; `Err` says why it cannot be asked.
@@ -181,11 +243,13 @@ type Known = Result<Arc<Box<dyn PreparedObject>>, String>;
 /// The same, prepared when the method is first asked.
 type Prepared = Mutex<Option<Known>>;
 
-impl AutoObject {
+impl Surface {
     fn look_alikes(&self) -> &LookAlikes {
         self.look_alikes.get_or_init(|| LookAlikes::of(&self.mesh, self.diameter, &self.symmetries))
     }
+}
 
+impl AutoObject {
     /// The object as method number `number` knows it, or why it cannot be asked.
     fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<Known, EstimatorError> {
         let Some(place) = self.members.get(number) else {
@@ -210,7 +274,7 @@ impl PreparedObject for AutoObject {
     }
 
     fn mesh(&self) -> Option<&Mesh> {
-        Some(&self.mesh)
+        self.surface.as_ref().map(|surface| &*surface.mesh)
     }
 
     fn notes(&self) -> &[String] {
@@ -223,7 +287,7 @@ impl PoseEstimator for AutoEstimator {
         METHOD
     }
 
-    /// A mesh, since poses are judged by rendering it, and one image at least.
+    /// An object, with a mesh if its poses are to be judged, and one image at least.
     fn needs(&self) -> Needs {
         Needs { depth: Need::Optional, rgb: Need::Optional, region: Need::Optional, object: Need::Required }
     }
@@ -238,23 +302,37 @@ impl PoseEstimator for AutoEstimator {
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
-        let mesh = object.needed_mesh(METHOD)?.clone();
-        let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), &mesh);
-        let kept =
-            kept.map_err(|e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) })?;
-        let note = |n| format!("mesh of {} not kept, or simplified again: {n}", object.name);
-        let diameter = object.info.as_ref().map_or_else(|| mesh.diameter(), |info| info.diameter);
-        Ok(Box::new(AutoObject {
-            mesh,
-            rendered: kept.mesh,
-            diameter,
-            threshold: VerificationOptions::default().threshold_for(diameter),
-            symmetries: object.info.as_ref().map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
-            look_alikes: OnceLock::new(),
-            members: self.members.iter().map(|_| Prepared::default()).collect(),
-            notes: kept.note.map(note).into_iter().collect(),
-            object: object.clone(),
-        }))
+        let mut notes = vec![];
+        let surface = match &object.mesh {
+            None => None,
+            Some(mesh) => {
+                let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
+                let kept = kept.map_err(|e| EstimatorError::Object {
+                    object: object.name.clone(),
+                    source: Box::new(e),
+                })?;
+                let note = |n| format!("mesh of {} not kept, or simplified again: {n}", object.name);
+                notes.extend(kept.note.map(note));
+                let diameter = object.info.as_ref().map_or_else(|| mesh.diameter(), |info| info.diameter);
+                Some(Surface {
+                    mesh: mesh.clone(),
+                    rendered: kept.mesh,
+                    diameter,
+                    threshold: VerificationOptions::default().threshold_for(diameter),
+                    symmetries: object
+                        .info
+                        .as_ref()
+                        .map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
+                    look_alikes: OnceLock::new(),
+                })
+            }
+        };
+        let members = self.members.iter().map(|_| Prepared::default()).collect();
+        let prepared = AutoObject { object: object.clone(), surface, members, notes };
+        if prepared.surface.is_none() && self.without_mesh(&prepared)?.is_none() {
+            return Err(lacks_mesh(&prepared));
+        }
+        Ok(Box::new(prepared))
     }
 
     fn estimate(
@@ -263,7 +341,10 @@ impl PoseEstimator for AutoEstimator {
         query: &Query<'_>,
     ) -> Result<Vec<PoseEstimate>, EstimatorError> {
         let object: &AutoObject = downcast(object, METHOD)?;
-        self.pool(object, query, |pool, notes| {
+        let Some(surface) = &object.surface else {
+            return self.answer_of_one(object, query);
+        };
+        self.pool((object, surface), query, |pool, notes| {
             let chosen = pool.chosen(query.max_instances).into_iter();
             let mut found: Vec<PoseEstimate> = chosen
                 .filter(|(h, _)| h.probability >= query.min_confidence)

@@ -47,7 +47,7 @@ impl Object {
             object: self.name.clone(),
             what: "mesh",
             method,
-            advice: "it was added from depth images: only --method mttm can look for it",
+            advice: "it was added from depth images: only --method mttm and --method auto can look for it",
         })
     }
 }

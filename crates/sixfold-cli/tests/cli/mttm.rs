@@ -94,7 +94,19 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
     let (there, here) =
         (pose_of(&run["poses"][0]["camera_from_object"]), pose_of(&still["poses"][0]["camera_from_object"]));
     assert_near(&(there * here.inverse() * case.truth), &moved);
-    // Only this method can look for it.
+    // auto asks this method alone, and calls no confidence a probability.
+    let auto = "estimate --method auto --depth moved.png --camera camera.json --json --object seen";
+    let answer = sixfold(dir, auto).expect(0);
+    let pose = &answer.json()["poses"][0];
+    assert_near(&pose_of(&pose["camera_from_object"]), &moved);
+    assert_eq!(pose["method"], "mttm");
+    assert!(pose["probability"].is_null() && pose["confidence"].is_number(), "{pose}");
+    assert!(
+        answer.stderr.contains("no mesh") && answer.stderr.contains("no probability"),
+        "{}",
+        answer.stderr
+    );
+    // Others cannot look for it.
     fails(dir, "estimate --depth depth.png --camera camera.json --object seen", &["seen", "no mesh", "mttm"]);
 }
 

@@ -164,12 +164,12 @@ impl FindRequest {
         }
         for name in &self.objects {
             let record = app.store.record(name).map_err(|e| ApiError::of_store("objects", &e))?;
-            if record.without_mesh && self.method != "mttm" {
+            if record.without_mesh && !["auto", "mttm"].contains(&self.method.as_str()) {
                 return Err(ApiError::field(
                     "objects",
                     format!("{name:?}, which was added from depth images and has no mesh"),
                     "an object with a mesh",
-                    "choose the method mttm",
+                    "choose the method auto or mttm",
                 ));
             }
         }
