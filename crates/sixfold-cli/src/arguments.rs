@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Estimate poses in the sample frames that come with Sixfold, score them and draw them
+    /// Find poses in the sample frames, score them and write overlays
     #[command(after_help = "Example:\n  sixfold demo --out out/demo")]
     Demo(DemoArguments),
     /// Estimate the 6D pose of known objects, in one image or in a whole dataset
@@ -63,7 +63,7 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold eval --dataset lmo --results results.csv --curves curves.png"
     )]
     Eval(EvalArguments),
-    /// Grasps of a parallel-jaw gripper: propose them from depth, try them in simulation
+    /// Propose grasps of a parallel-jaw gripper from depth, and try them in simulation
     #[command(
         after_help = "Example:\n  sixfold grasp propose --depth d.png --camera camera.json --mask mask.png --out out"
     )]
@@ -79,7 +79,7 @@ pub(crate) enum Command {
         after_help = "Example:\n  sixfold simulate-depth --dataset lmo --split test --out lmo-simulated"
     )]
     SimulateDepth(SimulateArguments),
-    /// Drop objects on a plane and write images of them from all around as a BOP dataset with ground truth
+    /// Drop objects on a plane, render them from all around, and write a BOP dataset with ground truth
     #[cfg(feature = "physics")]
     #[command(
         name = "simulate-scenes",
@@ -89,7 +89,7 @@ pub(crate) enum Command {
     /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
     #[command(hide = !NETWORKS, after_help = SYNTHESIZE_HELP)]
     Synthesize(Box<SynthesizeArguments>),
-    /// Train a network on a few posed images and renders
+    /// Train a network
     #[command(
         hide = !NETWORKS,
         after_help = "Example:\n  sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo"
@@ -101,18 +101,18 @@ pub(crate) enum Command {
     /// Keep objects under a name: add, list, show, remove
     #[command(after_help = "Example:\n  sixfold object add mug mug.ply --unit mm")]
     Object(ObjectArguments),
-    /// Write a board of AprilTags to print: an object stands on it while it is photographed
+    /// Write a board of AprilTags to print, for `sixfold teach` and `sixfold calibrate`
     #[command(after_help = "Example:\n  sixfold board --paper a4 --out board.pdf")]
     Board(BoardArguments),
-    /// Find the camera, and its pose in every photograph, from photographs of the printed board
+    /// Compute a camera's intrinsics, and its pose in each photograph, from photographs of the printed board
     #[command(after_help = "Examples:\n  \
         sixfold calibrate photographs --out out/calibration\n  \
         sixfold calibrate photographs --camera out/calibration/camera.json --out out/poses")]
     Calibrate(CalibrateArguments),
-    /// Learn a new object from photographs of it on the printed board: mesh, symmetries, a record to find it by
+    /// Learn a new object from photographs of it on the printed board, and store it under a name
     #[command(hide = !NETWORKS, after_help = TEACH_HELP)]
     Teach(Box<TeachArguments>),
-    /// Serve web pages and an HTTP API on this machine: objects, poses, grasps
+    /// Start a server with web pages and an HTTP API for objects, poses and grasps
     #[command(hide = !crate::commands::serve::IS_BUILT_IN, after_help = crate::commands::serve::AFTER_HELP)]
     Serve(Box<ServeArguments>),
     /// Print shell completions

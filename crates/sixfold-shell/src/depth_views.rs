@@ -22,8 +22,8 @@ pub struct DepthViewArguments {
     /// Where the object is in each of them (PNG, above zero inside), in the same order
     #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth", conflicts_with = "mesh")]
     pub masks: Vec<PathBuf>,
-    /// Take masks as they are, without holding them against depth: by default what lies on the table around the object or beyond
-    /// a depth edge is left out, and a mask that is more than a third too large is refused
+    /// Use masks unchanged. By default they are checked against depth: the table and surfaces beyond depth edges are removed,
+    /// and a mask that is more than a third too large is refused
     #[arg(long, requires = "depth", conflicts_with = "mesh")]
     pub mask_as_is: bool,
     /// Camera of the depth images: a file of BOP, OpenCV or ROS (docs/cameras.md), and depth_scale

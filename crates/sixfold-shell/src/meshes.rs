@@ -6,7 +6,7 @@ use sixfold_mesh::MeshOptions;
 /// How mesh files are read, by whatever command and from datasets and stores alike.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct MeshArguments {
-    /// Let mesh files name textures, materials and buffers outside their own folder: any file of this machine
+    /// Let mesh files refer to textures, materials and buffers outside their folder (any file of this machine)
     #[arg(long, global = true)]
     pub allow_outside: bool,
 }

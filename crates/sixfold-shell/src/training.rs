@@ -27,7 +27,7 @@ pub struct MaterialArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
+    /// Frames of the split to use as photographs: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "objects")]
     pub frames: Option<PathBuf>,
     /// Open no photograph, learn from renders of the dataset's models alone

@@ -18,7 +18,7 @@ pub(crate) struct BoardArguments {
     /// Size of the paper: a4, a3, letter
     #[arg(long, value_name = "PAPER", default_value = "a4")]
     pub paper: Paper,
-    /// File to write: .pdf to print, .png to look at
+    /// File to write: .pdf for printing, .png for viewing
     #[arg(long, value_name = "FILE", default_value = "board.pdf")]
     pub out: PathBuf,
     #[command(flatten)]

@@ -16,19 +16,19 @@ pub(crate) struct CalibrateArguments {
     /// Photographs of the board (PNG, JPEG), or folders of them
     #[arg(required = true, value_name = "PHOTOGRAPHS")]
     pub photographs: Vec<PathBuf>,
-    /// Keep this camera and find poses alone
+    /// Use the intrinsics of this file, and compute only poses
     #[arg(long, value_name = "FILE", conflicts_with_all = ["pinhole", "wide"])]
     pub camera: Option<PathBuf>,
-    /// What the ruler on the printed board measures, millimetres (default: 100)
+    /// Measured length of the printed ruler, millimetres (default: 100)
     #[arg(long, value_name = "MM")]
     pub ruler: Option<f64>,
     /// Estimate no lens distortion
     #[arg(long, conflicts_with = "wide")]
     pub pinhole: bool,
-    /// Estimate one coefficient of distortion more (k3), for wide lenses
+    /// Also estimate the distortion coefficient k3, for wide lenses
     #[arg(long)]
     pub wide: bool,
-    /// Folder for the camera file, the poses and the pictures
+    /// Folder for the camera file, the poses and the images
     #[arg(long, value_name = "DIR", default_value = "out/calibration")]
     pub out: PathBuf,
     #[command(flatten)]

@@ -13,13 +13,13 @@ pub(crate) struct DetectArguments {
     /// Colour images: PNG or JPEG of any size, grey or colour
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]
     pub rgb: Vec<PathBuf>,
-    /// BOP dataset folder: detect in the images of its targets. Stopped, the same command resumes
+    /// BOP dataset folder: detect in the images of its targets. After a stop, the same command resumes
     #[arg(long, value_name = "DIR", requires = "out")]
     pub dataset: Option<PathBuf>,
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Targets file that says which images (default: its test_targets_bop19.json, or all images)
+    /// Targets file that lists the images (default: the dataset's test_targets_bop19.json, or all images)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "rgb")]
     pub targets: Option<PathBuf>,
     /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
@@ -38,13 +38,13 @@ pub(crate) struct DetectArguments {
     /// wants it)
     #[arg(long, value_name = "SCORE")]
     pub threshold: Option<f32>,
-    /// Of two boxes of an object that overlap more than this (intersection over union), leave the worse one out
+    /// If two boxes of an object overlap more than this (intersection over union), keep only the better one
     #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub overlap: f32,
-    /// Most detections of each object in an image, the best ones
+    /// Maximum number of detections per object in an image
     #[arg(long, value_name = "N", default_value = "100")]
     pub per_object: usize,
-    /// Most detections in an image, the best ones
+    /// Maximum number of detections in an image
     #[arg(long, value_name = "N", default_value = "100")]
     pub most: usize,
     /// Boxes only

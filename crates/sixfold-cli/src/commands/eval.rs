@@ -38,13 +38,13 @@ pub(crate) struct EvalArguments {
     /// Leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE")]
     pub except: Option<PathBuf>,
-    /// With --detections: score from which on detections count for recall and false detections, 0 to 1
+    /// With --detections: minimum score of detections that count for recall and false detections, 0 to 1
     #[arg(long, value_name = "SCORE", default_value = "0.4", value_parser = score)]
     pub min_score: f64,
-    /// With --detections: whatever objects are called counts for nothing, as for the proposals of a detector of any object
+    /// With --detections: ignore object ids, for a detector for any object
     #[arg(long, requires = "detections", conflicts_with = "results")]
     pub one_class: bool,
-    /// With --detections: write the ground truth that they were scored with as a COCO file
+    /// With --detections: write the ground truth as a COCO file
     #[arg(long, value_name = "FILE.json", requires = "detections", conflicts_with = "results")]
     pub write_truth: Option<PathBuf>,
     /// Also score as 6D detection (BOP'24: AP of MSSD and MSPD)

@@ -29,7 +29,7 @@ mod built_in {
 
     #[derive(Debug, Args)]
     pub(crate) struct ServeArguments {
-        /// Address to listen on; another than this machine's own needs --token
+        /// Address to listen on; other addresses than 127.0.0.1 need --token
         #[arg(long, value_name = "IP", default_value = "127.0.0.1")]
         pub host: IpAddr,
         /// Port to listen on; 0 takes any free one
@@ -50,22 +50,22 @@ mod built_in {
         /// Folder of jobs, with their uploaded files and results
         #[arg(long, value_name = "DIR", default_value = "sixfold-data")]
         pub data: PathBuf,
-        /// Jobs that are worked on at once; each uses all --threads
+        /// Number of jobs that run at the same time; each uses all --threads
         #[arg(long, value_name = "N", default_value = "1", value_parser = count::<64>)]
         pub workers: NonZeroUsize,
         /// Trained model that `sixfold train pix2pose` wrote: offers the method pix2pose
         #[arg(long, value_name = "FILE.safetensors")]
         pub pix2pose: Option<PathBuf>,
-        /// Most megabytes of one request
+        /// Maximum size of a request, megabytes
         #[arg(long, value_name = "MB", default_value = "100", value_parser = count::<4096>)]
         pub max_upload: NonZeroUsize,
-        /// Most jobs that wait
+        /// Maximum number of waiting jobs
         #[arg(long, value_name = "N", default_value = "100", value_parser = count::<100_000>)]
         pub max_waiting: NonZeroUsize,
-        /// Finished jobs that are kept
+        /// Number of finished jobs that are kept
         #[arg(long, value_name = "N", default_value = "500", value_parser = count::<1_000_000>)]
         pub keep: NonZeroUsize,
-        /// Give a job up after this time
+        /// Stop a job after this time
         #[arg(long, value_name = "TIME", default_value = "1800s", value_parser = duration)]
         pub job_timeout: Duration,
     }

@@ -38,19 +38,19 @@ pub(crate) struct TeachArguments {
     /// Millimetres per unit of the depth images
     #[arg(long, value_name = "MM", requires = "depth", value_parser = ranges::depth_scale)]
     pub depth_scale: Option<f64>,
-    /// Camera of the photographs (default: found from the board in them)
+    /// Camera of the photographs (default: computed from the board in them)
     #[arg(long, value_name = "FILE")]
     pub camera: Option<PathBuf>,
-    /// What the ruler on the printed board measures, millimetres (default: 100)
+    /// Measured length of the printed ruler, millimetres (default: 100)
     #[arg(long, value_name = "MM")]
     pub ruler: Option<f64>,
-    /// Mesh of the object: it is laid into the photographs, and coloured by them if it has no colours
+    /// Mesh of the object, to align with the photographs; without colours it gets theirs
     #[arg(long, value_name = "FILE", requires = "unit", conflicts_with = "hull_only")]
     pub mesh: Option<PathBuf>,
     /// Unit of the mesh file: m, cm, mm, in
     #[arg(long, value_name = "UNIT", requires = "mesh")]
     pub unit: Option<Unit>,
-    /// Do not look for hollows by comparing photographs
+    /// Do not search for hollows by comparing photographs
     #[arg(long)]
     pub hull_only: bool,
     /// Folder of stored objects
@@ -59,7 +59,7 @@ pub(crate) struct TeachArguments {
     /// Replace an object of the same name
     #[arg(long)]
     pub replace: bool,
-    /// Folder for masks, mesh and picture; a run that was stopped is resumed there (default: out/teach/NAME)
+    /// Folder for masks, mesh and images; a stopped run resumes there (default: out/teach/NAME)
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     #[command(flatten)]

@@ -196,7 +196,7 @@ fn help_shows_the_defaults() {
         ("pix2pose", "- tless: T-LESS"),
         ("detector", "Highest learning rate [default: 0.002]"),
         ("detector", "Largest rotation in the image plane, degrees [default: 15]"),
-        ("detector", "unless something else is asked for, 0 to 1 [default: 0.4]"),
+        ("detector", "Default score threshold of the detector, 0 to 1 [default: 0.4]"),
         ("nol", "(default: 5000; the dissertation's network: 350000)"),
         ("nol", "- average: Their mean, for comparison"),
         ("nol", "[default: lstm]"),

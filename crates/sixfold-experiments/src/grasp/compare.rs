@@ -51,12 +51,12 @@ pub(crate) struct CompareArguments {
     /// Scenes of each object
     #[arg(long, value_name = "N", default_value = "15")]
     pub trials: u64,
-    /// A harder setting: twice the sensor's noise and lost edges, a hand that misses its place by 5 mm and 3 degrees (standard
-    /// deviations on each axis), pads with a friction of 0.25 where the planner believes the gripper's file, objects of 0.5 kg
+    /// A harder setting: twice the sensor noise and lost edges, errors of the gripper's pose of 5 mm and 3 degrees (standard
+    /// deviation per axis), friction of 0.25, which the planner does not know, objects of 0.5 kg
     #[arg(long)]
     pub hard: bool,
-    /// Try each grasp so many times, each time with another error of the hand (with --hard; an exact hand does the same again):
-    /// the fraction that holds depends less on luck
+    /// Number of tries of each grasp, each with another error of the gripper's pose (with --hard, since exact poses repeat):
+    /// more tries reduce chance
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
     #[command(flatten)]

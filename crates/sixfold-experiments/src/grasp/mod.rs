@@ -23,7 +23,7 @@ pub(crate) enum GraspCommand {
     /// Compare geometry, experience and both on the same simulated scenes
     #[command(after_help = "Example:\n  \
         sixfold grasp compare --experiences experience.db --list benches/grasp-objects.json --meshes DIR --hard --out out/compare\n\n\
-        Stopped, the same command resumes.")]
+        After a stop, the same command resumes.")]
     Compare(Box<compare::CompareArguments>),
 }
 

@@ -23,29 +23,29 @@ pub(crate) struct ReproduceArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ReproduceCommand {
-    /// Do the probabilities of --method auto hold, and what of absent objects? Also fits them
+    /// Measure how accurate the probabilities of --method auto are, also for absent objects; or fit them
     #[command(after_help = auto::AFTER_HELP)]
     Auto(Box<auto::ReproduceAutoArguments>),
-    /// Recall and AR of Pix2Pose per object, what each part of the method is worth, and times
+    /// Measure recall and AR of Pix2Pose per object, the contribution of each part, and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
-        Every row is kept; interrupted, it continues when the same command is given again.")]
+        Every row is kept. After a stop, the same command resumes.")]
     Pix2pose(Box<pix2pose::ReproducePix2PoseArguments>),
-    /// Masks and poses of template matching per object, with its ablations, point pair features, and times
+    /// Measure masks and poses of template matching per object, with ablations, point pair features and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
-        Every image is kept; interrupted, it continues when the same command is given again.")]
+        Every image is kept. After a stop, the same command resumes.")]
     Mttm(mttm::ReproduceMttmArguments),
-    /// Poses and views of Neural Object Learning beside truth and real pixels, wrong meshes, another lamp, and times
+    /// Measure poses and views of Neural Object Learning, with wrong meshes, under other light, and times
     #[command(after_help = nol::arguments::AFTER_HELP)]
     Nol(nol::arguments::ReproduceNolArguments),
-    /// Objects taught from simulated photographs: poses, meshes and symmetries beside the truth, found again in new images
+    /// Teach objects from simulated photographs; measure poses, meshes and symmetries, and find them in new images
     #[command(after_help = teach::AFTER_HELP)]
     Teach(teach::ReproduceTeachArguments),
-    /// Grasps from experience: table 6.2, figure 6.7, learning from nothing, handles
+    /// Measure grasps from experience: table 6.2, figure 6.7, learning from an empty store, handles
     #[command(after_help = "Example:\n  \
         sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
-        Every part is kept; interrupted, it continues when the same command is given again.")]
+        Every part is kept. After a stop, the same command resumes.")]
     Dgcm(Box<dgcm::ReproduceDgcmArguments>),
 }
 

@@ -43,7 +43,7 @@ pub(crate) struct ReproduceMttmArguments {
     /// Take every N-th image
     #[arg(long, value_name = "N", default_value = "1")]
     pub every: std::num::NonZeroUsize,
-    /// Another network than that within the program: a file that `sixfold train mttm` wrote
+    /// Network to use instead of the built-in one: a file that `sixfold train mttm` wrote
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: Option<PathBuf>,
     /// Leave out point pair features, for comparison on the same images

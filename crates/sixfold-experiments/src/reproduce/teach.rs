@@ -27,7 +27,7 @@ use sixfold_teach::{SalientSegmenter, ShapeOptions, TeachOptions, Teaching};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
-    Every object is kept; interrupted, it continues when the same command is given again.";
+    Every object is kept. After a stop, the same command resumes.";
 
 /// Distance of colours between neighbouring places of a mesh without colours, 1/m: patches of a few centimetres.
 const PATCHES: f64 = 90.0;
@@ -44,7 +44,7 @@ pub(crate) struct ReproduceTeachArguments {
     /// Folder of the meshes
     #[arg(long, value_name = "DIR")]
     meshes: PathBuf,
-    /// A photograph: what the table looks like
+    /// Photograph for the texture of the table
     #[arg(long, value_name = "FILE")]
     ground: PathBuf,
     /// Photographs of each object

@@ -23,7 +23,7 @@ pub struct NetworkArguments {
 /// Where experiences wait for a server.
 #[derive(Debug, Default, Args)]
 pub struct OutboxArguments {
-    /// With a server as --experiences: file of this robot's copy of its store, in which new experiences wait while it is away
+    /// With a server as --experiences: file of the local copy, which keeps new experiences while the server is unreachable
     /// (default: outbox.db in --out)
     #[arg(long, value_name = "FILE")]
     pub outbox: Option<PathBuf>,

@@ -22,7 +22,7 @@ pub struct InputArguments {
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
     #[arg(long, value_name = "MM", value_parser = ranges::depth_scale)]
     pub depth_scale: Option<f64>,
-    /// The object's mask: PNG, above zero inside (default: the largest thing on the table)
+    /// The object's mask: PNG, above zero inside (default: the largest object on the table)
     #[arg(long, value_name = "FILE")]
     pub mask: Option<PathBuf>,
 }

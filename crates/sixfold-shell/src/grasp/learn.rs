@@ -30,13 +30,13 @@ use crate::ranges::in_range;
 /// Arguments of `sixfold grasp learn`.
 #[derive(Debug, Args)]
 pub struct LearnArguments {
-    /// The store of experiences, a file or postgres://user@host/database; it is made where there is none
+    /// The store of experiences, a file or postgres://user@host/database; it is created if it does not exist
     #[arg(long, value_name = "FILE", value_parser = store_place())]
     pub experiences: StorePlace,
     /// Where experiences wait for a server.
     #[command(flatten)]
     pub outbox: OutboxArguments,
-    /// Synthetic objects to learn on: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
+    /// Families of synthetic objects: all, or some of can, mug, cup, bottle, bowl, box, clamp, drill
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present_any = ["objects", "list"], conflicts_with_all = ["objects", "list", "meshes"])]
     pub families: Vec<String>,
     /// Synthetic objects of each family
@@ -48,19 +48,19 @@ pub struct LearnArguments {
     /// Scenes of each object
     #[arg(long, value_name = "N", default_value = "4")]
     pub attempts: u64,
-    /// Grasps tried in a scene until one holds, the best first
+    /// Maximum number of grasps tried in a scene until one holds, the best first
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
-    /// Further grasps tried in every scene, spread over the ranked ones: what fails teaches how much to trust a grasp
+    /// Number of further grasps tried in every scene, spread over the ranking; failures improve the ranking
     #[arg(long, value_name = "N", default_value = "0")]
     pub explore: usize,
-    /// Feature distance of the nearest experience from which on it proposes: 0 for never (dissertation: 0.9)
+    /// Maximum feature distance at which the nearest experience proposes the grasp; 0 for never (dissertation: 0.9)
     #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
     pub near: f64,
     /// Try and store only grasps on parts of this name (synthetic objects: handle of mug and drill)
     #[arg(long, value_name = "NAME")]
     pub part: Option<String>,
-    /// Stronger sensor noise, an imprecise hand, less friction and a heavier object, see `sixfold grasp compare --help`
+    /// Stronger sensor noise, an imprecise gripper, less friction and a heavier object, see `sixfold grasp compare --help`
     #[arg(long)]
     pub hard: bool,
     /// The simulated trials.

@@ -40,11 +40,11 @@ impl StoreArguments {
 /// Where what methods derive from mesh files is kept.
 #[derive(Debug, Args)]
 pub(crate) struct CacheArguments {
-    /// Folder for what methods derive from mesh files and datasets, to be faster the next time; at most 1 GB (default: sixfold in
-    /// the user's cache folder, ~/.cache)
+    /// Cache folder for data computed from mesh files and datasets, at most 1 GB (default: sixfold in the user's cache folder,
+    /// ~/.cache)
     #[arg(long, value_name = "DIR", env = "SIXFOLD_CACHE")]
     pub cache: Option<PathBuf>,
-    /// Keep nothing of what methods derive from mesh files
+    /// Do not use the cache
     #[arg(long)]
     pub no_cache: bool,
 }
@@ -66,7 +66,7 @@ const OF_ONE_IMAGE: [&str; 6] = ["depth", "camera", "objects", "object_id", "mas
 /// Options that belong to no method.
 #[derive(Debug, Args)]
 pub(crate) struct CommonArguments {
-    /// Colour image: what a method works on, or for the overlay
+    /// Colour image to search in, or for the overlay
     #[arg(long, value_name = "FILE", requires = "camera", conflicts_with = "dataset")]
     pub rgb: Option<PathBuf>,
     /// Depth image: PNG, one channel of 16 bits
@@ -78,19 +78,19 @@ pub(crate) struct CommonArguments {
     /// Millimetres per unit of the depth image, in place of the camera file's depth_scale
     #[arg(long, value_name = "MM", value_parser = ranges::depth_scale, conflicts_with = "dataset")]
     pub depth_scale: Option<f64>,
-    /// Objects to look for: mesh files, or names given with `sixfold object add`
+    /// Objects to search for: mesh files, or names given with `sixfold object add`
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
     pub objects: Vec<String>,
     /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// Which of a trained model's or detector's objects to look for in one image (default: the model's only one)
+    /// Object id of the trained network or detector to search for (default: its only object)
     #[arg(long, value_name = "ID", conflicts_with = "dataset")]
     pub object_id: Option<u32>,
-    /// The object lies in this mask (PNG, above zero inside)
+    /// Search only in this mask (PNG, above zero inside)
     #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
     pub mask: Option<PathBuf>,
-    /// The object lies in this box, in pixels
+    /// Search only in this box, pixels
     #[arg(
         long = "box",
         value_name = "X,Y,W,H",
@@ -99,7 +99,7 @@ pub(crate) struct CommonArguments {
         conflicts_with = "dataset"
     )]
     pub region: Option<Vec<f64>>,
-    /// Most instances of each object (in a dataset: what its targets say)
+    /// Maximum number of instances of each object (in a dataset: as in its targets)
     #[arg(long, value_name = "N", default_value = "1", value_parser = count::<1000>)]
     pub instances: NonZeroUsize,
     /// BOP dataset folder: estimate all its targets
@@ -114,11 +114,11 @@ pub(crate) struct CommonArguments {
     /// Leave out these frames of the dataset, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub except: Option<PathBuf>,
-    /// Where the objects are: gt for the ground truth's boxes, detect for those of --detector, or a file of COCO
-    /// detections (default: detect with --detector, else anywhere)
+    /// Boxes to search in: gt (ground truth), detect (from --detector), or a file of COCO detections (default: detect with
+    /// --detector, else the whole image)
     #[arg(long, value_name = "gt|detect|FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE, value_parser = NonEmptyStringValueParser::new())]
     pub boxes: Option<String>,
-    /// Trained detector that says where the objects are: a file that `sixfold train detector` wrote
+    /// Trained detector that provides the boxes: a file that `sixfold train detector` wrote
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
     /// Result: a CSV file in the BOP format for a dataset, a folder for one image
@@ -131,7 +131,7 @@ pub(crate) struct CommonArguments {
     /// and 0.05 with mttm, 0.4 and 0 with views, 0 with pix2pose; with auto the probability, 0.5 and 0)
     #[arg(long, value_name = "SCORE", value_parser = min_score)]
     pub min_score: Option<f64>,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value = "0")]
     pub seed: u64,
     #[command(flatten)]

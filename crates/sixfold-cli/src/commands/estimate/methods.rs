@@ -57,7 +57,7 @@ impl Method {
 /// Which form of a method of the dissertation runs.
 #[derive(Debug, Args)]
 pub(super) struct PresetArguments {
-    /// Run the method as it is published, in place of ours (docs/published.md says what that is, and what still differs)
+    /// Run the method as the dissertation describes it (docs/published.md lists what still differs)
     #[arg(long, value_name = "NAME", value_enum)]
     preset: Option<Preset>,
 }
@@ -98,7 +98,7 @@ pub(crate) static METHODS: &[Method] = &[
 
 #[derive(Debug, Args)]
 struct PpfArguments {
-    /// Match points on the table plane too
+    /// Search the plane of the table too
     #[arg(long)]
     keep_plane: bool,
 }
@@ -114,22 +114,22 @@ impl MethodArguments for PpfArguments {
 
 #[derive(Debug, Args)]
 struct MttmArguments {
-    /// Another network than that within the program
+    /// Network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     #[command(flatten)]
     preset: PresetArguments,
-    /// Who matches regions with templates; with --preset published the network alone
+    /// How regions are matched with templates (with --preset published: network)
     #[arg(long, value_enum, default_value = networks::DEFAULT_MATCHER, conflicts_with = "preset")]
     matcher: Matcher,
-    /// From which sides a mesh's templates are rendered; things that lie, or that lie on others, are found by those from around
-    /// (default: those that the object was added with, else above)
+    /// Directions from which a mesh's templates are rendered; around is for objects in any orientation (default: as in `object
+    /// add`, else above)
     #[arg(long, value_enum, value_name = "VIEWS")]
     templates: Option<TemplateViews>,
-    /// Judge poses by the templates alone, as if there were no mesh
+    /// Verify poses with the templates, not with the mesh
     #[arg(long)]
     templates_only: bool,
-    /// Match points on the table plane too
+    /// Search the plane of the table too
     #[arg(long)]
     keep_plane: bool,
 }
@@ -155,11 +155,11 @@ impl MethodArguments for MttmArguments {
 /// Who matches regions with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Matcher {
-    /// Template and region point by point, without a network
+    /// Compare points of template and region, without a network
     Points,
     /// The network's descriptors alone, as in the dissertation
     Network,
-    /// The network says where to look, and both say with which template
+    /// The network proposes regions; both match templates
     Both,
 }
 

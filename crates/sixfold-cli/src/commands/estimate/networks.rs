@@ -34,24 +34,24 @@ pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
 /// Poses from colour without training for the object.
 pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "views",
-    "rendered views of a mesh matched with a colour image, in boxes or where any object seems to be, no training",
+    "rendered views of a mesh matched with a colour image, in boxes or in those of a detector for any object, no training",
 );
 
 /// All methods, judged together.
 pub(super) const AUTO: Method = Method::of::<AutoArguments>(
     "auto",
-    "all methods that the images allow, one after the other until one is sure, each pose with the probability that it is right",
+    "all methods that the images allow, until an object is found with a high probability; each pose with its probability",
 );
 
 #[derive(Debug, Args)]
 struct AutoArguments {
-    /// Trained model that `sixfold train pix2pose` wrote; for mttm and views another network than that within the program
+    /// Weights that `sixfold train pix2pose` wrote; for mttm and views a network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
-    /// Ask no further method once this has passed for an object, such as 1s or 500ms; the poses then depend on how fast the machine is
+    /// Start no further method for an object after this time, such as 1s or 500ms; the result then depends on the machine
     #[arg(long, value_name = "TIME", value_parser = ranges::duration)]
     budget: Option<Duration>,
-    /// Match points on the table plane too
+    /// Search the plane of the table too
     #[arg(long)]
     keep_plane: bool,
 }
@@ -72,7 +72,7 @@ impl MethodArguments for AutoArguments {
 
 #[derive(Debug, Args)]
 struct ViewsArguments {
-    /// Another network than that within the program
+    /// Network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     /// Another detector of any object than that within the program, which says where to look if no box is given
@@ -101,7 +101,7 @@ impl MethodArguments for ViewsArguments {
 
 #[derive(Debug, Args)]
 struct Pix2PoseArguments {
-    /// Trained model that `sixfold train pix2pose` wrote; for mttm and views another network than that within the program
+    /// Weights that `sixfold train pix2pose` wrote; for mttm and views a network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     #[command(flatten)]

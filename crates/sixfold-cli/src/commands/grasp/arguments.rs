@@ -17,7 +17,7 @@ pub(crate) enum GraspCommand {
     #[command(after_help = "Examples:\n  \
         sixfold grasp propose --depth d.png --camera camera.json --mask mask.png --rgb c.png --out out\n  \
         sixfold grasp propose --depth d.png --camera camera.json --gripper my-gripper.json --json\n\n\
-        Without --mask the largest thing on the table is taken. The gripper's frame: origin midway between the finger \
+        Without --mask the largest object on the table is taken. The gripper's frame: origin midway between the finger \
         tips, z the approach, x the closing direction.")]
     Propose(ProposeArguments),
     /// Try one grasp in a physics engine: approach, close, lift 10 cm, shake (exit status 0 when it holds)
@@ -28,7 +28,7 @@ pub(crate) enum GraspCommand {
     /// Measure the planner: objects on a table, simulated depth views, proposals tried (runs sixfold-experiments)
     #[command(disable_help_flag = true)]
     Measure(Forwarded),
-    /// Learn by doing: a simulated hand tries grasps, and what works becomes experience
+    /// Try grasps with a simulated gripper, and store those that hold as experience
     #[cfg(all(feature = "physics", feature = "experience"))]
     #[command(after_help = "Examples:\n  \
         sixfold grasp learn --experiences experience.db --families all --members 6 --attempts 4 --out out/learn\n  \

@@ -34,10 +34,10 @@ pub(crate) struct ProposeArguments {
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
-    /// Most grasps
+    /// Maximum number of grasps
     #[arg(long, value_name = "N", default_value = "5", value_parser = count::<10_000>)]
     pub number: NonZeroUsize,
-    /// Propose from experience too: a store that `sixfold grasp learn` or `sixfold grasp store add` wrote, a file or
+    /// Also use the experiences of this store, which `sixfold grasp learn` or `sixfold grasp store add` wrote: a file or
     /// postgres://user@host/database
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "FILE", value_parser = store_place())]
@@ -45,21 +45,21 @@ pub(crate) struct ProposeArguments {
     #[cfg(feature = "experience")]
     #[command(flatten)]
     pub network: NetworkArguments,
-    /// Only experiences on parts of this name, such as handle, and only grasps that hold what they held
+    /// Use only experiences on parts with this name, such as handle, and return only grasps on that part
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", requires = "experiences")]
     pub part: Option<String>,
-    /// Propose as published, in place of our way (docs/published.md says what that is, and what still differs)
+    /// Propose grasps as the dissertation describes it (docs/published.md lists what still differs)
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", value_enum, requires = "experiences")]
     pub preset: Option<Preset>,
-    /// Take only what was seen: assume nothing of the object's far side
+    /// Use only the visible surface: assume nothing about the object's far side
     #[arg(long)]
     pub seen_only: bool,
     /// Folder for grasps.json and overlay.png
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value = "0")]
     pub seed: u64,
     #[command(flatten)]

@@ -25,7 +25,7 @@ pub(crate) struct StoreArguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum StoreCommand {
-    /// Store a grasp that worked: a depth image and a grasp on it
+    /// Store a grasp that held: a depth image and a grasp on it
     #[command(
         after_help = "Example:\n  sixfold grasp store add experience.db --depth depth.png --mask mask.png --camera camera.json --grasp grasps.json \
         --object mug --part handle"
@@ -37,11 +37,11 @@ pub(crate) enum StoreCommand {
         /// The store
         #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
-        /// List the grasps that were tried, whatever came of them
+        /// List all grasps that were tried, also those that failed
         #[arg(long)]
         attempts: bool,
     },
-    /// Show one experience: what is known, and an image
+    /// Show one experience, and write an image of it
     #[command(after_help = "Example:\n  sixfold grasp store show experience.db 1 --picture 1.png")]
     Show {
         /// The store
@@ -69,10 +69,10 @@ pub(crate) enum StoreCommand {
         #[arg(long, value_name = "ID")]
         attempt: Vec<i64>,
     },
-    /// Take over the experiences of other stores
+    /// Add the experiences of other stores
     #[command(after_help = "Example:\n  sixfold grasp store merge all.db robot-a.db robot-b.db")]
     Merge {
-        /// The store that gets them; it is made where there is none
+        /// The store that receives them; it is created if it does not exist
         #[arg(value_name = "FILE", value_parser = store_place())]
         file: StorePlace,
         /// The other stores
@@ -107,7 +107,7 @@ pub(crate) enum StoreCommand {
 
 #[derive(Debug, Args)]
 pub(crate) struct AddArguments {
-    /// The store; it is made where there is none
+    /// The store; it is created if it does not exist
     #[arg(value_name = "FILE", value_parser = store_place())]
     pub file: StorePlace,
     #[command(flatten)]
@@ -115,13 +115,13 @@ pub(crate) struct AddArguments {
     /// The grasp: a grasps.json of `sixfold grasp propose`, or JSON with camera_from_gripper (4x4, metres), opening and width
     #[arg(long, value_name = "FILE")]
     pub grasp: PathBuf,
-    /// Which grasp of a list, from 1
+    /// Number of the grasp in the file, from 1
     #[arg(long, value_name = "N", default_value = "1")]
     pub number: usize,
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
-    /// What was grasped
+    /// Name of the object that was grasped
     #[arg(long, value_name = "NAME")]
     pub object: String,
     /// The part that was grasped, such as handle

@@ -25,7 +25,7 @@ pub(crate) struct TryArguments {
     /// Unit of the mesh file: m, cm, mm, in
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// Where the middle of the finger tips is when they close, metres
+    /// Point midway between the finger tips when they close, metres
     #[arg(
         long,
         value_name = "X,Y,Z",
@@ -52,7 +52,7 @@ pub(crate) struct TryArguments {
         default_value = "1,0,0"
     )]
     pub closing: Vec<f64>,
-    /// Distance of the pads before they close, metres (default: as far as they go)
+    /// Distance of the pads before they close, metres (default: the gripper's maximum)
     #[arg(long, value_name = "M")]
     pub opening: Option<f64>,
     /// A trial of `sixfold grasp measure` in place of --tip: JSON with world_from_object, world_from_gripper, opening

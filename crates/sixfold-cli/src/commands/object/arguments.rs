@@ -32,10 +32,10 @@ pub(crate) enum ObjectCommand {
     /// List the stored objects
     #[command(after_help = "Example:\n  sixfold object list")]
     List,
-    /// Show one object, and draw it
+    /// Show one object, and render it
     #[command(after_help = "Example:\n  sixfold object show mug --picture mug.png")]
     Show {
-        /// Its name
+        /// Name of the object
         name: String,
         /// Image to write
         #[arg(long, value_name = "FILE.png")]
@@ -50,19 +50,19 @@ pub(crate) enum ObjectCommand {
     #[cfg(feature = "networks")]
     #[command(after_help = "Example:\n  sixfold object export mug --bop out/mug")]
     Export {
-        /// Its name
+        /// Name of the object
         name: String,
         /// Folder of the new dataset
         #[arg(long, value_name = "DIR")]
         bop: PathBuf,
-        /// Its number in the dataset
+        /// Object id in the dataset
         #[arg(long, value_name = "ID", default_value_t = 1)]
         id: u32,
     },
     /// Remove one object
     #[command(after_help = "Example:\n  sixfold object remove mug")]
     Remove {
-        /// Its name
+        /// Name of the object
         name: String,
     },
 }
@@ -89,7 +89,7 @@ pub(crate) struct AddArguments {
     /// Object id in models_info.json
     #[arg(long, value_name = "ID")]
     pub model_id: Option<u32>,
-    /// The object may turn freely about this axis of its own frame: x, y or z
+    /// Axis of a continuous symmetry, in the object's frame: x, y or z
     #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
     pub turns_about: Option<Axis>,
     /// Find the mesh's symmetries (`sixfold object symmetries`) and store those that are sure, by shape and colours or by shape
@@ -117,7 +117,7 @@ pub(crate) enum Axis {
 pub(crate) enum TemplateViews {
     /// From above, the camera held upright: 305 views with 7 turns, for what stands on a table, z axis up
     Above,
-    /// From everywhere and however the camera is held: 642 views with 24 turns
+    /// From all sides, any rotation of the camera: 642 views with 24 turns
     Around,
 }
 

@@ -34,9 +34,9 @@ pub(crate) struct SymmetriesArguments {
 /// What is held against itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Evidence {
-    /// The shape alone: for methods that see depth only
+    /// Shape alone: for methods that use depth
     Shape,
-    /// Shape and, where the mesh has them, colours
+    /// Shape and colours, if the mesh has colours
     Colors,
 }
 

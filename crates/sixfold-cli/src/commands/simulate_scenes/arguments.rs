@@ -27,7 +27,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold simulate-scenes --families can,mug --toys 40 --scenes 100 --views 10 --out out/toys\n  \
     sixfold simulate-scenes --dataset lmo --sensor xtion --out out/lmo-scenes\n\n\
     The folder is a BOP dataset, for `sixfold estimate --dataset` and `sixfold eval`. preview.png shows its first scenes.\n\
-    Stopped, the same command resumes.";
+    After a stop, the same command resumes.";
 
 #[derive(Debug, Args)]
 pub(crate) struct SimulateScenesArguments {
@@ -61,7 +61,7 @@ pub(crate) struct SimulateScenesArguments {
     /// Images of each scene
     #[arg(long, value_name = "N", default_value = "4")]
     pub views: usize,
-    /// Objects dropped in a scene, fewest and most; none twice while there are enough of them
+    /// Number of objects in a scene, minimum and maximum; no object twice if there are enough
     #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [6, 10])]
     pub objects_per_scene: Vec<usize>,
     /// Objects are dropped over a disc of this radius, metres
@@ -70,10 +70,10 @@ pub(crate) struct SimulateScenesArguments {
     /// Fraction of the objects that start upright, the z axis of their mesh up; the others fall in any orientation
     #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub upright: f64,
-    /// Fraction of the objects that fall wherever they fall, also on others; the rest look for a free place
+    /// Fraction of the objects that may fall on others; the rest fall on a free place
     #[arg(long, value_name = "FRACTION", default_value = "0.4")]
     pub stacked: f64,
-    /// Let objects collide as they are (hollow things stay hollow) and not as their convex hulls; takes seconds an object
+    /// Collide with the exact shape, hollows included, instead of the convex hull; takes seconds per object
     #[arg(long)]
     pub exact: bool,
     /// Distance of the camera from the objects, smallest and largest, metres
@@ -91,7 +91,7 @@ pub(crate) struct SimulateScenesArguments {
     /// Leave out the colour images (and the preview, which is made of them)
     #[arg(long)]
     pub no_rgb: bool,
-    /// Leave out the masks, which are most of the files; poses, boxes and visibility are written all the same
+    /// Write no masks, which are most of the files; poses, boxes and visibility are still written
     #[arg(long)]
     pub no_masks: bool,
     /// New dataset folder

@@ -15,9 +15,9 @@ use sixfold_shell::ranges::{self, in_range, without_duplicates};
 pub(crate) enum WeightingKind {
     /// The network of NOL
     Network,
-    /// All photographs alike
+    /// All photographs with the same weight
     Average,
-    /// The photograph that looks at the place most directly
+    /// The photograph that sees the surface most directly
     Best,
 }
 
@@ -66,7 +66,7 @@ pub(crate) struct SynthesizeArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Which frames of the split are photographs to learn from: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
+    /// Frames of the split to use as photographs: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "photographs")]
     pub frames: Option<PathBuf>,
     /// Object ids of the dataset (default: all)
@@ -87,44 +87,44 @@ pub(crate) struct SynthesizeArguments {
     /// Name of the new dataset's split
     #[arg(long, value_name = "NAME", default_value = "train_nol", value_parser = ranges::folder_name)]
     pub new_split: String,
-    /// Make views as published, in place of our way: --select pose, --refinement published, --turns 7 (docs/published.md)
+    /// Make views as the dissertation describes it: --select pose, --refinement published, --turns 7 (docs/published.md)
     #[arg(long, value_name = "NAME", value_enum)]
     pub preset: Option<Preset>,
-    /// By what photographs are chosen (default: surface; with --preset published: pose)
+    /// How photographs are chosen (default: surface; with --preset published: pose)
     #[arg(long, value_name = "BY", value_enum)]
     pub select: Option<SelectKind>,
-    /// Most photographs of an object
+    /// Maximum number of photographs of an object
     #[arg(long, value_name = "N", default_value = "16")]
     pub sources: usize,
-    /// Photographs behind each new view
+    /// Number of photographs used for each new view
     #[arg(long, value_name = "N", default_value = "6")]
     pub per_view: usize,
-    /// Photographs that show less of the object than this fraction are left out
+    /// Minimum visible fraction of the object; other photographs are left out
     #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub least_visible: f64,
-    /// Trained detector whose masks are taken where the photographs have none of their own (default: masks are rendered
-    /// from the poses, which know nothing of what hides the object)
+    /// Trained detector that makes masks for photographs without masks (default: masks rendered from the poses, without
+    /// occlusion)
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
-    /// How colours of several photographs become one
+    /// How the colours of several photographs are combined
     #[arg(long, value_enum, default_value = "network")]
     pub weighting: WeightingKind,
-    /// Another NOL network than the one that comes with the program
+    /// NOL network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: Option<PathBuf>,
-    /// Take the poses as they are
+    /// Do not refine the poses
     #[arg(long)]
     pub no_refine: bool,
-    /// How poses are made better (default: ours; with --preset published: published)
+    /// How poses are refined (default: ours; with --preset published: published)
     #[arg(long, value_name = "HOW", value_enum, conflicts_with = "no_refine")]
     pub refinement: Option<RefinementKind>,
     /// Whether objects moved between the photographs
     #[arg(long, value_enum, default_value = "judge")]
     pub scene: SceneArgument,
-    /// How rough the given poses are: standard deviation in millimetres along each axis and degrees about each
+    /// Error of the given poses: standard deviation in millimetres along each axis and degrees about each
     #[arg(long, value_name = "MM,DEGREES", value_delimiter = ',', default_values_t = [6.0, 1.7])]
     pub rough: Vec<f64>,
-    /// For experiments: disturb the given poses by up to so many millimetres along and degrees about each axis
+    /// For experiments: disturb the given poses by at most these millimetres along and degrees about each axis
     #[arg(long, value_name = "MM,DEGREES", value_delimiter = ',')]
     pub disturb: Vec<f64>,
     /// Degrees between views, in azimuth and elevation
@@ -143,7 +143,7 @@ pub(crate) struct SynthesizeArguments {
     /// Folder of photographs for backgrounds (default: procedural textures)
     #[arg(long, value_name = "DIR")]
     pub backgrounds: Option<PathBuf>,
-    /// Put the photographs themselves, cut to the object, into the new dataset too
+    /// Also put the photographs, cropped to the object, into the new dataset
     #[arg(long)]
     pub with_photographs: bool,
     /// Seed of rotations, distances, backgrounds and disturbances
@@ -161,7 +161,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     A file for --photographs (paths are relative to it; poses as in BOP, object to camera, millimetres; mask may be left out):\n  \
     {\"mesh\": \"mug.ply\", \"unit\": \"mm\", \"photographs\": [{\"image\": \"1.png\", \"camera\": \"camera.json\",\n    \
     \"cam_R_m2c\": [1,0,0, 0,1,0, 0,0,1], \"cam_t_m2c\": [0, 0, 600], \"mask\": \"1-mask.png\"}]}\n\n\
-    Stopped, the same command resumes.";
+    After a stop, the same command resumes.";
 
 impl SynthesizeArguments {
     /// Tests every option that is a number.

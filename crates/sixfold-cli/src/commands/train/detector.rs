@@ -48,7 +48,7 @@ pub(crate) struct TrainDetectorArguments {
     /// The pretrained encoder's fraction of the learning rate, 0 to 1
     #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_share)]
     pub encoder_share: f64,
-    /// Stages of the ImageNet encoder that stay as they are, of five
+    /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
     /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random)
@@ -64,19 +64,19 @@ pub(crate) struct TrainDetectorArguments {
     /// Largest rotation in the image plane, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
     pub rotation: Degrees,
-    /// Draw the meshes in random colours, as untextured CAD models
+    /// Render the meshes in random colours, for CAD models without texture
     #[arg(long)]
     pub no_mesh_colors: bool,
-    /// Larger images will be reduced to so many pixels along their longer side before detection
+    /// Larger images are reduced to this length of their longer side, pixels, before detection
     #[arg(long, value_name = "PIXELS", default_value_t = default().longest_side)]
     pub longest_side: usize,
-    /// Score below which detections will be left out unless something else is asked for, 0 to 1
+    /// Default score threshold of the detector, 0 to 1
     #[arg(long, value_name = "SCORE", default_value_t = default().threshold)]
     pub threshold: f32,
     /// Continue from the weights of another training of the same objects instead of ImageNet's
     #[arg(long, value_name = "FILE.safetensors")]
     pub init: Option<PathBuf>,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Seed of weights and samples

@@ -63,7 +63,7 @@ pub(crate) struct TrainDgcmArguments {
     /// Seed of weights, objects, views and pairs
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Folder for the model and the training's checkpoints, log and curves

@@ -54,42 +54,42 @@ pub(crate) enum TrainCommand {
     #[command(after_help = "Examples:\n  \
         sixfold train pix2pose --dataset lmo --frames frames.json --out out/lmo\n  \
         sixfold train pix2pose --object mug.ply --unit mm --out out/mug\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Pix2pose(Box<TrainPix2PoseArguments>),
     /// Boxes and masks of objects in colour images: `sixfold detect`, `sixfold estimate --detector`
     #[command(after_help = "Examples:\n  \
         sixfold train detector --dataset lmo --frames frames.json --backgrounds photographs --out out/detector\n  \
         sixfold train detector --object mug.ply --unit mm --out out/mug-detector\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Detector(Box<TrainDetectorArguments>),
     /// Train the network that transfers grasps from experience, on procedural objects
     #[cfg(feature = "experience")]
     #[command(after_help = "Example:\n  sixfold train dgcm --out out/dgcm\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Dgcm(Box<TrainDgcmArguments>),
     /// Train the network that finds objects by their templates in depth, on procedural objects
     #[cfg(feature = "physics")]
     #[command(after_help = "Example:\n  sixfold train mttm --out out/mttm\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Mttm(Box<TrainMttmArguments>),
     /// Train the network that renders new views of an object from few photographs, on procedural objects
     #[command(after_help = "Example:\n  sixfold train nol --backgrounds photographs --out out/nol\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Nol(Box<TrainNolArguments>),
     /// Train the network that matches rendered views of any object with colour images, on procedural objects
     #[command(after_help = "Example:\n  sixfold train views --backgrounds photographs --out out/views\n\n\
-        Interrupted, it resumes when the same command is given again.")]
+        After a stop, the same command resumes.")]
     Views(Box<TrainViewsArguments>),
     /// Train the network that refines poses in colour images, of any object, on procedural objects
     #[command(
         after_help = "Example:\n  sixfold train refiner --backgrounds photographs --out out/refiner\n\n\
-                      Writes model.safetensors with its card; the one within the program was made like that."
+                      Writes model.safetensors with its card. The built-in refiner was trained with this command."
     )]
     Refiner(Box<TrainRefinerArguments>),
     /// Train the detector of any object in colour images, on procedural objects
     #[command(
         after_help = "Example:\n  sixfold train proposals --backgrounds photographs --out out/proposals\n\n\
-                      Interrupted, it resumes when the same command is given again."
+                      After a stop, the same command resumes."
     )]
     Proposals(Box<TrainProposalsArguments>),
 }

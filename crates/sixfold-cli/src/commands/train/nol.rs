@@ -30,7 +30,7 @@ pub(crate) struct TrainNolArguments {
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<NolKind>(), help = presets("Network", default().network.name(), NolRecipe::published().network.name()))]
     pub network: Option<NolKind>,
-    /// Which losses are summed up: the columns of the dissertation's table 4.6 (default: smooth)
+    /// Losses to sum: the columns of the dissertation's table 4.6 (default: smooth)
     #[arg(long, value_parser = choices::<NolLosses>())]
     pub loss: Option<NolLosses>,
     /// ImageNet weights of DenseNet-121 in torchvision's layout (.pth), for --network paper
@@ -43,7 +43,7 @@ pub(crate) struct TrainNolArguments {
         default_value = default().parts.integrator.name()
     )]
     pub integrator: IntegratorKind,
-    /// Leave the decoder out: the loss looks at the weighted colours themselves
+    /// Train without the decoder: the loss compares the weighted colours
     #[arg(long)]
     pub no_decoder: bool,
     /// Folder of photographs (PNG, JPEG) for textures, backgrounds and clutter (default: procedural textures only)
@@ -60,7 +60,7 @@ pub(crate) struct TrainNolArguments {
     /// Seed of weights and samples
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Folder for the model and the training's checkpoints, log, curves and preview

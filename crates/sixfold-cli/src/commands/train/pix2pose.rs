@@ -107,7 +107,7 @@ pub(crate) struct TrainPix2PoseArguments {
     pub per_object: Option<usize>,
     #[arg(long, value_name = "RATE", help = learning_rate_help())]
     pub learning_rate: Option<f64>,
-    /// Train the compact network against discriminators, one an object, as the dissertation's are
+    /// Train the compact network with a discriminator for each object, as in the dissertation
     #[arg(long, conflicts_with = "no_adversarial")]
     pub adversarial: bool,
     /// Train a network of the dissertation without its discriminator
@@ -116,12 +116,12 @@ pub(crate) struct TrainPix2PoseArguments {
     /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network resnet50 (default: random)
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
-    /// Stages of the ImageNet encoder that stay as they are, of five
+    /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
     #[arg(long, value_name = "FRACTION", help = render_share_help())]
     pub render_share: Option<f32>,
-    /// Fraction of renders whose pose lies near one of a photograph, 0 to 1; the others look from anywhere above
+    /// Fraction of renders with a pose near that of a photograph, 0 to 1; the others are from any direction above
     #[arg(long, value_name = "FRACTION", default_value_t = default().near_photographs)]
     pub near_photographs: f32,
     /// Largest rotation of photographs in the image plane, degrees
@@ -133,23 +133,23 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Continue from the weights of another training instead of ImageNet's
     #[arg(long, value_name = "FILE.safetensors")]
     pub init: Option<PathBuf>,
-    /// Draw the meshes in random colours, as untextured CAD models
+    /// Render the meshes in random colours, for CAD models without texture
     #[arg(long)]
     pub no_mesh_colors: bool,
-    /// Learn the coordinates of the meshes' convex hulls, as if nothing better were known of the objects
+    /// Train on the meshes' convex hulls, as if the exact meshes were not known
     #[arg(long)]
     pub convex_hull: bool,
     /// Plain L1 for symmetric objects instead of the transformer loss
     #[arg(long)]
     pub no_transformer_loss: bool,
-    /// Plain L1 with one side of a symmetric object standing for all, instead of the transformer loss
+    /// Plain L1 with poses limited to one side of a symmetric object, instead of the transformer loss
     #[arg(long)]
     pub view_limits: bool,
     /// Train as published; or take symmetric poses, outlier thresholds and occlusion of an experiment of the dissertation (its
     /// appendix A); or both, with a comma (default: symmetries of the dataset, thresholds of the BOP entries)
     #[arg(long, value_name = "NAME[,NAME]", value_parser = choices::<TrainingPreset>(), value_delimiter = ',')]
     pub preset: Vec<TrainingPreset>,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Seed of weights and samples

@@ -26,7 +26,7 @@ pub(crate) struct TrainProposalsArguments {
     /// Images in a step
     #[arg(long, value_name = "N", default_value_t = default().options.batch)]
     pub batch: usize,
-    /// Synthetic objects to learn from
+    /// Number of synthetic objects to train on
     #[arg(long, value_name = "N", default_value_t = default().objects)]
     pub objects: usize,
     /// Side of the training images in pixels, a multiple of 32
@@ -35,7 +35,7 @@ pub(crate) struct TrainProposalsArguments {
     /// Seed of objects, weights and samples
     #[arg(long, default_value_t = default().options.common.seed)]
     pub seed: u64,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Folder for the model and the training's checkpoints, log and curves

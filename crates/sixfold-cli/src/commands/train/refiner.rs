@@ -23,13 +23,13 @@ pub(crate) struct TrainRefinerArguments {
     /// Highest learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().options.common.learning_rate)]
     pub learning_rate: f64,
-    /// Objects in a step; of each four poses
+    /// Objects in a step, with four poses each
     #[arg(long, value_name = "N", default_value_t = default().options.batch)]
     pub batch: usize,
     /// Seed of the samples
     #[arg(long, default_value_t = default().options.common.seed)]
     pub seed: u64,
-    /// Train no further: write the model of the last checkpoint in --out
+    /// Do not train: write the model of the last checkpoint in --out
     #[arg(long)]
     pub export: bool,
     /// Folder for the model and the training's checkpoints, log and curves

@@ -32,12 +32,12 @@ pub(super) const AFTER_HELP: &str = "Examples:\n  \
     sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 24 --views 1 --out sim\n  \
     sixfold reproduce auto --dataset sim --absent 8 --disturb --out out/auto\n  \
     sixfold reproduce auto --dataset sim --absent 8 --disturb --fit calibration.json --out out/auto-fit\n\n\
-    Every image is kept; interrupted, it continues when the same command is given again.";
+    Every image is kept. After a stop, the same command resumes.";
 
 /// `sixfold reproduce auto`.
 #[derive(Debug, Args)]
 pub(crate) struct ReproduceAutoArguments {
-    /// BOP dataset folders; all images of the split, all objects with ground truth
+    /// BOP dataset folders with ground truth
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     pub dataset: Vec<PathBuf>,
     /// Split of the datasets
@@ -46,28 +46,28 @@ pub(crate) struct ReproduceAutoArguments {
     /// Take every N-th image
     #[arg(long, value_name = "N", default_value = "1")]
     pub every: std::num::NonZeroUsize,
-    /// Objects of the dataset that an image does not show and that are searched all the same, for each image
+    /// Number of absent objects of the dataset to search for in each image
     #[arg(long, value_name = "N", default_value = "0")]
     pub absent: usize,
-    /// Meshes of other objects, which none of the images shows: searched in every image
+    /// Meshes of objects that no image shows, to search for in every image
     #[arg(long, value_name = "MESH", num_args = 1..)]
     pub strangers: Vec<PathBuf>,
     /// Unit of these meshes
     #[arg(long, value_name = "UNIT", requires = "strangers")]
     pub unit: Option<Unit>,
-    /// What the methods are given
+    /// Images given to the methods
     #[arg(long, value_enum, num_args = 1.., default_values = ["depth", "both", "color"])]
     pub given: Vec<Given>,
-    /// Colour the images as other lamps and cameras would: rendered ones are too clean
+    /// Change the colours as other lamps and cameras would, for rendered images
     #[arg(long)]
     pub disturb: bool,
-    /// Ask all methods, fit the probabilities to what came of it, and write them to this file
+    /// Run all methods, fit the probabilities to the results, and write them to this file
     #[arg(long, value_name = "FILE")]
     pub fit: Option<PathBuf>,
-    /// Probabilities by this file in place of those within the program
+    /// Probabilities of this file instead of the built-in ones
     #[arg(long, value_name = "FILE", conflicts_with = "fit")]
     pub calibration: Option<PathBuf>,
-    /// Ask methods on depth alone, and no views
+    /// Use only methods on depth, not views
     #[arg(long)]
     pub without_views: bool,
     /// Seed of the choice of absent objects and of the disturbance

@@ -43,15 +43,15 @@ pub(crate) struct ReproduceDgcmArguments {
     /// Folder that the list's meshes are in (default: the list's own)
     #[arg(long, value_name = "DIR")]
     pub meshes: Option<PathBuf>,
-    /// Few scenes and views: a look, no measurement
+    /// Few scenes and views, for a quick check
     #[arg(long)]
     pub quick: bool,
     #[command(flatten)]
     pub network: NetworkArguments,
-    /// Folder for table.md, reproduce.json, images and everything kept on the way
+    /// Folder for table.md, reproduce.json, images and intermediate results
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value = "0")]
     pub seed: u64,
 }

@@ -7,7 +7,7 @@ use clap::Args;
 /// Shown under `sixfold reproduce nol --help`.
 pub(crate) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce nol --dataset lmo --frames data/lmo-training-frames.json --weights nol.safetensors --hope hope --out out/reproduce-nol\n\n\
-    Every row is kept; interrupted, it continues when the same command is given again.";
+    Every row is kept. After a stop, the same command resumes.";
 
 #[derive(Debug, Args)]
 pub(crate) struct ReproduceNolArguments {
