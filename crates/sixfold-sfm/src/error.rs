@@ -1,0 +1,108 @@
+//! Why photographs cannot be put together, or one of them cannot.
+
+use sixfold_geometry::{CameraError, OptionError};
+use thiserror::Error;
+
+/// Why a photograph has no pose. Photographs are numbers from 0.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum LeftOut {
+    /// Too few features.
+    FewFeatures {
+        /// How many it has.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+    },
+    /// Too few matches with any other photograph.
+    FewMatches {
+        /// Most matches with another photograph that agree with one motion of the camera.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+    },
+    /// It matches others, but none of the largest group.
+    OtherGroup {
+        /// The photographs of its group.
+        group: Vec<usize>,
+    },
+    /// Too few of its features agree with the points that the others see.
+    FewInliers {
+        /// How many agree.
+        found: usize,
+        /// How many should.
+        of: usize,
+    },
+}
+
+impl LeftOut {
+    /// The reason in words; `name` gives what a photograph is called.
+    pub fn reason(&self, name: &dyn Fn(usize) -> String) -> String {
+        match self {
+            LeftOut::FewFeatures { found, least } => {
+                format!("{found} features, expected at least {least}: blurred, or without texture?")
+            }
+            LeftOut::FewMatches { found, least } => format!(
+                "at most {found} features match another photograph, expected at least {least}: blurred, or taken too far from the others?"
+            ),
+            LeftOut::OtherGroup { group } => {
+                let others: Vec<String> = group.iter().map(|i| name(*i)).collect();
+                let listed = others.iter().take(4).cloned().collect::<Vec<_>>().join(", ");
+                let more =
+                    if others.len() > 4 { format!(" and {} more", others.len() - 4) } else { String::new() };
+                format!(
+                    "matches only {listed}{more}: photographs between this group and the others are missing"
+                )
+            }
+            LeftOut::FewInliers { found, of } => format!(
+                "{found} of {of} features lie where the other photographs say: did something move, or is it blurred?"
+            ),
+        }
+    }
+}
+
+/// Why photographs cannot be put together.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SfmError {
+    /// Too few photographs.
+    #[error("{found} photographs match each other, expected at least {least}")]
+    TooFew {
+        /// How many match.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+        /// For each photograph, why it does not; `None` for those that match.
+        left_out: Vec<Option<LeftOut>>,
+    },
+    /// The camera only rotated.
+    #[error(
+        "all photographs are taken from one place: the largest angle between two rays to one point is {degrees:.2} degrees, expected \
+         at least {least:.1}; walk around the object"
+    )]
+    NoBaseline {
+        /// The largest median angle of a pair.
+        degrees: f64,
+        /// What is needed.
+        least: f64,
+    },
+    /// Lists of different lengths, or a match beyond a photograph's features.
+    #[error("matches of photographs {first} and {second}: {what}")]
+    Matches {
+        /// The first photograph.
+        first: usize,
+        /// The second.
+        second: usize,
+        /// What was found and expected.
+        what: String,
+    },
+    /// The progress said to stop.
+    #[error("stopped")]
+    Stopped,
+    /// The camera is none.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// An option is out of range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+}

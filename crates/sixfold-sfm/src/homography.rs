@@ -1,0 +1,107 @@
+//! The map that a plane makes between two photographs, and the two motions of the camera that explain it (Ma, Soatto, Košecká and Sastry
+//! 2004, "An Invitation to 3-D Vision", section 5.3.3).
+
+use sixfold_geometry::nalgebra::{Rotation3, SMatrix, SVector, SymmetricEigen, UnitQuaternion};
+use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
+
+/// The map between points on the planes `z = 1` that takes each first point to the second (direct linear transformation); `None` for
+/// fewer than four points or points on a line.
+pub(crate) fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
+    if pairs.len() < 4 {
+        return None;
+    }
+    let mut sum = SMatrix::<f64, 9, 9>::zeros();
+    for (a, b) in pairs {
+        for row in [
+            [-a.x, -a.y, -1.0, 0.0, 0.0, 0.0, b.x * a.x, b.x * a.y, b.x],
+            [0.0, 0.0, 0.0, -a.x, -a.y, -1.0, b.y * a.x, b.y * a.y, b.y],
+        ] {
+            let row = SVector::<f64, 9>::from(row);
+            sum += row * row.transpose();
+        }
+    }
+    let eigen = SymmetricEigen::new(sum);
+    let mut order: [usize; 9] = std::array::from_fn(|i| i);
+    order.sort_by(|a, b| eigen.eigenvalues[*a].total_cmp(&eigen.eigenvalues[*b]));
+    if !(eigen.eigenvalues[order[1]] > 1e-12 * eigen.eigenvalues[order[8]]) {
+        return None;
+    }
+    Some(Mat3::from_row_slice(eigen.eigenvectors.column(order[0]).as_slice()))
+}
+
+/// Squared distance of the second point from where the map takes the first.
+pub(crate) fn transfer(map: &Mat3, (a, b): &(Vec2, Vec2)) -> f64 {
+    let p = map * a.push(1.0);
+    if p.z.abs() > 1e-12 { (p.xy() / p.z - b).norm_squared() } else { f64::INFINITY }
+}
+
+/// The motions (translation of length 1) that a plane's map allows with all points before both cameras: two, or fewer where the map
+/// is that of a rotation alone.
+pub(crate) fn motions(map: &Mat3, pairs: &[(Vec2, Vec2)]) -> Vec<Pose> {
+    let singular = map.svd(false, false).singular_values;
+    let mut sorted = [singular[0], singular[1], singular[2]];
+    sorted.sort_by(f64::total_cmp);
+    if !(sorted[1] > 1e-12) {
+        return vec![];
+    }
+    let positive = pairs.iter().map(|(a, b)| (b.push(1.0)).dot(&(map * a.push(1.0)))).sum::<f64>() >= 0.0;
+    let h = map / sorted[1] * if positive { 1.0 } else { -1.0 };
+    let eigen = SymmetricEigen::new(h.transpose() * h);
+    let mut order = [0, 1, 2];
+    order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+    let [v1, v2, v3]: [Vec3; 3] = order.map(|i| eigen.eigenvectors.column(i).into_owned());
+    let (s1, s3) = (eigen.eigenvalues[order[0]], eigen.eigenvalues[order[2]]);
+    if !(s1 - s3 > 1e-9) {
+        return vec![];
+    }
+    let (along, across) =
+        (((1.0 - s3).max(0.0) / (s1 - s3)).sqrt(), ((s1 - 1.0).max(0.0) / (s1 - s3)).sqrt());
+    let of = |sign: f64| {
+        let u = (v1 * along + v3 * (sign * across)).try_normalize(0.0)?;
+        let (hv, hu) = (h * v2, h * u);
+        let from = Mat3::from_columns(&[v2, u, v2.cross(&u)]);
+        let to = Mat3::from_columns(&[hv, hu, hv.cross(&hu)]);
+        let rotation =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&(to * from.transpose())));
+        let mut normal = v2.cross(&u);
+        let mut translation = (h - rotation.to_rotation_matrix().into_inner()) * normal;
+        let before = pairs.iter().filter(|(a, _)| normal.dot(&a.push(1.0)) > 0.0).count();
+        if 2 * before < pairs.len() {
+            (normal, translation) = (-normal, -translation);
+        }
+        let all_before = pairs.iter().filter(|(a, _)| normal.dot(&a.push(1.0)) > 0.0).count();
+        let direction = translation.try_normalize(1e-9)?;
+        (10 * all_before > 8 * pairs.len()).then(|| Pose::new(rotation, direction))
+    };
+    [1.0, -1.0].into_iter().filter_map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_planes_map_holds_the_true_motion() {
+        for k in 0..20 {
+            let t = f64::from(k);
+            let motion = Pose::exp(&[0.4, 0.2 * t.cos(), -0.2, 0.2 * t.sin(), -0.3, 0.1].into());
+            let pairs: Vec<(Vec2, Vec2)> = (0..12)
+                .map(|i| {
+                    let s = f64::from(i);
+                    let p = Vec3::new((1.3 * s).sin(), (2.1 * s).cos(), 0.0);
+                    let p = Vec3::new(p.x, p.y, 3.0 + 0.4 * p.x - 0.2 * p.y);
+                    let q = motion.transform_point(&p);
+                    ((p / p.z).xy(), (q / q.z).xy())
+                })
+                .collect();
+            let map = homography(&pairs).unwrap();
+            assert!(pairs.iter().all(|pair| transfer(&map, pair) < 1e-18));
+            let truth = motion.with_translation(motion.translation().normalize());
+            let best = motions(&map, &pairs)
+                .iter()
+                .map(|m| (m.inverse() * truth).log().norm())
+                .fold(f64::INFINITY, f64::min);
+            assert!(best < 1e-5, "{best:e}, {k}");
+        }
+    }
+}

@@ -1,0 +1,104 @@
+//! Features of two photographs that choose each other (mutual nearest neighbours of descriptors).
+
+use rayon::prelude::*;
+use sixfold_geometry::nalgebra::DMatrix;
+use sixfold_geometry::{Progress, Vec2};
+
+/// Features of a photograph.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Features {
+    /// Where they are, pixels.
+    pub points: Vec<Vec2>,
+    /// Their descriptors one after the other, each of length 1.
+    pub descriptors: Vec<f32>,
+}
+
+impl Features {
+    fn matrix(&self) -> DMatrix<f32> {
+        let count = self.points.len().max(1);
+        let channels = self.descriptors.len() / count;
+        DMatrix::from_column_slice(channels, self.descriptors.len() / channels.max(1), &self.descriptors)
+    }
+}
+
+/// What two photographs have in common.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PairMatches {
+    /// Numbers of the photographs, the smaller first.
+    pub pair: (usize, usize),
+    /// Numbers of the features in both.
+    pub matches: Vec<(u32, u32)>,
+}
+
+/// Features of every pair of photographs that choose each other and whose product is at least `least`; `None` when `progress` said
+/// to stop. All descriptors have the same length.
+pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
+    let matrices: Vec<DMatrix<f32>> = features.iter().map(Features::matrix).collect();
+    let pairs: Vec<(usize, usize)> =
+        (0..features.len()).flat_map(|a| (a + 1..features.len()).map(move |b| (a, b))).collect();
+    let done = std::sync::atomic::AtomicUsize::new(0);
+    let go = std::sync::atomic::AtomicBool::new(true);
+    let found: Vec<PairMatches> = pairs
+        .par_iter()
+        .map(|(a, b)| {
+            use std::sync::atomic::Ordering::Relaxed;
+            let mut matches = vec![];
+            if go.load(Relaxed) {
+                matches = mutual(&matrices[*a], &matrices[*b], least);
+                let count = done.fetch_add(1, Relaxed) + 1;
+                if !progress.report(count, pairs.len()) {
+                    go.store(false, Relaxed);
+                }
+            }
+            PairMatches { pair: (*a, *b), matches }
+        })
+        .collect();
+    go.into_inner().then_some(found)
+}
+
+fn mutual(a: &DMatrix<f32>, b: &DMatrix<f32>, least: f32) -> Vec<(u32, u32)> {
+    if a.ncols() == 0 || b.ncols() == 0 || a.nrows() != b.nrows() {
+        return vec![];
+    }
+    // Column j holds the products of b's feature j with all of a's.
+    let products = a.transpose() * b;
+    let mut best_of_a = vec![(f32::NEG_INFINITY, 0u32); a.ncols()];
+    let mut best_of_b = Vec::with_capacity(b.ncols());
+    for (j, column) in products.column_iter().enumerate() {
+        let mut best = (f32::NEG_INFINITY, 0u32);
+        for (i, product) in column.iter().enumerate() {
+            if *product > best.0 {
+                best = (*product, i as u32);
+            }
+            if *product > best_of_a[i].0 {
+                best_of_a[i] = (*product, j as u32);
+            }
+        }
+        best_of_b.push(best);
+    }
+    let chosen = |(i, (product, j)): (usize, &(f32, u32))| {
+        let mutual = best_of_b[*j as usize].1 == i as u32 && *product >= least;
+        mutual.then_some((i as u32, *j))
+    };
+    best_of_a.iter().enumerate().filter_map(chosen).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn features(descriptors: &[[f32; 3]]) -> Features {
+        Features { points: vec![Vec2::zeros(); descriptors.len()], descriptors: descriptors.concat() }
+    }
+
+    #[test]
+    fn only_features_that_choose_each_other_match() {
+        let a = features(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.8, 0.0]]);
+        let b = features(&[[0.0, 0.0, 1.0], [0.9, 0.436, 0.0], [0.0, 1.0, 0.0]]);
+        let found = matched(&[a.clone(), b, Features::default()], 0.5, &()).unwrap();
+        assert_eq!(found.len(), 3);
+        assert_eq!((found[0].pair, &found[0].matches), ((0, 1), &vec![(0, 1), (1, 2)]));
+        assert!(found[1].matches.is_empty() && found[2].matches.is_empty());
+        assert!(matched(&[a.clone(), a], 0.5, &|_: usize, _: usize| false).is_none());
+    }
+}
