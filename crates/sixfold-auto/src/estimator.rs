@@ -82,10 +82,7 @@ impl AutoEstimator {
     }
 
     /// The first method that knows an object without a mesh, with what it knows.
-    fn without_mesh(
-        &self,
-        object: &AutoObject,
-    ) -> Result<Option<(&dyn PoseEstimator, Arc<Box<dyn PreparedObject>>)>, EstimatorError> {
+    fn without_mesh(&self, object: &AutoObject) -> Result<Option<Knowing<'_>>, EstimatorError> {
         for (number, member) in self.members.iter().enumerate() {
             if let Ok(prepared) = object.prepared(number, member.as_ref())? {
                 return Ok(Some((member.as_ref(), prepared)));
@@ -240,7 +237,9 @@ struct Surface {
 
 /// An object as one method knows it; `Err` says why it cannot be asked.
 type Known = Result<Arc<Box<dyn PreparedObject>>, String>;
-/// The same, prepared when the method is first asked.
+/// A method with an object as it knows it.
+type Knowing<'a> = (&'a dyn PoseEstimator, Arc<Box<dyn PreparedObject>>);
+/// The same as [`Known`], prepared when the method is first asked.
 type Prepared = Mutex<Option<Known>>;
 
 impl Surface {
