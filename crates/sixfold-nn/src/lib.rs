@@ -26,6 +26,7 @@ pub mod options;
 pub mod pretrained;
 pub mod recipe;
 pub mod resnet;
+pub mod roi_align;
 pub mod salient;
 pub mod schedule;
 pub mod train_error;

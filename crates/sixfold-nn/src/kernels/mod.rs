@@ -8,12 +8,15 @@ mod dense;
 mod depthwise;
 mod gather;
 mod lstm;
+mod roi_align;
 mod shared;
 mod upsample;
 
 pub use gather::{Places, SampledPixel, neighbours};
 pub(crate) use gather::{gather_backward, gather_forward};
 pub(crate) use lstm::{lstm_backward, lstm_forward};
+pub(crate) use roi_align::roi_align_backward;
+pub use roi_align::{Regions, roi_align_forward};
 pub use shared::{Activation, ConvSpec};
 pub use upsample::Upsampling;
 pub(crate) use upsample::{upsample_2x, upsample_2x_backward};
