@@ -9,6 +9,7 @@
 //! origin in the middle of the mesh's box and the same axes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+mod cones;
 mod distance;
 mod error;
 mod fusion;
@@ -29,6 +30,7 @@ mod stereo;
 mod surface;
 mod teaching;
 mod view;
+pub use cones::{Cone, volume_of_masks};
 pub use error::TeachError;
 pub use located::{Located, SeenTags, locate};
 pub use pairs::pose_of_points;
