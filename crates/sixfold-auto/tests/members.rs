@@ -220,6 +220,13 @@ fn who_cannot_answer_is_left_out_and_said() {
     let object = auto.prepare(&Object::of_mesh("wedge", wedge(), info)).unwrap();
     let error = auto.estimate(object.as_ref(), &query).unwrap_err().to_string();
     assert!(error.contains("--method auto") && error.contains("--rgb"), "{error}");
+    // Without a mesh nothing can be judged: a method that knows the object answers alone, and if none does, a mesh is lacking.
     let bare = Object { mesh: None, ..Object::of_model(None) };
-    assert!(matches!(auto.prepare(&bare), Err(EstimatorError::Lacks { method: "auto", .. })));
+    let nobody = AutoEstimator::new(vec![lacking as Arc<dyn PoseEstimator>]).unwrap();
+    assert!(matches!(nobody.prepare(&bare), Err(EstimatorError::Lacks { method: "auto", .. })));
+    let one = AutoEstimator::new(vec![told("a", &[truth()]) as Arc<dyn PoseEstimator>]).unwrap();
+    let poses = one.estimate(one.prepare(&bare).unwrap().as_ref(), &query).unwrap();
+    assert_eq!(poses.len(), 1);
+    assert_eq!((poses[0].probability, &poses[0].details["method"]), (None, &"a".into()));
+    assert!(poses[0].notes[0].contains("--method a answered alone"), "{:?}", poses[0].notes);
 }
