@@ -243,6 +243,24 @@ type Knowing<'a> = (&'a dyn PoseEstimator, Arc<Box<dyn PreparedObject>>);
 type Prepared = Mutex<Option<Known>>;
 
 impl Surface {
+    /// The surface of an object with this mesh, and a note where something could not be kept.
+    fn of(object: &Object, mesh: &Arc<Mesh>) -> Result<(Surface, Option<String>), EstimatorError> {
+        let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
+        let kept =
+            kept.map_err(|e| EstimatorError::Object { object: object.name.clone(), source: Box::new(e) })?;
+        let note = kept.note.map(|n| format!("mesh of {} not kept, or simplified again: {n}", object.name));
+        let diameter = object.info.as_ref().map_or_else(|| mesh.diameter(), |info| info.diameter);
+        let surface = Surface {
+            mesh: mesh.clone(),
+            rendered: kept.mesh,
+            diameter,
+            threshold: VerificationOptions::default().threshold_for(diameter),
+            symmetries: object.info.as_ref().map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
+            look_alikes: OnceLock::new(),
+        };
+        Ok((surface, note))
+    }
+
     fn look_alikes(&self) -> &LookAlikes {
         self.look_alikes.get_or_init(|| LookAlikes::of(&self.mesh, self.diameter, &self.symmetries))
     }
@@ -301,31 +319,8 @@ impl PoseEstimator for AutoEstimator {
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
-        let mut notes = vec![];
-        let surface = match &object.mesh {
-            None => None,
-            Some(mesh) => {
-                let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
-                let kept = kept.map_err(|e| EstimatorError::Object {
-                    object: object.name.clone(),
-                    source: Box::new(e),
-                })?;
-                let note = |n| format!("mesh of {} not kept, or simplified again: {n}", object.name);
-                notes.extend(kept.note.map(note));
-                let diameter = object.info.as_ref().map_or_else(|| mesh.diameter(), |info| info.diameter);
-                Some(Surface {
-                    mesh: mesh.clone(),
-                    rendered: kept.mesh,
-                    diameter,
-                    threshold: VerificationOptions::default().threshold_for(diameter),
-                    symmetries: object
-                        .info
-                        .as_ref()
-                        .map_or_else(Vec::new, |i| i.symmetry_poses(SYMMETRY_STEP)),
-                    look_alikes: OnceLock::new(),
-                })
-            }
-        };
+        let (surface, note) = object.mesh.as_ref().map(|mesh| Surface::of(object, mesh)).transpose()?.unzip();
+        let notes = note.flatten().into_iter().collect();
         let members = self.members.iter().map(|_| Prepared::default()).collect();
         let prepared = AutoObject { object: object.clone(), surface, members, notes };
         if prepared.surface.is_none() && self.without_mesh(&prepared)?.is_none() {

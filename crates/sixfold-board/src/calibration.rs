@@ -1,11 +1,11 @@
 //! A camera from several photographs of the board (Zhang 2000).
 
+use sixfold_geometry::homography::homography;
 use sixfold_geometry::{Camera, Pose, Vec2};
 
 use crate::board::Corner;
 use crate::bundle::{INTRINSICS, Solution, Unknowns, camera_of, numbers_of, solve};
 use crate::error::BoardError;
-use crate::homography::homography;
 use crate::pose::{allowed_misfit, check_corners, initial_pose, root_mean_square};
 
 /// Fewest photographs that determine a camera with its lens.

@@ -2,10 +2,10 @@
 //! Wang and Olson 2016).
 
 use rayon::prelude::*;
+use sixfold_geometry::homography::{apply, homography};
 use sixfold_geometry::{Image, Mat3, RgbImage, Vec2};
 
 use crate::family::{CELLS, Cells, SIDE, decode, mirrored};
-use crate::homography::{apply, homography};
 use crate::quad::{Quad, around, brightness, convex_hull, refined};
 
 /// Fewest grey levels between black and white around a pixel that is called either.

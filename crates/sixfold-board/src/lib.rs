@@ -27,7 +27,6 @@ mod calibration;
 mod detector;
 mod error;
 mod family;
-mod homography;
 mod pdf;
 mod pose;
 mod quad;

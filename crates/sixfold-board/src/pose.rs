@@ -1,12 +1,12 @@
 //! The camera's pose from one photograph of the board.
 
+use sixfold_geometry::homography::homography;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::{Camera, Mat3, Pose, Vec2, Vec3};
 
 use crate::board::Corner;
 use crate::bundle::{Unknowns, numbers_of, solve};
 use crate::error::BoardError;
-use crate::homography::homography;
 
 /// Fewest tags of a photograph that is used: with one or two the board may lean either way.
 pub(crate) const FEWEST_TAGS: usize = 4;

@@ -11,6 +11,7 @@ mod camera;
 mod cloud;
 mod depth_check;
 mod frame_id;
+pub mod homography;
 mod icp;
 mod image;
 mod kabsch;

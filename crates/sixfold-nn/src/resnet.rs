@@ -153,46 +153,6 @@ impl ResNet50 {
         maps
     }
 
-    fn map_norms(mut self, map: impl Fn(BatchNorm) -> BatchNorm) -> Self {
-        self.bn1 = map(self.bn1);
-        for layer in [&mut self.layer1, &mut self.layer2, &mut self.layer3, &mut self.layer4] {
-            for block in layer {
-                for norm in [&mut block.bn1, &mut block.bn2, &mut block.bn3] {
-                    *norm = map(norm.clone());
-                }
-                if let Some((_, norm)) = &mut block.downsample {
-                    *norm = map(norm.clone());
-                }
-            }
-        }
-        self
-    }
-
-    /// Every batch normalisation keeps its statistics, weights and biases in a training, as torchvision's detectors do: their
-    /// batches are too small for statistics.
-    pub fn freeze_norms(self) -> Self {
-        self.map_norms(Module::freeze)
-    }
-
-    /// Every batch normalisation adds this to the variance; torchvision's published detectors were trained with 0.
-    pub fn with_norm_epsilon(self, epsilon: f64) -> Self {
-        self.map_norms(|mut norm| {
-            norm.epsilon = epsilon;
-            norm
-        })
-    }
-
-    /// Keeps the first convolution and the first `layers` of four layers as they are while the rest trains.
-    pub fn freeze_layers(mut self, layers: usize) -> Self {
-        self.conv1 = self.conv1.no_grad();
-        self.bn1 = self.bn1.no_grad();
-        let all = [&mut self.layer1, &mut self.layer2, &mut self.layer3, &mut self.layer4];
-        for layer in all.into_iter().take(layers) {
-            *layer = std::mem::take(layer).no_grad();
-        }
-        self
-    }
-
     /// `batch x 3 x height x width` to `batch x classes` logits; none if the network has no classifier.
     pub fn classify(&self, x: Tensor<4>) -> Option<Tensor<2>> {
         self.classify_map(self.features(x).pop()?)

@@ -184,7 +184,7 @@ impl System {
     }
 }
 
-/// The state with the least cost near a start; only the numbers `free` of the lens may change, which are believed to be near those of
+/// The state with the lowest cost near a start; only the numbers `free` of the lens may change, which are believed to be near those of
 /// `guess`. The first pose stays. `seen` holds where each point is seen.
 pub(crate) fn adjusted(
     start: Bundle,

@@ -1,38 +1,13 @@
-//! The map that a plane makes between two photographs, and the two motions of the camera that explain it (Ma, Soatto, Košecká and Sastry
+//! The two motions of the camera that explain the map which a plane makes between two photographs (Ma, Soatto, Košecká and Sastry
 //! 2004, "An Invitation to 3-D Vision", section 5.3.3).
 
-use sixfold_geometry::nalgebra::{Rotation3, SMatrix, SVector, SymmetricEigen, UnitQuaternion};
+use sixfold_geometry::homography::apply;
+use sixfold_geometry::nalgebra::{Rotation3, SymmetricEigen, UnitQuaternion};
 use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
-
-/// The map between points on the planes `z = 1` that takes each first point to the second (direct linear transformation); `None` for
-/// fewer than four points or points on a line.
-pub(crate) fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
-    if pairs.len() < 4 {
-        return None;
-    }
-    let mut sum = SMatrix::<f64, 9, 9>::zeros();
-    for (a, b) in pairs {
-        for row in [
-            [-a.x, -a.y, -1.0, 0.0, 0.0, 0.0, b.x * a.x, b.x * a.y, b.x],
-            [0.0, 0.0, 0.0, -a.x, -a.y, -1.0, b.y * a.x, b.y * a.y, b.y],
-        ] {
-            let row = SVector::<f64, 9>::from(row);
-            sum += row * row.transpose();
-        }
-    }
-    let eigen = SymmetricEigen::new(sum);
-    let mut order: [usize; 9] = std::array::from_fn(|i| i);
-    order.sort_by(|a, b| eigen.eigenvalues[*a].total_cmp(&eigen.eigenvalues[*b]));
-    if !(eigen.eigenvalues[order[1]] > 1e-12 * eigen.eigenvalues[order[8]]) {
-        return None;
-    }
-    Some(Mat3::from_row_slice(eigen.eigenvectors.column(order[0]).as_slice()))
-}
 
 /// Squared distance of the second point from where the map takes the first.
 pub(crate) fn transfer(map: &Mat3, (a, b): &(Vec2, Vec2)) -> f64 {
-    let p = map * a.push(1.0);
-    if p.z.abs() > 1e-12 { (p.xy() / p.z - b).norm_squared() } else { f64::INFINITY }
+    apply(map, a).map_or(f64::INFINITY, |p| (p - b).norm_squared())
 }
 
 /// The motions (translation of length 1) that a plane's map allows with all points before both cameras: two, or fewer where the map
@@ -78,6 +53,8 @@ pub(crate) fn motions(map: &Mat3, pairs: &[(Vec2, Vec2)]) -> Vec<Pose> {
 
 #[cfg(test)]
 mod tests {
+    use sixfold_geometry::homography::homography;
+
     use super::*;
 
     #[test]

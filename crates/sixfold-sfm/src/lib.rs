@@ -4,7 +4,7 @@
 //! ([`two_views`]; Nistér 2004, Stewénius et al. 2006), tracks over all photographs, photographs added one by one by PnP and
 //! triangulation (Schönberger and Frahm 2016), and a robust bundle adjustment (Triggs et al. 2000). Features come from anywhere.
 //!
-//! Nothing here knows lengths: the unit is that of the baseline of the first two photographs until something measures it. The same
+//! Nothing here knows lengths: the unit is the median distance of a photograph from the points that it shows. The same
 //! input and seed give the same poses, at any number of threads.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]

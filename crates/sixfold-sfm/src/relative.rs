@@ -81,7 +81,7 @@ fn moved(motion: &Pose, step: &Vector5<f64>) -> Pose {
     Pose::new(rotation, (t + u * step[3] + v * step[4]).normalize())
 }
 
-/// The motion near a start with the least sum of squared Sampson errors, each counted up to `limit` (Levenberg-Marquardt).
+/// The motion near a start with the smallest sum of squared Sampson errors, each counted up to `limit` (Levenberg-Marquardt).
 pub(crate) fn refined(start: &Pose, pairs: &[(Vec2, Vec2)], limit: f64, iterations: usize) -> Pose {
     let cost = |motion: &Pose| {
         let e = essential(motion);

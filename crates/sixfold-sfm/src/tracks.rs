@@ -4,7 +4,7 @@
 /// A track: for each photograph that shows the point, which one and its feature; by photograph.
 pub(crate) type Track = Vec<(usize, u32)>;
 
-/// Joins matches of features, given from the most to the least trusted. `counts` are the numbers of features of the photographs.
+/// Joins matches of features, the most trusted first. `counts` are the numbers of features of the photographs.
 pub(crate) fn joined(counts: &[usize], matches: impl Iterator<Item = [(usize, u32); 2]>) -> Vec<Track> {
     let mut first = vec![0usize];
     counts.iter().for_each(|count| first.push(first[first.len() - 1] + count));

@@ -2,12 +2,13 @@
 //! homography where all matches lie on one plane, for a plane allows two motions.
 
 use rand::RngExt;
+use sixfold_geometry::homography::homography;
 use sixfold_geometry::random::stream;
 use sixfold_geometry::stats::median;
 use sixfold_geometry::{Mat3, Pose, Vec2};
 
 use crate::five_point::essential_matrices;
-use crate::homography::{homography, motions, transfer};
+use crate::homography::{motions, transfer};
 use crate::relative::{before_both, essential, motion_of, parallax, refined, sampson};
 
 /// A sample without a wrong match is taken with this probability.

@@ -69,7 +69,7 @@ pub struct BatchNorm {
     /// Whether the layer takes part in training.
     pub training: Param<Flag>,
     momentum: f64,
-    pub(crate) epsilon: f64,
+    epsilon: f64,
 }
 
 impl BatchNorm {

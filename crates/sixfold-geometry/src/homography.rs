@@ -1,10 +1,11 @@
 //! Maps between planes: the direct linear transformation with normalised points (Hartley and Zisserman 2004, algorithm 4.2).
 
-use sixfold_geometry::nalgebra::{SMatrix, SVector, SymmetricEigen};
-use sixfold_geometry::{Mat3, Vec2, Vec3};
+use nalgebra::{SMatrix, SVector, SymmetricEigen};
 
-/// The map that takes each first point to the second; `None` for fewer than four points or points on a line.
-pub(crate) fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
+use crate::{Mat3, Vec2, Vec3};
+
+/// The map (norm 1) that takes each first point to the second, all in one unit of length or pixels; `None` for fewer than four points or points on a line.
+pub fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
     if pairs.len() < 4 {
         return None;
     }
@@ -35,7 +36,7 @@ pub(crate) fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
 }
 
 /// Where a map takes a point; `None` for the horizon and what is behind it.
-pub(crate) fn apply(map: &Mat3, point: &Vec2) -> Option<Vec2> {
+pub fn apply(map: &Mat3, point: &Vec2) -> Option<Vec2> {
     let p = map * Vec3::new(point.x, point.y, 1.0);
     (p.z.abs() > 1e-12).then(|| Vec2::new(p.x / p.z, p.y / p.z))
 }
