@@ -277,3 +277,49 @@ fn stepped(
     }
     Some(next)
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::Camera;
+
+    use super::*;
+
+    #[test]
+    fn wrong_observations_do_not_move_the_solution() {
+        let camera =
+            Camera { fx: 800.0, fy: 800.0, cx: 320.0, cy: 240.0, width: 640, height: 480, distortion: None };
+        let lens = Lens::of(&camera);
+        let poses: Vec<Pose> = (0..6)
+            .map(|k| Pose::exp(&[0.2 * f64::from(k), 0.0, 2.0, 0.0, -0.1 * f64::from(k), 0.0].into()))
+            .collect();
+        let points: Vec<Vec3> = (0..60)
+            .map(|i| Vec3::from_fn(|axis, _| 0.4 * (f64::from(i) * [1.3, 2.1, 3.7][axis]).sin()))
+            .collect();
+        let truth = Bundle { lens, poses, points };
+        // Every eighth observation is 40 pixels off, to one side.
+        let wrong = |i: usize, k: usize| (i * 6 + k) % 8 == 3;
+        let pixel =
+            |i: usize, k: usize| lens.project(&truth.poses[k].transform_point(&truth.points[i])).unwrap();
+        let observed =
+            |i: usize, k: usize| pixel(i, k) + Vec2::new(if wrong(i, k) { 40.0 } else { 0.0 }, 0.0);
+        let seen: Vec<Vec<Seen>> = (0..truth.points.len())
+            .map(|i| (0..6).map(|camera| Seen { camera, pixel: observed(i, camera) }).collect())
+            .collect();
+        let mut start = truth.clone();
+        for (k, pose) in start.poses.iter_mut().enumerate().skip(1) {
+            let s = k as f64;
+            *pose = moved(
+                pose,
+                &Vector6::new(0.01 * s.sin(), 0.01, -0.01 * s.cos(), 0.01, 0.005 * s.sin(), -0.01),
+            );
+        }
+        let found = adjusted(start, &seen, &lens, &[], 40);
+        for i in 0..truth.points.len() {
+            for k in 0..6 {
+                let off = found.lens.project(&found.poses[k].transform_point(&found.points[i])).unwrap()
+                    - pixel(i, k);
+                assert!(off.norm() < 0.01, "point {i}, photograph {k}: {} pixels", off.norm());
+            }
+        }
+    }
+}
