@@ -3,10 +3,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use sixfold_bop::{VISIBILITY_DELTA, ground_truth_visibility};
-use sixfold_geometry::{Camera, Mask, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
-use sixfold_io::{CameraFile, read_mask, read_rgb};
+use sixfold_geometry::{Camera, Mask, Mat3, Pose, PoseError, RgbImage, Vec3, undistort_rgb};
+use sixfold_io::{CameraFile, limits, read_mask, read_regular_text, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 
 use crate::error::TrainingSetError;
@@ -15,23 +15,95 @@ use crate::rough_images::{
     Disturber, RoughImage, RoughImageOptions, RoughImages, RoughObject, detected_mask, detections,
 };
 
-#[derive(Deserialize)]
+/// A file that lists photographs of one object with its pose in each, and its mesh if there is one. Paths are relative to the file.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
-    mesh: String,
-    unit: String,
-    photographs: Vec<Entry>,
+pub struct PhotographFile {
+    /// The mesh.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mesh: Option<String>,
+    /// Unit of the mesh file: m, cm, mm, in.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<String>,
+    /// The photographs.
+    pub photographs: Vec<PhotographEntry>,
 }
 
-#[derive(Deserialize)]
+/// A photograph in a [`PhotographFile`].
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(non_snake_case)]
-struct Entry {
-    image: String,
-    camera: String,
-    cam_R_m2c: [f64; 9],
-    cam_t_m2c: [f64; 3],
-    mask: Option<String>,
+pub struct PhotographEntry {
+    /// Its image: PNG or JPEG.
+    pub image: String,
+    /// Its camera: a file of BOP, OpenCV or ROS.
+    pub camera: String,
+    /// Rotation from the object's frame to the camera's, by rows.
+    pub cam_R_m2c: [f64; 9],
+    /// Translation of the same, millimetres.
+    pub cam_t_m2c: [f64; 3],
+    /// Where the object is seen, of the image without lens distortion: PNG, 0 outside; 128 where something may hide the object.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mask: Option<String>,
+    /// Measured depth from the same pixels: PNG of 16 bits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth: Option<String>,
+    /// Millimetres per unit of the depth image.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_scale: Option<f64>,
+}
+
+impl PhotographFile {
+    /// Reads a file; its images are not read.
+    ///
+    /// # Errors
+    /// [`TrainingSetError::Photographs`], which names the file and the field.
+    pub fn read(path: &Path) -> Result<PhotographFile, TrainingSetError> {
+        let wrong = |reason: String| TrainingSetError::Photographs { path: path.to_owned(), reason };
+        let text = read_regular_text(path, limits::SMALL_TEXT).map_err(|error| wrong(error.to_string()))?;
+        let file: PhotographFile = serde_json::from_str(&text).map_err(|error| {
+            wrong(format!(
+                "{error}; expected {{\"mesh\", \"unit\", \"photographs\": [{{\"image\", \"camera\", \"cam_R_m2c\", \"cam_t_m2c\", \"mask\", \"depth\", \"depth_scale\"}}]}}"
+            ))
+        })?;
+        if file.photographs.is_empty() {
+            return Err(wrong("field photographs: found none, expected at least one".into()));
+        }
+        for (number, entry) in file.photographs.iter().enumerate() {
+            entry.pose().map_err(|error| wrong(format!("field photographs[{number}].cam_R_m2c: {error}")))?;
+            if entry.depth.is_some()
+                && !entry.depth_scale.is_some_and(|scale| scale > 0.0 && scale.is_finite())
+            {
+                return Err(wrong(format!(
+                    "field photographs[{number}].depth_scale: expected millimetres per unit of the depth image, above 0"
+                )));
+            }
+        }
+        Ok(file)
+    }
+
+    /// The mesh, metres; `None` where the file names none.
+    ///
+    /// # Errors
+    /// [`TrainingSetError`].
+    pub fn read_mesh(&self, path: &Path) -> Result<Option<Mesh>, TrainingSetError> {
+        let wrong = |reason: String| TrainingSetError::Photographs { path: path.to_owned(), reason };
+        let Some(mesh) = &self.mesh else { return Ok(None) };
+        let unit =
+            self.unit.as_deref().ok_or_else(|| wrong("field unit: expected m, cm, mm or in".into()))?;
+        let unit: Unit = unit.parse().map_err(|error| wrong(format!("field unit: {error}")))?;
+        Ok(Some(read_mesh(path.parent().unwrap_or(Path::new("")).join(mesh), unit)?))
+    }
+}
+
+impl PhotographEntry {
+    /// Takes points of the object's frame to the camera's.
+    ///
+    /// # Errors
+    /// [`PoseError`] where the matrix is no rotation.
+    pub fn pose(&self) -> Result<Pose, PoseError> {
+        Pose::from_parts(&Mat3::from_row_slice(&self.cam_R_m2c), Vec3::from(self.cam_t_m2c) * 1e-3)
+    }
 }
 
 impl RoughImages {
@@ -45,24 +117,16 @@ impl RoughImages {
         options: &RoughImageOptions<'_>,
     ) -> Result<RoughImages, TrainingSetError> {
         let wrong = |reason: String| TrainingSetError::Photographs { path: path.to_owned(), reason };
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        let file: File = serde_json::from_str(&text).map_err(|error| {
-            wrong(format!(
-                "{error}; expected {{\"mesh\", \"unit\", \"photographs\": [{{\"image\", \"camera\", \"cam_R_m2c\", \"cam_t_m2c\", \"mask\"}}]}}"
-            ))
-        })?;
+        let file = PhotographFile::read(path)?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        let unit: Unit = file.unit.parse().map_err(|error| wrong(format!("field unit: {error}")))?;
-        let mesh = read_mesh(folder.join(&file.mesh), unit)?;
-        if file.photographs.is_empty() {
-            return Err(wrong("field photographs: found none, expected at least one".into()));
-        }
+        let mesh = file.read_mesh(path)?;
+        let mesh = mesh.ok_or_else(|| wrong("field mesh: found none, expected the object's mesh".into()))?;
         let mut disturber = Disturber::new(options);
         let mut images = vec![];
         for (number, entry) in file.photographs.iter().enumerate() {
             let (image, camera) = pinhole_image(folder, entry)?;
-            let rotation = Mat3::from_row_slice(&entry.cam_R_m2c);
-            let given = Pose::from_parts(&rotation, Vec3::from(entry.cam_t_m2c) * 1e-3)
+            let given = entry
+                .pose()
                 .map_err(|error| wrong(format!("field photographs[{number}].cam_R_m2c: {error}")))?;
             let pose = disturber.disturb(&given);
             let mask = match &entry.mask {
@@ -98,7 +162,7 @@ fn mask_of_detector(
 }
 
 /// An image without distortion, and its camera.
-fn pinhole_image(folder: &Path, entry: &Entry) -> Result<(RgbImage, Camera), TrainingSetError> {
+fn pinhole_image(folder: &Path, entry: &PhotographEntry) -> Result<(RgbImage, Camera), TrainingSetError> {
     let image = read_rgb(&folder.join(&entry.image))?;
     let file = folder.join(&entry.camera);
     let (width, height) = image.size();

@@ -158,6 +158,15 @@ impl<'a> ImageFile<'a> {
     /// [`ImageFileError`] naming the file: also for a JPEG, whose zeros are not exact, for several colours, and where alpha and
     /// colour say different things.
     pub fn mask(&self) -> Result<Mask, ImageFileError> {
+        Ok(self.mask_and_hidden()?.0)
+    }
+
+    /// A mask as [`ImageFile::mask`] reads it, and the part of it where nobody knows whether the object is there, because something
+    /// may hide it: the value 128 of grey images of 8 bits; `None` where there is none.
+    ///
+    /// # Errors
+    /// Those of [`ImageFile::mask`].
+    pub fn mask_and_hidden(&self) -> Result<(Mask, Option<Mask>), ImageFileError> {
         let (image, format) = self.decode()?;
         if format == ImageFormat::Jpeg {
             return Err(ImageFileError::Mask {
@@ -167,7 +176,9 @@ impl<'a> ImageFile<'a> {
         }
         let data = mask_pixels::inside(&image)
             .map_err(|reason| ImageFileError::Mask { path: self.path.to_owned(), reason })?;
-        self.image(image.width(), image.height(), data)
+        let hidden = mask_pixels::hidden(&image);
+        let hidden = hidden.map(|hidden| self.image(image.width(), image.height(), hidden)).transpose()?;
+        Ok((self.image(image.width(), image.height(), data)?, hidden))
     }
 
     /// A colour image; grey becomes colour, alpha is dropped, and of 16 bits the upper eight are kept.
@@ -203,8 +214,15 @@ pub(crate) fn png_of_rgb(image: &RgbImage) -> Option<DynamicImage> {
     image::RgbImage::from_raw(image.width() as u32, image.height() as u32, data).map(DynamicImage::from)
 }
 
-pub(crate) fn png_of_mask(mask: &Mask) -> Option<DynamicImage> {
-    let data: Vec<u8> = mask.as_slice().iter().map(|&m| if m { 255 } else { 0 }).collect();
+/// 255 inside, 0 outside, and 128 where it is inside and hidden.
+pub(crate) fn png_of_mask(mask: &Mask, hidden: Option<&Mask>) -> Option<DynamicImage> {
+    let is_hidden = |i: usize| hidden.is_some_and(|h| h.as_slice().get(i).copied().unwrap_or(false));
+    let value = |(i, m): (usize, &bool)| match m {
+        true if is_hidden(i) => mask_pixels::HIDDEN,
+        true => 255,
+        false => 0,
+    };
+    let data: Vec<u8> = mask.as_slice().iter().enumerate().map(value).collect();
     image::GrayImage::from_raw(mask.width() as u32, mask.height() as u32, data).map(DynamicImage::from)
 }
 
@@ -343,6 +361,23 @@ mod tests {
         let path = dir.path().join("mask.png");
         write_png(&path, image).unwrap();
         file(&path).mask().map(|m| m.as_slice().to_vec()).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn the_hidden_part_of_a_mask_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("mask.png");
+        let mask = Image::from_vec(4, 1, vec![false, true, true, false]).unwrap();
+        let hidden = Image::from_vec(4, 1, vec![false, false, true, false]).unwrap();
+        crate::write_mask_and_hidden(&path, &mask, Some(&hidden)).unwrap();
+        assert_eq!(crate::read_mask_and_hidden(&path).unwrap(), (mask.clone(), Some(hidden)));
+        assert_eq!(file(&path).mask().unwrap(), mask);
+        crate::write_mask(&path, &mask).unwrap();
+        assert_eq!(crate::read_mask_and_hidden(&path).unwrap(), (mask, None));
+        // In colour, 128 is a colour.
+        let grey = image::RgbImage::from_vec(2, 1, vec![0, 0, 0, 128, 128, 128]).unwrap();
+        write_png(&path, grey.into()).unwrap();
+        assert_eq!(file(&path).mask_and_hidden().unwrap().1, None);
     }
 
     /// A 16-bit mask lost its values below 129, a coloured one what was dark.

@@ -60,5 +60,21 @@ pub fn write_depth(path: &Path, depth: &DepthImage, metres_per_unit: f64) -> Res
 /// # Errors
 /// [`ImageFileError`] naming the file.
 pub fn write_mask(path: &Path, mask: &Mask) -> Result<(), ImageFileError> {
-    write(path, png_of_mask(mask))
+    write(path, png_of_mask(mask, None))
+}
+
+/// Reads a mask with the part of it where nobody knows whether the object is there: [`ImageFile::mask_and_hidden`].
+///
+/// # Errors
+/// [`ImageFileError`] naming the file.
+pub fn read_mask_and_hidden(path: &Path) -> Result<(Mask, Option<Mask>), ImageFileError> {
+    ImageFile::new(path).mask_and_hidden()
+}
+
+/// Writes a mask as PNG: 255 inside, 0 outside, 128 where it is inside and hidden.
+///
+/// # Errors
+/// [`ImageFileError`] naming the file.
+pub fn write_mask_and_hidden(path: &Path, mask: &Mask, hidden: Option<&Mask>) -> Result<(), ImageFileError> {
+    write(path, png_of_mask(mask, hidden))
 }

@@ -20,7 +20,10 @@ pub use error::ImageFileError;
 pub use files::{make_folder_of, sync_folder_of, write_atomically, write_atomically_with};
 pub use hash::{Fnv1a, fnv1a, fnv1a_of_file};
 pub use image_files::ImageFile;
-pub use images::{read_depth, read_mask, read_rgb, write_depth, write_mask, write_rgb};
+pub use images::{
+    read_depth, read_mask, read_mask_and_hidden, read_rgb, write_depth, write_mask, write_mask_and_hidden,
+    write_rgb,
+};
 pub use limit::{DEFAULT_MAX_PIXELS, check_pixels, max_pixels, set_max_pixels};
 pub use lock::{LockError, WriteLock};
 pub use regular::{limits, open_regular, read_regular, read_regular_text};

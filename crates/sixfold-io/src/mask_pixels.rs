@@ -26,6 +26,16 @@ pub(crate) fn inside(image: &DynamicImage) -> Result<Vec<bool>, String> {
     }
 }
 
+/// The grey value of pixels of which nobody knows whether they show the object.
+pub(crate) const HIDDEN: u8 = 128;
+
+/// Which pixels of a grey image of 8 bits are [`HIDDEN`]; `None` where none is.
+pub(crate) fn hidden(image: &DynamicImage) -> Option<Vec<bool>> {
+    let DynamicImage::ImageLuma8(pixels) = image else { return None };
+    let hidden: Vec<bool> = pixels.as_raw().iter().map(|v| *v == HIDDEN).collect();
+    hidden.contains(&true).then_some(hidden)
+}
+
 /// What the pixels' values are made of.
 trait Value: Copy + Default + PartialEq {}
 impl Value for u8 {}

@@ -1,6 +1,6 @@
 //! The visual hull: what no photograph shows to be empty (Laurentini 1994), as a signed distance.
 
-use sixfold_geometry::{Image, Mask, Vec3};
+use sixfold_geometry::{Image, Mask, Plane, Vec3};
 
 use crate::distance::signed_distance;
 use crate::grid::Grid;
@@ -38,7 +38,7 @@ impl<'a> Outlined<'a> {
 
 /// The signed distance to the hull on a grid, metres, below zero inside; points that no view shows are outside. `floor` is where
 /// the object stands: what is below is outside.
-pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor: Option<f64>) -> Grid {
+pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor: Option<Plane>) -> Grid {
     let ignored = usize::from(views.len() >= ONE_MAY_BE_WRONG);
     Grid::new(volume, cells, |point| {
         // Beyond the outer border of one mask is outside; a hole has to be seen in two, lest one wrong mask drills through.
@@ -53,7 +53,7 @@ pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor:
         }
         let distance = outer.max(largest[ignored]);
         let distance = if distance.is_finite() { distance } else { volume.size().max() as f32 };
-        floor.map_or(distance, |floor| distance.max((floor - point.z) as f32))
+        floor.map_or(distance, |floor| distance.max(-floor.distance(point) as f32))
     })
 }
 
@@ -70,7 +70,7 @@ mod tests {
         let pose = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
         let eye = pose.inverse().translation();
         let image = Image::filled(80, 80, [0; 3]);
-        View { image, camera, camera_from_world: pose, eye, depth: None, mask: None }
+        View { image, camera, camera_from_world: pose, eye, depth: None, mask: None, hidden: None }
     }
 
     fn square(half: f64, hole: bool) -> Mask {

@@ -53,7 +53,11 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
             for (view, depth) in views.iter().zip(&depths) {
                 let cosine = (view.eye - point).normalize().dot(normal);
                 let Some((pixel, z)) = view.project(point) else { continue };
-                let front = f64::from(depth[(pixel.x.round() as usize, pixel.y.round() as usize)]);
+                let nearest = (pixel.x.round() as usize, pixel.y.round() as usize);
+                let front = f64::from(depth[nearest]);
+                if view.is_hidden(nearest) {
+                    continue;
+                }
                 if cosine > FLATTEST && front > 0.0 && z < front + BEHIND {
                     seen.push((cosine * cosine, bilinear_rgb(&view.image, pixel.x, pixel.y)));
                 }

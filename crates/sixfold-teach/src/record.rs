@@ -5,11 +5,11 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sixfold_bop::{GroundTruth, NewImage, SceneWriter, write_camera};
+use sixfold_data::{PhotographEntry, PhotographFile};
 use sixfold_estimator::{NewObject, Object, ObjectRecord, ObjectStore};
-use sixfold_geometry::{Camera, Mat3, Pose, RgbImage, Vec3, undistort_rgb};
+use sixfold_geometry::{Camera, Pose, RgbImage, undistort_rgb};
 use sixfold_io::{limits, read_mask, read_regular_text, read_rgb, write_atomically, write_mask, write_rgb};
 use sixfold_mesh::{
     FoundSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, SymmetryOptions, Unit, find_symmetries, ply_files,
@@ -33,23 +33,6 @@ pub struct Stored {
     pub symmetries: Vec<FoundSymmetry>,
     /// How many photographs are kept.
     pub photographs: usize,
-}
-
-#[derive(Serialize, Deserialize)]
-#[allow(non_snake_case)]
-struct Entry {
-    image: String,
-    camera: String,
-    cam_R_m2c: [f64; 9],
-    cam_t_m2c: [f64; 3],
-    mask: Option<String>,
-}
-
-#[derive(Serialize, Deserialize)]
-struct PhotographFile {
-    mesh: String,
-    unit: String,
-    photographs: Vec<Entry>,
 }
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
@@ -109,18 +92,21 @@ fn write_photographs(folder: &Path, posed: &[Posed]) -> Result<(), Failure> {
         write_rgb(&folder.join(&file), image)?;
         write_mask(&folder.join(&mask_file), mask)?;
         let (rotation, t) = (pose.rotation_matrix(), pose.translation() * 1000.0);
-        photographs.push(Entry {
+        photographs.push(PhotographEntry {
             image: file,
             camera: "camera.json".to_owned(),
             cam_R_m2c: std::array::from_fn(|i| rotation[(i / 3, i % 3)]),
             cam_t_m2c: [t.x, t.y, t.z],
             mask: Some(mask_file),
+            depth: None,
+            depth_scale: None,
         });
         if number == 0 {
             write_atomically(&folder.join("camera.json"), serde_json::to_string_pretty(camera)?.as_bytes())?;
         }
     }
-    let file = PhotographFile { mesh: "../mesh.ply".to_owned(), unit: "m".to_owned(), photographs };
+    let file =
+        PhotographFile { mesh: Some("../mesh.ply".to_owned()), unit: Some("m".to_owned()), photographs };
     let text = serde_json::to_string_pretty(&file)?;
     Ok(write_atomically(&folder.join("photographs.json"), text.as_bytes())?)
 }
@@ -142,8 +128,7 @@ pub fn export_bop(object: &Object, id: u32, dataset: &Path) -> Result<usize, Tea
     write_model(mesh, info, id, dataset).map_err(|e| failed(e.to_string()))?;
     let Some(file) = photographs_of(object) else { return Ok(0) };
     let wrong = |what: String| TeachError::File { path: file.clone(), what };
-    let text = read_regular_text(&file, limits::SMALL_TEXT).map_err(|e| wrong(e.to_string()))?;
-    let list: PhotographFile = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let list = PhotographFile::read(&file).map_err(|e| wrong(e.to_string()))?;
     let folder = file.parent().unwrap_or(Path::new(""));
     let mut scene = SceneWriter::new(dataset, "train_real", 1);
     for (number, entry) in list.photographs.iter().enumerate() {
@@ -158,9 +143,7 @@ pub fn export_bop(object: &Object, id: u32, dataset: &Path) -> Result<usize, Tea
             Some(mask) => Some(read_mask(&folder.join(mask))?),
             None => None,
         };
-        let pose =
-            Pose::from_parts(&Mat3::from_row_slice(&entry.cam_R_m2c), Vec3::from(entry.cam_t_m2c) * 1e-3)
-                .map_err(|e| wrong(format!("field photographs[{number}].cam_R_m2c: {e}")))?;
+        let pose = entry.pose().map_err(|e| wrong(e.to_string()))?;
         let truth = [GroundTruth::new(id, pose)];
         let masks = mask.map(|m| vec![m]);
         let image = NewImage {

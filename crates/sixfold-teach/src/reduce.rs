@@ -23,9 +23,10 @@ pub(crate) fn reduced_photograph(photograph: PosedPhotograph, side: usize) -> Po
         ((p.x.round() as usize).min(width - 1), (p.y.round() as usize).min(height - 1))
     };
     let depth = photograph.depth.map(|d| Arc::new(Image::from_fn(size.0, size.1, |x, y| d[nearest(x, y)])));
-    let mask = photograph.mask.map(|m| Arc::new(Image::from_fn(size.0, size.1, |x, y| m[nearest(x, y)])));
+    let of_mask = |m: Arc<Mask>| Arc::new(Image::from_fn(size.0, size.1, |x, y| m[nearest(x, y)]));
+    let (mask, hidden) = (photograph.mask.map(of_mask), photograph.hidden.map(of_mask));
     let image = Arc::new(reduced(&photograph.image, size, sx, &source));
-    PosedPhotograph { image, depth, mask, camera, ..photograph }
+    PosedPhotograph { image, depth, mask, hidden, camera, ..photograph }
 }
 
 /// A photograph with at most `side` pixels along its longer side and, where its lens is known, without distortion, with the camera that

@@ -2,12 +2,13 @@
 
 use rayon::prelude::*;
 use sixfold_board::Board;
-use sixfold_geometry::{DepthImage, Image, Mask, Pose, Progress, Vec3};
+use sixfold_geometry::{DepthImage, Image, Mask, Plane, Pose, Progress, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Culling, RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::error::TeachError;
 use crate::fusion::carved;
+use crate::given::{given_masks, searched_volume};
 use crate::grid::Grid;
 use crate::hull::{Outlined, hull};
 use crate::paint::{centre, finer, painted};
@@ -27,6 +28,8 @@ const APART: f64 = 50.0;
 const SECOND: f64 = 0.2;
 /// Parts whose boxes are this near are of one object, metres.
 const TOGETHER: f64 = 0.015;
+/// Why a photograph is left out whose mask shows nothing.
+pub(crate) const NOT_IN_SIGHT: &str = "the object is not in sight";
 /// Overlap of a mask with what all others say, below which it contradicts them.
 const SAME: f64 = 0.7;
 /// How high above the board an object reaches at most, as a fraction of the sheet's longer side.
@@ -82,8 +85,10 @@ pub struct Capture {
     pub photographs: Vec<PosedPhotograph>,
     /// The board it stands on; the world is then the board's frame.
     pub board: Option<Board>,
-    /// Where the object is searched for.
-    pub volume: Volume,
+    /// The plane on which the object stands, its normal upwards; `None` where that is not known.
+    pub floor: Option<Plane>,
+    /// Where the object is searched for; `None` to compute that from masks.
+    pub volume: Option<Volume>,
 }
 
 impl Capture {
@@ -92,11 +97,22 @@ impl Capture {
         let [low, high] = board.extent();
         let height = HEIGHT * (high - low).max();
         let volume = Volume { low: Vec3::new(low.x, low.y, 0.0), high: Vec3::new(high.x, high.y, height) };
-        Capture { photographs, board: Some(board), volume }
+        Capture {
+            photographs,
+            board: Some(board),
+            floor: Some(Plane { normal: Vec3::z(), offset: 0.0 }),
+            volume: Some(volume),
+        }
     }
 
-    fn floor(&self) -> Option<f64> {
-        self.board.as_ref().map(|_| TABLE)
+    /// An object in photographs with poses from elsewhere.
+    pub fn without_board(photographs: Vec<PosedPhotograph>, floor: Option<Plane>) -> Capture {
+        Capture { photographs, board: None, floor, volume: None }
+    }
+
+    /// Below this plane there is no object.
+    fn floor(&self) -> Option<Plane> {
+        self.floor.map(|floor| Plane { offset: floor.offset + TABLE, ..floor })
     }
 }
 
@@ -144,11 +160,21 @@ pub fn segment(
     options: &ShapeOptions,
     progress: &dyn Progress,
 ) -> Result<Segmentation, TeachError> {
-    check_photographs(capture)?;
+    let searched = match capture.volume {
+        Some(volume) => volume,
+        None => {
+            check_count(capture)?;
+            searched_volume(capture, segmenter, options)?
+        }
+    };
+    check_photographs(capture, &searched)?;
+    if let Some(given) = given_masks(capture, &searched) {
+        return Ok(given);
+    }
     let all: Vec<usize> = (0..capture.photographs.len()).collect();
-    let volume = rough_volume(capture, &all, segmenter, options, progress)?;
+    let volume = rough_volume(capture, &searched, segmenter, options, progress)?;
     // Once more in views of the object alone, with what is around it.
-    let around = volume.scaled(1.3).within(&capture.volume);
+    let around = volume.scaled(1.3).within(&searched);
     let views = views_of(capture, &around, options.fine_side, &all);
     let views = with_cues(views, capture, segmenter, progress, all.len())?;
     let odds: Vec<(View, Image<f32>)> = views.iter().map(|(_, v, c)| (v.clone(), c.sum())).collect();
@@ -169,17 +195,25 @@ fn no_object() -> TeachError {
     TeachError::NoObject { hint: String::new() }
 }
 
-fn check_photographs(capture: &Capture) -> Result<(), TeachError> {
+fn with_depth(capture: &Capture) -> bool {
+    capture.photographs.iter().any(|p| p.depth.is_some())
+}
+
+fn check_count(capture: &Capture) -> Result<(), TeachError> {
     let found = capture.photographs.len();
-    let with_depth = capture.photographs.iter().any(|p| p.depth.is_some());
-    let least = if with_depth { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
+    let least = if with_depth(capture) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
     if found < least {
         return Err(TeachError::TooFewPhotographs { found, least, reasons: String::new() });
     }
-    if with_depth {
+    Ok(())
+}
+
+fn check_photographs(capture: &Capture, searched: &Volume) -> Result<(), TeachError> {
+    check_count(capture)?;
+    if with_depth(capture) {
         return Ok(());
     }
-    let centre = capture.volume.centre();
+    let centre = searched.centre();
     let towards: Vec<Vec3> = capture
         .photographs
         .iter()
@@ -215,19 +249,20 @@ fn with_cues(
 /// The box around the object.
 fn rough_volume(
     capture: &Capture,
-    all: &[usize],
+    searched: &Volume,
     segmenter: &dyn Segmenter,
     options: &ShapeOptions,
     progress: &dyn Progress,
 ) -> Result<Volume, TeachError> {
-    let views = views_of(capture, &capture.volume, options.coarse_side, all);
-    let least = if capture.photographs.iter().any(|p| p.depth.is_some()) { 1 } else { FEWEST_PHOTOGRAPHS };
+    let all: Vec<usize> = (0..capture.photographs.len()).collect();
+    let views = views_of(capture, searched, options.coarse_side, &all);
+    let least = if with_depth(capture) { 1 } else { FEWEST_PHOTOGRAPHS };
     if views.len() < least {
         return Err(TeachError::TooFewPhotographs { found: views.len(), least, reasons: String::new() });
     }
     let views = with_cues(views, capture, segmenter, progress, 0)?;
     let odds: Vec<(View, Image<f32>)> = views.into_iter().map(|(_, v, c)| (v, c.sum())).collect();
-    let shape = consensus(&odds, &capture.volume, options.coarse_cells, capture.floor());
+    let shape = consensus(&odds, searched, options.coarse_cells, capture.floor());
     let parts = objects(&shape);
     let Some(first) = parts.first() else { return Err(no_object()) };
     if let Some(second) = parts.get(1) {
@@ -238,7 +273,7 @@ fn rough_volume(
         }
     }
     let found = shape.volume_of(first).grown(2.0 * shape.step);
-    Ok(found.within(&capture.volume))
+    Ok(found.within(searched))
 }
 
 /// Parts of a rough shape that lie apart, largest first: parts of one object may hang together by too little to be seen.
@@ -290,7 +325,7 @@ fn consistent(
     let given = |i: usize| views[i].0.mask.is_some();
     let mut used: Vec<usize> = (0..views.len()).filter(|i| found[*i].as_slice().contains(&true)).collect();
     for i in (0..views.len()).filter(|i| !used.contains(i)) {
-        left_out.push((numbers[i], "the object is not in sight".to_owned()));
+        left_out.push((numbers[i], NOT_IN_SIGHT.to_owned()));
     }
     // The shape of what is left decides again, as the first one is cut by a wrong mask too.
     for _ in 0..3 {
@@ -496,12 +531,11 @@ fn depth_of(
     let depths: Vec<DepthImage> = all
         .iter()
         .zip(&masks)
-        .map(|(depth, mask)| {
-            Image::from_fn(
-                depth.width(),
-                depth.height(),
-                |x, y| if mask[(x, y)] { depth[(x, y)] } else { 0.0 },
-            )
+        .zip(&views)
+        .map(|((depth, mask), view)| {
+            Image::from_fn(depth.width(), depth.height(), |x, y| {
+                if mask[(x, y)] && !view.is_hidden((x, y)) { depth[(x, y)] } else { 0.0 }
+            })
         })
         .collect();
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();

@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 use sixfold_board::Board;
-use sixfold_geometry::{Image, Mask, RgbImage, Vec3};
+use sixfold_geometry::{Image, Mask, Plane, RgbImage, Vec3};
 use sixfold_nn::salient::SalientNetwork;
 use sixfold_nn::weights::WeightsError;
 
@@ -69,7 +69,11 @@ impl Cues {
         segmenter: &dyn Segmenter,
     ) -> Result<Cues, Box<dyn std::error::Error + Send + Sync>> {
         if let Some(mask) = &view.mask {
-            let certain = mask.map(|inside| if *inside { MOST } else { -MOST });
+            let certain = Image::from_fn(mask.width(), mask.height(), |x, y| match mask[(x, y)] {
+                true if view.is_hidden((x, y)) => 0.0,
+                true => MOST,
+                false => -MOST,
+            });
             let nothing = Image::filled(mask.width(), mask.height(), 0.0);
             return Ok(Cues { salience: certain, board: nothing });
         }
@@ -310,10 +314,10 @@ pub(crate) fn consensus(
     views: &[(View, Image<f32>)],
     volume: &Volume,
     cells: usize,
-    floor: Option<f64>,
+    floor: Option<Plane>,
 ) -> Grid {
     let grid = Grid::new(volume, cells, |point| {
-        if floor.is_some_and(|floor| point.z < floor) {
+        if floor.is_some_and(|floor| floor.distance(point) < 0.0) {
             return 1.0;
         }
         let (mut sum, mut shown, mut empty) = (0.0, 0, 0);
@@ -405,7 +409,7 @@ pub(crate) fn covered(view: &View, shape: &Grid) -> Mask {
 }
 
 /// The largest part of a mask and others of at least a fifth of it, with holes of fewer pixels than a fiftieth filled.
-fn without_specks(mask: &Mask) -> Mask {
+pub(crate) fn without_specks(mask: &Mask) -> Mask {
     let inside = parts(mask, true);
     let largest = inside.first().map_or(0, Vec::len);
     let (w, h) = mask.size();

@@ -8,15 +8,15 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use sixfold_board::{Board, Paper};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Camera, Mask, Pose, RgbImage};
-use sixfold_io::{limits, read_depth, read_mask, read_regular_text, read_rgb};
+use sixfold_geometry::{Camera, Mask, Plane, Pose, RgbImage, Vec3};
+use sixfold_io::{limits, read_depth, read_mask_and_hidden, read_regular_text, read_rgb};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 
 use crate::error::TeachError;
 use crate::record::Posed;
 use crate::reduce::reduced_photograph;
 use crate::shape::Capture;
-use crate::teaching::{By, Photograph, ShapeFacts, TeachOptions};
+use crate::teaching::{By, Photograph, ShapeFacts, TeachOptions, World};
 use crate::view::PosedPhotograph;
 
 /// The only version of `teaching.json` there is.
@@ -30,14 +30,20 @@ pub(crate) struct State {
     pub version: u32,
     /// What the ruler on the printed board measures, metres.
     pub ruler: Option<f64>,
+    /// What the poses are relative to.
+    #[serde(default)]
+    pub world: World,
     /// A camera that was given.
     pub given_camera: Option<Camera>,
     pub photographs: Vec<Photograph>,
     /// How often something was changed.
     #[serde(default)]
     pub revision: u64,
-    /// What was found: paper, camera, error in pixels.
-    pub located: Option<(Paper, Camera, f64)>,
+    /// What was found: paper, unless there is no board; camera; error in pixels.
+    pub located: Option<(Option<Paper>, Camera, f64)>,
+    /// The plane on which the object stands, where there is no board: its normal, and its distance from the origin along it, metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub floor: Option<[f64; 4]>,
     /// The space that holds the object: least and largest coordinates.
     pub volume: Option<[[f64; 3]; 2]>,
     pub shape: Option<ShapeFacts>,
@@ -112,11 +118,16 @@ impl Snapshot {
         self.state.located.as_ref().map(|(_, camera, _)| camera)
     }
 
-    /// The board, once it is found.
+    /// The board, once it is found, if there is one.
     pub fn board(&self) -> Option<Board> {
-        let (paper, ..) = self.state.located.as_ref()?;
-        let board = Board::new(*paper);
+        let paper = self.state.located.as_ref()?.0?;
+        let board = Board::new(paper);
         Some(self.state.ruler.and_then(|ruler| board.with_ruler(ruler)).unwrap_or(board))
+    }
+
+    /// The plane on which the object stands, where there is no board and if it is known.
+    pub fn floor(&self) -> Option<Plane> {
+        self.state.floor.map(|[x, y, z, offset]| Plane { normal: Vec3::new(x, y, z), offset })
     }
 
     /// A photograph's pose, if it has one.
@@ -132,7 +143,6 @@ impl Snapshot {
         let Some((_, camera, _)) = &self.state.located else {
             return Err(TeachError::Order { missing: "find the poses of the photographs" });
         };
-        let board = self.board().ok_or(TeachError::Order { missing: "find the board" })?;
         let (mut photographs, mut numbers) = (vec![], vec![]);
         for (number, p) in self.state.photographs.iter().enumerate() {
             let Some(pose) = p.pose().filter(|_| !p.left_out_by_person) else { continue };
@@ -144,22 +154,31 @@ impl Snapshot {
                 Some((file, unit)) => Some(read_depth(&self.path("depth", file), *unit)?),
                 None => None,
             };
-            let mask = match p.mask_by {
-                Some(By::Person) => Some(read_mask(&self.path("masks", &format!("{number:06}.png")))?),
-                _ => None,
+            let (mask, hidden) = match p.mask_by {
+                Some(By::Person) => {
+                    let (mask, hidden) =
+                        read_mask_and_hidden(&self.path("masks", &format!("{number:06}.png")))?;
+                    (Some(Arc::new(mask)), hidden.map(Arc::new))
+                }
+                _ => (None, None),
             };
             let posed = PosedPhotograph {
                 name: p.name.clone(),
                 image: Arc::new(image),
                 depth: depth.map(Arc::new),
-                mask: mask.map(Arc::new),
+                mask,
+                hidden,
                 camera: *camera,
                 camera_from_world: pose,
             };
             photographs.push(reduced_photograph(posed, SIDE));
             numbers.push(number);
         }
-        Ok((Capture::on_board(photographs, board), numbers))
+        let capture = match self.board() {
+            Some(board) => Capture::on_board(photographs, board),
+            None => Capture::without_board(photographs, self.floor()),
+        };
+        Ok((capture, numbers))
     }
 
     /// What is known of the mesh, once it is made.
@@ -183,7 +202,7 @@ impl Snapshot {
         read_mesh(&path, Unit::Metre).map_err(|e| TeachError::File { path, what: e.to_string() })
     }
 
-    /// A photograph's mask, without lens distortion, once it is found.
+    /// The pixels of a photograph that certainly show the object, without lens distortion, once they are found.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -192,7 +211,13 @@ impl Snapshot {
         if self.state.photographs[number].mask_by.is_none() {
             return Ok(None);
         }
-        Ok(Some(read_mask(&self.path("masks", &format!("{number:06}.png")))?))
+        let (mask, hidden) = read_mask_and_hidden(&self.path("masks", &format!("{number:06}.png")))?;
+        Ok(Some(match hidden {
+            Some(hidden) => {
+                Mask::from_fn(mask.width(), mask.height(), |x, y| mask[(x, y)] && !hidden[(x, y)])
+            }
+            None => mask,
+        }))
     }
 
     /// The photographs that are used, reduced, with mask and the pose of the object in each.
@@ -243,7 +268,7 @@ impl Snapshot {
 
     /// What it was begun with.
     pub fn options(&self) -> TeachOptions {
-        TeachOptions { ruler: self.state.ruler, camera: self.state.given_camera }
+        TeachOptions { ruler: self.state.ruler, camera: self.state.given_camera, world: self.state.world }
     }
 
     /// A number that is another one after each change.

@@ -13,10 +13,14 @@
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Mask, Pose, Progress, Vec3};
-use sixfold_io::{ImageFile, WriteLock, read_mask, read_rgb, write_atomically, write_mask};
+use sixfold_io::{
+    ImageFile, WriteLock, read_mask, read_mask_and_hidden, read_rgb, write_atomically, write_mask,
+    write_mask_and_hidden,
+};
 use sixfold_mesh::{Mesh, PlyFormat, Unit, read_mesh, write_ply};
 
 use crate::error::TeachError;
@@ -94,6 +98,17 @@ pub struct ShapeFacts {
     pub with_depth: f64,
 }
 
+/// What the poses of the photographs are relative to.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum World {
+    /// The printed board, which the photographs show.
+    #[default]
+    Board,
+    /// Poses are given with [`Teaching::set_pose`], in a frame of the giver's choice.
+    Given,
+}
+
 /// What is known before the first photograph.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct TeachOptions {
@@ -101,6 +116,8 @@ pub struct TeachOptions {
     pub ruler: Option<f64>,
     /// The camera; `None` to find it from the photographs.
     pub camera: Option<Camera>,
+    /// What the poses are relative to.
+    pub world: World,
 }
 
 /// A folder in which an object is taught. One process at a time changes it.
@@ -116,6 +133,19 @@ impl Deref for Teaching {
     fn deref(&self) -> &Snapshot {
         &self.known
     }
+}
+
+/// A value as it is read again from the file: the last digit of a number may be another one.
+fn as_kept<T: Serialize + DeserializeOwned>(value: &T) -> Option<T> {
+    serde_json::from_str(&serde_json::to_string(value).ok()?).ok()
+}
+
+/// Whether two values are the same once both were kept.
+fn is_same<T: Serialize + DeserializeOwned + PartialEq>(a: &T, b: &T) -> bool {
+    a == b
+        || as_kept(a) == as_kept(b)
+        || as_kept(a).is_some_and(|a| a == *b)
+        || as_kept(b).is_some_and(|b| *a == b)
 }
 
 fn rows(pose: &Pose) -> [[f64; 4]; 4] {
@@ -139,10 +169,12 @@ impl Teaching {
             let state = State {
                 version: VERSION,
                 ruler: options.ruler,
+                world: options.world,
                 given_camera: options.camera,
                 photographs: vec![],
                 revision: 0,
                 located: None,
+                floor: None,
                 volume: None,
                 shape: None,
                 outdated: None,
@@ -151,12 +183,14 @@ impl Teaching {
             Snapshot { folder, state }
         };
         let mut teaching = Teaching { known, _lock: lock };
-        let given = options.ruler.is_some() || options.camera.is_some();
+        let given = options.ruler.is_some() || options.camera.is_some() || options.world != World::default();
         let same = teaching.known.state.ruler == options.ruler
-            && teaching.known.state.given_camera == options.camera;
+            && teaching.known.state.world == options.world
+            && is_same(&teaching.known.state.given_camera, &options.camera);
         if given && !same {
             teaching.known.state.ruler = options.ruler;
             teaching.known.state.given_camera = options.camera;
+            teaching.known.state.world = options.world;
             teaching.forget_from(Step::Poses);
         }
         teaching.save()?;
@@ -254,6 +288,38 @@ impl Teaching {
         if self.known.state.located.is_some() {
             return Ok(());
         }
+        match self.known.state.world {
+            World::Board => self.locate_by_board(progress),
+            World::Given => self.take_given_poses(),
+        }
+    }
+
+    /// Poses are those that were given.
+    fn take_given_poses(&mut self) -> Result<(), TeachError> {
+        let camera = self.known.state.given_camera.ok_or(TeachError::Order { missing: "give the camera" })?;
+        for photograph in &mut self.known.state.photographs {
+            let (width, height) = photograph.size.unwrap_or((camera.width, camera.height));
+            photograph.left_out = if photograph.pose_by != Some(By::Person) {
+                Some("no pose was given".to_owned())
+            } else if (width, height) != (camera.width, camera.height) {
+                Some(format!(
+                    "{width}x{height} pixels, the camera is that of {}x{}: expected whole images of one camera",
+                    camera.width, camera.height
+                ))
+            } else {
+                None
+            };
+        }
+        if self.known.state.photographs.iter().all(|p| p.left_out.is_some()) {
+            let found =
+                TeachError::TooFewPhotographs { found: 0, least: self.fewest(), reasons: String::new() };
+            return Err(self.with_reasons(found));
+        }
+        self.known.state.located = Some((None, camera, 0.0));
+        self.save()
+    }
+
+    fn locate_by_board(&mut self, progress: &dyn Progress) -> Result<(), TeachError> {
         let count = self.known.state.photographs.len();
         let mut seen = vec![];
         for (done, photograph) in self.known.state.photographs.iter().enumerate() {
@@ -274,7 +340,7 @@ impl Teaching {
             photograph.pose_by = pose.map(|_| By::Program);
             (photograph.camera_from_board, photograph.left_out) = (pose, reason);
         }
-        self.known.state.located = Some((board.paper(), camera, rms));
+        self.known.state.located = Some((Some(board.paper()), camera, rms));
         self.save()
     }
 
@@ -437,18 +503,23 @@ impl Teaching {
             return Err(TeachError::File { path: PathBuf::from(&photograph.name), what });
         }
         let photograph = &mut self.known.state.photographs[number];
-        photograph.camera_from_board = Some(rows(camera_from_board));
+        let given = Some(rows(camera_from_board));
+        if photograph.pose_by == Some(By::Person) && is_same(&photograph.camera_from_board, &given) {
+            return Ok(());
+        }
+        photograph.camera_from_board = given;
         (photograph.pose_by, photograph.left_out) = (Some(By::Person), None);
         self.forget_from(Step::Masks);
         self.save()
     }
 
-    /// Corrects a mask, of the photograph's size, without lens distortion. The mesh is made again; the masks of other photographs
-    /// only where this one reaches beyond the space in which the object was found.
+    /// Corrects a mask, of the photograph's size, without lens distortion; `hidden` is the part of it where something may hide the
+    /// object. The mesh is made again; the masks of other photographs only where this one reaches beyond the space in which the
+    /// object was found.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::MaskSize`], [`TeachError::Io`].
-    pub fn set_mask(&mut self, number: usize, mask: &Mask) -> Result<(), TeachError> {
+    pub fn set_mask(&mut self, number: usize, mask: &Mask, hidden: Option<&Mask>) -> Result<(), TeachError> {
         let size = ImageFile::new(&self.photograph_file(number)?).size()?;
         if mask.size() != size {
             let name = self.known.state.photographs[number].name.clone();
@@ -462,7 +533,13 @@ impl Teaching {
         }
         let path = self.path("masks", &format!("{number:06}.png"));
         sixfold_io::make_folder_of(&path).map_err(|source| TeachError::Io { path: path.clone(), source })?;
-        write_mask(&path, mask)?;
+        if self.known.state.photographs[number].mask_by == Some(By::Person)
+            && read_mask_and_hidden(&path)
+                .is_ok_and(|(old, was_hidden)| old == *mask && was_hidden.as_ref() == hidden)
+        {
+            return Ok(());
+        }
+        write_mask_and_hidden(&path, mask, hidden)?;
         let within = self.is_within(number, mask);
         let photograph = &mut self.known.state.photographs[number];
         photograph.mask_by = Some(By::Person);
@@ -535,7 +612,7 @@ impl Teaching {
             state.volume = None;
         }
         if step <= Step::Poses {
-            (state.located, state.outdated) = (None, None);
+            (state.located, state.floor, state.outdated) = (None, None, None);
             for p in state.photographs.iter_mut().filter(|p| p.pose_by != Some(By::Person)) {
                 (p.camera_from_board, p.pose_by, p.left_out) = (None, None, None);
             }

@@ -17,8 +17,10 @@ pub struct PosedPhotograph {
     pub image: Arc<RgbImage>,
     /// Measured depth in metres, from the same pixels.
     pub depth: Option<Arc<DepthImage>>,
-    /// Where the object is, if somebody said so.
+    /// Where the object is or may be, if somebody said so, without lens distortion.
     pub mask: Option<Arc<Mask>>,
+    /// The part of the mask where something may hide the object: it says nothing there.
+    pub hidden: Option<Arc<Mask>>,
     /// Its camera, with lens distortion.
     pub camera: Camera,
     /// Takes points of the world to the camera's frame.
@@ -94,8 +96,10 @@ pub(crate) struct View {
     pub eye: Vec3,
     /// Metres; 0 where nothing was measured.
     pub depth: Option<DepthImage>,
-    /// A mask that somebody gave.
+    /// A mask that somebody gave: where the object is or may be.
     pub mask: Option<Mask>,
+    /// The part of it where something may hide the object.
+    pub hidden: Option<Mask>,
 }
 
 impl View {
@@ -129,13 +133,25 @@ impl View {
         let depth = photograph.depth.as_ref().map(|depth| {
             Image::from_fn(width, height, |x, y| nearest(x, y).map_or(0.0, |pixel| depth[pixel]))
         });
-        let mask = photograph
-            .mask
-            .as_ref()
-            .map(|mask| Image::from_fn(width, height, |x, y| nearest(x, y).is_some_and(|pixel| mask[pixel])));
+        // Masks have no lens distortion.
+        let of_mask = |mask: &Arc<Mask>| {
+            Image::from_fn(width, height, |x, y| {
+                let (u, v) = ((x as f64 + 0.5) / scale + low.x, (y as f64 + 0.5) / scale + low.y);
+                nearest_pixel(&Vec2::new(u, v), mask.width(), mask.height()).is_some_and(|pixel| mask[pixel])
+            })
+        };
+        let (mask, hidden) = (photograph.mask.as_ref().map(of_mask), photograph.hidden.as_ref().map(of_mask));
         let image = reduced(&photograph.image, (width, height), 1.0 / scale, &source);
         let eye = photograph.camera_from_world.inverse().translation();
-        Some(View { image, camera, camera_from_world: photograph.camera_from_world, eye, depth, mask })
+        Some(View {
+            image,
+            camera,
+            camera_from_world: photograph.camera_from_world,
+            eye,
+            depth,
+            mask,
+            hidden,
+        })
     }
 
     /// Where a point of the world is seen, and how deep; `None` behind the camera or outside the view.
@@ -144,6 +160,11 @@ impl View {
         let pixel = self.camera.project(&p)?;
         let (w, h) = (self.camera.width as f64 - 1.0, self.camera.height as f64 - 1.0);
         (pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x <= w && pixel.y <= h).then_some((pixel, p.z))
+    }
+
+    /// Whether something may hide the object at a pixel.
+    pub fn is_hidden(&self, pixel: (usize, usize)) -> bool {
+        self.hidden.as_ref().is_some_and(|hidden| hidden[pixel])
     }
 
     /// The point of the world that a pixel shows at a depth, metres.
@@ -207,4 +228,35 @@ fn neighbours(x: f64, length: usize) -> (usize, usize, f64) {
     let x = x.clamp(0.0, length as f64 - 1.0);
     let low = x.floor();
     (low as usize, (low as usize + 1).min(length - 1), x - low)
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::BrownConrady;
+
+    use super::*;
+
+    #[test]
+    fn masks_are_those_of_the_photograph_without_distortion() {
+        let distortion = Some(BrownConrady { k1: 0.4, ..BrownConrady::default() });
+        let camera = Camera { fx: 200.0, fy: 200.0, cx: 99.5, cy: 74.5, width: 200, height: 150, distortion };
+        let left = Image::from_fn(200, 150, |x, _| x < 40);
+        let photograph = PosedPhotograph {
+            name: "p".to_owned(),
+            image: Arc::new(Image::filled(200, 150, [0; 3])),
+            depth: None,
+            mask: Some(Arc::new(left.clone())),
+            hidden: Some(Arc::new(left)),
+            camera,
+            camera_from_world: Pose::from_translation(Vec3::new(0.0, 0.0, 1.0)),
+        };
+        let wide = Volume { low: Vec3::new(-2.0, -2.0, 0.0), high: Vec3::new(2.0, 2.0, 0.1) };
+        let view = View::new(&photograph, &wide, 200).unwrap();
+        // The border lies at column 39.5 of the pinhole's pixels, 60 pixels left of the centre.
+        let border = (view.camera.cx - 60.0 * view.camera.fx / 200.0).round() as usize;
+        let row = view.camera.height / 2;
+        let mask = view.mask.as_ref().unwrap();
+        assert!(mask[(border - 1, row)] && !mask[(border + 1, row)]);
+        assert!(view.is_hidden((border - 1, row)) && !view.is_hidden((border + 1, row)));
+    }
 }

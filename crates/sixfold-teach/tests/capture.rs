@@ -9,7 +9,7 @@ use sixfold_mesh::Mesh;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
 use sixfold_teach::{
     By, Capture, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, Snapshot, TeachError,
-    TeachOptions, Teaching, export_bop, photographs_of, reconstruct, segment,
+    TeachOptions, Teaching, World, export_bop, photographs_of, reconstruct, segment,
 };
 
 fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
@@ -189,8 +189,11 @@ fn a_body_is_taught_stored_and_exported_and_a_second_run_does_nothing_again() {
 fn corrections_are_kept_and_what_they_change_is_made_again() {
     let truth = photographs();
     let dir = tempfile::tempdir().unwrap();
-    let mut teaching =
-        Teaching::open(dir.path(), &TeachOptions { camera: Some(options().camera), ruler: None }).unwrap();
+    let mut teaching = Teaching::open(
+        dir.path(),
+        &TeachOptions { camera: Some(options().camera), ..TeachOptions::default() },
+    )
+    .unwrap();
     for (i, file) in truth.files.iter().enumerate() {
         teaching.add_photograph(&format!("p{i}.png"), file).unwrap();
     }
@@ -198,11 +201,11 @@ fn corrections_are_kept_and_what_they_change_is_made_again() {
     assert!(matches!(teaching.find_masks(&Salient::new(), &coarse(), &()), Err(TeachError::Order { .. })));
     teaching.locate(&()).unwrap();
     for (i, mask) in truth.masks.iter().enumerate() {
-        teaching.set_mask(i, mask).unwrap();
+        teaching.set_mask(i, mask, None).unwrap();
     }
     let small = Image::filled(3, 3, true);
-    assert!(matches!(teaching.set_mask(0, &small), Err(TeachError::MaskSize { .. })));
-    assert!(matches!(teaching.set_mask(99, &small), Err(TeachError::NoPhotograph { index: 99, .. })));
+    assert!(matches!(teaching.set_mask(0, &small, None), Err(TeachError::MaskSize { .. })));
+    assert!(matches!(teaching.set_mask(99, &small, None), Err(TeachError::NoPhotograph { index: 99, .. })));
     teaching.set_left_out(9, true).unwrap();
     // With masks of all photographs nobody has to look for them.
     let salient = Salient::new();
@@ -238,7 +241,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     assert!(red(&snapshot.overlay(3, 320).unwrap()) > 50);
     assert_eq!(snapshot.image(3, 320).unwrap().0.size(), (320, 240));
     // A mask changes the mesh alone; the old mesh stays to be shown.
-    teaching.set_mask(3, &truth.masks[3]).unwrap();
+    teaching.set_mask(3, &truth.masks[3], None).unwrap();
     let snapshot = Snapshot::read(dir.path()).unwrap();
     assert!(snapshot.shape().is_none() && snapshot.last_mesh().unwrap().is_some());
     assert_eq!(snapshot.photographs()[3].mask_by, Some(By::Person));
@@ -250,7 +253,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     assert!(Snapshot::read(dir.path()).unwrap().shape().is_some());
     // One that reaches beyond the space of the object is seen by all photographs.
     let everywhere = Image::filled(640, 480, true);
-    teaching.set_mask(4, &everywhere).unwrap();
+    teaching.set_mask(4, &everywhere, None).unwrap();
     assert!(teaching.photographs()[0].mask_by.is_none());
     teaching.forget_corrections(4).unwrap();
     assert_eq!(teaching.photographs()[4].mask_by, None);
@@ -273,6 +276,7 @@ fn posed(images: &[RgbImage], poses: &[Pose]) -> Vec<PosedPhotograph> {
         image: Arc::new(image.clone()),
         depth: None,
         mask: None,
+        hidden: None,
         camera: options().camera,
         camera_from_world: *pose,
     };
@@ -351,6 +355,7 @@ fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
                 image: Arc::new(Image::filled(640, 480, [90; 3])),
                 depth: Some(Arc::new(sixfold_render::render_depth(&there, &pose, &options.camera))),
                 mask: Some(Arc::new(capture.mask(i).unwrap())),
+                hidden: None,
                 camera: options.camera,
                 camera_from_world: pose,
             }
@@ -422,4 +427,103 @@ fn a_mesh_that_is_there_already_is_laid_into_the_photographs_and_coloured_by_the
     teaching.set_mesh(Some(&rod)).unwrap();
     let error = teaching.reconstruct(&coarse(), &()).unwrap_err();
     assert!(matches!(error, TeachError::MeshDoesNotFit { .. }), "{error}");
+}
+
+/// The right half of each mask hidden by something in every second photograph.
+fn half_hidden() -> Vec<(Mask, Option<Mask>)> {
+    let cut = |(i, mask): (usize, &Mask)| {
+        let [x, _, width, _] = mask.bounding_box().unwrap();
+        let before = Mask::from_fn(mask.width(), mask.height(), |u, _| u > x + width / 2);
+        let either = Mask::from_fn(mask.width(), mask.height(), |u, v| mask[(u, v)] || before[(u, v)]);
+        if i % 2 == 0 { (mask.clone(), None) } else { (either, Some(before)) }
+    };
+    photographs().masks.iter().enumerate().map(cut).collect()
+}
+
+#[test]
+fn poses_and_masks_that_are_given_need_no_board_and_what_is_hidden_cuts_nothing() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let options =
+        TeachOptions { camera: Some(options().camera), world: World::Given, ..TeachOptions::default() };
+    let mut teaching = Teaching::open(dir.path(), &options).unwrap();
+    // In the object's own frame, which no board knows.
+    let pose = |i: usize| {
+        let (p, b) = (&truth.camera_from_board[i], &truth.board_from_object);
+        Pose::new(p.rotation() * b.rotation(), p.transform_point(&b.translation()))
+    };
+    let give = |teaching: &mut Teaching| {
+        for (i, (mask, hidden)) in half_hidden().iter().enumerate() {
+            teaching.add_photograph(&format!("p{i}.png"), &truth.files[i]).unwrap();
+            teaching.set_pose(i, &pose(i)).unwrap();
+            teaching.set_mask(i, mask, hidden.as_ref()).unwrap();
+        }
+    };
+    give(&mut teaching);
+    let salient = Salient::new();
+    teaching.locate(&()).unwrap();
+    teaching.find_masks(&salient, &coarse(), &()).unwrap();
+    assert_eq!(salient.calls(), 0, "masks were given");
+    let rough = ShapeOptions { stereo: false, ..coarse() };
+    teaching.reconstruct(&rough, &()).unwrap();
+    let (low, high) = box_of(&teaching);
+    let (true_low, true_high) = body().bounding_box();
+    for k in 0..3 {
+        assert!(low[k] < true_low[k] + 1e-3 && high[k] > true_high[k] - 1e-3, "cut: {low} {high}");
+        // Nothing is seen from below, and no plane is known.
+        let most = if k == 2 { 0.05 } else { 0.015 };
+        assert!(low[k] > true_low[k] - most && high[k] < true_high[k] + 0.015, "{low} {high}");
+    }
+    // Where something hides the object, its colours are not the object's, and its mask does not show it.
+    let mask = teaching.mask(1).unwrap().unwrap();
+    let hidden = half_hidden()[1].1.clone().unwrap();
+    assert!(mask.as_slice().iter().zip(hidden.as_slice()).all(|(m, h)| !(*m && *h)));
+    // The same again changes nothing, in another run too.
+    let revision = teaching.revision();
+    give(&mut teaching);
+    assert!(teaching.shape().is_some() && teaching.revision() >= revision);
+    drop(teaching);
+    let mut again = Teaching::open(dir.path(), &options).unwrap();
+    give(&mut again);
+    assert!(again.shape().is_some(), "a second run begins nothing again");
+    // The same masks without a word of what hides the object cut it in two.
+    for (i, (mask, hidden)) in half_hidden().iter().enumerate() {
+        let certain = Mask::from_fn(mask.width(), mask.height(), |x, y| {
+            mask[(x, y)] && !hidden.as_ref().is_some_and(|h| h[(x, y)])
+        });
+        again.set_mask(i, &certain, None).unwrap();
+    }
+    again.find_masks(&salient, &coarse(), &()).unwrap();
+    again.reconstruct(&rough, &()).unwrap();
+    let (low, high) = box_of(&again);
+    assert!((high - low).min() < (true_high - true_low).min() - 0.01, "{low} {high}");
+}
+
+/// The box of a taught mesh, in the frame of the poses.
+fn box_of(teaching: &Teaching) -> (Vec3, Vec3) {
+    let rows = teaching.shape().unwrap().board_from_object;
+    let shift = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
+    teaching.mesh().unwrap().transformed(&shift).bounding_box()
+}
+
+#[test]
+fn poses_that_are_missing_or_fit_nothing_are_named() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let options =
+        TeachOptions { camera: Some(options().camera), world: World::Given, ..TeachOptions::default() };
+    let mut teaching = Teaching::open(dir.path(), &options).unwrap();
+    for (i, file) in truth.files.iter().enumerate().take(5) {
+        teaching.add_photograph(&format!("p{i}.png"), file).unwrap();
+    }
+    let error = teaching.locate(&()).unwrap_err();
+    assert!(error.to_string().contains("p0.png: no pose was given"), "{error}");
+    // All the same pose: what the masks show has no place in common.
+    for i in 0..5 {
+        teaching.set_pose(i, &truth.camera_from_board[0]).unwrap();
+        teaching.set_mask(i, &truth.masks[i], None).unwrap();
+    }
+    teaching.locate(&()).unwrap();
+    let error = teaching.find_masks(&Salient::new(), &coarse(), &()).unwrap_err();
+    assert!(error.to_string().contains("check the poses"), "{error}");
 }

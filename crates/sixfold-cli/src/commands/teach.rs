@@ -23,13 +23,15 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold board --out board.pdf                         # print it, stand the object on it, photograph it from all sides\n  \
     sixfold teach mug --photographs photographs\n  \
     sixfold teach mug --photographs colour --depth depth --depth-scale 1 --camera camera.json\n  \
+    sixfold teach mug --photographs photographs.json      # with poses, masks and depth from elsewhere\n  \
     sixfold estimate --rgb image.png --camera camera.json --object mug --method views --out out";
 
 #[derive(Debug, Args)]
 pub(crate) struct TeachArguments {
     /// Name of the object: letters, digits, - and _
     pub name: String,
-    /// Photographs of the object on the board (PNG, JPEG), or folders of them: 8 to 40, from all sides
+    /// Photographs of the object on the board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one JSON file that lists
+    /// photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     pub photographs: Vec<PathBuf>,
     /// Depth images from the same places (PNG, 16 bit), or folders of them, in the order of the photographs' names
@@ -103,7 +105,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     let out = a.out.clone().unwrap_or_else(|| Path::new("out/teach").join(&a.name));
     let mut teaching = opened(a, &out)?;
     let options = ShapeOptions { stereo: !a.hull_only, ..ShapeOptions::default() };
-    let bar = Bar::stopped_by_interrupts("finding tags");
+    let bar = Bar::stopped_by_interrupts("finding poses");
     teaching.locate(&bar)?;
     bar.finish();
     let bar = Bar::stopped_by_interrupts("finding the object");
@@ -132,6 +134,28 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
 
 /// The folder with all that was given.
 fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
+    match a.photographs.as_slice() {
+        [file] if file.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => {
+            with_poses(a, file, out)
+        }
+        _ => on_board(a, out),
+    }
+}
+
+/// Photographs with poses, from a file.
+fn with_poses(a: &TeachArguments, file: &Path, out: &Path) -> Result<Teaching> {
+    if a.ruler.is_some() || a.camera.is_some() || !a.depth.is_empty() {
+        bail!(
+            "--ruler, --camera and --depth belong to photographs of the board: {} names what it has",
+            file.display()
+        );
+    }
+    let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
+    Ok(Teaching::open_file(out, file, mesh.as_ref())?)
+}
+
+/// Photographs of the object on the board.
+fn on_board(a: &TeachArguments, out: &Path) -> Result<Teaching> {
     let ruler = ruler_in_metres(a.ruler)?;
     let files = photograph_files(&a.photographs)?;
     let depth = if a.depth.is_empty() { vec![] } else { photograph_files(&a.depth)? };
@@ -146,7 +170,7 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         _ => None,
     };
     let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
-    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera })?;
+    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera, ..TeachOptions::default() })?;
     teaching.set_mesh(mesh.as_ref())?;
     for (i, file) in files.iter().enumerate() {
         let bytes = read_regular(file, limits::IMAGE).with_context(|| file.display().to_string())?;
@@ -156,12 +180,8 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
             teaching.add_depth(number, &bytes, scale / 1000.0)?;
         }
     }
-    // Photographs of an earlier run in this folder that are not given again are not used.
     let given: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
-    for number in 0..teaching.photographs().len() {
-        let left_out = !given.contains(&teaching.photographs()[number].name);
-        teaching.set_left_out(number, left_out)?;
-    }
+    teaching.leave_out_others(&given)?;
     Ok(teaching)
 }
 

@@ -7,6 +7,7 @@ mod mttm;
 mod nol;
 mod pix2pose;
 mod teach;
+mod teach_dataset;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
@@ -42,6 +43,9 @@ pub(crate) enum ReproduceCommand {
     /// Teach objects from simulated photographs; measure poses, meshes and symmetries, and find them in new images
     #[command(after_help = teach::AFTER_HELP)]
     Teach(teach::ReproduceTeachArguments),
+    /// Teach objects of a dataset from a few of its images, without their meshes; measure meshes, and poses in the other images
+    #[command(after_help = teach_dataset::AFTER_HELP)]
+    TeachDataset(teach_dataset::TeachDatasetArguments),
     /// Measure grasps from experience: table 6.2, figure 6.7, learning from an empty store, handles
     #[command(after_help = "Example:\n  \
         sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
@@ -56,6 +60,7 @@ pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
         ReproduceCommand::Mttm(arguments) => mttm::run(arguments, &a.json),
         ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),
         ReproduceCommand::Teach(arguments) => teach::run(arguments, &a.json),
+        ReproduceCommand::TeachDataset(arguments) => teach_dataset::run(arguments, &a.json),
         ReproduceCommand::Dgcm(arguments) => dgcm::run(arguments, &a.json),
     }
 }

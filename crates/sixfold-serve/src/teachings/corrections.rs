@@ -167,8 +167,8 @@ pub(crate) async fn set_mask(
 ) -> Answer<Json<TeachingView>> {
     let body = bytes(&app, body)?;
     app.blocking(move |app| {
-        let mask = ImageFile::of_bytes(std::path::Path::new("mask"), &body).mask();
-        let mask = mask.map_err(|e| ApiError::of_image("mask", &e))?;
+        let mask = ImageFile::of_bytes(std::path::Path::new("mask"), &body).mask_and_hidden();
+        let (mask, hidden) = mask.map_err(|e| ApiError::of_image("mask", &e))?;
         if !mask.as_slice().contains(&true) {
             return Err(ApiError::field(
                 "mask",
@@ -179,8 +179,9 @@ pub(crate) async fn set_mask(
         }
         changed(app, &path, |teaching, number| {
             let size = teaching.photographs()[number].size;
-            let mask = size.and_then(|size| enlarged(&mask, size)).unwrap_or(mask);
-            teaching.set_mask(number, &mask).map_err(|e| of_teach(&e))
+            let enlarged = |mask: Mask| size.and_then(|size| enlarged(&mask, size)).unwrap_or(mask);
+            let (mask, hidden) = (enlarged(mask), hidden.map(enlarged));
+            teaching.set_mask(number, &mask, hidden.as_ref()).map_err(|e| of_teach(&e))
         })
     })
     .await

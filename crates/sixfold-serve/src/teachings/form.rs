@@ -106,7 +106,11 @@ impl<'f> Given<'f> {
             image.map_err(|e| ApiError::of_image("depth", &e))?;
         }
         let most = sizes.iter().max_by_key(|(_, count)| **count).map(|(size, _)| *size);
-        let options = TeachOptions { ruler: ruler(form)?, camera: camera(form, there.or(most))? };
+        let options = TeachOptions {
+            ruler: ruler(form)?,
+            camera: camera(form, there.or(most))?,
+            ..TeachOptions::default()
+        };
         let pairs = photographs.iter().enumerate().map(|(i, p)| (*p, depth.get(i).copied()));
         Ok(Given { photographs: pairs.collect(), depth_unit, options })
     }

@@ -1,0 +1,88 @@
+//! Masks that somebody gave, and where they, or what stands out in whole photographs, say that the object is.
+
+use sixfold_geometry::{Camera, Image, Mask, Pose};
+
+use crate::cones::{Cone, volume_of_masks};
+use crate::error::TeachError;
+use crate::reduce::undistorted;
+use crate::shape::{Capture, NOT_IN_SIGHT, Segmentation, ShapeOptions};
+use crate::silhouette::{Segmenter, without_specks};
+use crate::view::{PosedPhotograph, Volume};
+
+/// Where masks say that the object is: those that were given, or where there are none what stands out in whole photographs.
+pub(crate) fn searched_volume(
+    capture: &Capture,
+    segmenter: &dyn Segmenter,
+    options: &ShapeOptions,
+) -> Result<Volume, TeachError> {
+    let given: Vec<Masked> = capture.photographs.iter().filter_map(Masked::given).collect();
+    let masked = if given.len() >= 2 {
+        given
+    } else {
+        let found = |p| Masked::salient(p, segmenter, options.coarse_side).map_err(TeachError::Masks);
+        capture.photographs.iter().map(found).collect::<Result<_, _>>()?
+    };
+    let cones: Vec<Cone<'_>> = masked.iter().map(Masked::cone).collect();
+    volume_of_masks(&cones).ok_or_else(|| TeachError::NoObject {
+        hint: "; what the masks show has no place in common: check the poses, or take photographs from more sides".to_owned(),
+    })
+}
+
+/// A photograph's mask with all that a cone needs.
+struct Masked {
+    camera: Camera,
+    pose: Pose,
+    mask: Mask,
+    unknown: Option<Mask>,
+}
+
+impl Masked {
+    fn given(p: &PosedPhotograph) -> Option<Masked> {
+        let unknown = p.hidden.as_ref().map(|hidden| (**hidden).clone());
+        Some(Masked { camera: p.camera, pose: p.camera_from_world, mask: certain(p)?, unknown })
+    }
+
+    fn salient(
+        p: &PosedPhotograph,
+        segmenter: &dyn Segmenter,
+        side: usize,
+    ) -> Result<Masked, Box<dyn std::error::Error + Send + Sync>> {
+        let (image, camera) = undistorted(&p.image, Some(&p.camera), side);
+        let mask = without_specks(&segmenter.foreground(&image)?.map(|p| *p > 0.5));
+        Ok(Masked { camera: camera.unwrap_or(p.camera), pose: p.camera_from_world, mask, unknown: None })
+    }
+
+    fn cone(&self) -> Cone<'_> {
+        Cone {
+            camera: &self.camera,
+            camera_from_world: &self.pose,
+            mask: &self.mask,
+            unknown: self.unknown.as_ref(),
+        }
+    }
+}
+
+/// The pixels that certainly show the object, of a photograph whose mask was given.
+pub(crate) fn certain(p: &PosedPhotograph) -> Option<Mask> {
+    let mask = p.mask.as_ref()?;
+    Some(match &p.hidden {
+        Some(hidden) => Image::from_fn(mask.width(), mask.height(), |x, y| {
+            mask[(x, y)] && !hidden.get(x, y).copied().unwrap_or(false)
+        }),
+        None => (**mask).clone(),
+    })
+}
+
+/// The masks, where somebody gave all of them: nothing is searched then.
+pub(crate) fn given_masks(capture: &Capture, volume: &Volume) -> Option<Segmentation> {
+    let certain: Vec<Mask> = capture.photographs.iter().map(certain).collect::<Option<_>>()?;
+    let (mut masks, mut left_out) = (vec![], vec![]);
+    for (number, (photograph, certain)) in capture.photographs.iter().zip(&certain).enumerate() {
+        let in_sight = certain.as_slice().contains(&true);
+        if !in_sight {
+            left_out.push((number, NOT_IN_SIGHT.to_owned()));
+        }
+        masks.push(photograph.mask.as_ref().filter(|_| in_sight).map(|mask| (**mask).clone()));
+    }
+    Some(Segmentation { volume: *volume, masks, left_out })
+}
