@@ -14,6 +14,7 @@ mod distance;
 mod error;
 mod fusion;
 mod grid;
+mod ground;
 mod hull;
 mod located;
 mod paint;
@@ -29,6 +30,8 @@ mod snapshot;
 mod stereo;
 mod surface;
 mod teaching;
+mod unboarded;
+mod upright;
 mod view;
 pub use cones::{Cone, volume_of_masks};
 pub use error::TeachError;
@@ -41,4 +44,7 @@ pub use shape::{
 pub use silhouette::{SalientSegmenter, Segmenter};
 pub use snapshot::Snapshot;
 pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching};
+pub use unboarded::{
+    DepthOf, KnownLength, PutTogether, SeenFeatures, features_of, put_together,
+};
 pub use view::{PosedPhotograph, Volume};
