@@ -116,9 +116,9 @@ fn xfeat(weights: &str, device: &Device) -> Result<XFeat, Box<dyn Error>> {
 
 /// The first image of a batch, whose values are 0 to 1.
 fn image_of(batch: TensorData) -> Result<RgbImage, Box<dyn Error>> {
-    let [_, 3, height, width] = batch.shape.as_slice() else { return Err("expected 3 channels".into()) };
-    let (height, width) = (*height, *width);
-    let values: Vec<f32> = batch.iter::<f32>().collect();
+    let batch = Tensor::<4>::from_data(batch, &Device::default());
+    let [_, 3, height, width] = batch.dims() else { return Err("expected 3 channels".into()) };
+    let values: Vec<f32> = batch.try_into_vec_as()?;
     let at = |x: usize, y: usize, c: usize| (values[(c * height + y) * width + x] * 255.0).round() as u8;
     Ok(RgbImage::from_fn(width, height, |x, y| [0, 1, 2].map(|c| at(x, y, c))))
 }

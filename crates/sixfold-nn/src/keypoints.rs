@@ -196,9 +196,8 @@ impl Maps {
         let of_row = |y: usize| {
             let is_maximum = move |x: usize| {
                 let value = self.heat[y * w + x];
-                let around = |y: usize| {
-                    &self.heat[y * w + x.saturating_sub(REACH)..y * w + (x + REACH + 1).min(w)]
-                };
+                let around =
+                    |y: usize| &self.heat[y * w + x.saturating_sub(REACH)..y * w + (x + REACH + 1).min(w)];
                 value > threshold
                     && (y.saturating_sub(REACH)..(y + REACH + 1).min(h))
                         .all(|y| around(y).iter().all(|v| *v <= value))
@@ -308,7 +307,11 @@ mod tests {
             assert!((found.scores[i] - score).abs() < 0.005, "{i}: {} {score}", found.scores[i]);
             let descriptor = &found.descriptors[i * CHANNELS..(i + 1) * CHANNELS];
             for (channel, number) in [0, 13, 37, 63].into_iter().zip(numbers) {
-                assert!((descriptor[channel] - number).abs() < 0.005, "{i}, {channel}: {} {number}", descriptor[channel]);
+                assert!(
+                    (descriptor[channel] - number).abs() < 0.005,
+                    "{i}, {channel}: {} {number}",
+                    descriptor[channel]
+                );
             }
         }
         let best = KeypointOptions { most: 5, ..KeypointOptions::default() };

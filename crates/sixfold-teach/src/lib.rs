@@ -44,7 +44,5 @@ pub use shape::{
 pub use silhouette::{SalientSegmenter, Segmenter};
 pub use snapshot::Snapshot;
 pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching};
-pub use unboarded::{
-    DepthOf, KnownLength, PutTogether, SeenFeatures, features_of, put_together,
-};
+pub use unboarded::{DepthOf, KnownLength, PutTogether, SeenFeatures, features_of, put_together};
 pub use view::{PosedPhotograph, Volume};

@@ -39,9 +39,7 @@ pub fn features_of(finder: &KeypointFinder, image: &RgbImage) -> Result<Features
     let ratio = Vec2::new(width as f64 / size.0 as f64, height as f64 / size.1 as f64);
     let at = |x: f64, y: f64| Vec2::new((x + 0.5) * ratio.x - 0.5, (y + 0.5) * ratio.y - 0.5);
     let options = KeypointOptions { most: FEATURES, ..KeypointOptions::default() };
-    let find = |image: &RgbImage| {
-        finder.find(image, &options).map_err(TeachError::Features)
-    };
+    let find = |image: &RgbImage| finder.find(image, &options).map_err(TeachError::Features);
     let found = if scale > 1.0 { find(&reduced(image, size, ratio.x, &at))? } else { find(image)? };
     let Keypoints { positions, descriptors, .. } = found;
     Ok(Features { points: positions.iter().map(|p| at(p.x, p.y)).collect(), descriptors })
@@ -183,8 +181,7 @@ fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachE
         SfmError::TooFew { found, least, left_out } => {
             let name = |i: usize| seen[i].name.clone();
             let of = |(s, reason): (&SeenFeatures, Option<sixfold_sfm::LeftOut>)| {
-                let reason =
-                    if s.size == size { reason?.reason(&name) } else { other_size(s.size, size) };
+                let reason = if s.size == size { reason?.reason(&name) } else { other_size(s.size, size) };
                 Some(format!("; {}: {reason}", s.name))
             };
             let all: Vec<String> = seen.iter().zip(left_out).filter_map(of).collect();
@@ -270,7 +267,8 @@ fn marked(
     };
     let limit = MARKED * pinhole.width.max(pinhole.height) as f64;
     for ((i, straight), (pose, _)) in shown.iter().zip(&rays) {
-        let error = pinhole.project(&pose.transform_point(&point)).map_or(f64::INFINITY, |p| (p - straight).norm());
+        let error =
+            pinhole.project(&pose.transform_point(&point)).map_or(f64::INFINITY, |p| (p - straight).norm());
         if error > limit {
             return Err(wrong(format!(
                 "{}: the {which} point is marked {error:.0} pixels from where the marks in the other photographs put it, expected at \
@@ -295,7 +293,9 @@ fn metres_of_depth(
         let Some(image) = depth(i)? else { continue };
         any = true;
         for point in &scene.points {
-            let Some((_, feature)) = point.seen.iter().find(|(photograph, _)| *photograph == i) else { continue };
+            let Some((_, feature)) = point.seen.iter().find(|(photograph, _)| *photograph == i) else {
+                continue;
+            };
             let pixel = seen[i].features.points[*feature as usize];
             let z = pose.transform_point(&point.position).z;
             if let Some(measured) = smooth_depth(&image, &pixel) {

@@ -33,7 +33,8 @@ pub(crate) fn upright(points: &[Vec3], camera_from_scene: &[Pose]) -> Upright {
     let centre = meeting_point(camera_from_scene, &eyes).unwrap_or_else(|| middle(points));
     let mut distances: Vec<f64> = eyes.iter().map(|e| (e - centre).norm()).collect();
     let distance = median(&mut distances).unwrap_or(1.0);
-    let near: Vec<Vec3> = points.iter().filter(|p| (*p - centre).norm() < REACH * distance).copied().collect();
+    let near: Vec<Vec3> =
+        points.iter().filter(|p| (*p - centre).norm() < REACH * distance).copied().collect();
     let table = table(&near, &eyes, THICKNESS * distance);
     let (up, origin) = match table {
         Some(plane) => (plane.normal, centre - plane.normal * plane.distance(&centre)),
@@ -138,7 +139,8 @@ mod tests {
             points.push(Vec3::new(0.04 * a, 0.03 * b, 0.12));
             points.push(Vec3::new(3.0 + a, b, -0.7));
         }
-        let poses = (0..9).map(|i| looking_at(&Vec3::new(0.0, 0.0, 0.05), 40.0 * f64::from(i), 40.0, 0.6, 3.0));
+        let poses =
+            (0..9).map(|i| looking_at(&Vec3::new(0.0, 0.0, 0.05), 40.0 * f64::from(i), 40.0, 0.6, 3.0));
         (points, poses.collect())
     }
 
