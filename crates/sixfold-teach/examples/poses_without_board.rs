@@ -9,11 +9,12 @@
 use std::path::Path;
 
 use sixfold_bop::BopDataset;
-use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3, stats::median, umeyama};
+use sixfold_geometry::random::{normal, stream};
+use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3, stats::median, umeyama};
 use sixfold_mesh::{Unit, read_mesh};
 use sixfold_nn::keypoints::KeypointFinder;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, patterned};
-use sixfold_teach::{PutTogether, SeenFeatures, TeachError, features_of, put_together};
+use sixfold_teach::{KnownLength, PutTogether, SeenFeatures, TeachError, features_of, put_together};
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -44,8 +45,20 @@ fn simulated(mesh: &Path, unit: Unit, seed: u64, ground: &[&str]) -> Result<(), 
     let table = RgbImage::filled(16, 16, [120, 110, 100]);
     let capture = SimulatedCapture::without_board(&mesh, (&cloth, 0.6), &table, &options, seed);
     let images: Vec<RgbImage> = (0..options.photographs).filter_map(|i| capture.photograph(i)).collect();
-    let depths: Vec<DepthImage> = (0..options.photographs).filter_map(|i| capture.depth(i)).collect();
-    let found = located(&images, None, &|i| Ok(depths.get(i).cloned()))?;
+    // Two corners of the cloth, marked in three photographs to a pixel.
+    let ends = [Vec3::new(-0.12, -0.08, 0.0), Vec3::new(0.12, 0.08, 0.0)];
+    let mut random = stream(seed, 9);
+    let mut marked = |i: usize| {
+        let pose = capture.camera_from_board[i];
+        let mut error = || Vec2::new(f64::from(normal(&mut random)), f64::from(normal(&mut random)));
+        let ends = ends.map(|end| {
+            let pixel = options.camera.project(&pose.transform_point(&end))?;
+            Some(options.camera.distort_point(&pixel) + error())
+        });
+        (i, ends)
+    };
+    let length = KnownLength { metres: (ends[0] - ends[1]).norm(), ends: [0, 5, 10].map(&mut marked).to_vec() };
+    let found = located(&images, None, Some(&length))?;
     let (c, truth) = (found.camera, options.camera);
     println!(
         "camera: fx {:.1} (true {:.1}), cx {:.1} ({:.1}), cy {:.1} ({:.1}), floor {:?}",
@@ -64,14 +77,18 @@ fn bop(dataset: &Path, scene: u32, object: u32, images: &[u32]) -> Result<(), Fa
         let all = &scene.image(*image)?.ground_truth;
         truth.push(all.iter().find(|t| t.obj_id == object).map(|t| t.camera_from_object));
     }
-    let found = located(&photographs, Some(&camera), &|i| Ok(scene.depth(images[i]).ok().flatten()))?;
+    // Scores need no length; the reconstruction does: 0.1 m along x of the object's frame, as its ground truth shows it.
+    let end = |pose: &Pose, x: f64| camera.project(&pose.transform_point(&Vec3::new(x, 0.0, 0.0)));
+    let marked = truth.iter().enumerate().filter_map(|(i, pose)| Some((i, pose.as_ref()?)));
+    let ends = marked.map(|(i, pose)| (i, [end(pose, -0.05), end(pose, 0.05)])).collect();
+    let found = located(&photographs, Some(&camera), Some(&KnownLength { metres: 0.1, ends }))?;
     compare(&found, &truth)
 }
 
 fn located(
     images: &[RgbImage],
     camera: Option<&Camera>,
-    depth: sixfold_teach::DepthOf<'_>,
+    length: Option<&KnownLength>,
 ) -> Result<PutTogether, Failure> {
     let finder = KeypointFinder::shipped()?;
     let start = std::time::Instant::now();
@@ -82,7 +99,7 @@ fn located(
     let seen: Vec<SeenFeatures> = images.iter().enumerate().map(of).collect::<Result<_, TeachError>>()?;
     let counts: Vec<usize> = seen.iter().map(|s| s.features.points.len()).collect();
     println!("features: {counts:?}, {:.1} s", start.elapsed().as_secs_f64());
-    let found = put_together(&seen, camera, None, depth, &())?;
+    let found = put_together(&seen, camera, length, &|_| Ok(None), &())?;
     println!("put together: {:.1} s", start.elapsed().as_secs_f64());
     for (i, pose) in found.camera_from_world.iter().enumerate() {
         if let Err(reason) = pose {
@@ -115,7 +132,7 @@ fn compare(found: &PutTogether, truth: &[Option<Pose>]) -> Result<(), Failure> {
         })
         .collect();
     println!(
-        "{} of {} put together, rms {:.2} px; error: median {:.3} degrees, {:.2} mm; largest {:.3} degrees, {:.2} mm; scale by depth {:.4}",
+        "{} of {} put together, rms {:.2} px; error: median {:.3} degrees, {:.2} mm; largest {:.3} degrees, {:.2} mm; scale {:.4}",
         eyes.len(),
         truth.len(),
         found.rms,
