@@ -71,16 +71,29 @@ pub enum KeypointError {
     Option(#[from] OptionError),
 }
 
-/// The network's maps of an image, `width / 8` x `height / 8` cells.
-struct Maps {
+/// The features of an image, `width / 8` x `height / 8` cells.
+struct Cells {
     columns: usize,
     rows: usize,
-    /// Probability of a keypoint at each pixel.
-    heat: Vec<f32>,
-    /// Of each cell.
-    reliability: Vec<f32>,
     /// [`CHANNELS`] numbers of length 1 for each cell.
     features: Vec<f32>,
+}
+
+/// Where an image has keypoints.
+struct Heat {
+    /// Probability of a keypoint at each pixel.
+    pixels: Vec<f32>,
+    /// Of each cell's feature.
+    reliability: Vec<f32>,
+}
+
+/// An image as the network sees it.
+struct Seen {
+    normalised: Tensor<4>,
+    columns: usize,
+    rows: usize,
+    /// Sides of the image by those that the network sees.
+    ratio: Vec2,
 }
 
 /// XFeat with its weights, as it finds keypoints.
@@ -111,23 +124,18 @@ impl KeypointFinder {
     /// [`KeypointError`]: an image of less than 32x32 pixels, an option out of range.
     pub fn find(&self, image: &RgbImage, options: &KeypointOptions) -> Result<Keypoints, KeypointError> {
         options.check()?;
-        let (width, height) = image.size();
-        let (w, h) = (width / MULTIPLE * MULTIPLE, height / MULTIPLE * MULTIPLE);
-        if w == 0 || h == 0 {
-            return Err(KeypointError::Size { width, height });
-        }
-        let data = TensorData::new(stretched(image, w, h), [1, 1, h, w]);
-        let maps = self.maps(Tensor::<4>::from_data(data, &self.device), w / CELL, h / CELL);
-        let mut found = maps.maxima(options.threshold);
+        let seen = self.seen(image)?;
+        let (cells, reliability) = self.cells(&seen);
+        let heat = Heat { pixels: self.heat(&seen), reliability };
+        let mut found = cells.maxima(&heat, options.threshold);
         // Stable: equal scores stay in the order of the pixels.
         found.sort_by(|a, b| b.2.total_cmp(&a.2));
         found.truncate(options.most);
-        let ratio = Vec2::new(width as f64 / w as f64, height as f64 / h as f64);
         let position = |x: usize, y: usize| {
-            Vec2::new((x as f64 + 0.5) * ratio.x - 0.5, (y as f64 + 0.5) * ratio.y - 0.5)
+            Vec2::new((x as f64 + 0.5) * seen.ratio.x - 0.5, (y as f64 + 0.5) * seen.ratio.y - 0.5)
         };
         let descriptors: Vec<[f32; CHANNELS]> =
-            found.par_iter().map(|(x, y, _)| maps.descriptor(*x, *y)).collect();
+            found.par_iter().map(|(x, y, _)| cells.descriptor(*x as f32, *y as f32)).collect();
         Ok(Keypoints {
             positions: found.iter().map(|(x, y, _)| position(*x, *y)).collect(),
             scores: found.iter().map(|k| k.2).collect(),
@@ -135,15 +143,50 @@ impl KeypointFinder {
         })
     }
 
-    fn maps(&self, image: Tensor<4>, columns: usize, rows: usize) -> Maps {
-        let cells = columns * rows;
-        let normalised = XFeat::normalised(image);
-        let numbers = |t: Tensor<4>| t.into_data().iter::<f32>().collect::<Vec<f32>>();
-        let logits = numbers(self.network.keypoints(normalised.clone()));
-        let seen = self.network.forward(normalised);
-        let (planes, reliability) = (numbers(seen.features), numbers(seen.reliability));
+    /// Descriptors of given positions of an image, [`CHANNELS`] numbers each; all 0 for those far outside.
+    ///
+    /// # Errors
+    /// [`KeypointError::Size`].
+    pub fn described(&self, image: &RgbImage, positions: &[Vec2]) -> Result<Vec<f32>, KeypointError> {
+        let seen = self.seen(image)?;
+        let (cells, _) = self.cells(&seen);
+        let of = |p: &Vec2| {
+            let (x, y) = ((p.x + 0.5) / seen.ratio.x - 0.5, (p.y + 0.5) / seen.ratio.y - 0.5);
+            cells.descriptor(x as f32, y as f32)
+        };
+        Ok(positions.par_iter().map(of).collect::<Vec<_>>().into_flattened())
+    }
+
+    fn seen(&self, image: &RgbImage) -> Result<Seen, KeypointError> {
+        let (width, height) = image.size();
+        let (w, h) = (width / MULTIPLE * MULTIPLE, height / MULTIPLE * MULTIPLE);
+        if w == 0 || h == 0 {
+            return Err(KeypointError::Size { width, height });
+        }
+        let data = TensorData::new(stretched(image, w, h), [1, 1, h, w]);
+        let normalised = XFeat::normalised(Tensor::<4>::from_data(data, &self.device));
+        let ratio = Vec2::new(width as f64 / w as f64, height as f64 / h as f64);
+        Ok(Seen { normalised, columns: w / CELL, rows: h / CELL, ratio })
+    }
+
+    /// Features of the cells, and how reliable they are.
+    fn cells(&self, seen: &Seen) -> (Cells, Vec<f32>) {
+        let (columns, rows) = (seen.columns, seen.rows);
+        let output = self.network.forward(seen.normalised.clone());
+        let planes = numbers(output.features);
+        let mut features = vec![0.0; columns * rows * CHANNELS];
+        for (cell, feature) in features.chunks_exact_mut(CHANNELS).enumerate() {
+            feature.iter_mut().enumerate().for_each(|(c, v)| *v = planes[c * columns * rows + cell]);
+            to_length_one(feature);
+        }
+        (Cells { columns, rows, features }, numbers(output.reliability))
+    }
+
+    /// The probability of a keypoint at each pixel.
+    fn heat(&self, seen: &Seen) -> Vec<f32> {
+        let (columns, cells) = (seen.columns, seen.columns * seen.rows);
+        let logits = numbers(self.network.keypoints(seen.normalised.clone()));
         let mut heat = vec![0.0; cells * CELL * CELL];
-        let mut features = vec![0.0; cells * CHANNELS];
         for cell in 0..cells {
             let of = |k: usize| logits[k * cells + cell];
             let largest = (0..=CELL * CELL).map(of).fold(f32::NEG_INFINITY, f32::max);
@@ -152,12 +195,13 @@ impl KeypointFinder {
             for k in 0..CELL * CELL {
                 heat[(y + k / CELL) * columns * CELL + x + k % CELL] = (of(k) - largest).exp() / sum;
             }
-            let feature = &mut features[cell * CHANNELS..(cell + 1) * CHANNELS];
-            feature.iter_mut().enumerate().for_each(|(c, v)| *v = planes[c * cells + cell]);
-            to_length_one(feature);
         }
-        Maps { columns, rows, heat, reliability, features }
+        heat
     }
+}
+
+fn numbers(tensor: Tensor<4>) -> Vec<f32> {
+    tensor.into_data().iter::<f32>().collect()
 }
 
 fn to_length_one(feature: &mut [f32]) {
@@ -188,22 +232,23 @@ fn stretched(image: &RgbImage, width: usize, height: usize) -> Vec<f32> {
     rows.par_iter().flat_map_iter(row).collect()
 }
 
-impl Maps {
+impl Cells {
     /// Pixels that are the maximum around them, with their scores. The last column and row have none: the authors' interpolation finds
     /// nothing there.
-    fn maxima(&self, threshold: f32) -> Vec<(usize, usize, f32)> {
+    fn maxima(&self, heat: &Heat, threshold: f32) -> Vec<(usize, usize, f32)> {
         let (w, h) = (self.columns * CELL, self.rows * CELL);
+        let pixels = &heat.pixels[..];
         let of_row = |y: usize| {
             let is_maximum = move |x: usize| {
-                let value = self.heat[y * w + x];
+                let value = pixels[y * w + x];
                 let around =
-                    |y: usize| &self.heat[y * w + x.saturating_sub(REACH)..y * w + (x + REACH + 1).min(w)];
+                    |y: usize| &pixels[y * w + x.saturating_sub(REACH)..y * w + (x + REACH + 1).min(w)];
                 value > threshold
                     && (y.saturating_sub(REACH)..(y + REACH + 1).min(h))
                         .all(|y| around(y).iter().all(|v| *v <= value))
             };
             (0..w - 1).filter(move |x| is_maximum(*x)).filter_map(move |x| {
-                let score = self.heat[y * w + x] * self.reliability_at(x, y);
+                let score = pixels[y * w + x] * self.reliability_at(&heat.reliability, x, y);
                 ((x, y) != (0, 0) && score > 0.0).then_some((x, y, score))
             })
         };
@@ -211,9 +256,9 @@ impl Maps {
     }
 
     /// Where a pixel lies between the cells, as the authors compute it: from -1/2 in the first column to the number of cells less 1/2.
-    fn between_cells(&self, x: usize, y: usize) -> [f32; 2] {
-        let along = |at: usize, cells: usize| {
-            let grid = 2.0 * (at as f32 / (cells * CELL - 1) as f32) - 1.0;
+    fn between_cells(&self, x: f32, y: f32) -> [f32; 2] {
+        let along = |at: f32, cells: usize| {
+            let grid = 2.0 * (at / (cells * CELL - 1) as f32) - 1.0;
             ((grid + 1.0) * cells as f32 - 1.0) / 2.0
         };
         [along(x, self.columns), along(y, self.rows)]
@@ -225,12 +270,12 @@ impl Maps {
     }
 
     /// Bilinear; 0 beyond the border.
-    fn reliability_at(&self, x: usize, y: usize) -> f32 {
-        let [x, y] = self.between_cells(x, y);
+    fn reliability_at(&self, reliability: &[f32], x: usize, y: usize) -> f32 {
+        let [x, y] = self.between_cells(x as f32, y as f32);
         let (left, top) = (x.floor(), y.floor());
         let (dx, dy) = (x - left, y - top);
         let at = |i: isize, j: isize| {
-            self.cell(left as isize + i, top as isize + j).map_or(0.0, |cell| self.reliability[cell])
+            self.cell(left as isize + i, top as isize + j).map_or(0.0, |cell| reliability[cell])
         };
         at(0, 0) * (1.0 - dx) * (1.0 - dy)
             + at(1, 0) * dx * (1.0 - dy)
@@ -239,7 +284,7 @@ impl Maps {
     }
 
     /// Bicubic; 0 beyond the border; of length 1.
-    fn descriptor(&self, x: usize, y: usize) -> [f32; CHANNELS] {
+    fn descriptor(&self, x: f32, y: f32) -> [f32; CHANNELS] {
         let [x, y] = self.between_cells(x, y);
         let (left, top) = (x.floor(), y.floor());
         let (across, down) = (cubic(x - left), cubic(y - top));

@@ -57,7 +57,8 @@ fn simulated(mesh: &Path, unit: Unit, seed: u64, ground: &[&str]) -> Result<(), 
         });
         (i, ends)
     };
-    let length = KnownLength { metres: (ends[0] - ends[1]).norm(), ends: [0, 5, 10].map(&mut marked).to_vec() };
+    let length =
+        KnownLength { metres: (ends[0] - ends[1]).norm(), ends: [0, 5, 10].map(&mut marked).to_vec() };
     let found = located(&images, None, Some(&length))?;
     let (c, truth) = (found.camera, options.camera);
     println!(
