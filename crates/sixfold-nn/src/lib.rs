@@ -21,6 +21,7 @@ mod discriminator;
 mod enlarge;
 mod files;
 pub mod fingerprint;
+pub mod keypoints;
 pub mod learner;
 pub mod options;
 pub mod pretrained;

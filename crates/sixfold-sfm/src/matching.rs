@@ -1,4 +1,5 @@
-//! Features of two photographs that choose each other (mutual nearest neighbours of descriptors).
+//! Features of two photographs that choose each other (mutual nearest neighbours of descriptors), where descriptors do not bear that a
+//! photograph is rotated also with the second photograph rotated.
 
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::DMatrix;
@@ -11,13 +12,22 @@ pub struct Features {
     pub points: Vec<Vec2>,
     /// Their descriptors one after the other, each of length 1.
     pub descriptors: Vec<f32>,
+    /// Descriptors of the same points in the rotated photograph, for several rotations; may be empty.
+    pub rotated: Vec<Vec<f32>>,
 }
 
+/// Features by which the rotation of a pair is chosen: the first of each photograph.
+const SCREENED: usize = 512;
+
 impl Features {
-    fn matrix(&self) -> DMatrix<f32> {
+    /// Descriptors as columns: as the photograph is, then rotated.
+    fn matrices(&self) -> Vec<DMatrix<f32>> {
         let count = self.points.len().max(1);
-        let channels = self.descriptors.len() / count;
-        DMatrix::from_column_slice(channels, self.descriptors.len() / channels.max(1), &self.descriptors)
+        let of = |descriptors: &Vec<f32>| {
+            let channels = descriptors.len() / count;
+            DMatrix::from_column_slice(channels, descriptors.len() / channels.max(1), descriptors)
+        };
+        std::iter::once(&self.descriptors).chain(&self.rotated).map(of).collect()
     }
 }
 
@@ -30,10 +40,11 @@ pub struct PairMatches {
     pub matches: Vec<(u32, u32)>,
 }
 
-/// Features of every pair of photographs that choose each other and whose product is at least `least`; `None` when `progress` said
-/// to stop. All descriptors have the same length.
+/// Features of every pair of photographs that choose each other and whose product is at least `least`, with the rotation of the second
+/// photograph that matches most; `None` when `progress` said to stop. All descriptors have the same length, and features are the
+/// best ones first.
 pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
-    let matrices: Vec<DMatrix<f32>> = features.iter().map(Features::matrix).collect();
+    let matrices: Vec<Vec<DMatrix<f32>>> = features.iter().map(Features::matrices).collect();
     let pairs: Vec<(usize, usize)> =
         (0..features.len()).flat_map(|a| (a + 1..features.len()).map(move |b| (a, b))).collect();
     let done = std::sync::atomic::AtomicUsize::new(0);
@@ -44,7 +55,7 @@ pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Op
             use std::sync::atomic::Ordering::Relaxed;
             let mut matches = vec![];
             if go.load(Relaxed) {
-                matches = mutual(&matrices[*a], &matrices[*b], least);
+                matches = best_matches(&matrices[*a][0], &matrices[*b], least);
                 let count = done.fetch_add(1, Relaxed) + 1;
                 if !progress.report(count, pairs.len()) {
                     go.store(false, Relaxed);
@@ -54,6 +65,20 @@ pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Op
         })
         .collect();
     go.into_inner().then_some(found)
+}
+
+/// The matches with one of several sets of descriptors of the same points, the one with most among the first features.
+fn best_matches(a: &DMatrix<f32>, b: &[DMatrix<f32>], least: f32) -> Vec<(u32, u32)> {
+    let first = |m: &DMatrix<f32>| m.columns(0, m.ncols().min(SCREENED)).into_owned();
+    let best = if b.len() > 1 {
+        let few = first(a);
+        let counts: Vec<usize> = b.iter().map(|b| mutual(&few, &first(b), least).len()).collect();
+        // The first of equal ones.
+        (0..b.len()).max_by_key(|k| (counts[*k], std::cmp::Reverse(*k))).unwrap_or(0)
+    } else {
+        0
+    };
+    mutual(a, &b[best], least)
 }
 
 fn mutual(a: &DMatrix<f32>, b: &DMatrix<f32>, least: f32) -> Vec<(u32, u32)> {
@@ -88,7 +113,8 @@ mod tests {
     use super::*;
 
     fn features(descriptors: &[[f32; 3]]) -> Features {
-        Features { points: vec![Vec2::zeros(); descriptors.len()], descriptors: descriptors.concat() }
+        let points = vec![Vec2::zeros(); descriptors.len()];
+        Features { points, descriptors: descriptors.concat(), rotated: vec![] }
     }
 
     #[test]
@@ -100,5 +126,15 @@ mod tests {
         assert_eq!((found[0].pair, &found[0].matches), ((0, 1), &vec![(0, 1), (1, 2)]));
         assert!(found[1].matches.is_empty() && found[2].matches.is_empty());
         assert!(matched(&[a.clone(), a], 0.5, &|_: usize, _: usize| false).is_none());
+    }
+
+    #[test]
+    fn the_rotation_that_matches_most_is_taken() {
+        let a = features(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+        let mut b = features(&[[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]);
+        assert_eq!(matched(&[a.clone(), b.clone()], 0.5, &()).unwrap()[0].matches, [(1, 1)]);
+        b.rotated =
+            vec![[[0.0f32; 3]; 3].concat(), [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]].concat()];
+        assert_eq!(matched(&[a, b], 0.5, &()).unwrap()[0].matches, [(0, 1), (2, 0)]);
     }
 }

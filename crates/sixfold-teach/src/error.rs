@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use sixfold_board::BoardError;
 use sixfold_estimator::StoreError;
 use sixfold_io::ImageFileError;
+use sixfold_nn::keypoints::KeypointError;
+use sixfold_sfm::SfmError;
 use thiserror::Error;
 
 /// Why an object cannot be learnt from photographs.
@@ -67,6 +69,51 @@ pub enum TeachError {
         /// Of the camera.
         camera_height: usize,
     },
+    /// No photograph at all.
+    #[error("there is no photograph: take 12 to 40 from all sides")]
+    NoPhotographs,
+    /// Photographs without a board that cannot be put together.
+    #[error(
+        "{found} photographs show enough of the same, expected at least {least}: take 16 to 40 in steps of at most 20 degrees around \
+         the object, sharp, on a ground with much texture (newspaper, a patterned cloth) that stays in place{reasons}"
+    )]
+    NotTogether {
+        /// How many match each other.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+        /// Why the others do not; empty or `; FILE: REASON; ...`.
+        reasons: String,
+    },
+    /// Photographs without a board that cannot be put together, for another reason.
+    #[error("poses from photographs: {0}")]
+    Sfm(#[source] SfmError),
+    /// Without a board nothing says how long a metre is.
+    #[error(
+        "photographs without a board do not show how large things are: give the length between two points that you marked in \
+         two or more photographs (--length 0.12 --ends PHOTOGRAPH:X,Y:X,Y), or depth images"
+    )]
+    NoScale,
+    /// Depth images that do not show how large things are.
+    #[error(
+        "{found} features of the photographs have a measured depth, expected at least {least}: check --depth-scale and whether depth \
+         images are from the same places, or give --length and --ends"
+    )]
+    FewDepths {
+        /// How many have.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+    },
+    /// Marked points that give no length.
+    #[error("--ends: {what}")]
+    Ends {
+        /// What was found and expected.
+        what: String,
+    },
+    /// No features can be searched in an image.
+    #[error("features of a photograph: {0}")]
+    Features(#[source] KeypointError),
     /// Nothing stands on the board.
     #[error(
         "no object was found that all photographs agree on: expected one object on the board, opaque, in the same place in every \

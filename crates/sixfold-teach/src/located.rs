@@ -54,7 +54,8 @@ pub fn locate(seen: &[SeenTags], camera: Option<&Camera>, ruler: Option<f64>) ->
     let no_board = || TeachError::NoBoard { reasons: reasons(seen.iter().map(|s| (s, Some(few_tags(s))))) };
     let board = Board::of_tags(&tags).ok_or_else(no_board)?;
     let board = ruler.and_then(|ruler| board.with_ruler(ruler)).unwrap_or(board);
-    let size = common_size(seen).ok_or_else(no_board)?;
+    let with_tags = seen.iter().filter(|s| !s.tags.is_empty());
+    let size = common_size(with_tags.map(|s| s.size)).ok_or_else(no_board)?;
     let mut states: Vec<Result<(), String>> = seen.iter().map(|s| usable(s, size)).collect();
     let corners: Vec<Vec<Corner>> = seen
         .iter()
@@ -101,11 +102,11 @@ fn usable(seen: &SeenTags, (width, height): (usize, usize)) -> Result<(), String
     Ok(())
 }
 
-/// The size of most photographs that show tags.
-fn common_size(seen: &[SeenTags]) -> Option<(usize, usize)> {
+/// The size of most photographs.
+pub(crate) fn common_size(sizes: impl Iterator<Item = (usize, usize)>) -> Option<(usize, usize)> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
-    for photograph in seen.iter().filter(|s| !s.tags.is_empty()) {
-        *counts.entry(photograph.size).or_default() += 1;
+    for size in sizes {
+        *counts.entry(size).or_default() += 1;
     }
     counts.into_iter().max_by_key(|(_, count)| *count).map(|(size, _)| size)
 }

@@ -1,6 +1,6 @@
 //! Simulated photographs of an object on the board, with exact truth: for tests, and to try a way of taking photographs.
 //!
-//! Rendered: the printed board on a table, the object with a shadow, a lamp that changes from photograph to photograph. Then the
+//! Rendered: the printed board, or a patterned cloth, on a table, the object with a shadow, a lamp that changes from photograph to photograph. Then the
 //! lens's distortion, blur, motion, noise; the caller may store them as JPEG.
 
 use rayon::prelude::*;
@@ -11,6 +11,7 @@ use sixfold_geometry::{BrownConrady, Camera, DepthImage, Image, Mask, Mat3, Pose
 use sixfold_mesh::Mesh;
 use sixfold_render::{Light, Material, SceneObject, VisibilityBuffer, shade};
 
+pub use crate::ground::patterned;
 use crate::view::bilinear_rgb;
 
 /// How much more than the camera's image is rendered on each side, as a fraction of its size.
@@ -72,6 +73,31 @@ impl<'a> SimulatedCapture<'a> {
         options: &'a SimulationOptions,
         seed: u64,
     ) -> SimulatedCapture<'a> {
+        let [low, high] = board.extent();
+        let sheet = quad(low, high, 0.0, 1.0, &board.image(6.0));
+        SimulatedCapture::on_sheet(mesh, sheet, ground, options, seed)
+    }
+
+    /// An object that stands on a square cloth in place of a board: `cloth` covers `side` metres, for example
+    /// [`patterned`](crate::simulation::patterned). Same seed, same images; poses are those of [`SimulatedCapture::new`].
+    pub fn without_board(
+        mesh: &'a Mesh,
+        (cloth, side): (&RgbImage, f64),
+        ground: &'a RgbImage,
+        options: &'a SimulationOptions,
+        seed: u64,
+    ) -> SimulatedCapture<'a> {
+        let half = Vec2::repeat(0.5 * side);
+        SimulatedCapture::on_sheet(mesh, quad(-half, half, 0.0, 1.0, cloth), ground, options, seed)
+    }
+
+    fn on_sheet(
+        mesh: &'a Mesh,
+        sheet: Mesh,
+        ground: &'a RgbImage,
+        options: &'a SimulationOptions,
+        seed: u64,
+    ) -> SimulatedCapture<'a> {
         let (low, high) = mesh.bounding_box();
         let mut random = stream(seed, 0);
         let angle = f64::from(uniform(&mut random, [0.0, std::f32::consts::TAU]));
@@ -91,7 +117,7 @@ impl<'a> SimulatedCapture<'a> {
             looking_at(&target, azimuth, elevation, distance, roll)
         };
         let camera_from_board = (0..options.photographs).map(pose).collect();
-        let scene = Scene::new(mesh, board, ground, &board_from_object);
+        let scene = Scene::new(mesh, sheet, ground, &board_from_object);
         SimulatedCapture { camera_from_board, board_from_object, scene, options, seed }
     }
 
@@ -155,9 +181,7 @@ fn quad(low: Vec2, high: Vec2, z: f64, repeat: f32, texture: &RgbImage) -> Mesh 
 }
 
 impl<'a> Scene<'a> {
-    fn new(object: &'a Mesh, board: &Board, ground: &'a RgbImage, board_from_object: &Pose) -> Scene<'a> {
-        let [low, high] = board.extent();
-        let sheet = quad(low, high, 0.0, 1.0, &board.image(6.0));
+    fn new(object: &'a Mesh, sheet: Mesh, ground: &'a RgbImage, board_from_object: &Pose) -> Scene<'a> {
         let reach = Vec2::repeat(1.2);
         let table = quad(-reach, reach, -0.001, 1.0, ground);
         Scene { object, sheet, table, board_from_object: *board_from_object, ground }
