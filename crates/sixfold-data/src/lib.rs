@@ -22,7 +22,7 @@ mod visible_mask;
 pub use backgrounds::{background_files, backgrounds_with_images, plain_backgrounds};
 pub use colors::image_color_augmentation;
 pub use error::{PosedImageError, TrainingSetError};
-pub use photograph_file::{PhotographEntry, PhotographFile};
+pub use photograph_file::{FloorEntry, PhotographEntry, PhotographFile};
 pub use posed_image::{MIN_PIXELS, PosedImage};
 pub use poses::{DEFAULT_CAMERA, PoseRange, PoseVariation, default_distances, distances};
 pub use prepared_mesh::{PreparedMesh, is_textured};

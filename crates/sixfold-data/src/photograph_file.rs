@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use sixfold_bop::{VISIBILITY_DELTA, ground_truth_visibility};
-use sixfold_geometry::{Camera, Mask, Mat3, Pose, PoseError, RgbImage, Vec3, undistort_rgb};
+use sixfold_geometry::{Camera, Mask, Mat3, Plane, Pose, PoseError, RgbImage, Vec3, undistort_rgb};
 use sixfold_io::{CameraFile, limits, read_mask, read_regular_text, read_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
 
@@ -25,8 +25,37 @@ pub struct PhotographFile {
     /// Unit of the mesh file: m, cm, mm, in.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
+    /// The plane on which the object stands, in the object's frame: nothing of the object is below. Without a point the highest plane
+    /// that the masks allow.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub floor: Option<FloorEntry>,
     /// The photographs.
     pub photographs: Vec<PhotographEntry>,
+}
+
+/// A plane in a [`PhotographFile`].
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FloorEntry {
+    /// Its normal, upwards; of any length but 0.
+    pub normal: [f64; 3],
+    /// A point of it, millimetres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub point: Option<[f64; 3]>,
+}
+
+impl FloorEntry {
+    /// The normal, of length 1; `None` where it has no direction or a number is not finite.
+    pub fn up(&self) -> Option<Vec3> {
+        let normal = Vec3::from(self.normal).try_normalize(1e-12)?;
+        normal.iter().all(|v| v.is_finite()).then_some(normal)
+    }
+
+    /// The plane, metres; `None` without a point.
+    pub fn plane(&self) -> Option<Plane> {
+        let (normal, point) = (self.up()?, Vec3::from(self.point?) * 1e-3);
+        Some(Plane { normal, offset: normal.dot(&point) }).filter(|plane| plane.offset.is_finite())
+    }
 }
 
 /// A photograph in a [`PhotographFile`].
@@ -63,11 +92,16 @@ impl PhotographFile {
         let text = read_regular_text(path, limits::SMALL_TEXT).map_err(|error| wrong(error.to_string()))?;
         let file: PhotographFile = serde_json::from_str(&text).map_err(|error| {
             wrong(format!(
-                "{error}; expected {{\"mesh\", \"unit\", \"photographs\": [{{\"image\", \"camera\", \"cam_R_m2c\", \"cam_t_m2c\", \"mask\", \"depth\", \"depth_scale\"}}]}}"
+                "{error}; expected {{\"mesh\", \"unit\", \"floor\", \"photographs\": [{{\"image\", \"camera\", \"cam_R_m2c\", \"cam_t_m2c\", \"mask\", \"depth\", \"depth_scale\"}}]}}"
             ))
         })?;
         if file.photographs.is_empty() {
             return Err(wrong("field photographs: found none, expected at least one".into()));
+        }
+        if file.floor.is_some_and(|f| f.up().is_none() || (f.point.is_some() && f.plane().is_none())) {
+            return Err(wrong(
+                "field floor.normal: expected a direction, three numbers that are not all 0".into(),
+            ));
         }
         for (number, entry) in file.photographs.iter().enumerate() {
             entry.pose().map_err(|error| wrong(format!("field photographs[{number}].cam_R_m2c: {error}")))?;

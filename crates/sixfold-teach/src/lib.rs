@@ -29,6 +29,7 @@ mod shape;
 mod silhouette;
 pub mod simulation;
 mod snapshot;
+mod standing;
 mod stereo;
 mod surface;
 mod teaching;

@@ -43,6 +43,7 @@ impl Teaching {
         for entry in &list.photographs {
             teaching.add_entry(entry, file, beside)?;
         }
+        teaching.set_floor(list.floor.and_then(|f| f.up()), list.floor.and_then(|f| f.plane()))?;
         let name = |entry: &PhotographEntry| beside.join(&entry.image).display().to_string();
         teaching.leave_out_others(&list.photographs.iter().map(name).collect::<Vec<String>>())?;
         Ok(teaching)

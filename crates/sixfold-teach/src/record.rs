@@ -105,8 +105,12 @@ fn write_photographs(folder: &Path, posed: &[Posed]) -> Result<(), Failure> {
             write_atomically(&folder.join("camera.json"), serde_json::to_string_pretty(camera)?.as_bytes())?;
         }
     }
-    let file =
-        PhotographFile { mesh: Some("../mesh.ply".to_owned()), unit: Some("m".to_owned()), photographs };
+    let file = PhotographFile {
+        mesh: Some("../mesh.ply".to_owned()),
+        unit: Some("m".to_owned()),
+        floor: None,
+        photographs,
+    };
     let text = serde_json::to_string_pretty(&file)?;
     Ok(write_atomically(&folder.join("photographs.json"), text.as_bytes())?)
 }

@@ -14,6 +14,7 @@ use crate::hull::{Outlined, hull};
 use crate::paint::{centre, finer, painted};
 use crate::placed::{PLACING_STEPS, placed};
 use crate::silhouette::{Cues, Segmenter, consensus, masks};
+use crate::standing::standing;
 use crate::stereo::{Reach, StereoOptions, depths};
 use crate::surface::surface;
 use crate::view::{PosedPhotograph, View, Volume};
@@ -87,6 +88,8 @@ pub struct Capture {
     pub board: Option<Board>,
     /// The plane on which the object stands, its normal upwards; `None` where that is not known.
     pub floor: Option<Plane>,
+    /// Where is up. An object of which the floor is not known stands on the highest plane that the masks allow.
+    pub up: Option<Vec3>,
     /// Where the object is searched for; `None` to compute that from masks.
     pub volume: Option<Volume>,
 }
@@ -101,13 +104,14 @@ impl Capture {
             photographs,
             board: Some(board),
             floor: Some(Plane { normal: Vec3::z(), offset: 0.0 }),
+            up: None,
             volume: Some(volume),
         }
     }
 
     /// An object in photographs with poses from elsewhere.
     pub fn without_board(photographs: Vec<PosedPhotograph>, floor: Option<Plane>) -> Capture {
-        Capture { photographs, board: None, floor, volume: None }
+        Capture { photographs, board: None, floor, up: None, volume: None }
     }
 
     /// Below this plane there is no object.
@@ -424,6 +428,10 @@ pub fn reconstruct(
     let volume = rough.volume_of(first).grown(2.0 * rough.step);
     step(progress, 1, SHAPE_STEPS)?;
     let fine = hull(&outlined, &volume, options.fine_cells, capture.floor());
+    let fine = match capture.up.filter(|_| capture.floor.is_none()) {
+        Some(up) => standing(fine, &views, &masks, &up),
+        None => fine,
+    };
     let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
         Some(known) => {
             step(progress, 2, SHAPE_STEPS)?;

@@ -44,6 +44,9 @@ pub(crate) struct State {
     /// The plane on which the object stands, where there is no board: its normal, and its distance from the origin along it, metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub floor: Option<[f64; 4]>,
+    /// Where is up, where somebody said so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub up: Option<[f64; 3]>,
     /// The space that holds the object: least and largest coordinates.
     pub volume: Option<[[f64; 3]; 2]>,
     pub shape: Option<ShapeFacts>,
@@ -176,7 +179,10 @@ impl Snapshot {
         }
         let capture = match self.board() {
             Some(board) => Capture::on_board(photographs, board),
-            None => Capture::without_board(photographs, self.floor()),
+            None => Capture {
+                up: self.state.up.map(Vec3::from),
+                ..Capture::without_board(photographs, self.floor())
+            },
         };
         Ok((capture, numbers))
     }

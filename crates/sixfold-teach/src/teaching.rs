@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_geometry::{Camera, Mask, Pose, Progress, Vec3};
+use sixfold_geometry::{Camera, Mask, Plane, Pose, Progress, Vec3};
 use sixfold_io::{
     ImageFile, WriteLock, read_mask, read_mask_and_hidden, read_rgb, write_atomically, write_mask,
     write_mask_and_hidden,
@@ -175,6 +175,7 @@ impl Teaching {
                 revision: 0,
                 located: None,
                 floor: None,
+                up: None,
                 volume: None,
                 shape: None,
                 outdated: None,
@@ -513,6 +514,22 @@ impl Teaching {
         self.save()
     }
 
+    /// Says where is up, and on which plane the object stands, in the frame of poses that are given: nothing of the object is below.
+    /// Where up is known alone, it stands on the highest plane that the masks allow.
+    ///
+    /// # Errors
+    /// [`TeachError::Io`].
+    pub fn set_floor(&mut self, up: Option<Vec3>, floor: Option<Plane>) -> Result<(), TeachError> {
+        let floor = floor.map(|p| [p.normal.x, p.normal.y, p.normal.z, p.offset]);
+        let up = up.map(|v| [v.x, v.y, v.z]);
+        if is_same(&self.known.state.floor, &floor) && is_same(&self.known.state.up, &up) {
+            return Ok(());
+        }
+        (self.known.state.floor, self.known.state.up) = (floor, up);
+        self.forget_from(Step::Masks);
+        self.save()
+    }
+
     /// Corrects a mask, of the photograph's size, without lens distortion; `hidden` is the part of it where something may hide the
     /// object. The mesh is made again; the masks of other photographs only where this one reaches beyond the space in which the
     /// object was found.
@@ -612,7 +629,10 @@ impl Teaching {
             state.volume = None;
         }
         if step <= Step::Poses {
-            (state.located, state.floor, state.outdated) = (None, None, None);
+            (state.located, state.outdated) = (None, None);
+            if state.world != World::Given {
+                state.floor = None;
+            }
             for p in state.photographs.iter_mut().filter(|p| p.pose_by != Some(By::Person)) {
                 (p.camera_from_board, p.pose_by, p.left_out) = (None, None, None);
             }

@@ -10,24 +10,32 @@ use serde::{Deserialize, Serialize};
 use sixfold_bop::{
     BopDataset, GroundTruthInfo, ModelPoints, Models, Scene, VISIBILITY_DELTA, add_s, ground_truth_visibility,
 };
-use sixfold_data::{PhotographEntry, PhotographFile};
+use sixfold_data::{FloorEntry, PhotographEntry, PhotographFile};
 use sixfold_estimator::{Object, PoseEstimator, Query, Region};
-use sixfold_geometry::{Camera, KdTree, Mask, Pose, Vec3};
+use sixfold_geometry::{Camera, KdTree, Mask, Plane, Pose, Vec3, stats::median};
 use sixfold_io::write_mask_and_hidden;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
-use sixfold_teach::{SalientSegmenter, ShapeOptions, Teaching};
+use sixfold_shell::ranges::in_range;
+use sixfold_teach::{MOST_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach-dataset --dataset lmo --objects 5 6 8 9 12 --out out/reproduce-teach-dataset\n\n\
     Every object is kept. After a stop, the same command resumes.";
 
-/// An image teaches, or tests, an object of which at least this fraction is visible.
-const VISIBLE: f64 = 0.75;
+/// An object of which less is visible is not searched in an image, as in the BOP Challenge.
 const VISIBLE_TO_FIND: f64 = 0.1;
+/// Points of each other object that stands on the board.
+const BODY_POINTS: usize = 3000;
+/// Steps of the search for the board's normal, as tangents of the angle: it is within 45 degrees of the camera's direction.
+const FIRST_STEP: f64 = 1.0;
+const LAST_STEP: f64 = 0.001;
+/// Fewest other objects that say a plane, and the largest mean deviation of their lowest points from it, metres. Chosen by hand.
+const FEWEST_BODIES: usize = 4;
+const BELOW: f64 = 0.006;
 /// A pose is right within this fraction of the diameter (Hinterstoisser et al. 2012).
 const RIGHT: f64 = 0.1;
 
@@ -45,6 +53,9 @@ pub(crate) struct TeachDatasetArguments {
     /// Images that teach each object, from as different sides as there are
     #[arg(long, value_name = "N", default_value_t = 16)]
     photographs: usize,
+    /// An image teaches an object of which at least this fraction is visible
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.5)]
+    min_visible: f64,
     /// Most other images in which each object is searched
     #[arg(long, value_name = "N", default_value_t = 1000)]
     images: usize,
@@ -105,6 +116,8 @@ impl Seen {
 }
 
 pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Outcome> {
+    in_range("--min-visible", a.min_visible, 0.0..=1.0)?;
+    in_range("--photographs", a.photographs, 4..=MOST_PHOTOGRAPHS)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     let info = dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let mut meshes = BTreeMap::new();
@@ -131,7 +144,7 @@ pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Out
             Some(row) => row,
             None => {
                 let info = info.0.get(&id).cloned().unwrap_or_else(|| ModelInfo::of_mesh(mesh));
-                let row = measured(a, (id, mesh, &info), &seen(&scenes, id, &meshes)?, &scenes)?;
+                let row = measured(a, (id, mesh, &info), &seen(&scenes, id, &meshes)?, (&scenes, &meshes))?;
                 write_atomically(&file, serde_json::to_string_pretty(&row)?.as_bytes())?;
                 row
             }
@@ -188,8 +201,8 @@ fn seen(scenes: &[Scene], id: u32, meshes: &BTreeMap<u32, Mesh>) -> Result<Vec<S
 }
 
 /// Images from as different sides as there are: each the one farthest from those before.
-fn chosen(seen: &[Seen], most: usize) -> Vec<usize> {
-    let good: Vec<usize> = (0..seen.len()).filter(|i| seen[*i].info.visib_fract >= VISIBLE).collect();
+fn chosen(seen: &[Seen], most: usize, visible: f64) -> Vec<usize> {
+    let good: Vec<usize> = (0..seen.len()).filter(|i| seen[*i].info.visib_fract >= visible).collect();
     let Some(first) =
         good.iter().max_by(|a, b| seen[**a].info.visib_fract.total_cmp(&seen[**b].info.visib_fract))
     else {
@@ -218,7 +231,12 @@ fn image_file(scenes: &[Scene], seen: &Seen) -> Result<PathBuf> {
 }
 
 /// Writes what `sixfold teach` reads: poses, masks and the images' paths.
-fn photograph_file(folder: &Path, scenes: &[Scene], used: &[&Seen]) -> Result<PathBuf> {
+fn photograph_file(
+    folder: &Path,
+    scenes: &[Scene],
+    used: &[&Seen],
+    floor: Option<FloorEntry>,
+) -> Result<PathBuf> {
     let mut photographs = vec![];
     for (number, seen) in used.iter().enumerate() {
         let mask = format!("{number:06}_mask.png");
@@ -241,7 +259,7 @@ fn photograph_file(folder: &Path, scenes: &[Scene], used: &[&Seen]) -> Result<Pa
     let camera = used.first().map(|s| s.camera).context("no image shows enough of the object")?;
     write_atomically(&folder.join("camera.json"), serde_json::to_string_pretty(&camera)?.as_bytes())?;
     let file = folder.join("photographs.json");
-    let list = PhotographFile { mesh: None, unit: None, photographs };
+    let list = PhotographFile { mesh: None, unit: None, floor, photographs };
     write_atomically(&file, serde_json::to_string_pretty(&list)?.as_bytes())?;
     Ok(file)
 }
@@ -250,15 +268,16 @@ fn measured(
     a: &TeachDatasetArguments,
     (id, mesh, info): (u32, &Mesh, &ModelInfo),
     seen: &[Seen],
-    scenes: &[Scene],
+    (scenes, meshes): (&[Scene], &BTreeMap<u32, Mesh>),
 ) -> Result<Row> {
-    let numbers = chosen(seen, a.photographs);
+    let numbers = chosen(seen, a.photographs, a.min_visible);
     let used: Vec<&Seen> = numbers.iter().map(|i| &seen[*i]).collect();
     if used.len() < 4 {
-        bail!("object {id}: {} images show {VISIBLE} of it, expected at least 4", used.len());
+        bail!("object {id}: {} images show {} of it, expected at least 4", used.len(), a.min_visible);
     }
     let folder = a.out.join(format!("{id:06}"));
-    let file = photograph_file(&folder, scenes, &used)?;
+    let floor = up(scenes, id, &used, meshes)?;
+    let file = photograph_file(&folder, scenes, &used, floor)?;
     let mut teaching = Teaching::open_file(folder.join("teaching"), &file, None)?;
     let shape = ShapeOptions::default();
     teaching.locate(&())?;
@@ -295,6 +314,53 @@ fn measured(
         found: search.right(&views, &taught, &true_from_taught.inverse())?,
         found_with_true_mesh: search.right(&views, &known, &Pose::identity())?,
     })
+}
+
+/// Where is up in the object's frame: the normal of the plane on which the other annotated objects of each image stand, as a printed
+/// board would say it; the median of the images. The object's true mesh is not used.
+fn up(scenes: &[Scene], id: u32, used: &[&Seen], meshes: &BTreeMap<u32, Mesh>) -> Result<Option<FloorEntry>> {
+    let mut normals = vec![];
+    for seen in used {
+        let Some(scene) = scenes.iter().find(|s| s.scene_id == seen.scene) else { continue };
+        let object_from_camera = seen.pose.inverse();
+        let mut bodies = vec![];
+        for truth in scene.image(seen.image)?.ground_truth.iter().filter(|t| t.obj_id != id) {
+            let Some(mesh) = meshes.get(&truth.obj_id) else { continue };
+            let pose = object_from_camera * truth.camera_from_object;
+            let points = mesh.sample_surface(BODY_POINTS, 7).points;
+            bodies.push(points.iter().map(|p| pose.transform_point(p)).collect::<Vec<Vec3>>());
+        }
+        normals.extend(standing_plane(&bodies, &object_from_camera.translation()).map(|plane| plane.normal));
+    }
+    let of = |axis: usize| median(&mut normals.iter().map(|n| n[axis]).collect::<Vec<f64>>());
+    let (Some(x), Some(y), Some(z)) = (of(0), of(1), of(2)) else { return Ok(None) };
+    Ok(Some(FloorEntry { normal: [x, y, z], point: None }))
+}
+
+/// The plane that bodies touch from above, on the cameras' side: the normal along which their lowest points are at the same height.
+fn standing_plane(bodies: &[Vec<Vec3>], eye: &Vec3) -> Option<Plane> {
+    let lowest = |normal: &Vec3| -> Vec<f64> {
+        bodies.iter().map(|body| body.iter().map(|p| normal.dot(p)).fold(f64::INFINITY, f64::min)).collect()
+    };
+    // The mean distance from the median: one body may stand on another.
+    let spread = |normal: &Vec3| {
+        let mut heights = lowest(normal);
+        let middle = median(&mut heights).unwrap_or(f64::NAN);
+        (heights.iter().map(|h| (h - middle).abs()).sum::<f64>() / heights.len() as f64, middle)
+    };
+    let mut best = eye.try_normalize(1e-9)?;
+    let mut step = FIRST_STEP;
+    while step > LAST_STEP {
+        let across =
+            best.cross(&Vec3::x()).try_normalize(0.1).unwrap_or_else(|| best.cross(&Vec3::y()).normalize());
+        let other = best.cross(&across);
+        let around = (-4..=4).flat_map(|i| (-4..=4).map(move |j| (0.25 * f64::from(i), 0.25 * f64::from(j))));
+        let tried = around.map(|(i, j)| (best + step * (i * across + j * other)).normalize());
+        best = tried.min_by(|a, b| spread(a).0.total_cmp(&spread(b).0))?;
+        step *= 0.6;
+    }
+    let (error, offset) = spread(&best);
+    (bodies.len() >= FEWEST_BODIES && error < BELOW).then_some(Plane { normal: best, offset })
 }
 
 /// Mean distances in millimetres: of the found mesh to the truth, and of the truth where an image shows it to the found mesh.
