@@ -186,7 +186,7 @@ fn found(store: &dyn ExperienceStore, file: &StorePlace, id: i64) -> Result<Stor
     match store.get(id)? {
         Some(stored) => Ok(stored),
         None => bail!(
-            "{}: there is no experience {id}; `sixfold grasp store list` shows which there are",
+            "{}: there is no experience {id}; `sixfold grasp store list` lists the ids",
             file.display()
         ),
     }
