@@ -20,7 +20,7 @@ pub enum ModelError {
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// The card does not describe a DGCM-Net.
-    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is no DGCM-Net of this version", file.display())]
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is not a DGCM-Net of this version", file.display())]
     Card {
         /// The file.
         file: PathBuf,

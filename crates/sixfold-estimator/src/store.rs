@@ -74,7 +74,7 @@ pub enum StoreError {
     },
     /// There is something of this name that is none.
     #[error(
-        "{} is no stored object (it holds no object.json) and is left alone: give another name, or remove it yourself",
+        "{} is not a stored object (it has no object.json) and was not changed: give another name, or remove it yourself",
         path.display()
     )]
     NotAnObject {

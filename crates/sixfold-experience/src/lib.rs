@@ -114,7 +114,7 @@ pub enum StoreError {
         file: PathBuf,
     },
     /// The store may not be written.
-    #[error("{}: the experience store may only be read; check the permissions of file and folder, or, of a server, that it is no standby", file.display())]
+    #[error("{}: the experience store is read-only; check the permissions of the file and its folder, or, for PostgreSQL, that the server is not a standby", file.display())]
     ReadOnly {
         /// The file.
         file: PathBuf,

@@ -7,6 +7,7 @@
 #[macro_use]
 extern crate sixfold_shell;
 
+mod charts;
 mod grasp;
 mod reproduce;
 
@@ -55,6 +56,9 @@ enum Command {
     Reproduce(reproduce::ReproduceArguments),
     /// Grasps of a parallel-jaw gripper, measured in simulation
     Grasp(grasp::GraspArguments),
+    /// Write the charts of the documentation from the result files, or check them
+    #[command(after_help = "Example:\n  sixfold-experiments charts --check")]
+    Charts(charts::ChartsArguments),
 }
 
 fn main() -> ExitCode {
@@ -69,5 +73,6 @@ fn main() -> ExitCode {
     exit_code(&match &arguments.command {
         Command::Reproduce(a) => reproduce::run(a),
         Command::Grasp(a) => grasp::run(a),
+        Command::Charts(a) => charts::run(a),
     })
 }

@@ -16,7 +16,7 @@ use crate::{Mat3, Vec3};
 pub enum PoseError {
     /// The 3x3 part is not a rotation.
     #[error(
-        "the 3x3 part is no rotation: R^T R differs from the identity by up to {orthogonality:.2e} \
+        "the 3x3 part is not a rotation: R^T R differs from the identity by up to {orthogonality:.2e} \
          (at most {tolerance:.0e} is accepted) and its determinant is {determinant:.6} (expected 1)"
     )]
     NotARotation {

@@ -20,7 +20,7 @@ pub(crate) fn inside(image: &DynamicImage) -> Result<Vec<bool>, String> {
         DynamicImage::ImageRgba8(p) => with_alpha::<u8, 4>(p.as_raw(), u8::MAX),
         DynamicImage::ImageRgba16(p) => with_alpha::<u16, 4>(p.as_raw(), u16::MAX),
         other => Err(format!(
-            "{:?} is no kind of mask, expected grey, palette or RGB, with alpha or without",
+            "{:?} is not a mask format, expected grey, palette or RGB, with alpha or without",
             other.color()
         )),
     }

@@ -372,7 +372,7 @@ mod tests {
             ("164.627", "\"big\"", ["object 10, diameter", "above zero", "\"big\""]),
             ("164.627", "-1", ["object 10, diameter", "above zero", "-1"]),
             ("\"min_y\": -1,", "", ["object 10, min_y", "a number", "no such field"]),
-            ("[[-1,0,0,-7", "[[-2,0,0,-7", ["object 10, symmetries_discrete[0]", "rigid", "no rotation"]),
+            ("[[-1,0,0,-7", "[[-2,0,0,-7", ["object 10, symmetries_discrete[0]", "rigid", "not a rotation"]),
             ("[[-1,0,0,-7,", "[[0,-7,", ["object 10, symmetries_discrete[0]", "16 numbers", "array of 14"]),
             ("[0, 0, 2]", "[0, 0, 0]", ["object 2, symmetries_continuous[0].axis", "direction", "0.0"]),
             ("\"10\"", "\"ten\"", ["object id", "whole number", "ten"]),

@@ -72,7 +72,7 @@ pub enum TemplateError {
         high: f64,
     },
     /// More views than templates that a file may hold.
-    #[error("found {found} views, expected up to {most}: leave out those that look alike")]
+    #[error("found {found} views, expected at most {most}: leave out views that look nearly the same")]
     TooManyViews {
         /// Views found.
         found: usize,

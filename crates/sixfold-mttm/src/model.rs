@@ -29,7 +29,7 @@ pub enum ModelError {
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// The card does not describe a network of template matching.
-    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is no network of template matching of this version", file.display())]
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is not a template-matching network of this version", file.display())]
     Card {
         /// The file.
         file: PathBuf,

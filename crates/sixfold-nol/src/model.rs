@@ -29,7 +29,7 @@ pub enum ModelError {
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// The card does not describe a network of NOL.
-    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is no NOL network of this version", file.display())]
+    #[error("{}: the card's `{field}`: expected {expected}, found {found}; the file is not a NOL network of this version", file.display())]
     Card {
         /// The file.
         file: PathBuf,

@@ -6,11 +6,13 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+mod bars;
 mod font;
 mod ticks;
 
 use sixfold_geometry::{Image, RgbImage};
 
+pub use bars::{BarChart, BarGroup};
 use font::FONT;
 pub use ticks::{Ticks, ticks, ticks_logarithmic};
 

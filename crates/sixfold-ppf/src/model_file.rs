@@ -201,7 +201,7 @@ fn check(found: &Description, mesh: &Mesh) -> Result<(), &'static str> {
         return Err("field samples: a point that is not on the object");
     }
     if !samples.normals.iter().all(|n| (n.norm() - 1.0).abs() <= SAME_NORMAL) {
-        return Err("field normals: one that is no direction");
+        return Err("field normals: a normal has length zero or is not finite");
     }
     if found.visible_from.contains(&0) {
         return Err("field visible_from: a sample that no view sees");

@@ -144,7 +144,7 @@ impl ApiError {
         ApiError::plain(
             StatusCode::INTERNAL_SERVER_ERROR,
             format!("{what}: {error}"),
-            "look at the server's disk and its messages",
+            "check the server's disk and its messages",
         )
     }
 
@@ -164,21 +164,21 @@ impl ApiError {
             .with_status(StatusCode::BAD_REQUEST),
             StoreError::Unknown { name, there, .. } => ApiError::field(
                 field,
-                format!("{name:?}, which is no stored object"),
-                format!("one of those there are ({there})"),
-                "add the object, or look at /v1/objects",
+                format!("{name:?}, which is not a stored object"),
+                format!("one of the stored objects ({there})"),
+                "add the object; /v1/objects lists those that exist",
             )
             .with_status(StatusCode::NOT_FOUND),
             StoreError::Exists { name, .. } => ApiError::field(
                 field,
-                format!("{name:?}, which is there already"),
+                format!("{name:?}, which exists already"),
                 "a new name",
                 "give replace=true or another name",
             )
             .with_status(StatusCode::CONFLICT),
             StoreError::Locked(_) => ApiError::plain(
                 StatusCode::CONFLICT,
-                format!("{field}: another process changes this object"),
+                format!("{field}: another process is changing this object"),
                 "try again in a moment",
             ),
             StoreError::NotAnObject { .. } | StoreError::Record { .. } | StoreError::StoredMesh { .. } => {

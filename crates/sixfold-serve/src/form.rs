@@ -108,7 +108,7 @@ impl Form {
             "form",
             format!("a field {name:?}, which is not known"),
             all.join(", "),
-            "look at /v1/openapi.json",
+            "see /v1/openapi.json",
         ))
     }
 

@@ -188,6 +188,6 @@ async fn not_there() -> ApiError {
 }
 
 async fn not_allowed() -> ApiError {
-    let advice = "look at /v1/openapi.json for the methods of this path";
+    let advice = "see /v1/openapi.json for the methods of this path";
     ApiError::plain(StatusCode::METHOD_NOT_ALLOWED, "this path does not take this method", advice)
 }

@@ -156,7 +156,7 @@ impl DatasetFolder {
         match std::fs::read(file) {
             Ok(there) if there == bytes => Ok(()),
             Ok(_) => bail!(
-                "{}: it is not what this command wrote there: somebody changed it; remove the folder and start again, or choose \
+                "{}: it differs from what this command wrote there: the file was changed; remove the folder and start again, or choose \
                  another --out",
                 file.display()
             ),

@@ -141,7 +141,7 @@ fn check_key(key: &str, plain: &str, value: &Value) -> Result<(), String> {
              the image, and remove the field"
         )),
         "fisheyemodel" if number == Some(0.0) || value == &Value::Bool(false) => Ok(()),
-        "fisheyemodel" => Err(format!("field {key}: a fisheye lens is no pinhole camera; {RECTIFY}")),
+        "fisheyemodel" => Err(format!("field {key}: a fisheye lens is not a pinhole camera; {RECTIFY}")),
         "cammodel" | "cameramodel" if value.as_str() == Some("pinhole") => Ok(()),
         "cammodel" | "cameramodel" => {
             Err(format!("field {key}: found {}, expected \"pinhole\"; {RECTIFY}", found(value)))

@@ -175,9 +175,9 @@ impl Jobs {
         self.state().by_id.get(id).cloned().ok_or_else(|| {
             ApiError::field(
                 "id",
-                format!("{id:?}, which is no job"),
+                format!("{id:?}, which is not a job"),
                 "the id of a job of this server",
-                "look at /v1/jobs; finished jobs are removed when there are many newer ones",
+                "/v1/jobs lists them; finished jobs are removed when there are many newer ones",
             )
             .with_status(StatusCode::NOT_FOUND)
         })
@@ -322,7 +322,7 @@ fn found(folder: PathBuf, id: String) -> Job {
             fail(
                 &mut record,
                 format!("the server ended {MAX_ATTEMPTS} times while it worked on this job"),
-                "look at the server's messages; ask for less at once",
+                "read the server's messages; ask for less at once",
             );
         } else {
             (record.state, record.started) = (JobState::Queued, None);

@@ -289,7 +289,7 @@ pub(super) fn run(app: &App, request: &FindRequest, work: &mut Work<'_>) -> Resu
         Some(depth) if needs.depth != Need::Unused => {
             let prepared = PreparedDepth::new(depth, &images.camera, &estimator.depth_options());
             let prepared: Arc<PreparedDepth> = prepared.map_err(|e| {
-                ApiError::about("depth", e, "a depth image of a scene", "look at what was measured")
+                ApiError::about("depth", e, "a depth image of a scene", "inspect the depth image")
             })?;
             notes.extend(depth_notes(&prepared, estimator.as_ref()));
             Some(prepared)

@@ -176,9 +176,9 @@ impl Teachings {
         locked(&self.all).get(id).cloned().ok_or_else(|| {
             ApiError::field(
                 "id",
-                format!("{id:?}, which is no teaching"),
+                format!("{id:?}, which is not a teaching"),
                 "the id of a teaching of this server",
-                "look at /v1/teachings",
+                "/v1/teachings lists them",
             )
             .with_status(StatusCode::NOT_FOUND)
         })
@@ -266,7 +266,7 @@ pub(crate) fn of_teach(error: &TeachError) -> ApiError {
             "number",
             index.to_string(),
             format!("the number of one of {photographs} photographs, from 0"),
-            "look at the teaching",
+            "inspect the teaching",
         )
         .with_status(StatusCode::NOT_FOUND),
         TeachError::MaskSize { .. } => ApiError::about(

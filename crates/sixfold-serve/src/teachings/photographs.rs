@@ -44,7 +44,7 @@ pub(super) fn number(text: &str) -> Answer<usize> {
             "number",
             format!("{text:?}"),
             "the number of a photograph, from 0",
-            "look at the teaching",
+            "inspect the teaching",
         )
         .with_status(axum::http::StatusCode::NOT_FOUND)
     })

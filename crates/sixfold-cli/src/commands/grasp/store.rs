@@ -185,10 +185,9 @@ fn list(file: &StorePlace, json: &JsonArguments) -> Result<Outcome> {
 fn found(store: &dyn ExperienceStore, file: &StorePlace, id: i64) -> Result<Stored> {
     match store.get(id)? {
         Some(stored) => Ok(stored),
-        None => bail!(
-            "{}: there is no experience {id}; `sixfold grasp store list` shows which there are",
-            file.display()
-        ),
+        None => {
+            bail!("{}: there is no experience {id}; `sixfold grasp store list` lists the ids", file.display())
+        }
     }
 }
 
