@@ -5,6 +5,7 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+pub mod anchored;
 pub mod detect;
 pub mod detector;
 mod loss;
