@@ -1,6 +1,6 @@
 //! Detections of Faster R-CNN, Mask R-CNN or RetinaNet with given torchvision weights, for `checks/anchored_vs_torchvision.py`.
 //!
-//! `anchored_outputs WEIGHTS NORM_EPSILON OUTPUT.safetensors IMAGE ..`: the output holds of every image, under its number, `boxes`
+//! `anchored_outputs WEIGHTS NORM_EPSILON|- OUTPUT.safetensors IMAGE ..`: the output holds of every image, under its number, `boxes`
 //! (`count x 4`), `scores`, `labels`, the `masks` (`count x 28 x 28`) and the masks `pasted` into the image (`count x rows x columns`)
 //! of a network that has them, and the `seconds` that it took.
 
@@ -19,7 +19,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let [weights, epsilon, output, images @ ..] = arguments.as_slice() else {
         return Err("expected WEIGHTS NORM_EPSILON OUTPUT.safetensors IMAGE ..".into());
     };
-    let network = AnchoredNetwork::recognised(Path::new(weights), epsilon.parse()?)?;
+    let epsilon = if epsilon == "-" { None } else { Some(epsilon.parse()?) };
+    let network = AnchoredNetwork::recognised(Path::new(weights), |config| {
+        config.norm_epsilon = epsilon.unwrap_or(config.norm_epsilon);
+    })?;
     let network = network.ok_or("none of the three networks")?;
     let thresholds = network.config().thresholds();
     let mut outputs = Outputs::new();

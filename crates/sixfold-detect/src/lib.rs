@@ -16,6 +16,7 @@ pub mod recipe;
 pub mod samples;
 mod tabletop;
 mod targets;
+pub mod torchvision;
 pub mod training;
 
 pub use targets::{Annotation, Instance};

@@ -7,8 +7,13 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
-use sixfold_detect::anchored::{AnchoredConfig, AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
-use sixfold_geometry::RgbImage;
+use sixfold_detect::anchored::{
+    AnchoredConfig, AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds,
+};
+use sixfold_detect::detect::DetectOptions;
+use sixfold_detect::model::{DetectorModel, ModelError};
+use sixfold_detect::torchvision::objects_file;
+use sixfold_geometry::{Rect, RgbImage};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::pretrained::{PretrainedError, PretrainedFile};
 
@@ -120,12 +125,11 @@ fn any_number_of_threads_gives_the_same_detections_and_empty_images_none() {
     assert!(network.detect(&RgbImage::filled(1, 1, [9; 3]), &thresholds(kind), false).len() <= 8);
 }
 
+/// Another name and shape of a tensor, or that it is left out.
+type Change<'a> = &'a dyn Fn(&str, Vec<usize>) -> Option<(String, Vec<usize>)>;
+
 /// The weights under other names or of other shapes.
-fn changed(
-    from: &Path,
-    to: &Path,
-    change: impl Fn(&str, Vec<usize>) -> Option<(String, Vec<usize>)>,
-) -> PathBuf {
+fn changed(from: &Path, to: &Path, change: Change<'_>) -> PathBuf {
     let bytes = std::fs::read(from).unwrap();
     let file = SafeTensors::deserialize(&bytes).unwrap();
     let all = file.tensors();
@@ -157,7 +161,7 @@ fn old(name: &str) -> String {
 fn names_of_older_versions_are_understood() {
     let folder = tempfile::tempdir().unwrap();
     for kind in AnchoredKind::ALL {
-        let file = changed(&weights(*kind), &folder.path().join("old.safetensors"), |name, shape| {
+        let file = changed(&weights(*kind), &folder.path().join("old.safetensors"), &|name, shape| {
             Some((format!("model.{}", old(name)), shape))
         });
         let names = |path: &Path| -> Vec<String> {
@@ -175,19 +179,22 @@ fn names_of_older_versions_are_understood() {
 fn what_does_not_fit_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let kind = AnchoredKind::MaskRcnn;
-    let of = |change: &dyn Fn(&str, Vec<usize>) -> Option<(String, Vec<usize>)>| {
+    let of = |change: Change<'_>| {
         let file = changed(&weights(kind), &folder.path().join("wrong.safetensors"), change);
         load(&file, &config(kind)).unwrap_err().to_string()
     };
     let error = of(&|name, shape| (!name.contains("mask_head.2.0.bias")).then(|| (name.to_owned(), shape)));
-    for word in ["wrong.safetensors", "roi_heads.mask_head.2.0.bias", "expected shape [8]", "found no tensor"] {
+    for word in ["wrong.safetensors", "roi_heads.mask_head.2.0.bias", "expected shape [8]", "found no tensor"]
+    {
         assert!(error.contains(word), "{word} is not in {error}");
     }
     let error = of(&|name, shape| {
         let flat = name == "roi_heads.box_head.fc7.weight";
         Some((name.to_owned(), if flat { vec![256] } else { shape }))
     });
-    for word in ["roi_heads.box_head.fc7.weight", "expected shape [16, 16]", "found [256]", "maskrcnn_resnet50_fpn"] {
+    for word in
+        ["roi_heads.box_head.fc7.weight", "expected shape [16, 16]", "found [256]", "maskrcnn_resnet50_fpn"]
+    {
         assert!(error.contains(word), "{word} is not in {error}");
     }
     // Weights of one network are not those of another.
@@ -198,15 +205,109 @@ fn what_does_not_fit_is_named() {
 }
 
 #[test]
-fn a_file_tells_which_network_it_holds() {
+fn a_file_tells_which_network_it_holds_and_its_sizes() {
     let folder = tempfile::tempdir().unwrap();
-    // Too small for the network of full size, which the message names.
     for kind in AnchoredKind::ALL {
-        let error = AnchoredNetwork::recognised(&weights(*kind), 0.0).unwrap_err().to_string();
-        assert!(error.contains(kind.torchvision()) && error.contains("backbone.body.conv1.weight"), "{error}");
+        let sides = |config: &mut AnchoredConfig| (config.min_side, config.max_side) = (96, 160);
+        let network = AnchoredNetwork::recognised(&weights(*kind), sides).unwrap().unwrap();
+        let hidden = if *kind == AnchoredKind::RetinaNet { 0 } else { 16 };
+        // Normalisations without a count of batches count as frozen.
+        assert_eq!(*network.config(), AnchoredConfig { hidden, norm_epsilon: 0.0, ..config(*kind) });
+        let counted = changed(&weights(*kind), &folder.path().join("counted.safetensors"), &|name, shape| {
+            let counts = name == "backbone.body.bn1.bias";
+            Some((
+                if counts { "backbone.body.bn1.num_batches_tracked".to_owned() } else { name.to_owned() },
+                shape,
+            ))
+        });
+        // The bias is missing then, but the sizes are known before.
+        let mut epsilon = None;
+        let error = AnchoredNetwork::recognised(&counted, |config| epsilon = Some(config.norm_epsilon));
+        assert_eq!(epsilon, Some(1e-5));
+        assert!(error.unwrap_err().to_string().contains("tensor backbone.body.bn1.bias"));
     }
-    let file = changed(&weights(AnchoredKind::RetinaNet), &folder.path().join("other.safetensors"), |name, shape| {
-        name.starts_with("backbone").then(|| (name.to_owned(), shape))
-    });
-    assert!(AnchoredNetwork::recognised(&file, 0.0).unwrap().is_none());
+    let file = changed(
+        &weights(AnchoredKind::RetinaNet),
+        &folder.path().join("other.safetensors"),
+        &|name, shape| name.starts_with("backbone").then(|| (name.to_owned(), shape)),
+    );
+    assert!(AnchoredNetwork::recognised(&file, |_| ()).unwrap().is_none());
+    let error = DetectorModel::load(&file).unwrap_err().to_string();
+    assert!(error.contains("other.safetensors") && error.contains("retinanet_resnet50_fpn"), "{error}");
+}
+
+/// Weights in a folder with this text beside them.
+fn beside(folder: &Path, kind: AnchoredKind, text: &str) -> PathBuf {
+    let file = folder.join("detector.safetensors");
+    std::fs::copy(weights(kind), &file).unwrap();
+    std::fs::write(objects_file(&file), text).unwrap();
+    file
+}
+
+#[test]
+fn a_detector_gives_the_objects_of_its_labels() {
+    let folder = tempfile::tempdir().unwrap();
+    let kind = AnchoredKind::MaskRcnn;
+    let sides = r#""norm_epsilon": 1e-5, "min_side": 96, "max_side": 160, "threshold": 0.05"#;
+    let file = beside(folder.path(), kind, &format!("{{{sides}}}"));
+    let model = DetectorModel::load(&file).unwrap();
+    let ids = |model: &DetectorModel| model.classes().iter().map(|c| c.id).collect::<Vec<_>>();
+    assert_eq!((ids(&model), model.usage().threshold), (vec![1, 2, 3], 0.05));
+    assert_eq!(model.card().training_frames, None);
+    let image = pattern(90, 70);
+    let options = DetectOptions { most: 8, ..model.options() };
+    let found = model.detect(&image, &options).unwrap();
+    let expected = load(&weights(kind), &config(kind)).unwrap().detect(&image, &thresholds(kind), true);
+    assert_eq!(found.len(), expected.len());
+    for (f, e) in found.iter().zip(&expected) {
+        assert_eq!((model.id_of(f.class), f.score), (e.label as u32, e.score));
+        let [left, top, right, bottom] = e.corners.map(f64::from);
+        assert_eq!(f.bbox, Rect { x: left, y: top, width: right - left, height: bottom - top });
+        let mask = e.mask.as_ref().unwrap().pasted(&e.corners, image.size()).mask(image.size());
+        assert_eq!(f.mask.as_ref(), Some(&mask));
+    }
+    let none = DetectOptions { masks: false, ..options };
+    assert!(model.detect(&image, &none).unwrap().iter().all(|d| d.mask.is_none()));
+
+    // Two of the labels, whose detections are not crowded out by the others.
+    let file = beside(folder.path(), kind, &format!(r#"{{"objects": {{"3": 8, "1": 20}}, {sides}}}"#));
+    let model = DetectorModel::load(&file).unwrap();
+    assert_eq!(ids(&model), [20, 8]);
+    let found: Vec<u32> =
+        model.detect(&image, &options).unwrap().iter().map(|d| model.id_of(d.class)).collect();
+    assert_eq!(found.len(), 8);
+    assert!(found.contains(&20) && found.contains(&8), "{found:?}");
+    assert!(model.check_object(20).is_ok() && model.check_object(3).is_err());
+    let error = model.save(&folder.path().join("again.safetensors")).unwrap_err().to_string();
+    assert!(error.contains("is not written again"), "{error}");
+    assert!(matches!(model.detect(&RgbImage::filled(0, 0, [0; 3]), &options), Err(ModelError::EmptyImage)));
+}
+
+#[test]
+fn a_wrong_file_beside_the_weights_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for (text, words) in [
+        ("{", "EOF"),
+        (r#"{"classes": 3}"#, "unknown field `classes`"),
+        (r#"{"objects": {}}"#, "0 objects"),
+        (r#"{"objects": {"0": 5}}"#, "label 0, but the weights have the labels 1 to 3"),
+        (r#"{"objects": {"4": 5}}"#, "label 4, but"),
+        (r#"{"objects": {"1": 5, "2": 5}}"#, "object 5 for the labels 1 and 2"),
+        (r#"{"norm_epsilon": -1}"#, "norm_epsilon -1"),
+        (r#"{"threshold": 2}"#, "threshold 2"),
+        (r#"{"min_side": 0}"#, "min_side 0"),
+        (r#"{"max_side": 99999}"#, "max_side 99999"),
+    ] {
+        let file = beside(folder.path(), AnchoredKind::FasterRcnn, text);
+        let error = DetectorModel::load(&file).unwrap_err().to_string();
+        assert!(
+            error.contains("detector.objects.json") && error.contains(words),
+            "{words} is not in {error}"
+        );
+    }
+    // RetinaNet's labels begin with 0.
+    let file = beside(folder.path(), AnchoredKind::RetinaNet, r#"{"objects": {"0": 5}}"#);
+    assert_eq!(DetectorModel::load(&file).unwrap().id_of(0), 5);
+    let error = DetectorModel::load(&folder.path().join("none.pth")).unwrap_err();
+    assert!(matches!(error, ModelError::Weights(_)), "{error}");
 }

@@ -66,9 +66,8 @@ impl Bottlenecks {
                 })
                 .collect()
         });
-        let fc = classes
-            .filter(|_| layers == LAYERS)
-            .map(|classes| dense([inputs, classes], &mut rng, device));
+        let fc =
+            classes.filter(|_| layers == LAYERS).map(|classes| dense([inputs, classes], &mut rng, device));
         ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc }
     }
 

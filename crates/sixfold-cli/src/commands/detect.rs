@@ -10,6 +10,7 @@ use sixfold_bop::{BopDataset, Detection, write_detections};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::model::DetectorModel;
+use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_geometry::RgbImage;
 use sixfold_io::read_rgb;
 use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, RunOptions, detections};
@@ -100,6 +101,9 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     } = a;
     let mut options = RunOptions::default();
     options.add("weights", &weights.to_string_lossy());
+    if let Some(file) = existing_objects_file(weights) {
+        options.add("objects of the weights", &file.to_string_lossy());
+    }
     options.add("dataset", &dataset.as_deref().map_or_else(String::new, |d| d.to_string_lossy().into()));
     options.add("split", split);
     options.add("ids", &format!("{ids:?}"));

@@ -22,7 +22,9 @@ impl Scales {
         let side = FINEST << level;
         match self {
             Scales::One => vec![side as f32],
-            Scales::Three => [0.0, 1.0, 2.0].map(|i: f64| (side as f64 * (i / 3.0).exp2()).trunc() as f32).to_vec(),
+            Scales::Three => {
+                [0.0, 1.0, 2.0].map(|i: f64| (side as f64 * (i / 3.0).exp2()).trunc() as f32).to_vec()
+            }
         }
     }
 
@@ -73,7 +75,10 @@ mod tests {
         assert_eq!(Scales::Three.of_level(0), [32.0, 40.0, 50.0]);
         assert_eq!(Scales::Three.of_level(4), [512.0, 645.0, 812.0]);
         let retina = about_origin(&Scales::Three.of_level(0));
-        assert_eq!(retina[..3], [[-23.0, -11.0, 23.0, 11.0], [-28.0, -14.0, 28.0, 14.0], [-35.0, -18.0, 35.0, 18.0]]);
+        assert_eq!(
+            retina[..3],
+            [[-23.0, -11.0, 23.0, 11.0], [-28.0, -14.0, 28.0, 14.0], [-35.0, -18.0, 35.0, 18.0]]
+        );
         assert_eq!(retina.len(), Scales::Three.anchors());
     }
 

@@ -1,6 +1,10 @@
 //! Boxes as left, top, right and bottom: their code relative to an anchor (Girshick et al. 2014, appendix C), clipping, overlap and
 //! suppression of overlapping ones.
 
+use std::collections::BTreeMap;
+
+use super::config::Thresholds;
+
 /// Left, top, right and bottom in pixels; a pixel's border lies on whole numbers, as in COCO.
 pub(super) type Corners = [f32; 4];
 
@@ -108,9 +112,67 @@ pub(super) fn suppress_in_groups(
     kept
 }
 
+/// A detection in the resized image.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Found {
+    pub label: usize,
+    pub score: f32,
+    pub corners: Corners,
+}
+
+/// Boxes with a score of their label, before suppression.
+#[derive(Debug, Default)]
+pub(super) struct Candidates {
+    boxes: Vec<Corners>,
+    scores: Vec<f32>,
+    labels: Vec<usize>,
+}
+
+impl Candidates {
+    pub(super) fn push(&mut self, found: Found) {
+        self.boxes.push(found.corners);
+        self.scores.push(found.score);
+        self.labels.push(found.label);
+    }
+
+    /// What is left of them after suppression, best first.
+    pub(super) fn suppressed(&self, thresholds: &Thresholds) -> Vec<Found> {
+        let Thresholds { overlap, most, per_label, .. } = *thresholds;
+        let mut of_label: BTreeMap<usize, usize> = BTreeMap::new();
+        let mut found = vec![];
+        for i in suppress_in_groups(&self.boxes, &self.scores, &self.labels, overlap) {
+            let count = of_label.entry(self.labels[i]).or_default();
+            if found.len() == most {
+                break;
+            }
+            if *count < per_label {
+                *count += 1;
+                found.push(Found { label: self.labels[i], score: self.scores[i], corners: self.boxes[i] });
+            }
+        }
+        found
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn detections_are_limited_in_all_and_by_label() {
+        let mut candidates = Candidates::default();
+        for (i, label) in [1, 1, 2, 1, 2].into_iter().enumerate() {
+            let x = 20.0 * i as f32;
+            candidates.push(Found { label, score: 0.9 - 0.1 * i as f32, corners: [x, 0.0, x + 10.0, 10.0] });
+        }
+        let labels = |most: usize, per_label: usize| -> Vec<usize> {
+            let thresholds = Thresholds { score: 0.0, overlap: 0.5, most, per_label };
+            candidates.suppressed(&thresholds).iter().map(|f| f.label).collect()
+        };
+        assert_eq!(labels(9, 9), [1, 1, 2, 1, 2]);
+        assert_eq!(labels(9, 1), [1, 2]);
+        assert_eq!(labels(2, 9), [1, 1]);
+    }
 
     #[test]
     fn a_code_moves_and_scales_a_box() {

@@ -53,8 +53,9 @@ pub struct AnchoredConfig {
     pub pyramid: usize,
     /// Numbers in the two layers of the box head.
     pub hidden: usize,
-    /// Added to the variances of the ResNet's frozen normalisations: 1e-5 where a network was built by torchvision's default, 0 where
-    /// it is one of the COCO_V1 weights, for which torchvision sets it to 0 (`overwrite_eps`). The weights do not state it.
+    /// Added to the variances of the ResNet's normalisations. torchvision's is 1e-5, but 0 for frozen normalisations of networks built
+    /// with its COCO_V1 weights (`overwrite_eps`). No weight file states it; those of normalisations that are not frozen, which count
+    /// their batches, always have 1e-5.
     pub norm_epsilon: f64,
     /// Images are resized to this shorter side, pixels (Ren et al. 2015, section 3.3; torchvision: 800).
     pub min_side: usize,
@@ -71,6 +72,8 @@ pub struct Thresholds {
     pub overlap: f64,
     /// Maximum number of detections, the best ones.
     pub most: usize,
+    /// Maximum number of detections of a label; torchvision has no such limit.
+    pub per_label: usize,
 }
 
 impl AnchoredConfig {
@@ -93,7 +96,7 @@ impl AnchoredConfig {
     /// torchvision's thresholds: those of COCO's average precision.
     pub fn thresholds(&self) -> Thresholds {
         let most = if self.kind == AnchoredKind::RetinaNet { 300 } else { 100 };
-        Thresholds { score: 0.05, overlap: 0.5, most }
+        Thresholds { score: 0.05, overlap: 0.5, most, per_label: usize::MAX }
     }
 
     /// The first label that stands for an object.

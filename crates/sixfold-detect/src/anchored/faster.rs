@@ -5,10 +5,10 @@ use burn::tensor::{Device, Tensor};
 use sixfold_geometry::random::stream;
 
 use super::anchors::{Scales, anchors};
-use super::boxes::Corners;
+use super::boxes::{Corners, Found};
 use super::config::{AnchoredConfig, Thresholds};
 use super::fpn::Backbone;
-use super::heads::{Found, Levels, RoiHeads, detections};
+use super::heads::{Levels, RoiHeads, detections};
 use super::masks::MaskProbabilities;
 use super::network::vector;
 use super::rpn::{LevelOutput, Most, ProposalNetwork, proposals};
@@ -32,12 +32,13 @@ impl FasterRcnn {
         }
     }
 
-    /// The detections in the resized image, best first, with their masks if the network has some and they are asked for.
+    /// The detections in the resized image, best first, of labels that are `wanted`, with masks if the network has them and they
+    /// are asked for.
     pub(super) fn detect(
         &self,
         x: Tensor<4>,
         input: &Input,
-        labels: usize,
+        wanted: &[bool],
         thresholds: &Thresholds,
         masks: bool,
     ) -> Vec<(Found, Option<MaskProbabilities>)> {
@@ -54,8 +55,7 @@ impl FasterRcnn {
         }
         let levels = Levels::new(&maps, input.filled);
         let (logits, codes) = self.roi_heads.classify(&levels, &proposals);
-        let found =
-            detections(vector(logits), &vector(codes), &proposals, labels, input.filled, thresholds);
+        let found = detections(vector(logits), &vector(codes), &proposals, wanted, input.filled, thresholds);
         if !masks || found.is_empty() {
             return found.into_iter().map(|f| (f, None)).collect();
         }
@@ -65,7 +65,7 @@ impl FasterRcnn {
         };
         let logits = vector(logits);
         let of = |(number, f): (usize, Found)| {
-            (f, Some(MaskProbabilities::new(&logits, number * labels + f.label)))
+            (f, Some(MaskProbabilities::new(&logits, number * wanted.len() + f.label)))
         };
         found.into_iter().enumerate().map(of).collect()
     }

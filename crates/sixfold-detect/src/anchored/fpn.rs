@@ -59,7 +59,10 @@ impl Backbone {
             ConvConfig { stride: 2, padding: Padding::Zeros(1), ..config }.init(1.0, random, device)
         };
         let extra_blocks = one_stage.then(|| Further { p6: further(random), p7: further(random) });
-        Backbone { body: resnet.init(seed, device), fpn: Pyramid { inner_blocks, layer_blocks, extra_blocks } }
+        Backbone {
+            body: resnet.init(seed, device),
+            fpn: Pyramid { inner_blocks, layer_blocks, extra_blocks },
+        }
     }
 
     /// `1 x 3 x rows x columns`, both multiples of 32, to five levels of `1 x pyramid x ..`, finest first: at 1/4 to 1/64 of the

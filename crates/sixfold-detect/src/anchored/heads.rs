@@ -11,7 +11,7 @@ use sixfold_nn::kernels::{Activation, Regions};
 use sixfold_nn::layers::{Conv, ConvConfig};
 use sixfold_nn::roi_align::roi_align;
 
-use super::boxes::{Corners, area, clipped, decode, is_large, suppress_in_groups};
+use super::boxes::{Candidates, Corners, Found, area, clipped, decode, is_large};
 use super::config::{AnchoredConfig, AnchoredKind, Thresholds};
 use super::fpn::rectified;
 
@@ -66,14 +66,6 @@ struct MaskPredictor {
     mask_fcn_logits: Conv,
 }
 
-/// A detection in the resized image.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Found {
-    pub label: usize,
-    pub score: f32,
-    pub corners: Corners,
-}
-
 /// The levels of an image's pyramid for pooling.
 pub(super) struct Levels<'a> {
     maps: &'a [Tensor<4>],
@@ -86,7 +78,8 @@ impl<'a> Levels<'a> {
     /// rows, as torchvision finds them.
     pub(super) fn new(maps: &'a [Tensor<4>], filled: [usize; 2]) -> Levels<'a> {
         let maps = &maps[..POOLED_LEVELS.min(maps.len())];
-        let scale = |map: &Tensor<4>| (map.dims()[2] as f32 / filled[0] as f32).log2().round_ties_even().exp2();
+        let scale =
+            |map: &Tensor<4>| (map.dims()[2] as f32 / filled[0] as f32).log2().round_ties_even().exp2();
         Levels { maps, scales: maps.iter().map(scale).collect() }
     }
 
@@ -182,36 +175,31 @@ fn softmax(logits: &mut [f32]) {
 }
 
 /// The detections of an image of so many rows and columns, best first, from the `logits` (`proposals x labels`) and `codes`
-/// (`proposals x (4 labels)`) of its proposals. Label 0, the background, is none.
+/// (`proposals x (4 labels)`) of its proposals; only of labels that are `wanted`. Label 0, the background, is none.
 pub(super) fn detections(
     mut logits: Vec<f32>,
     codes: &[f32],
     proposals: &[Corners],
-    labels: usize,
+    wanted: &[bool],
     image: [usize; 2],
     thresholds: &Thresholds,
 ) -> Vec<Found> {
-    let (mut boxes, mut scores, mut groups) = (vec![], vec![], vec![]);
+    let labels = wanted.len();
+    let mut candidates = Candidates::default();
     for ((of, logits), codes) in
         proposals.iter().zip(logits.chunks_exact_mut(labels)).zip(codes.chunks_exact(4 * labels))
     {
         softmax(logits);
         for (label, code) in codes.as_chunks::<4>().0.iter().enumerate().skip(1) {
-            if logits[label] > thresholds.score {
+            if wanted[label] && logits[label] > thresholds.score {
                 let corners = clipped(decode(*code, of, CODE_WEIGHTS), image);
                 if is_large(&corners, MIN_SIDE) {
-                    boxes.push(corners);
-                    scores.push(logits[label]);
-                    groups.push(label);
+                    candidates.push(Found { label, score: logits[label], corners });
                 }
             }
         }
     }
-    let kept = suppress_in_groups(&boxes, &scores, &groups, thresholds.overlap);
-    kept.into_iter()
-        .take(thresholds.most)
-        .map(|i| Found { label: groups[i], score: scores[i], corners: boxes[i] })
-        .collect()
+    candidates.suppressed(thresholds)
 }
 
 #[cfg(test)]
@@ -220,14 +208,14 @@ mod tests {
 
     fn maps(device: &Device) -> Vec<Tensor<4>> {
         // Every level holds its own number.
-        let map = |level: usize| Tensor::full([1, 2, 64 >> level, 64 >> level], level as f32 + 1.0, device);
+        let map = |level: usize| Tensor::full([1, 2, 256 >> level, 256 >> level], level as f32 + 1.0, device);
         (0..5).map(map).collect()
     }
 
     #[test]
     fn boxes_are_pooled_from_the_level_of_their_size_and_stay_in_order() {
         let maps = maps(&Device::flex());
-        let levels = Levels::new(&maps, [250, 240]);
+        let levels = Levels::new(&maps, [1000, 960]);
         assert_eq!(levels.scales, [0.25, 0.125, 0.0625, 0.03125]);
         let square = |side: f32| [0.0, 0.0, side, side];
         let boxes = [square(224.0), square(20.0), square(223.0), square(900.0), square(112.0)];
@@ -245,13 +233,16 @@ mod tests {
         let mut codes = vec![0.0; 24];
         // Label 2 of the first: half a width to the right.
         codes[8] = 5.0;
-        let thresholds = Thresholds { score: 0.1, overlap: 0.5, most: 9 };
-        let found = detections(logits.clone(), &codes, &proposals, 3, [8, 40], &thresholds);
+        let thresholds = Thresholds { score: 0.1, overlap: 0.5, most: 9, per_label: 9 };
+        let found = detections(logits.clone(), &codes, &proposals, &[true; 3], [8, 40], &thresholds);
         let score = 3f32.exp() / (3f32.exp() + 2.0);
         assert_eq!(found.len(), 1);
         assert_eq!((found[0].label, found[0].corners), (2, [5.0, 0.0, 15.0, 8.0]));
         assert!((found[0].score - score).abs() < 1e-6);
-        let all = Thresholds { score: 0.0, overlap: 0.5, most: 3 };
-        assert_eq!(detections(logits, &codes, &proposals, 3, [8, 40], &all).len(), 3);
+        let all = Thresholds { score: 0.0, most: 3, ..thresholds };
+        let count =
+            |wanted: &[bool]| detections(logits.clone(), &codes, &proposals, wanted, [8, 40], &all).len();
+        assert_eq!(count(&[true; 3]), 3);
+        assert_eq!(count(&[true, true, false]), 2);
     }
 }

@@ -6,8 +6,8 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::Device;
 use sixfold_nn::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
+use sixfold_nn::resnet::Bottlenecks;
 
-use super::anchors::Scales;
 use super::config::{AnchoredConfig, AnchoredKind};
 use super::network::{AnchoredNetwork, Layers};
 
@@ -22,27 +22,70 @@ impl AnchoredKind {
     }
 }
 
-/// What a file must hold to be one of the three networks: end of a tensor's name, the network, and the tensor's rows a label.
+/// What a file must hold to be one of the three networks: end of a tensor's name, the network, and the tensor's rows a label (of
+/// RetinaNet one for each anchor of a pixel).
 const SIGNS: [(&str, AnchoredKind, usize); 3] = [
     ("roi_heads.mask_predictor.mask_fcn_logits.weight", AnchoredKind::MaskRcnn, 1),
     ("roi_heads.box_predictor.cls_score.weight", AnchoredKind::FasterRcnn, 1),
     ("head.classification_head.cls_logits.weight", AnchoredKind::RetinaNet, 9),
 ];
 
-/// Which network a file's tensors belong to, and how many labels it has; `None` where it is none of the three.
-pub(crate) fn recognise(file: &PretrainedFile) -> Option<(AnchoredKind, usize)> {
-    debug_assert_eq!(SIGNS[2].2, Scales::Three.anchors());
-    SIGNS.iter().find_map(|(sign, kind, per_label)| {
-        let (_, shape) = file.tensors().find(|(name, _)| name.ends_with(sign))?;
-        Some((*kind, shape.first()? / per_label))
-    })
+/// Largest sizes that are made: a wrong number in a file would ask for all memory. ResNet-152 has 36 blocks in a layer.
+const MAX_LABELS: usize = 10_000;
+const MAX_BLOCKS: usize = 64;
+const MAX_WIDTH: usize = 256;
+const MAX_PYRAMID: usize = 1024;
+const MAX_HIDDEN: usize = 8192;
+
+/// A file's tensors by the ends of their names.
+struct Shapes<'a>(&'a PretrainedFile);
+
+impl Shapes<'_> {
+    /// Rows of the tensor whose name ends so, within 1 and a limit.
+    fn rows(&self, end: &str, most: usize) -> Option<usize> {
+        let (_, shape) = self.0.tensors().find(|(name, _)| name.ends_with(end))?;
+        shape.first().copied().filter(|rows| (1..=most).contains(rows))
+    }
+
+    /// Numbers in all tensors.
+    fn numbers(&self) -> usize {
+        let product = |shape: &[usize]| shape.iter().fold(1usize, |n, side| n.saturating_mul(*side));
+        self.0.tensors().fold(0, |n, (_, shape)| n.saturating_add(product(shape)))
+    }
+
+    /// Sizes of the network that the file holds; `None` where it is none of the three. More than the tensors' numbers are never made.
+    fn config(&self) -> Option<AnchoredConfig> {
+        let (kind, per_label, rows) = SIGNS.iter().find_map(|(sign, kind, per_label)| {
+            Some((*kind, per_label, self.rows(sign, MAX_LABELS * per_label)?))
+        })?;
+        let width = self.rows("backbone.body.conv1.weight", MAX_WIDTH)?;
+        let layer = |layer: usize| {
+            let has = |block: &usize| {
+                self.rows(&format!("body.layer{}.{block}.conv2.weight", layer + 1), usize::MAX).is_some()
+            };
+            (0..MAX_BLOCKS).take_while(has).count()
+        };
+        let old = "fpn.inner_blocks.0.bias";
+        let pyramid =
+            self.rows("fpn.inner_blocks.0.0.bias", MAX_PYRAMID).or_else(|| self.rows(old, MAX_PYRAMID))?;
+        let hidden = match kind {
+            AnchoredKind::RetinaNet => 0,
+            _ => self.rows("roi_heads.box_head.fc6.bias", MAX_HIDDEN)?,
+        };
+        let blocks = [0, 1, 2, 3].map(layer);
+        let config =
+            AnchoredConfig { blocks, width, pyramid, hidden, ..AnchoredConfig::new(kind, rows / per_label) };
+        let inner = |layer: usize| (width << layer) * (width << layer);
+        let of_body: usize = blocks.iter().enumerate().map(|(layer, count)| 9 * count * inner(layer)).sum();
+        let of_heads = 9 * pyramid * pyramid + hidden * (49 * pyramid + hidden + 5 * config.labels);
+        (of_body + of_heads <= self.numbers()).then_some(config)
+    }
 }
 
 /// PyTorch's names of a tensor, that of the newest version first.
 fn names(name: &str) -> Vec<String> {
     let parts: Vec<&str> = name.split('.').collect();
     let number = |i: usize| parts.get(i).and_then(|part| part.parse::<usize>().ok());
-    // Burn's name of an enum's variant is no part of PyTorch's.
     match parts.as_slice() {
         ["backbone", "fpn", kind @ ("inner_blocks" | "layer_blocks"), level, last] => {
             let stem = format!("backbone.fpn.{kind}.{level}");
@@ -58,7 +101,10 @@ fn names(name: &str) -> Vec<String> {
         }
         ["head", head, "conv", _, last] => {
             let layer = number(3).unwrap_or(0);
-            vec![format!("head.{head}.conv.{layer}.0.{last}"), format!("head.{head}.conv.{}.{last}", 2 * layer)]
+            vec![
+                format!("head.{head}.conv.{layer}.0.{last}"),
+                format!("head.{head}.conv.{}.{last}", 2 * layer),
+            ]
         }
         _ => vec![name.to_owned()],
     }
@@ -87,15 +133,25 @@ impl AnchoredNetwork {
         Ok(AnchoredNetwork { layers, ..network })
     }
 
-    /// The same with torchvision's own sizes, which the file's tensors decide: `None` where it holds none of the three networks.
-    /// For `norm_epsilon` see [`AnchoredConfig`].
+    /// The same with the sizes that the file's tensors have: `None` where they are none of the three networks. What no weight file states
+    /// is as torchvision has it by default; `change` may change it before the network is made.
     ///
     /// # Errors
     /// [`PretrainedError`].
-    pub fn recognised(path: &Path, norm_epsilon: f64) -> Result<Option<AnchoredNetwork>, PretrainedError> {
+    pub fn recognised(
+        path: &Path,
+        change: impl FnOnce(&mut AnchoredConfig),
+    ) -> Result<Option<AnchoredNetwork>, PretrainedError> {
         let file = PretrainedFile::open(path)?;
-        let Some((kind, labels)) = recognise(&file) else { return Ok(None) };
-        let config = AnchoredConfig { norm_epsilon, ..AnchoredConfig::new(kind, labels) };
+        let Some(mut config) = Shapes(&file).config() else { return Ok(None) };
+        config.norm_epsilon = epsilon_of(&file);
+        change(&mut config);
         AnchoredNetwork::from_pytorch(&file, &config, &Device::flex()).map(Some)
     }
+}
+
+/// PyTorch's epsilon for normalisations that were in training and so counted their batches, 0 for frozen ones.
+fn epsilon_of(file: &PretrainedFile) -> f64 {
+    let trained = file.tensors().any(|(name, _)| name.ends_with(".num_batches_tracked"));
+    if trained { Bottlenecks::default().epsilon } else { 0.0 }
 }

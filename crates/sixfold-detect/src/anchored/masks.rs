@@ -35,7 +35,9 @@ impl MaskProbabilities {
     /// Of the mask with this number among the logits of many.
     pub(super) fn new(logits: &[f32], number: usize) -> MaskProbabilities {
         let pixels = MASK_SIDE * MASK_SIDE;
-        MaskProbabilities { values: logits[number * pixels..][..pixels].iter().map(|v| sigmoid(*v)).collect() }
+        MaskProbabilities {
+            values: logits[number * pixels..][..pixels].iter().map(|v| sigmoid(*v)).collect(),
+        }
     }
 
     /// The mask of a box (left, top, right and bottom) in an image of `size` (columns, rows).
@@ -94,17 +96,18 @@ mod tests {
     #[test]
     fn a_full_mask_fills_its_box_and_what_is_outside_of_the_image_is_cut() {
         let full = MaskProbabilities { values: vec![1.0; MASK_SIDE * MASK_SIDE] };
-        // 28 pixels wide: a pixel of the mask is one of the image.
+        // The numbers are those of paste_masks_in_image(torch.ones(1, 1, 28, 28), box, (40, 60)) >= 0.5: one pixel more on the right
+        // and below, as the whole box counts its last pixel.
         let pasted = full.pasted(&[10.0, 20.0, 38.0, 48.0], (60, 40));
         assert_eq!((pasted.corner, pasted.size), ([9, 19], [31, 21]));
         let mask = pasted.mask((60, 40));
-        assert_eq!(mask.bounding_box(), Some([10, 20, 28, 19]));
+        assert_eq!(mask.bounding_box(), Some([10, 20, 29, 20]));
         assert!(mask[(24, 39)] && !mask[(9, 30)] && !mask[(39, 30)]);
         // All of it outside, and partly.
         let outside = full.pasted(&[70.0, 50.0, 80.0, 60.0], (60, 40));
         assert!(outside.mask((60, 40)).bounding_box().is_none());
         let left = full.pasted(&[-14.0, 0.0, 14.0, 28.0], (60, 40)).mask((60, 40));
-        assert_eq!(left.bounding_box(), Some([0, 0, 14, 28]));
+        assert_eq!(left.bounding_box(), Some([0, 0, 15, 29]));
     }
 
     #[test]

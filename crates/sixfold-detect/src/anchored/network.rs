@@ -38,6 +38,8 @@ pub(crate) enum Layers {
 pub struct AnchoredNetwork {
     pub(super) layers: Layers,
     pub(super) config: AnchoredConfig,
+    /// Of every label whether it is detected.
+    pub(super) wanted: Vec<bool>,
     pub(super) device: Device,
 }
 
@@ -59,7 +61,12 @@ impl AnchoredConfig {
             AnchoredKind::RetinaNet => Layers::OneStage(RetinaNet::init(self, seed, device)),
             _ => Layers::TwoStages(FasterRcnn::init(self, seed, device)),
         };
-        AnchoredNetwork { layers, config: self.clone(), device: device.clone() }
+        AnchoredNetwork {
+            layers,
+            config: self.clone(),
+            wanted: vec![true; self.labels],
+            device: device.clone(),
+        }
     }
 }
 
@@ -69,6 +76,12 @@ impl AnchoredNetwork {
         &self.config
     }
 
+    /// Only these of the labels are detected; others do not count as detections of an image.
+    pub fn with_labels(mut self, labels: &[usize]) -> AnchoredNetwork {
+        self.wanted = (0..self.config.labels).map(|label| labels.contains(&label)).collect();
+        self
+    }
+
     /// Detects objects in an image of any size, best first, with masks if the network has them and `masks` asks for them. Nothing in
     /// an image without pixels.
     pub fn detect(&self, image: &RgbImage, thresholds: &Thresholds, masks: bool) -> Vec<AnchoredDetection> {
@@ -76,11 +89,11 @@ impl AnchoredNetwork {
         let [rows, columns] = input.padded;
         let data = TensorData::new(input.values.clone(), [1, 3, rows, columns]);
         let x = Tensor::from_data(data, &self.device);
-        let labels = self.config.labels;
+        let wanted = &self.wanted;
         let found = match &self.layers {
-            Layers::TwoStages(network) => network.detect(x, &input, labels, thresholds, masks),
+            Layers::TwoStages(network) => network.detect(x, &input, wanted, thresholds, masks),
             Layers::OneStage(network) => {
-                network.detect(x, &input, labels, thresholds).into_iter().map(|f| (f, None)).collect()
+                network.detect(x, &input, wanted, thresholds).into_iter().map(|f| (f, None)).collect()
             }
         };
         found

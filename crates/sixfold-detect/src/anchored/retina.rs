@@ -8,10 +8,9 @@ use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
 
 use super::anchors::{Scales, anchors};
-use super::boxes::{Corners, clipped, decode, largest, suppress_in_groups};
+use super::boxes::{Candidates, Corners, Found, clipped, decode, largest};
 use super::config::{AnchoredConfig, Thresholds};
 use super::fpn::{Backbone, rectified};
-use super::heads::Found;
 use super::rpn::LevelOutput;
 use super::transform::Input;
 
@@ -59,7 +58,8 @@ impl RetinaNet {
         let conv = tower(random);
         let mut cls_logits = last(anchors * config.labels, random);
         let bias = -((1.0 - PRIOR) / PRIOR).ln();
-        cls_logits.bias = burn::module::Param::from_tensor(Tensor::full([anchors * config.labels], bias, device));
+        cls_logits.bias =
+            burn::module::Param::from_tensor(Tensor::full([anchors * config.labels], bias, device));
         let classification_head = ClassificationHead { conv, cls_logits };
         let regression_head = RegressionHead { conv: tower(random), bbox_reg: last(4 * anchors, random) };
         RetinaNet { backbone, head: Heads { classification_head, regression_head } }
@@ -70,52 +70,58 @@ impl RetinaNet {
         let Heads { classification_head, regression_head } = &self.head;
         let through = |convs: &[Conv], x: Tensor<4>| convs.iter().fold(x, |x, conv| conv.forward(x));
         let heads = |level: Tensor<4>| {
-            let logits = classification_head.cls_logits.forward(through(&classification_head.conv, level.clone()));
+            let logits =
+                classification_head.cls_logits.forward(through(&classification_head.conv, level.clone()));
             [logits, regression_head.bbox_reg.forward(through(&regression_head.conv, level))]
         };
         self.backbone.forward(x).into_iter().map(heads).collect()
     }
 
-    /// The detections in the resized image, best first.
-    pub(super) fn detect(&self, x: Tensor<4>, input: &Input, labels: usize, thresholds: &Thresholds) -> Vec<Found> {
+    /// The detections in the resized image, best first, of labels that are `wanted`.
+    pub(super) fn detect(
+        &self,
+        x: Tensor<4>,
+        input: &Input,
+        wanted: &[bool],
+        thresholds: &Thresholds,
+    ) -> Vec<Found> {
         let raw = self.forward(x);
-        let grids: Vec<[usize; 2]> = raw.iter().map(|[logits, _]| [logits.dims()[2], logits.dims()[3]]).collect();
+        let grids: Vec<[usize; 2]> =
+            raw.iter().map(|[logits, _]| [logits.dims()[2], logits.dims()[3]]).collect();
         let anchors = anchors(Scales::Three, &grids, input.padded);
-        let levels: Vec<LevelOutput> =
-            raw.iter().map(|[logits, codes]| LevelOutput::new(logits, codes, Scales::Three.anchors())).collect();
-        detections(&levels, &anchors, labels, input.filled, thresholds)
+        let levels: Vec<LevelOutput> = raw
+            .iter()
+            .map(|[logits, codes]| LevelOutput::new(logits, codes, Scales::Three.anchors()))
+            .collect();
+        detections(&levels, &anchors, wanted, input.filled, thresholds)
     }
 }
 
 fn detections(
     levels: &[LevelOutput],
     anchors: &[Vec<Corners>],
-    labels: usize,
+    wanted: &[bool],
     image: [usize; 2],
     thresholds: &Thresholds,
 ) -> Vec<Found> {
-    let (mut boxes, mut scores, mut groups) = (vec![], vec![], vec![]);
+    let labels = wanted.len();
+    let mut candidates = Candidates::default();
     for (level, anchors) in levels.iter().zip(anchors) {
-        let (mut numbers, mut of_level) = (vec![], vec![]);
+        let (mut numbers, mut scores) = (vec![], vec![]);
         for (number, logit) in level.logits.iter().enumerate() {
             let score = sigmoid(*logit);
-            if score > thresholds.score {
+            if score > thresholds.score && wanted[number % labels] {
                 numbers.push(number);
-                of_level.push(score);
+                scores.push(score);
             }
         }
-        for i in largest(&of_level, MAX_CANDIDATES) {
+        for i in largest(&scores, MAX_CANDIDATES) {
             let (anchor, label) = (numbers[i] / labels, numbers[i] % labels);
-            boxes.push(clipped(decode(level.codes[anchor], &anchors[anchor], [1.0; 4]), image));
-            scores.push(of_level[i]);
-            groups.push(label);
+            let corners = clipped(decode(level.codes[anchor], &anchors[anchor], [1.0; 4]), image);
+            candidates.push(Found { label, score: scores[i], corners });
         }
     }
-    let kept = suppress_in_groups(&boxes, &scores, &groups, thresholds.overlap);
-    kept.into_iter()
-        .take(thresholds.most)
-        .map(|i| Found { label: groups[i], score: scores[i], corners: boxes[i] })
-        .collect()
+    candidates.suppressed(thresholds)
 }
 
 #[cfg(test)]
@@ -124,17 +130,19 @@ mod tests {
 
     #[test]
     fn the_best_labels_of_every_level_are_decoded() {
-        let anchors = vec![vec![[0.0, 0.0, 10.0, 10.0], [20.0, 20.0, 60.0, 60.0]], vec![[0.0, 0.0, 30.0, 30.0]]];
+        let anchors =
+            vec![vec![[0.0, 0.0, 10.0, 10.0], [20.0, 20.0, 60.0, 60.0]], vec![[0.0, 0.0, 30.0, 30.0]]];
         let level = |logits: Vec<f32>, codes: Vec<[f32; 4]>| LevelOutput { logits, codes };
         let levels = [
             // Second anchor, label 1.
             level(vec![-9.0, -9.0, -9.0, 2.0], vec![[0.0; 4], [0.25, 0.0, 0.0, 0.0]]),
             level(vec![0.0, -9.0], vec![[0.0; 4]]),
         ];
-        let thresholds = Thresholds { score: 0.05, overlap: 0.5, most: 9 };
-        let found = detections(&levels, &anchors, 2, [50, 100], &thresholds);
+        let thresholds = Thresholds { score: 0.05, overlap: 0.5, most: 9, per_label: 9 };
+        let found = detections(&levels, &anchors, &[true; 2], [50, 100], &thresholds);
         assert_eq!(found[0], Found { label: 1, score: sigmoid(2.0), corners: [30.0, 20.0, 70.0, 50.0] });
         assert_eq!(found[1], Found { label: 0, score: 0.5, corners: [0.0, 0.0, 30.0, 30.0] });
         assert_eq!(found.len(), 2);
+        assert_eq!(detections(&levels, &anchors, &[true, false], [50, 100], &thresholds), found[1..]);
     }
 }

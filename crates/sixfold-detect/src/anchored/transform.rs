@@ -73,7 +73,8 @@ impl Input {
         let mut values = vec![0.0; 3 * pixels];
         let (rows_to, columns_to) = (taps(rows, filled[0]), taps(columns, filled[1]));
         for (channel, target) in values.chunks_exact_mut(pixels).enumerate() {
-            let value = |rgb: &[u8; 3]| (f32::from(rgb[channel]) / 255.0 - MEAN[channel]) / DEVIATION[channel];
+            let value =
+                |rgb: &[u8; 3]| (f32::from(rgb[channel]) / 255.0 - MEAN[channel]) / DEVIATION[channel];
             let plane: Vec<f32> = image.as_slice().iter().map(value).collect();
             interpolate(&plane, columns, &rows_to, &columns_to, |x, y, v| target[y * padded[1] + x] = v);
         }
@@ -102,7 +103,8 @@ mod tests {
 
     #[test]
     fn an_image_is_enlarged_between_its_pixels_and_padded_with_zeros() {
-        let config = AnchoredConfig { min_side: 4, max_side: 99, ..AnchoredConfig::new(AnchoredKind::FasterRcnn, 2) };
+        let config =
+            AnchoredConfig { min_side: 4, max_side: 99, ..AnchoredConfig::new(AnchoredKind::FasterRcnn, 2) };
         let image = RgbImage::from_fn(3, 2, |x, _| [if x == 2 { 255 } else { 0 }; 3]);
         let input = Input::new(&image, &config).unwrap();
         assert_eq!((input.filled, input.padded, input.image), ([4, 6], [32, 32], [2, 3]));
