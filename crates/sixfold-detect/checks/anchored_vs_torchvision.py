@@ -293,6 +293,8 @@ def write_fixtures(folder):
         fit_heads(network, tensor(images[0]), -3.0)
         state = {k: v.half() for k, v in network.state_dict().items() if "num_batches" not in k}
         save_file(state, folder / f"{name}.safetensors")
+        if name == "faster-rcnn":
+            torch.save({"epoch": 3, "model": state}, folder / f"{name}.pth")
         network.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
         outputs = {}
         for i, image in enumerate(images):

@@ -112,6 +112,14 @@ fn detections_are_those_of_torchvision() {
 }
 
 #[test]
+fn pickled_weights_are_the_same() {
+    let kind = AnchoredKind::FasterRcnn;
+    let network = load(&weights(kind).with_extension("pth"), &config(kind)).unwrap();
+    let image = &images()[1];
+    check(kind, 1, image, &network.detect(image, &thresholds(kind), true));
+}
+
+#[test]
 fn any_number_of_threads_gives_the_same_detections_and_empty_images_none() {
     let kind = AnchoredKind::MaskRcnn;
     let network = load(&weights(kind), &config(kind)).unwrap();
