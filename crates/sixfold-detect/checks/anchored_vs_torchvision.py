@@ -259,7 +259,7 @@ class SmallResNet(torch.nn.Module):
 def small_network(name):
     """The network in miniature: 8 channels in its pyramid, 4 labels, images of 96 pixels."""
     channels, labels, sides = 8, 4, {"min_size": 96, "max_size": 160}
-    first = 1 if name == "retina-net" else 0
+    first = 1 if name == "retinanet-anchors" else 0
     layers = {f"layer{i + 1}": str(i) for i in range(first, 4)}
     more = LastLevelP6P7(channels, channels) if first else LastLevelMaxPool()
     backbone = BackboneWithFPN(SmallResNet(), layers, [16, 32, 64, 128][first:], channels, extra_blocks=more)
@@ -285,7 +285,7 @@ def pattern(columns, rows):
 
 def write_fixtures(folder):
     """Weights, rounded to 16 bits, and detections of the small networks."""
-    for name in ("faster-rcnn", "mask-rcnn", "retina-net"):
+    for name in ("faster-rcnn", "mask-rcnn", "retinanet-anchors"):
         torch.manual_seed(5)
         network = small_network(name).eval()
         images = [pattern(90, 70), pattern(61, 110)]

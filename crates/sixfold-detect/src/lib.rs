@@ -6,6 +6,7 @@
 #![warn(unreachable_pub, unnameable_types)]
 
 pub mod anchored;
+mod card;
 pub mod detect;
 pub mod detector;
 mod loss;

@@ -1,6 +1,7 @@
 //! A trained detector: the network with the objects it knows, as one file; or weights of torchvision.
 
-use crate::anchored::{AnchoredDetection, AnchoredNetwork, Thresholds};
+use crate::anchored::{AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
+use crate::card::{anchored_kind, classes_of, read_anchored};
 use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode};
 use crate::network::{Detector, DetectorConfig, EncoderKind};
 use crate::torchvision::{self, Torchvision};
@@ -99,12 +100,6 @@ pub enum ModelError {
         /// What is wrong with it.
         found: String,
     },
-    /// Weights of torchvision are used as they are.
-    #[error("{}: a detector of torchvision is not written again; copy its file", file.display())]
-    NotWritten {
-        /// Where it was to be written.
-        file: PathBuf,
-    },
     /// There is nothing to look at.
     #[error("the image is empty (0x0 pixels); give one with at least one pixel")]
     EmptyImage,
@@ -179,9 +174,27 @@ impl DetectorModel {
         if pickled || matches!(read_card(path), Err(WeightsError::Card { .. })) {
             return Self::of_torchvision(path);
         }
+        if anchored_kind(&read_card(path)?).is_some() {
+            let (network, labels, classes, usage, card) = read_anchored(path, &Device::flex())?;
+            let network = network.with_labels(&labels);
+            return Ok(DetectorModel { network: Network::Anchored(network, labels), classes, usage, card });
+        }
         let device = Device::flex();
         let (network, config, classes, usage, card) = read(path, &device)?;
         Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
+    }
+
+    /// A model of a trained network with anchors, whose labels are the classes in their order. `card` gets architecture, classes and
+    /// sizes filled in.
+    pub fn of_anchored(
+        network: AnchoredNetwork,
+        classes: Vec<ClassEntry>,
+        usage: DetectorUse,
+        card: ModelCard,
+    ) -> Self {
+        let first = network.config().first_label();
+        let labels = (first..first + classes.len()).collect();
+        DetectorModel { network: Network::Anchored(network, labels), classes, usage, card }
     }
 
     fn of_torchvision(path: &Path) -> Result<Self, ModelError> {
@@ -221,12 +234,7 @@ impl DetectorModel {
         let (network, config, classes, ..) = read(path, device)?;
         let found: Vec<u32> = classes.iter().map(|c| c.id).collect();
         if found != ids {
-            return Err(ModelError::Card {
-                file: path.to_path_buf(),
-                field: "objects",
-                expected: "the objects that are to be trained, in this order",
-                found: format!("{found:?} instead of {ids:?}"),
-            });
+            return Err(other_objects(path, &found, ids));
         }
         Ok((network, config))
     }
@@ -234,13 +242,51 @@ impl DetectorModel {
     /// Writes the weight file and, beside it, the card as text.
     ///
     /// # Errors
-    /// [`ModelError::Weights`]; [`ModelError::NotWritten`] for a network of torchvision.
+    /// [`ModelError::Weights`].
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
-        let Network::Anchorless(network) = &self.network else {
-            return Err(ModelError::NotWritten { file: path.to_path_buf() });
+        let (network, labels) = match &self.network {
+            Network::Anchorless(network) => {
+                save_weights(&network.network, &self.card, path)?;
+                return Ok(write_card_markdown(&self.card, &path.with_extension("md"))?);
+            }
+            Network::Anchored(network, labels) => (network, labels),
         };
-        save_weights(&network.network, &self.card, path)?;
-        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+        let mut card = self.card.clone();
+        if !card.extra.is_object() {
+            card.extra = serde_json::json!({});
+        }
+        card.extra["network"] = serde_json::to_value(network.config()).unwrap_or_default();
+        card.extra["use"] = serde_json::to_value(self.usage).unwrap_or_default();
+        card.extra["labels"] = serde_json::to_value(labels).unwrap_or_default();
+        card.objects = self.classes.iter().map(|c| serde_json::to_value(c).unwrap_or_default()).collect();
+        card.architecture = network.config().kind.architecture().to_owned();
+        network.save(&card, path)?;
+        Ok(write_card_markdown(&card, &path.with_extension("md"))?)
+    }
+
+    /// As [`DetectorModel::network_for_training`], of a network with anchors.
+    pub(crate) fn anchored_for_training(
+        path: &Path,
+        kind: AnchoredKind,
+        ids: &[u32],
+        device: &Device,
+    ) -> Result<AnchoredNetwork, ModelError> {
+        let card = read_card(path)?;
+        if anchored_kind(&card) != Some(kind) {
+            return Err(ModelError::Card {
+                file: path.to_path_buf(),
+                field: "architecture",
+                expected: "the network that is to be trained",
+                found: card.architecture,
+            });
+        }
+        let (network, _, classes, ..) = read_anchored(path, device)?;
+        let found: Vec<u32> = classes.iter().map(|c| c.id).collect();
+        let config = network.config();
+        if found != ids || config.labels != ids.len() + config.first_label() {
+            return Err(other_objects(path, &found, ids));
+        }
+        Ok(network)
     }
 
     /// The classes, in the network's order.
@@ -356,6 +402,15 @@ impl AnchorlessNetwork {
     }
 }
 
+fn other_objects(path: &Path, found: &[u32], ids: &[u32]) -> ModelError {
+    ModelError::Card {
+        file: path.to_path_buf(),
+        field: "objects",
+        expected: "the objects that are to be trained, in this order",
+        found: format!("{found:?} instead of {ids:?}"),
+    }
+}
+
 type Content = (Detector, DetectorConfig, Vec<ClassEntry>, DetectorUse, ModelCard);
 
 fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
@@ -369,18 +424,7 @@ fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
     if card.architecture != COMPACT && card.architecture != RETINANET {
         return Err(wrong("architecture", "detect-compact or detect-retinanet", card.architecture));
     }
-    let classes = card
-        .objects
-        .iter()
-        .map(|value| {
-            serde_json::from_value(value.clone()).map_err(|e| wrong("objects", "an id", e.to_string()))
-        })
-        .collect::<Result<Vec<ClassEntry>, _>>()?;
-    for (place, class) in classes.iter().enumerate() {
-        if classes[..place].contains(class) {
-            return Err(wrong("objects", "every id once", format!("object {} twice", class.id)));
-        }
-    }
+    let classes = classes_of(&card, path)?;
     let config: DetectorConfig = serde_json::from_value(card.extra["network"].clone())
         .map_err(|e| wrong("extra.network", "the network's sizes", e.to_string()))?;
     let usage: DetectorUse = serde_json::from_value(card.extra["use"].clone())

@@ -54,6 +54,11 @@ pub fn objects_file(weights: &Path) -> PathBuf {
     weights.with_extension("objects.json")
 }
 
+/// [`objects_file`] where it exists: what a run's options and inputs must name beside the weights.
+pub fn existing_objects_file(weights: &Path) -> Option<PathBuf> {
+    Some(objects_file(weights)).filter(|file| file.is_file())
+}
+
 impl Beside {
     /// The file beside these weights, or its defaults where there is none.
     fn read(weights: &Path) -> Result<Beside, ModelError> {

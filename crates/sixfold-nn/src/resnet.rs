@@ -167,6 +167,13 @@ struct Bottleneck {
 }
 
 impl Bottleneck {
+    fn freeze_norms(self) -> Bottleneck {
+        let Bottleneck { conv1, bn1, conv2, bn2, conv3, bn3, downsample } = self;
+        let downsample = downsample.map(|(conv, norm)| (conv, norm.freeze()));
+        let [bn1, bn2, bn3] = [bn1, bn2, bn3].map(Module::freeze);
+        Bottleneck { conv1, bn1, conv2, bn2, conv3, bn3, downsample }
+    }
+
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let y = self.conv1.forward_norm(x.clone(), &self.bn1, None, 0.0);
         let y = self.conv2.forward_norm(y, &self.bn2, None, 0.0);
@@ -179,6 +186,27 @@ impl Bottleneck {
 }
 
 impl ResNet50 {
+    /// For a training in which all normalisations stay as they are, and of the five stages (the first convolution, the four layers) the
+    /// first `stages`.
+    pub fn freeze_stages(self, stages: usize) -> ResNet50 {
+        let layer = |number: usize, blocks: Vec<Bottleneck>| {
+            let frozen = |block: Bottleneck| {
+                if number < stages { block.freeze() } else { block.freeze_norms() }
+            };
+            blocks.into_iter().map(frozen).collect()
+        };
+        let ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc } = self;
+        ResNet50 {
+            conv1: if stages > 0 { conv1.freeze() } else { conv1 },
+            bn1: bn1.freeze(),
+            layer1: layer(1, layer1),
+            layer2: layer(2, layer2),
+            layer3: layer(3, layer3),
+            layer4: layer(4, layer4),
+            fc,
+        }
+    }
+
     /// `batch x 3 x height x width` to the maps after the first convolution and after every layer that was built: 64, 256,
     /// 512, 1024 and 2048 channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution.
     pub fn features(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
@@ -247,5 +275,14 @@ mod tests {
         let grads = burn::optim::GradientsParams::from_grads(loss.backward(), &network);
         // 53 convolutions, 2 x 53 of their normalisations, weight and bias of the classifier.
         assert_eq!(grads.len(), 53 * 3 + 2);
+
+        // Without the normalisations, and without the first convolution and the first layer (10 convolutions).
+        for (stages, expected) in [(0, 53), (2, 53 - 11), (5, 0)] {
+            let network =
+                ResNet50Config { layers: 4, classes: Some(3) }.init(1, &device).freeze_stages(stages);
+            let loss = network.classify(input(&device)).unwrap().square().mean();
+            let grads = burn::optim::GradientsParams::from_grads(loss.backward(), &network);
+            assert_eq!(grads.len(), expected + 2, "{stages} stages");
+        }
     }
 }

@@ -206,7 +206,8 @@ fn weights_of_torchvision_are_a_detector() {
     }
     // Networks in miniature want small images.
     let sides = r#""min_side": 96, "max_side": 160, "norm_epsilon": 1e-5"#;
-    std::fs::write(path("mask.objects.json"), format!(r#"{{"objects": {{"1": 1, "3": 30}}, {sides}}}"#)).unwrap();
+    std::fs::write(path("mask.objects.json"), format!(r#"{{"objects": {{"1": 1, "3": 30}}, {sides}}}"#))
+        .unwrap();
     std::fs::write(path("faster.objects.json"), format!("{{{sides}}}")).unwrap();
     let rgb = "--rgb tiny/test/000007/rgb/000004.png --threshold 0.05";
 
@@ -220,7 +221,11 @@ fn weights_of_torchvision_are_a_detector() {
     let run = sixfold(tiny.path(), &format!("detect --weights faster.pth {rgb} --ids 2 --json"));
     let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
     assert!(found.iter().all(|d| d["object_id"] == 2 && d["mask_pixels"].is_null()), "{found:?}");
-    fails(tiny.path(), &format!("detect --weights faster.pth {rgb} --ids 9"), &["--ids", "knows the objects 1, 2, 3"]);
+    fails(
+        tiny.path(),
+        &format!("detect --weights faster.pth {rgb} --ids 9"),
+        &["--ids", "knows the objects 1, 2, 3"],
+    );
 
     // A dataset: with other objects of the labels it is another run.
     let all = "detect --weights mask.safetensors --dataset tiny --out found.json --threshold 0.05 --json";
@@ -229,14 +234,20 @@ fn weights_of_torchvision_are_a_detector() {
     fails(tiny.path(), all, &["objects of the weights"]);
 
     // Boxes for a pose.
-    std::fs::write(path("targets.json"), r#"[{"scene_id": 7, "im_id": 4, "obj_id": 1, "inst_count": 1}]"#).unwrap();
-    let pose = "estimate --dataset tiny --targets targets.json --out poses.csv --detector mask.safetensors --json";
+    std::fs::write(path("targets.json"), r#"[{"scene_id": 7, "im_id": 4, "obj_id": 1, "inst_count": 1}]"#)
+        .unwrap();
+    let pose =
+        "estimate --dataset tiny --targets targets.json --out poses.csv --detector mask.safetensors --json";
     let run = sixfold(tiny.path(), pose);
     assert!(run.code < 2, "{}", run.stderr);
 
     // What is none.
     std::fs::write(path("mask.objects.json"), r#"{"objects": {"9": 1}}"#).unwrap();
-    fails(tiny.path(), &format!("detect --weights mask.safetensors {rgb}"), &["mask.objects.json", "label 9"]);
+    fails(
+        tiny.path(),
+        &format!("detect --weights mask.safetensors {rgb}"),
+        &["mask.objects.json", "label 9"],
+    );
     std::fs::write(path("other.pth"), b"nothing").unwrap();
     fails(tiny.path(), &format!("detect --weights other.pth {rgb}"), &["other.pth", "PyTorch weight file"]);
     fails(tiny.path(), &format!("detect --weights none.pth {rgb}"), &["none.pth", "cannot be read"]);

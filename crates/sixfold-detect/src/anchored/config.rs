@@ -24,7 +24,7 @@ impl Choice for AnchoredKind {
         match self {
             AnchoredKind::FasterRcnn => "faster-rcnn",
             AnchoredKind::MaskRcnn => "mask-rcnn",
-            AnchoredKind::RetinaNet => "retina-net",
+            AnchoredKind::RetinaNet => "retinanet-anchors",
         }
     }
 
@@ -102,6 +102,14 @@ impl AnchoredConfig {
     /// The first label that stands for an object.
     pub fn first_label(&self) -> usize {
         usize::from(self.kind != AnchoredKind::RetinaNet)
+    }
+
+    /// Numbers in the largest layers; the network has more.
+    pub(super) fn numbers(&self) -> usize {
+        let AnchoredConfig { labels, blocks, width, pyramid, hidden, .. } = *self;
+        let inner = |layer: usize| (width << layer) * (width << layer);
+        let of_body: usize = blocks.iter().enumerate().map(|(layer, count)| 9 * count * inner(layer)).sum();
+        of_body + 9 * pyramid * pyramid + hidden * (49 * pyramid + hidden + 5 * labels)
     }
 
     pub(crate) fn resnet(&self) -> Bottlenecks {

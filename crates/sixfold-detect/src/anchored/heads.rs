@@ -119,17 +119,28 @@ impl<'a> Levels<'a> {
     }
 }
 
+impl BoxPredictor {
+    fn init(config: &AnchoredConfig, random: &mut Random, device: &Device) -> BoxPredictor {
+        let AnchoredConfig { labels, hidden, .. } = *config;
+        BoxPredictor {
+            cls_score: dense([hidden, labels], random, device),
+            bbox_pred: dense([hidden, 4 * labels], random, device),
+        }
+    }
+}
+
+fn mask_logits(config: &AnchoredConfig, random: &mut Random, device: &Device) -> Conv {
+    ConvConfig::new([config.pyramid, config.labels], 1, Activation::Linear).init(1.0, random, device)
+}
+
 impl RoiHeads {
     pub(super) fn init(config: &AnchoredConfig, random: &mut Random, device: &Device) -> RoiHeads {
-        let AnchoredConfig { labels, pyramid, hidden, .. } = *config;
+        let AnchoredConfig { pyramid, hidden, .. } = *config;
         let box_head = BoxHead {
             fc6: dense([pyramid * BOX_BINS * BOX_BINS, hidden], random, device),
             fc7: dense([hidden, hidden], random, device),
         };
-        let box_predictor = BoxPredictor {
-            cls_score: dense([hidden, labels], random, device),
-            bbox_pred: dense([hidden, 4 * labels], random, device),
-        };
+        let box_predictor = BoxPredictor::init(config, random, device);
         let masks = config.kind == AnchoredKind::MaskRcnn;
         let mask_head = masks.then(|| MaskHead {
             layers: (0..MASK_LAYERS).map(|_| rectified(pyramid, random, device)).collect(),
@@ -137,10 +148,24 @@ impl RoiHeads {
         let enlarge = ConvTransposeConfig { channels: [pyramid; 2], kernel: 2, stride: 2, bias: true };
         let mask_predictor = masks.then(|| MaskPredictor {
             conv5_mask: enlarge.init(2.0, random, device),
-            mask_fcn_logits: ConvConfig::new([pyramid, labels], 1, Activation::Linear)
-                .init(1.0, random, device),
+            mask_fcn_logits: mask_logits(config, random, device),
         });
         RoiHeads { box_head, box_predictor, mask_head, mask_predictor }
+    }
+
+    /// The same with new layers for other labels.
+    pub(super) fn relabelled(
+        self,
+        config: &AnchoredConfig,
+        random: &mut Random,
+        device: &Device,
+    ) -> RoiHeads {
+        let box_predictor = BoxPredictor::init(config, random, device);
+        let mask_predictor = self.mask_predictor.map(|predictor| MaskPredictor {
+            mask_fcn_logits: mask_logits(config, random, device),
+            ..predictor
+        });
+        RoiHeads { box_predictor, mask_predictor, ..self }
     }
 
     /// Of `boxes`, of which there is at least one: `boxes x labels` logits and `boxes x (4 labels)` codes.

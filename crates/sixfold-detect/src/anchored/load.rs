@@ -38,7 +38,7 @@ const MAX_PYRAMID: usize = 1024;
 const MAX_HIDDEN: usize = 8192;
 
 /// A file's tensors by the ends of their names.
-struct Shapes<'a>(&'a PretrainedFile);
+pub(super) struct Shapes<'a>(pub(super) &'a PretrainedFile);
 
 impl Shapes<'_> {
     /// Rows of the tensor whose name ends so, within 1 and a limit.
@@ -54,7 +54,7 @@ impl Shapes<'_> {
     }
 
     /// Sizes of the network that the file holds; `None` where it is none of the three. More than the tensors' numbers are never made.
-    fn config(&self) -> Option<AnchoredConfig> {
+    pub(super) fn config(&self) -> Option<AnchoredConfig> {
         let (kind, per_label, rows) = SIGNS.iter().find_map(|(sign, kind, per_label)| {
             Some((*kind, per_label, self.rows(sign, MAX_LABELS * per_label)?))
         })?;
@@ -75,10 +75,9 @@ impl Shapes<'_> {
         let blocks = [0, 1, 2, 3].map(layer);
         let config =
             AnchoredConfig { blocks, width, pyramid, hidden, ..AnchoredConfig::new(kind, rows / per_label) };
-        let inner = |layer: usize| (width << layer) * (width << layer);
-        let of_body: usize = blocks.iter().enumerate().map(|(layer, count)| 9 * count * inner(layer)).sum();
-        let of_heads = 9 * pyramid * pyramid + hidden * (49 * pyramid + hidden + 5 * config.labels);
-        (of_body + of_heads <= self.numbers()).then_some(config)
+        let epsilon = epsilon_of(self.0);
+        let config = AnchoredConfig { norm_epsilon: epsilon, ..config };
+        (config.numbers() <= self.numbers()).then_some(config)
     }
 }
 
@@ -144,7 +143,6 @@ impl AnchoredNetwork {
     ) -> Result<Option<AnchoredNetwork>, PretrainedError> {
         let file = PretrainedFile::open(path)?;
         let Some(mut config) = Shapes(&file).config() else { return Ok(None) };
-        config.norm_epsilon = epsilon_of(&file);
         change(&mut config);
         AnchoredNetwork::from_pytorch(&file, &config, &Device::flex()).map(Some)
     }

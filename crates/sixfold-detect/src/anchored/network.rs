@@ -3,12 +3,14 @@
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_geometry::RgbImage;
+use sixfold_nn::resnet::ResNet50;
 
 use super::config::{AnchoredConfig, AnchoredKind, Thresholds};
 use super::faster::FasterRcnn;
 use super::masks::MaskProbabilities;
 use super::retina::RetinaNet;
 use super::transform::Input;
+pub(super) use super::transform::normalise;
 
 /// A detected object.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,11 +28,35 @@ pub struct AnchoredDetection {
 /// The layers of one of the networks.
 #[derive(Module, Debug)]
 #[allow(clippy::large_enum_variant)]
-pub(crate) enum Layers {
+pub(super) enum Layers {
     /// Faster R-CNN and Mask R-CNN.
     TwoStages(FasterRcnn),
     /// RetinaNet.
     OneStage(RetinaNet),
+}
+
+impl Layers {
+    /// The ResNet, which is pretrained.
+    pub(super) fn body(&self) -> &ResNet50 {
+        match self {
+            Layers::TwoStages(network) => &network.backbone.body,
+            Layers::OneStage(network) => &network.backbone.body,
+        }
+    }
+
+    pub(super) fn body_mut(&mut self) -> &mut ResNet50 {
+        match self {
+            Layers::TwoStages(network) => &mut network.backbone.body,
+            Layers::OneStage(network) => &mut network.backbone.body,
+        }
+    }
+
+    /// The normalisations and the first stages of the ResNet stay as they are in a training.
+    pub(super) fn freeze_stages(mut self, stages: usize) -> Layers {
+        let body = self.body().clone().freeze_stages(stages);
+        *self.body_mut() = body;
+        self
+    }
 }
 
 /// A network with its sizes.
@@ -71,6 +97,11 @@ impl AnchoredConfig {
 }
 
 impl AnchoredNetwork {
+    pub(super) fn of_layers(layers: Layers, config: AnchoredConfig, device: Device) -> AnchoredNetwork {
+        let wanted = vec![true; config.labels];
+        AnchoredNetwork { layers, config, wanted, device }
+    }
+
     /// Sizes of the network.
     pub fn config(&self) -> &AnchoredConfig {
         &self.config

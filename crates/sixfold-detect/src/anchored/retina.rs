@@ -46,6 +46,16 @@ struct RegressionHead {
     bbox_reg: Conv,
 }
 
+/// The layer of the labels, which begin with the prior score.
+fn label_logits(config: &AnchoredConfig, random: &mut Random, device: &Device) -> Conv {
+    let outputs = Scales::Three.anchors() * config.labels;
+    let mut layer =
+        ConvConfig::new([config.pyramid, outputs], 3, Activation::Linear).init(0.01, random, device);
+    let bias = -((1.0 - PRIOR) / PRIOR).ln();
+    layer.bias = burn::module::Param::from_tensor(Tensor::full([outputs], bias, device));
+    layer
+}
+
 impl RetinaNet {
     pub(super) fn init(config: &AnchoredConfig, seed: u64, device: &Device) -> RetinaNet {
         let random = &mut stream(seed, 1);
@@ -56,13 +66,21 @@ impl RetinaNet {
             ConvConfig::new([width, outputs], 3, Activation::Linear).init(0.01, random, device)
         };
         let conv = tower(random);
-        let mut cls_logits = last(anchors * config.labels, random);
-        let bias = -((1.0 - PRIOR) / PRIOR).ln();
-        cls_logits.bias =
-            burn::module::Param::from_tensor(Tensor::full([anchors * config.labels], bias, device));
+        let cls_logits = label_logits(config, random, device);
         let classification_head = ClassificationHead { conv, cls_logits };
         let regression_head = RegressionHead { conv: tower(random), bbox_reg: last(4 * anchors, random) };
         RetinaNet { backbone, head: Heads { classification_head, regression_head } }
+    }
+
+    /// The same with a new layer for other labels.
+    pub(super) fn relabelled(
+        mut self,
+        config: &AnchoredConfig,
+        random: &mut Random,
+        device: &Device,
+    ) -> RetinaNet {
+        self.head.classification_head.cls_logits = label_logits(config, random, device);
+        self
     }
 
     /// Of every level `1 x (anchors * labels) x rows x columns` logits and `1 x (anchors * 4) x rows x columns` codes.

@@ -29,6 +29,8 @@ pub(super) struct Most {
 impl Most {
     /// For detection (torchvision).
     pub(super) const DETECTION: Most = Most { before: 1000, after: 1000 };
+    /// For training (torchvision).
+    pub(super) const TRAINING: Most = Most { before: 2000, after: 2000 };
 }
 
 /// torchvision's `rpn`.

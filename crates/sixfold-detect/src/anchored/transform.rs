@@ -9,6 +9,14 @@ const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 /// Rows and columns are padded to multiples of this, the coarsest stride of the ResNet.
 const ALIGNMENT: usize = 32;
 
+/// An image of three planes with values in 0..1, in place.
+pub(super) fn normalise(rgb: &mut [f32]) {
+    let pixels = rgb.len() / 3;
+    for ((plane, mean), deviation) in rgb.chunks_exact_mut(pixels.max(1)).zip(MEAN).zip(DEVIATION) {
+        plane.iter_mut().for_each(|v| *v = (*v - mean) / deviation);
+    }
+}
+
 /// An image at the network's scale. Sizes are rows and columns.
 #[derive(Debug, Clone)]
 pub(super) struct Input {

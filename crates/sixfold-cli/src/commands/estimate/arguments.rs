@@ -14,6 +14,7 @@ use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges::{self, count};
 
 use super::methods::{METHODS, Method};
+use super::networks::objects_file;
 
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
