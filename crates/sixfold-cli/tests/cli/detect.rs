@@ -252,3 +252,32 @@ fn weights_of_torchvision_are_a_detector() {
     fails(tiny.path(), &format!("detect --weights other.pth {rgb}"), &["other.pth", "PyTorch weight file"]);
     fails(tiny.path(), &format!("detect --weights none.pth {rgb}"), &["none.pth", "cannot be read"]);
 }
+
+#[test]
+fn detectors_with_anchors_are_trained_and_used() {
+    let tiny = Tiny::coloured();
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../sixfold-detect/tests/anchored");
+    let train = "train detector --dataset tiny --ids 1 --size 96 --batch 1 --frozen-stages 0 --longest-side 96";
+    for network in ["faster-rcnn", "mask-rcnn", "retinanet-anchors"] {
+        let start = format!("{network}.safetensors");
+        std::fs::copy(fixtures.join(&start), tiny.path().join(&start)).unwrap();
+        let of = format!("{train} --network {network} --out {network} --json");
+        fails(tiny.path(), &format!("{of} --steps 2"), &["--encoder", "ResNet-50"]);
+        let trained = sixfold(tiny.path(), &format!("{of} --encoder {start} --steps 2")).expect(0).json();
+        assert!(trained["losses"]["boxes"].as_f64().is_some_and(f64::is_finite), "{trained}");
+        let card = std::fs::read_to_string(tiny.path().join(network).join("model.md")).unwrap();
+        assert!(card.contains(&format!("detect-{network}")) && card.contains("7/0 7/4 7/11"), "{card}");
+        let rgb = "--rgb tiny/test/000007/rgb/000004.png --threshold 0.0001";
+        let run = sixfold(tiny.path(), &format!("detect --weights {network}/model.safetensors {rgb} --json"));
+        let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
+        assert!(found.iter().all(|d| d["object_id"] == 1), "{found:?}");
+        assert!(network != "mask-rcnn" || found.iter().any(|d| d["mask_pixels"].is_u64()), "{found:?}");
+        // From its own weights.
+        let further = of.replace("--out ", &format!("--init {network}/model.safetensors --steps 1 --out more-"));
+        sixfold(tiny.path(), &further).expect(0);
+        let other = further.replace(&format!("--network {network}"), "--network compact");
+        fails(tiny.path(), &other.replace("--out more-", "--out other-"), &["architecture"]);
+    }
+    let wrong = format!("{train} --network mask-rcnn --encoder faster-rcnn.safetensors --steps 1 --out wrong");
+    fails(tiny.path(), &wrong, &["--encoder", "weights of another network"]);
+}

@@ -256,6 +256,16 @@ mod tests {
     }
 
     #[test]
+    fn the_losses_of_the_box_head_are_torchvisions() {
+        // torchvision.models.detection.roi_heads.fastrcnn_loss on the same numbers.
+        let proposals = [[0.0, 0.0, 9.0, 9.0], [4.0, 0.0, 19.0, 9.0]];
+        let targets = [(1, [1.0, 1.0, 6.0, 9.0]), (0, [0.0; 4])];
+        let [labels, boxes] = classified(&numbers(6), &numbers(24), &proposals, &targets, 3);
+        assert!((labels.value - 0.646_893_442).abs() < 1e-6, "{}", labels.value);
+        assert!((boxes.value - 2.456_594_467).abs() < 1e-5, "{}", boxes.value);
+    }
+
+    #[test]
     fn codes_of_boxes_lie_where_the_network_has_them() {
         // Anchor 3 of two pixels with two anchors each: second of the second pixel.
         let layout = Layout { pixels: 2, per_pixel: 2 };

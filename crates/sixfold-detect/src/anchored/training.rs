@@ -361,3 +361,71 @@ impl Training for AnchoredTraining {
         self.learner.change(|network| network.freeze_stages(stages));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::anchored::AnchoredKind;
+    use crate::targets::Instance;
+    use sixfold_nn::pretrained::PretrainedFile;
+    use std::path::Path;
+
+    #[test]
+    fn the_losses_of_retinanet_are_torchvisions() {
+        // RetinaNet.compute_loss of the small network in tests/anchored (checks/anchored_vs_torchvision.py) on this image and these boxes.
+        let kind = AnchoredKind::RetinaNet;
+        let sizes = AnchoredConfig { blocks: [1; 4], width: 4, pyramid: 8, ..AnchoredConfig::new(kind, 4) };
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/anchored/retinanet-anchors.safetensors");
+        let device = Device::flex().autodiff();
+        let network =
+            AnchoredNetwork::from_pytorch(&PretrainedFile::open(&file).unwrap(), &sizes, &device).unwrap();
+        let Layers::OneStage(layers) = network.layers.freeze_stages(0) else {
+            panic!("RetinaNet has one stage")
+        };
+        let value = |c: usize, x: usize, y: usize| ((3 * x + 5 * y * (c + 1)) ^ (x * y / 16)) % 256;
+        let pixels = (0..3 * 96 * 96).map(|i| value(i / (96 * 96), i % 96, i / 96 % 96) as f32 / 255.0);
+        let mut input: Vec<f32> = pixels.collect();
+        normalise(&mut input);
+        let instance = |class, corners| Instance { class, corners };
+        let instances = vec![instance(1, [10.0, 12.0, 49.0, 40.0]), instance(3, [60.0, 20.0, 90.0, 89.0])];
+        let annotation = Annotation { size: [96, 96], labels: vec![0; 96 * 96], instances };
+        let x = Tensor::from_data(TensorData::new(input.clone(), [1, 3, 96, 96]), &device);
+        let mut sum = Sum::default();
+        retina(&layers, x, &AnchoredImage { input, annotation, number: 0 }, 4, &mut sum);
+        let [labels, boxes, ..] = sum.terms;
+        assert!((labels - 0.775_797_5).abs() < 1e-5, "{labels}");
+        assert!((boxes - 0.730_255_7).abs() < 1e-5, "{boxes}");
+    }
+
+    #[test]
+    fn masks_are_cut_out_of_the_image_as_torchvision_does() {
+        // project_masks_on_boxes of the same mask and box.
+        let mut labels = vec![0u8; 96 * 96];
+        for (y, row) in labels.chunks_exact_mut(96).enumerate().take(41).skip(12) {
+            row[10..50].fill(2);
+            if (20..25).contains(&y) {
+                row[30..40].fill(1);
+            }
+        }
+        let annotation = Annotation { size: [96, 96], labels, instances: vec![] };
+        let mask = mask_in(&annotation, 2, &[8.0, 10.5, 53.0, 37.0]);
+        assert!((mask.iter().sum::<f32>() - 637.522_34).abs() < 1e-2);
+        let row = [14 * 28, 14 * 28 + 13, 14 * 28 + 14, 14 * 28 + 25].map(|i| mask[i]);
+        let expected = [0.102_678_3, 0.497_171, 0.223_215_1, 0.808_036_8];
+        assert!(row.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{row:?}");
+    }
+
+    #[test]
+    fn what_is_not_to_be_learnt_is_no_background_and_flat_objects_are_left_out() {
+        let mut labels = vec![0; 64 * 64];
+        labels[20 * 64 + 20] = IGNORED;
+        let flat = Instance { class: 1, corners: [5.0, 5.0, 5.0, 9.0] };
+        let whole = Instance { class: 2, corners: [40.0, 40.0, 60.0, 60.0] };
+        let annotation = Annotation { size: [64, 64], labels, instances: vec![flat, whole] };
+        let (found, numbers) = objects(&annotation, 1);
+        assert_eq!((found, numbers), (vec![(3, whole.corners)], vec![2]));
+        let boxes = [[10.0, 10.0, 30.5, 30.5], [11.0, 10.0, 31.5, 30.5], [40.0, 40.0, 60.0, 60.0]];
+        let found = matched(&annotation, &[whole.corners], &boxes, OF_PROPOSALS);
+        assert_eq!(found, [Match::Between, Match::Background, Match::Object(0)]);
+    }
+}
