@@ -267,3 +267,36 @@ fn in_dataset(
     })?;
     Ok(outcome(summary.detections, &summary.skipped))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arguments::{Arguments, Command};
+    use clap::Parser;
+
+    #[test]
+    fn the_objects_of_torchvisions_labels_decide_about_a_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let weights = folder.path().join("mask.pth");
+        let of = || {
+            let words = ["sixfold", "detect", "--rgb", "a.png", "--weights", &weights.to_string_lossy()];
+            match Arguments::try_parse_from(words).unwrap().command {
+                Command::Detect(a) => run_options(&a),
+                _ => panic!("no detection"),
+            }
+        };
+        let without = of();
+        let write = |text: &str| std::fs::write(folder.path().join("mask.objects.json"), text).unwrap();
+        write("{}");
+        let with = of();
+        write(r#"{"objects": {"1": 2}}"#);
+        assert!(without != with && with != of());
+        std::fs::write(&weights, b"").unwrap();
+        let parsed =
+            Arguments::try_parse_from(["sixfold", "estimate", "--detector", &weights.to_string_lossy()]);
+        let Command::Estimate(a) = parsed.unwrap().command else { panic!("no estimate") };
+        let before = a.run_options();
+        write(r#"{"objects": {"1": 3}}"#);
+        assert!(a.run_options() != before);
+    }
+}

@@ -129,8 +129,9 @@ impl BoxPredictor {
     }
 }
 
+/// The layer of the masks. Small, so that training starts without a preference (chosen by hand; not swept).
 fn mask_logits(config: &AnchoredConfig, random: &mut Random, device: &Device) -> Conv {
-    ConvConfig::new([config.pyramid, config.labels], 1, Activation::Linear).init(1.0, random, device)
+    ConvConfig::new([config.pyramid, config.labels], 1, Activation::Linear).init(0.01, random, device)
 }
 
 impl RoiHeads {
