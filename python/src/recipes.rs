@@ -104,7 +104,8 @@ pub(crate) fn train_pix2pose<'py>(
 /// reads. A dict with model (its path), steps, seconds, losses.
 ///
 /// material, out, ids, frames, split, renders_only, init, backgrounds, progress, Ctrl-C and going on: as train_pix2pose.
-/// network: "compact" or the dissertation's "retinanet"; batch: images in a step; encoder_share: the pretrained encoder's
+/// network: "compact", "retinanet" (without anchors), or the dissertation's "faster-rcnn", "mask-rcnn" and "retinanet-anchors", which need
+/// encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_share: the pretrained encoder's
 /// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_share: fraction of
 /// training images that are parts of photographs; render_share: fraction of renders among pasted objects; rotation: largest rotation
 /// in the image plane, radians, 15 degrees if None; longest_side: larger images are reduced to so many pixels before detection; threshold: score

@@ -38,16 +38,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let model = DetectorModel::load(Path::new(weights))?;
     let image = read_rgb(Path::new(image))?;
-    let input =
-        NetworkImage::new(&image, model.config(), model.usage().longest_side).ok_or("an empty image")?;
-    let numbers = model.run(&input);
+    let anchorless = model.anchorless().ok_or("a detector of torchvision")?;
+    let input = NetworkImage::new(&image, anchorless.config(), model.usage().longest_side);
+    let input = input.ok_or("an empty image")?;
+    let numbers = anchorless.run(&input);
     let out = Path::new(out);
     std::fs::create_dir_all(out)?;
     std::fs::write(out.join("input.f32"), bytes(&input.values))?;
     let all = numbers.scores.iter().chain(&numbers.boxes).flatten().chain(&numbers.prototypes);
     std::fs::write(out.join("output.f32"), bytes(all))?;
     let options = model.options();
-    let network = times(rounds, || model.run(&input));
+    let network = times(rounds, || anchorless.run(&input));
     let whole = times(rounds, || model.detect(&image, &options));
     let (width, height) = (input.width, input.height);
     println!(

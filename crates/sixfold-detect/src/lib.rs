@@ -5,6 +5,8 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+pub mod anchored;
+mod card;
 pub mod detect;
 pub mod detector;
 mod loss;
@@ -15,6 +17,7 @@ pub mod recipe;
 pub mod samples;
 mod tabletop;
 mod targets;
+pub mod torchvision;
 pub mod training;
 
 pub use targets::{Annotation, Instance};

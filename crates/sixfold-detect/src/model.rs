@@ -1,11 +1,15 @@
-//! A trained detector: the network with the objects it knows, as one file.
+//! A trained detector: the network with the objects it knows, as one file; or weights of torchvision.
 
+use crate::anchored::{AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
+use crate::card::{anchored_kind, classes_of, read_anchored};
 use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode};
 use crate::network::{Detector, DetectorConfig, EncoderKind};
+use crate::torchvision::{self, Torchvision};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::RgbImage;
+use sixfold_geometry::{Rect, RgbImage};
+use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -73,6 +77,29 @@ pub enum ModelError {
     /// An option is out of range.
     #[error("{0}")]
     Option(String),
+    /// The file is neither of Sixfold nor one of torchvision's networks.
+    #[error(
+        "{}: expected a detector that `sixfold train detector` wrote, or torchvision's weights of fasterrcnn_resnet50_fpn, \
+         maskrcnn_resnet50_fpn or retinanet_resnet50_fpn, found no tensor of their last layers; give another file", file.display()
+    )]
+    Foreign {
+        /// The file.
+        file: PathBuf,
+    },
+    /// Weights of torchvision that do not fit its network.
+    #[error(transparent)]
+    Torchvision(PretrainedError),
+    /// The file beside weights of torchvision.
+    #[error(
+        "{}: expected what the labels of the weights beside it mean, such as {{\"objects\": {{\"1\": 5, \"2\": 8}}}} with an object's id \
+         for each label, found {found}; correct or remove it", file.display()
+    )]
+    Objects {
+        /// The file.
+        file: PathBuf,
+        /// What is wrong with it.
+        found: String,
+    },
     /// There is nothing to look at.
     #[error("the image is empty (0x0 pixels); give one with at least one pixel")]
     EmptyImage,
@@ -81,11 +108,27 @@ pub enum ModelError {
 /// A network and what it was trained on.
 #[derive(Debug, Clone)]
 pub struct DetectorModel {
-    network: Detector,
-    config: DetectorConfig,
+    network: Network,
     classes: Vec<ClassEntry>,
     usage: DetectorUse,
     card: ModelCard,
+}
+
+/// The kinds of networks.
+#[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant)]
+enum Network {
+    /// Those that Sixfold trains.
+    Anchorless(AnchorlessNetwork),
+    /// Those of torchvision, with the label of every class.
+    Anchored(AnchoredNetwork, Vec<usize>),
+}
+
+/// A network without anchors, which Sixfold trained.
+#[derive(Debug, Clone)]
+pub struct AnchorlessNetwork {
+    network: Detector,
+    config: DetectorConfig,
     device: Device,
 }
 
@@ -117,18 +160,51 @@ impl DetectorModel {
         extra["use"] = serde_json::to_value(usage).unwrap_or_default();
         let objects = classes.iter().map(|c| serde_json::to_value(c).unwrap_or_default()).collect();
         let card = ModelCard { architecture: architecture(&config).to_string(), objects, extra, ..card };
-        let network = network.valid();
-        DetectorModel { network, config, classes, usage, card, device: Device::flex() }
+        DetectorModel { network: anchorless(network, config, Device::flex()), classes, usage, card }
     }
 
-    /// Reads a weight file.
+    /// Reads a weight file: one that a training wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet (`.pth`, `.pt`
+    /// or `.safetensors`; [`crate::torchvision::objects_file`] beside it says which objects its labels are).
     ///
     /// # Errors
     /// [`ModelError`] for a file that cannot be read or is no detector.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let pickled =
+            path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pth") || e.eq_ignore_ascii_case("pt"));
+        if pickled || matches!(read_card(path), Err(WeightsError::Card { .. })) {
+            return Self::of_torchvision(path);
+        }
+        if anchored_kind(&read_card(path)?).is_some() {
+            let (network, labels, classes, usage, card) = read_anchored(path, &Device::flex())?;
+            let network = network.with_labels(&labels);
+            return Ok(DetectorModel { network: Network::Anchored(network, labels), classes, usage, card });
+        }
         let device = Device::flex();
         let (network, config, classes, usage, card) = read(path, &device)?;
-        Ok(DetectorModel { network: network.valid(), config, classes, usage, card, device })
+        Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
+    }
+
+    /// A model of a trained network with anchors, whose labels are the classes in their order. `card` gets architecture, classes and
+    /// sizes filled in.
+    pub fn of_anchored(
+        network: AnchoredNetwork,
+        classes: Vec<ClassEntry>,
+        usage: DetectorUse,
+        card: ModelCard,
+    ) -> Self {
+        let first = network.config().first_label();
+        let labels = (first..first + classes.len()).collect();
+        DetectorModel { network: Network::Anchored(network, labels), classes, usage, card }
+    }
+
+    fn of_torchvision(path: &Path) -> Result<Self, ModelError> {
+        let Torchvision { network, labels, classes, beside, card } = torchvision::read(path)?;
+        let default = DetectorUse::default();
+        let usage = DetectorUse {
+            longest_side: network.config().max_side,
+            threshold: beside.threshold.unwrap_or(default.threshold),
+        };
+        Ok(DetectorModel { network: Network::Anchored(network, labels), classes, usage, card })
     }
 
     /// The detector of any object that is within the program: one class, [`crate::proposals::ANY_OBJECT`].
@@ -143,7 +219,7 @@ impl DetectorModel {
             load_weights_from_bytes(config.init(0, &device), name, PROPOSALS, architecture(&config))?;
         let classes = vec![ClassEntry { id: crate::proposals::ANY_OBJECT }];
         let usage = serde_json::from_value(card.extra["use"].clone()).unwrap_or_default();
-        Ok(DetectorModel { network: network.valid(), config, classes, usage, card, device })
+        Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
     }
 
     /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
@@ -158,12 +234,7 @@ impl DetectorModel {
         let (network, config, classes, ..) = read(path, device)?;
         let found: Vec<u32> = classes.iter().map(|c| c.id).collect();
         if found != ids {
-            return Err(ModelError::Card {
-                file: path.to_path_buf(),
-                field: "objects",
-                expected: "the objects that are to be trained, in this order",
-                found: format!("{found:?} instead of {ids:?}"),
-            });
+            return Err(other_objects(path, &found, ids));
         }
         Ok((network, config))
     }
@@ -173,8 +244,49 @@ impl DetectorModel {
     /// # Errors
     /// [`ModelError::Weights`].
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
-        save_weights(&self.network, &self.card, path)?;
-        Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
+        let (network, labels) = match &self.network {
+            Network::Anchorless(network) => {
+                save_weights(&network.network, &self.card, path)?;
+                return Ok(write_card_markdown(&self.card, &path.with_extension("md"))?);
+            }
+            Network::Anchored(network, labels) => (network, labels),
+        };
+        let mut card = self.card.clone();
+        if !card.extra.is_object() {
+            card.extra = serde_json::json!({});
+        }
+        card.extra["network"] = serde_json::to_value(network.config()).unwrap_or_default();
+        card.extra["use"] = serde_json::to_value(self.usage).unwrap_or_default();
+        card.extra["labels"] = serde_json::to_value(labels).unwrap_or_default();
+        card.objects = self.classes.iter().map(|c| serde_json::to_value(c).unwrap_or_default()).collect();
+        card.architecture = network.config().kind.architecture().to_owned();
+        network.save(&card, path)?;
+        Ok(write_card_markdown(&card, &path.with_extension("md"))?)
+    }
+
+    /// As [`DetectorModel::network_for_training`], of a network with anchors.
+    pub(crate) fn anchored_for_training(
+        path: &Path,
+        kind: AnchoredKind,
+        ids: &[u32],
+        device: &Device,
+    ) -> Result<AnchoredNetwork, ModelError> {
+        let card = read_card(path)?;
+        if anchored_kind(&card) != Some(kind) {
+            return Err(ModelError::Card {
+                file: path.to_path_buf(),
+                field: "architecture",
+                expected: "the network that is to be trained",
+                found: card.architecture,
+            });
+        }
+        let (network, _, classes, ..) = read_anchored(path, device)?;
+        let found: Vec<u32> = classes.iter().map(|c| c.id).collect();
+        let config = network.config();
+        if found != ids || config.labels != ids.len() + config.first_label() {
+            return Err(other_objects(path, &found, ids));
+        }
+        Ok(network)
     }
 
     /// The classes, in the network's order.
@@ -204,9 +316,12 @@ impl DetectorModel {
         self.usage
     }
 
-    /// Sizes of the network.
-    pub fn config(&self) -> &DetectorConfig {
-        &self.config
+    /// The network where it is one without anchors.
+    pub fn anchorless(&self) -> Option<&AnchorlessNetwork> {
+        match &self.network {
+            Network::Anchorless(network) => Some(network),
+            Network::Anchored(..) => None,
+        }
     }
 
     /// The card.
@@ -225,10 +340,51 @@ impl DetectorModel {
     /// [`ModelError::Option`] and [`ModelError::EmptyImage`].
     pub fn detect(&self, image: &RgbImage, options: &DetectOptions) -> Result<Vec<Detected>, ModelError> {
         options.check().map_err(ModelError::Option)?;
-        let input =
-            NetworkImage::new(image, &self.config, self.usage.longest_side).ok_or(ModelError::EmptyImage)?;
-        let raw = self.run(&input);
-        Ok(decode(&raw, &input, image.size(), &self.config, options))
+        match &self.network {
+            Network::Anchorless(network) => {
+                let longest_side = self.usage.longest_side;
+                let input =
+                    NetworkImage::new(image, &network.config, longest_side).ok_or(ModelError::EmptyImage)?;
+                Ok(decode(&network.run(&input), &input, image.size(), &network.config, options))
+            }
+            Network::Anchored(..) if image.size().0 == 0 || image.size().1 == 0 => {
+                Err(ModelError::EmptyImage)
+            }
+            Network::Anchored(network, labels) => Ok(anchored(network, labels, image, options)),
+        }
+    }
+}
+
+/// Detections of a network of torchvision. Its boxes stay as they are: what their numbers mean is up to those who trained it.
+fn anchored(
+    network: &AnchoredNetwork,
+    labels: &[usize],
+    image: &RgbImage,
+    options: &DetectOptions,
+) -> Vec<Detected> {
+    let DetectOptions { threshold, overlap, per_class, most, masks } = *options;
+    let thresholds = Thresholds { score: threshold, overlap: f64::from(overlap), most, per_label: per_class };
+    let found = network.detect(image, &thresholds, masks);
+    let detected = |d: AnchoredDetection| {
+        let [left, top, right, bottom] = d.corners.map(f64::from);
+        Some(Detected {
+            class: labels.iter().position(|label| *label == d.label)?,
+            score: d.score,
+            bbox: Rect { x: left, y: top, width: right - left, height: bottom - top },
+            mask: d.mask.map(|mask| mask.pasted(&d.corners, image.size()).mask(image.size())),
+        })
+    };
+    found.into_iter().filter_map(detected).collect()
+}
+
+fn anchorless(network: Detector, config: DetectorConfig, device: Device) -> Network {
+    Network::Anchorless(AnchorlessNetwork { network: network.valid(), config, device })
+}
+
+impl AnchorlessNetwork {
+    /// Sizes of the network.
+    pub fn config(&self) -> &DetectorConfig {
+        &self.config
     }
 
     /// The network's output for an image.
@@ -246,6 +402,15 @@ impl DetectorModel {
     }
 }
 
+fn other_objects(path: &Path, found: &[u32], ids: &[u32]) -> ModelError {
+    ModelError::Card {
+        file: path.to_path_buf(),
+        field: "objects",
+        expected: "the objects that are to be trained, in this order",
+        found: format!("{found:?} instead of {ids:?}"),
+    }
+}
+
 type Content = (Detector, DetectorConfig, Vec<ClassEntry>, DetectorUse, ModelCard);
 
 fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
@@ -259,18 +424,7 @@ fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
     if card.architecture != COMPACT && card.architecture != RETINANET {
         return Err(wrong("architecture", "detect-compact or detect-retinanet", card.architecture));
     }
-    let classes = card
-        .objects
-        .iter()
-        .map(|value| {
-            serde_json::from_value(value.clone()).map_err(|e| wrong("objects", "an id", e.to_string()))
-        })
-        .collect::<Result<Vec<ClassEntry>, _>>()?;
-    for (place, class) in classes.iter().enumerate() {
-        if classes[..place].contains(class) {
-            return Err(wrong("objects", "every id once", format!("object {} twice", class.id)));
-        }
-    }
+    let classes = classes_of(&card, path)?;
     let config: DetectorConfig = serde_json::from_value(card.extra["network"].clone())
         .map_err(|e| wrong("extra.network", "the network's sizes", e.to_string()))?;
     let usage: DetectorUse = serde_json::from_value(card.extra["use"].clone())

@@ -15,10 +15,11 @@ use sixfold_nn::resnet::ResNet50Config;
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::{ModelCard, training_frames};
 
+use crate::anchored::{AnchoredConfig, AnchoredKind, AnchoredNetwork, AnchoredTraining};
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{Detector, DetectorConfig, Encoder};
 use crate::samples::{TrainingImageError, TrainingImageOptions, TrainingImageSource};
-use crate::training::{DetectorTraining, DetectorTrainingOptions};
+use crate::training::{AnyTraining, DetectorTraining, DetectorTrainingOptions};
 
 /// Which network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -28,15 +29,24 @@ pub enum DetectorKind {
     Compact,
     /// ResNet-50 with RetinaNet's pyramid and towers. Boxes come without anchors, unlike the dissertation's.
     Retinanet,
+    /// The dissertation's detectors, from pretrained weights of torchvision.
+    Anchored(AnchoredKind),
 }
 
 impl Choice for DetectorKind {
-    const ALL: &'static [DetectorKind] = &[DetectorKind::Compact, DetectorKind::Retinanet];
+    const ALL: &'static [DetectorKind] = &[
+        DetectorKind::Compact,
+        DetectorKind::Retinanet,
+        DetectorKind::Anchored(AnchoredKind::FasterRcnn),
+        DetectorKind::Anchored(AnchoredKind::MaskRcnn),
+        DetectorKind::Anchored(AnchoredKind::RetinaNet),
+    ];
 
     fn name(self) -> &'static str {
         match self {
             DetectorKind::Compact => "compact",
             DetectorKind::Retinanet => "retinanet",
+            DetectorKind::Anchored(kind) => kind.name(),
         }
     }
 
@@ -46,6 +56,7 @@ impl Choice for DetectorKind {
             DetectorKind::Retinanet => {
                 "ResNet-50 with RetinaNet's pyramid and towers (boxes without anchors); needs days on two cores"
             }
+            DetectorKind::Anchored(kind) => kind.help(),
         }
     }
 }
@@ -65,7 +76,8 @@ pub struct DetectorRecipe {
     pub encoder_share: f64,
     /// Stages of the ImageNet encoder that stay as they are, of five.
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones without.
+    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones without. For [`DetectorKind::Anchored`], which needs
+    /// it, these or torchvision's weights of the same network.
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (RetinaNet: 128).
     pub size: usize,
@@ -169,7 +181,7 @@ impl DetectorRecipe {
             return DetectorModel::network_for_training(file, ids, device).map_err(TrainError::method);
         }
         let (config, encoder) = match self.network {
-            DetectorKind::Compact => {
+            DetectorKind::Compact | DetectorKind::Anchored(_) => {
                 (DetectorConfig::compact(ids.len()), Encoder::Lite0(imagenet_encoder(device)?))
             }
             DetectorKind::Retinanet => {
@@ -186,10 +198,31 @@ impl DetectorRecipe {
     }
 }
 
+impl DetectorRecipe {
+    fn anchored(
+        &self,
+        kind: AnchoredKind,
+        ids: &[u32],
+        device: &Device,
+    ) -> Result<AnchoredNetwork, TrainError> {
+        if let Some(file) = &self.init {
+            return DetectorModel::anchored_for_training(file, kind, ids, device).map_err(TrainError::method);
+        }
+        let expected = "torchvision's weights of ResNet-50 or of the same network";
+        let wrong = |found: String| OptionError { field: "encoder", found, expected };
+        let file = self.encoder.as_deref().ok_or_else(|| wrong("none".to_owned()))?;
+        // The R-CNNs know a background beside the objects.
+        let labels = ids.len() + AnchoredConfig::new(kind, 1).first_label();
+        let network = AnchoredNetwork::pretrained(file, kind, labels, self.seed, device);
+        let network = network.map_err(TrainError::method)?;
+        Ok(network.ok_or_else(|| wrong(format!("weights of another network in {}", file.display())))?)
+    }
+}
+
 impl Recipe for DetectorRecipe {
     type Data = TrainingSet;
     type Samples = TrainingImageSource;
-    type Training = DetectorTraining;
+    type Training = AnyTraining;
     type Context = Context;
     type Report = ();
 
@@ -214,6 +247,11 @@ impl Recipe for DetectorRecipe {
         let wrong = self.encoder.is_some() && self.network == DetectorKind::Compact;
         let expected = "network retinanet; the compact network brings its ImageNet encoder along";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
+        let anchored = matches!(self.network, DetectorKind::Anchored(_));
+        let start = !anchored || self.encoder.is_some() || self.init.is_some();
+        let expected =
+            "torchvision's weights of ResNet-50 or of the same network, or weights to continue from";
+        OptionError::unless(start, "encoder", "none", expected)?;
         if let Err(TrainingImageError::Option { field, found, expected }) = self.scenes().check() {
             return Err(OptionError { field, found, expected });
         }
@@ -246,10 +284,9 @@ impl Recipe for DetectorRecipe {
         &self,
         material: TrainingSet,
         _: &mut Session<'_>,
-    ) -> Result<Prepared<DetectorTraining, Context>, TrainError> {
+    ) -> Result<Prepared<AnyTraining, Context>, TrainError> {
         let ids: Vec<u32> = material.objects.iter().map(|o| o.id).collect();
         let device = Device::flex().autodiff();
-        let (network, config) = self.network(&ids, &device)?;
         let options = self.options();
         let mut card = ModelCard::new("", &format!("Detector, {} network", self.network.name()));
         card.data.clone_from(&material.description);
@@ -258,7 +295,17 @@ impl Recipe for DetectorRecipe {
         card.extra = serde_json::json!({
             "training": options, "continued_from": continued_from(self.init.as_deref())?
         });
-        let training = DetectorTraining::new(network, config, self.size, options, device);
+        let training = match self.network {
+            DetectorKind::Anchored(kind) => {
+                let network = self.anchored(kind, &ids, &device)?;
+                AnyTraining::Anchored(Box::new(AnchoredTraining::new(network, self.size, options)))
+            }
+            _ => {
+                let (network, config) = self.network(&ids, &device)?;
+                let training = DetectorTraining::new(network, config, self.size, options, device);
+                AnyTraining::Anchorless(Box::new(training))
+            }
+        };
         let classes = ids.iter().map(|id| ClassEntry { id: *id }).collect();
         Ok(Prepared { training, card, context: Context { material, classes } })
     }
@@ -284,12 +331,20 @@ impl Recipe for DetectorRecipe {
 
     fn finish(
         &self,
-        Prepared { training, card, context }: Prepared<DetectorTraining, Context>,
+        Prepared { training, card, context }: Prepared<AnyTraining, Context>,
         session: &mut Session<'_>,
     ) -> Result<Option<()>, TrainError> {
         let usage = DetectorUse { longest_side: self.longest_side, threshold: self.threshold };
-        let (network, config) = training.into_network();
-        let model = DetectorModel::new(network, config, context.classes, usage, card);
+        let model = match training {
+            AnyTraining::Anchorless(training) => {
+                let (network, config) = training.into_network();
+                DetectorModel::new(network, config, context.classes, usage, card)
+            }
+            AnyTraining::Anchored(training) => {
+                let network = training.into_network().with_longest_side(self.longest_side);
+                DetectorModel::of_anchored(network, context.classes, usage, card)
+            }
+        };
         model.save(&session.model()).map_err(TrainError::method)?;
         Ok(Some(()))
     }

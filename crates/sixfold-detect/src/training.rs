@@ -1,5 +1,6 @@
 //! The training of a detector: image after image through the network, gradients summed over a batch, AdamW.
 
+use crate::anchored::{AnchoredImage, AnchoredTraining};
 use crate::loss::{LossWeights, RawOutput, loss};
 use crate::network::{Detector, DetectorConfig, DetectorOutput, MASK_STRIDE};
 use crate::samples::{TrainingImageOptions, TrainingImageSource};
@@ -224,6 +225,69 @@ impl Training for DetectorTraining {
     fn restored(&mut self) {
         let stages = self.options.frozen_stages;
         self.learner.change(|network| network.freeze(stages));
+    }
+}
+
+/// The training of a detector of any kind.
+pub enum AnyTraining {
+    /// Without anchors.
+    Anchorless(Box<DetectorTraining>),
+    /// With anchors.
+    Anchored(Box<AnchoredTraining>),
+}
+
+/// What a step of [`AnyTraining`] learns from.
+pub enum AnyBatch {
+    /// Without anchors.
+    Anchorless(Vec<TrainingImage>),
+    /// With anchors.
+    Anchored(Vec<AnchoredImage>),
+}
+
+impl Training for AnyTraining {
+    type Samples = TrainingImageSource;
+    type Batch = AnyBatch;
+
+    fn plan(&self, source: &TrainingImageSource) -> Result<Plan, TrainError> {
+        match self {
+            AnyTraining::Anchorless(training) => training.plan(source),
+            AnyTraining::Anchored(training) => training.plan(source),
+        }
+    }
+
+    fn batches<'a>(&self, source: &'a TrainingImageSource) -> Batches<'a, AnyBatch> {
+        match self {
+            AnyTraining::Anchorless(training) => {
+                let batches = training.batches(source);
+                Box::new(move |step| AnyBatch::Anchorless(batches(step)))
+            }
+            AnyTraining::Anchored(training) => {
+                let batches = training.batches(source);
+                Box::new(move |step| AnyBatch::Anchored(batches(step)))
+            }
+        }
+    }
+
+    fn step(&mut self, batch: AnyBatch, rate: f64) -> Losses {
+        match (self, batch) {
+            (AnyTraining::Anchorless(training), AnyBatch::Anchorless(batch)) => training.step(batch, rate),
+            (AnyTraining::Anchored(training), AnyBatch::Anchored(batch)) => training.step(batch, rate),
+            _ => unreachable!("a training makes its own batches"),
+        }
+    }
+
+    fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
+        match self {
+            AnyTraining::Anchorless(training) => training.learners(),
+            AnyTraining::Anchored(training) => training.learners(),
+        }
+    }
+
+    fn restored(&mut self) {
+        match self {
+            AnyTraining::Anchorless(training) => training.restored(),
+            AnyTraining::Anchored(training) => training.restored(),
+        }
     }
 }
 

@@ -1,5 +1,5 @@
 //! ResNet-50 (He et al. 2016, table 1) in torchvision's layout: names of the tensors, and the stride in the 3x3
-//! convolution of a bottleneck.
+//! convolution of a bottleneck. [`Bottlenecks`] gives networks of the same kind other sizes.
 
 use std::path::Path;
 
@@ -16,9 +16,84 @@ use crate::conv_norm::{BareConv, BareConvConfig};
 use crate::dense::dense;
 use crate::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
 
-/// Bottlenecks and inner channels of the four layers. A layer's output has four times as many channels.
-const LAYERS: [(usize, usize); 4] = [(3, 64), (4, 128), (6, 256), (3, 512)];
+/// Layers after the first convolution.
+const LAYERS: usize = 4;
+/// A layer's output has so many times its inner channels.
 const EXPANSION: usize = 4;
+
+/// Sizes of a network of bottlenecks (He et al. 2016, table 1).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bottlenecks {
+    /// Bottlenecks of the four layers.
+    pub blocks: [usize; 4],
+    /// Channels of the first convolution, and inner channels of the first layer; each further layer has twice as many.
+    pub width: usize,
+    /// Added to the variances of the normalisations.
+    pub epsilon: f64,
+}
+
+impl Default for Bottlenecks {
+    /// ResNet-50, with PyTorch's epsilon of a batch normalisation.
+    fn default() -> Self {
+        Bottlenecks { blocks: [3, 4, 6, 3], width: 64, epsilon: 1e-5 }
+    }
+}
+
+impl Bottlenecks {
+    /// Channels of the four layers' outputs: 256, 512, 1024 and 2048 of ResNet-50.
+    pub fn channels(&self) -> [usize; 4] {
+        [0, 1, 2, 3].map(|layer| EXPANSION * (self.width << layer))
+    }
+
+    /// The network with all four layers, without a classifier and with random weights (He et al. 2015).
+    pub fn init(&self, seed: u64, device: &Device) -> ResNet50 {
+        self.build(LAYERS, None, seed, device)
+    }
+
+    fn build(&self, layers: usize, classes: Option<usize>, seed: u64, device: &Device) -> ResNet50 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let conv1 = BareConvConfig::new([3, self.width], 7).with_stride(2).init(&mut rng, device);
+        let bn1 = self.norm(self.width, device);
+        let mut inputs = self.width;
+        let [layer1, layer2, layer3, layer4] = [0, 1, 2, 3].map(|layer| {
+            let inner = self.width << layer;
+            let blocks = if layer < layers { self.blocks[layer] } else { 0 };
+            (0..blocks)
+                .map(|block| {
+                    let stride = if block == 0 && layer > 0 { 2 } else { 1 };
+                    let channels = std::mem::replace(&mut inputs, EXPANSION * inner);
+                    self.bottleneck([channels, inner], stride, &mut rng, device)
+                })
+                .collect()
+        });
+        let fc =
+            classes.filter(|_| layers == LAYERS).map(|classes| dense([inputs, classes], &mut rng, device));
+        ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc }
+    }
+
+    fn norm(&self, channels: usize, device: &Device) -> BatchNorm {
+        BatchNormConfig { epsilon: self.epsilon, ..BatchNormConfig::new(channels) }.init(device)
+    }
+
+    fn bottleneck(
+        &self,
+        [inputs, inner]: [usize; 2],
+        stride: usize,
+        rng: &mut ChaCha8Rng,
+        device: &Device,
+    ) -> Bottleneck {
+        let outputs = EXPANSION * inner;
+        let mut conv = |channels: [usize; 2], kernel: usize, stride: usize| {
+            let conv = BareConvConfig::new(channels, kernel).with_stride(stride).init(rng, device);
+            (conv, self.norm(channels[1], device))
+        };
+        let (conv1, bn1) = conv([inputs, inner], 1, 1);
+        let (conv2, bn2) = conv([inner, inner], 3, stride);
+        let (conv3, bn3) = conv([inner, outputs], 1, 1);
+        let downsample = (stride != 1 || inputs != outputs).then(|| conv([inputs, outputs], 1, stride));
+        Bottleneck { conv1, bn1, conv2, bn2, conv3, bn3, downsample }
+    }
+}
 
 /// How much of ResNet-50 to build.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,31 +112,12 @@ impl ResNet50Config {
 
     /// The first convolution and the first `layers` of four layers, for their feature maps.
     pub fn features(layers: usize) -> Self {
-        ResNet50Config { layers: layers.min(LAYERS.len()), classes: None }
+        ResNet50Config { layers: layers.min(LAYERS), classes: None }
     }
 
     /// The network with random weights (He et al. 2015).
     pub fn init(&self, seed: u64, device: &Device) -> ResNet50 {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let conv1 = BareConvConfig::new([3, 64], 7).with_stride(2).init(&mut rng, device);
-        let bn1 = BatchNormConfig::new(64).init(device);
-        let mut inputs = 64;
-        let [layer1, layer2, layer3, layer4] = [0, 1, 2, 3].map(|layer| {
-            let (blocks, inner) = LAYERS[layer];
-            let blocks = if layer < self.layers { blocks } else { 0 };
-            (0..blocks)
-                .map(|block| {
-                    let stride = if block == 0 && layer > 0 { 2 } else { 1 };
-                    let channels = std::mem::replace(&mut inputs, EXPANSION * inner);
-                    Bottleneck::init(channels, inner, stride, &mut rng, device)
-                })
-                .collect()
-        });
-        let fc = self
-            .classes
-            .filter(|_| self.layers == LAYERS.len())
-            .map(|classes| dense([inputs, classes], &mut rng, device));
-        ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc }
+        Bottlenecks::default().build(self.layers, self.classes, seed, device)
     }
 
     /// The network with torchvision's weights from a `.pth` or `.safetensors` file. What is not built is left out.
@@ -76,7 +132,7 @@ impl ResNet50Config {
             network: "ResNet-50 in torchvision's layout",
             names: &|name| vec![name.to_owned()],
             unused: &|name| {
-                let later = (layers + 1..=LAYERS.len()).any(|l| name.starts_with(&format!("layer{l}.")));
+                let later = (layers + 1..=LAYERS).any(|l| name.starts_with(&format!("layer{l}.")));
                 later || (!classifier && name.starts_with("fc."))
             },
         };
@@ -84,7 +140,7 @@ impl ResNet50Config {
     }
 }
 
-/// ResNet-50, made by [`ResNet50Config`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456, 0.406)
+/// ResNet-50, made by [`ResNet50Config`], or one of other sizes, made by [`Bottlenecks`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456, 0.406)
 /// over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
 pub struct ResNet50 {
@@ -111,16 +167,10 @@ struct Bottleneck {
 }
 
 impl Bottleneck {
-    fn init(inputs: usize, inner: usize, stride: usize, rng: &mut ChaCha8Rng, device: &Device) -> Self {
-        let outputs = EXPANSION * inner;
-        let mut conv = |channels: [usize; 2], kernel: usize, stride: usize| {
-            let conv = BareConvConfig::new(channels, kernel).with_stride(stride).init(rng, device);
-            (conv, BatchNormConfig::new(channels[1]).init(device))
-        };
-        let (conv1, bn1) = conv([inputs, inner], 1, 1);
-        let (conv2, bn2) = conv([inner, inner], 3, stride);
-        let (conv3, bn3) = conv([inner, outputs], 1, 1);
-        let downsample = (stride != 1 || inputs != outputs).then(|| conv([inputs, outputs], 1, stride));
+    fn freeze_norms(self) -> Bottleneck {
+        let Bottleneck { conv1, bn1, conv2, bn2, conv3, bn3, downsample } = self;
+        let downsample = downsample.map(|(conv, norm)| (conv, norm.freeze()));
+        let [bn1, bn2, bn3] = [bn1, bn2, bn3].map(Module::freeze);
         Bottleneck { conv1, bn1, conv2, bn2, conv3, bn3, downsample }
     }
 
@@ -136,6 +186,27 @@ impl Bottleneck {
 }
 
 impl ResNet50 {
+    /// For a training in which all normalisations stay as they are, and of the five stages (the first convolution, the four layers) the
+    /// first `stages`.
+    pub fn freeze_stages(self, stages: usize) -> ResNet50 {
+        let layer = |number: usize, blocks: Vec<Bottleneck>| {
+            let frozen = |block: Bottleneck| {
+                if number < stages { block.freeze() } else { block.freeze_norms() }
+            };
+            blocks.into_iter().map(frozen).collect()
+        };
+        let ResNet50 { conv1, bn1, layer1, layer2, layer3, layer4, fc } = self;
+        ResNet50 {
+            conv1: if stages > 0 { conv1.freeze() } else { conv1 },
+            bn1: bn1.freeze(),
+            layer1: layer(1, layer1),
+            layer2: layer(2, layer2),
+            layer3: layer(3, layer3),
+            layer4: layer(4, layer4),
+            fc,
+        }
+    }
+
     /// `batch x 3 x height x width` to the maps after the first convolution and after every layer that was built: 64, 256,
     /// 512, 1024 and 2048 channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution.
     pub fn features(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
@@ -204,5 +275,14 @@ mod tests {
         let grads = burn::optim::GradientsParams::from_grads(loss.backward(), &network);
         // 53 convolutions, 2 x 53 of their normalisations, weight and bias of the classifier.
         assert_eq!(grads.len(), 53 * 3 + 2);
+
+        // Without the normalisations, and without the first convolution and the first layer (10 convolutions).
+        for (stages, expected) in [(0, 53), (2, 53 - 11), (5, 0)] {
+            let network =
+                ResNet50Config { layers: 4, classes: Some(3) }.init(1, &device).freeze_stages(stages);
+            let loss = network.classify(input(&device)).unwrap().square().mean();
+            let grads = burn::optim::GradientsParams::from_grads(loss.backward(), &network);
+            assert_eq!(grads.len(), expected + 2, "{stages} stages");
+        }
     }
 }

@@ -889,7 +889,7 @@ def train_detector(
     frames: Sequence[tuple[int, int]] | None = None,
     split: str | None = None,
     renders_only: bool = False,
-    network: Literal["compact", "retinanet"] = "compact",
+    network: Literal["compact", "retinanet", "faster-rcnn", "mask-rcnn", "retinanet-anchors"] = "compact",
     steps: int = 8000,
     batch: int = 4,
     learning_rate: float = 0.002,

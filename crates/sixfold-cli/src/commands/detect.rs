@@ -10,6 +10,7 @@ use sixfold_bop::{BopDataset, Detection, write_detections};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::model::DetectorModel;
+use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_geometry::RgbImage;
 use sixfold_io::read_rgb;
 use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, RunOptions, detections};
@@ -100,6 +101,9 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     } = a;
     let mut options = RunOptions::default();
     options.add("weights", &weights.to_string_lossy());
+    if let Some(file) = existing_objects_file(weights) {
+        options.add("objects of the weights", &file.to_string_lossy());
+    }
     options.add("dataset", &dataset.as_deref().map_or_else(String::new, |d| d.to_string_lossy().into()));
     options.add("split", split);
     options.add("ids", &format!("{ids:?}"));
@@ -262,4 +266,37 @@ fn in_dataset(
         }
     })?;
     Ok(outcome(summary.detections, &summary.skipped))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arguments::{Arguments, Command};
+    use clap::Parser;
+
+    #[test]
+    fn the_objects_of_torchvisions_labels_decide_about_a_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let weights = folder.path().join("mask.pth");
+        let of = || {
+            let words = ["sixfold", "detect", "--rgb", "a.png", "--weights", &weights.to_string_lossy()];
+            match Arguments::try_parse_from(words).unwrap().command {
+                Command::Detect(a) => run_options(&a),
+                _ => panic!("no detection"),
+            }
+        };
+        let without = of();
+        let write = |text: &str| std::fs::write(folder.path().join("mask.objects.json"), text).unwrap();
+        write("{}");
+        let with = of();
+        write(r#"{"objects": {"1": 2}}"#);
+        assert!(without != with && with != of());
+        std::fs::write(&weights, b"").unwrap();
+        let parsed =
+            Arguments::try_parse_from(["sixfold", "estimate", "--detector", &weights.to_string_lossy()]);
+        let Command::Estimate(a) = parsed.unwrap().command else { panic!("no estimate") };
+        let before = a.run_options();
+        write(r#"{"objects": {"1": 3}}"#);
+        assert!(a.run_options() != before);
+    }
 }

@@ -7,8 +7,9 @@ use sixfold_shell::output::JsonArguments;
 
 #[derive(Debug, Args)]
 pub(crate) struct DetectArguments {
-    /// Trained detector: a file that `sixfold train detector` wrote
-    #[arg(long, value_name = "FILE.safetensors")]
+    /// Trained detector: a file that `sixfold train detector` wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet
+    /// on ResNet-50 with a pyramid (.pth, .pt or .safetensors; the objects of their labels: NAME.objects.json beside them)
+    #[arg(long, value_name = "FILE")]
     pub weights: PathBuf,
     /// Colour images: PNG or JPEG of any size, grey or colour
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]

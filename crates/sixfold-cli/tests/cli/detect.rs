@@ -195,3 +195,94 @@ fn overlays_that_cannot_be_written_cost_no_detections() {
     fails(tiny.path(), &detect(one), &["one/overlay.png", "is there already"]);
     assert!(!tiny.path().join("one/detections.json").exists());
 }
+
+#[test]
+fn weights_of_torchvision_are_a_detector() {
+    let tiny = Tiny::coloured();
+    let path = |name: &str| tiny.path().join(name);
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../sixfold-detect/tests/anchored");
+    for (from, to) in [("mask-rcnn.safetensors", "mask.safetensors"), ("faster-rcnn.pth", "faster.pth")] {
+        std::fs::copy(fixtures.join(from), path(to)).unwrap();
+    }
+    // Networks in miniature want small images.
+    let sides = r#""min_side": 96, "max_side": 160, "norm_epsilon": 1e-5"#;
+    std::fs::write(path("mask.objects.json"), format!(r#"{{"objects": {{"1": 1, "3": 30}}, {sides}}}"#))
+        .unwrap();
+    std::fs::write(path("faster.objects.json"), format!("{{{sides}}}")).unwrap();
+    let rgb = "--rgb tiny/test/000007/rgb/000004.png --threshold 0.05";
+
+    let run = sixfold(tiny.path(), &format!("detect --weights mask.safetensors {rgb} --out one --json"));
+    let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
+    assert!(found.iter().all(|d| d["object_id"] == 1 || d["object_id"] == 30), "{found:?}");
+    assert!(found.iter().any(|d| d["mask_pixels"].as_u64() > Some(0)), "{found:?}");
+    let coco = json_of(&path("one/detections.json"));
+    assert_eq!((&coco[0]["bbox"], &coco[0]["category_id"]), (&found[0]["bbox"], &found[0]["object_id"]));
+    assert_eq!(coco[0]["segmentation"]["size"], serde_json::json!([HEIGHT, WIDTH]));
+    let run = sixfold(tiny.path(), &format!("detect --weights faster.pth {rgb} --ids 2 --json"));
+    let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
+    assert!(found.iter().all(|d| d["object_id"] == 2 && d["mask_pixels"].is_null()), "{found:?}");
+    fails(
+        tiny.path(),
+        &format!("detect --weights faster.pth {rgb} --ids 9"),
+        &["--ids", "knows the objects 1, 2, 3"],
+    );
+
+    // A dataset, with other objects of the labels.
+    let all = "detect --weights mask.safetensors --dataset tiny --out found.json --threshold 0.05 --json";
+    assert_eq!(sixfold(tiny.path(), all).expect(0).json()["images"], 3);
+    std::fs::write(path("mask.objects.json"), format!(r#"{{"objects": {{"2": 1}}, {sides}}}"#)).unwrap();
+    sixfold(tiny.path(), all).expect(0);
+    let found = json_of(&path("found.json")).as_array().unwrap().clone();
+    assert!(!found.is_empty() && found.iter().all(|d| d["category_id"] == 1), "{found:?}");
+
+    // Boxes for a pose.
+    std::fs::write(path("targets.json"), r#"[{"scene_id": 7, "im_id": 4, "obj_id": 1, "inst_count": 1}]"#)
+        .unwrap();
+    let pose =
+        "estimate --dataset tiny --targets targets.json --out poses.csv --detector mask.safetensors --json";
+    let run = sixfold(tiny.path(), pose);
+    assert!(run.code < 2, "{}", run.stderr);
+
+    // What is none.
+    std::fs::write(path("mask.objects.json"), r#"{"objects": {"9": 1}}"#).unwrap();
+    fails(
+        tiny.path(),
+        &format!("detect --weights mask.safetensors {rgb}"),
+        &["mask.objects.json", "label 9"],
+    );
+    std::fs::write(path("other.pth"), b"nothing").unwrap();
+    fails(tiny.path(), &format!("detect --weights other.pth {rgb}"), &["other.pth", "PyTorch weight file"]);
+    fails(tiny.path(), &format!("detect --weights none.pth {rgb}"), &["none.pth", "cannot be read"]);
+}
+
+#[test]
+fn detectors_with_anchors_are_trained_and_used() {
+    let tiny = Tiny::coloured();
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../sixfold-detect/tests/anchored");
+    let train =
+        "train detector --dataset tiny --ids 1 --size 96 --batch 1 --frozen-stages 0 --longest-side 96";
+    for network in ["faster-rcnn", "mask-rcnn", "retinanet-anchors"] {
+        let start = format!("{network}.safetensors");
+        std::fs::copy(fixtures.join(&start), tiny.path().join(&start)).unwrap();
+        let of = format!("{train} --network {network} --out {network} --json");
+        fails(tiny.path(), &format!("{of} --steps 2"), &["--encoder", "ResNet-50"]);
+        let trained = sixfold(tiny.path(), &format!("{of} --encoder {start} --steps 2")).expect(0).json();
+        assert!(trained["losses"]["boxes"].as_f64().is_some_and(f64::is_finite), "{trained}");
+        let card = std::fs::read_to_string(tiny.path().join(network).join("model.md")).unwrap();
+        assert!(card.contains(&format!("detect-{network}")) && card.contains("7/0 7/4 7/11"), "{card}");
+        let rgb = "--rgb tiny/test/000007/rgb/000004.png --threshold 0.0001";
+        let run = sixfold(tiny.path(), &format!("detect --weights {network}/model.safetensors {rgb} --json"));
+        let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
+        assert!(found.iter().all(|d| d["object_id"] == 1), "{found:?}");
+        assert!(network != "mask-rcnn" || found.iter().any(|d| d["mask_pixels"].is_u64()), "{found:?}");
+        // From its own weights.
+        let further =
+            of.replace("--out ", &format!("--init {network}/model.safetensors --steps 1 --out more-"));
+        sixfold(tiny.path(), &further).expect(0);
+        let other = further.replace(&format!("--network {network}"), "--network compact");
+        fails(tiny.path(), &other.replace("--out more-", "--out other-"), &["architecture"]);
+    }
+    let wrong =
+        format!("{train} --network mask-rcnn --encoder faster-rcnn.safetensors --steps 1 --out wrong");
+    fails(tiny.path(), &wrong, &["--encoder", "weights of another network"]);
+}

@@ -14,6 +14,7 @@ use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges::{self, count};
 
 use super::methods::{METHODS, Method};
+use super::networks::objects_file;
 
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold estimate --depth d.png --rgb c.png --camera camera.json --object mug.ply --unit mm --out out\n  \
@@ -118,8 +119,9 @@ pub(crate) struct CommonArguments {
     /// --detector, else the whole image)
     #[arg(long, value_name = "gt|detect|FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE, value_parser = NonEmptyStringValueParser::new())]
     pub boxes: Option<String>,
-    /// Trained detector that provides the boxes: a file that `sixfold train detector` wrote
-    #[arg(long, value_name = "FILE.safetensors")]
+    /// Trained detector that provides the boxes: a file that `sixfold train detector` wrote, or torchvision's weights, as for
+    /// `sixfold detect`
+    #[arg(long, value_name = "FILE")]
     pub detector: Option<PathBuf>,
     /// Result: a CSV file in the BOP format for a dataset, a folder for one image
     #[arg(long, value_name = "PATH")]
@@ -179,6 +181,9 @@ impl EstimateArguments {
                 let values: Vec<_> = values.map(|v| v.to_string_lossy()).collect();
                 options.add(&id.replace('_', "-"), &values.join(","));
             }
+        }
+        if let Some(file) = self.common.detector.as_deref().and_then(objects_file) {
+            options.add("objects of the detector", &file.to_string_lossy());
         }
         options
     }

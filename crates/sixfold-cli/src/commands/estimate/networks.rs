@@ -10,6 +10,7 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use sixfold_auto::AutoMembers;
 use sixfold_detect::detector::TrainedDetector;
+use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_estimator::{ObjectDetector, PoseEstimator, Region};
 use sixfold_geometry::RgbImage;
 use sixfold_mttm::model::MttmModel;
@@ -138,6 +139,11 @@ impl MethodArguments for Pix2PoseArguments {
         estimator.object_id = common.object_id;
         Ok(Box::new(estimator))
     }
+}
+
+/// The file beside a detector's weights that says which objects its labels are, if there is one.
+pub(super) fn objects_file(weights: &Path) -> Option<PathBuf> {
+    existing_objects_file(weights)
 }
 
 /// Where a detector sees the object best, if at all.

@@ -1,7 +1,7 @@
 //! In the place of `networks.rs` when the feature `networks` is off: what needs a network is refused.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 use sixfold_estimator::Region;
@@ -13,6 +13,10 @@ use crate::commands::without_networks::MESSAGE;
 
 /// Who matches with `--method mttm`, unless `--matcher` says so.
 pub(super) const DEFAULT_MATCHER: &str = "points";
+
+pub(super) fn objects_file(_weights: &Path) -> Option<PathBuf> {
+    None
+}
 
 pub(super) fn detected(_weights: &Path, _image: &RgbImage, _id: u32) -> Result<Option<Region>> {
     bail!("--detector: {MESSAGE}")

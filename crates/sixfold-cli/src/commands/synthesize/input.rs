@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_data::{RoughImageOptions, RoughImages, TrainingSetError};
 use sixfold_detect::detector::TrainedDetector;
+use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_geometry::RgbImage;
 use sixfold_runner::detections;
 use sixfold_shell::folder::Contents;
@@ -57,8 +58,13 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
 /// What the inputs hold.
 pub(super) fn contents(a: &SynthesizeArguments, images: &RoughImages) -> Result<Contents> {
     let mut contents = Contents::default();
-    for (name, file) in [("weights", &a.weights), ("detector", &a.detector), ("backgrounds", &a.backgrounds)]
-    {
+    let objects = a.detector.as_deref().and_then(existing_objects_file);
+    for (name, file) in [
+        ("weights", &a.weights),
+        ("detector", &a.detector),
+        ("objects of the detector", &objects),
+        ("backgrounds", &a.backgrounds),
+    ] {
         if let Some(file) = file {
             contents.add_path(name, file)?;
         }

@@ -51,7 +51,8 @@ pub(crate) struct TrainDetectorArguments {
     /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random)
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random). For the networks with anchors,
+    /// which need it, these or torchvision's weights of the same network, as trained on COCO
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
