@@ -9,6 +9,7 @@
 //! origin in the middle of the mesh's box and the same axes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+mod by_features;
 mod cones;
 mod distance;
 mod error;

@@ -69,7 +69,8 @@ fn without_depth(_: usize) -> Result<Option<DepthImage>, TeachError> {
 impl Taken {
     fn length(&self) -> KnownLength {
         let ends = ENDS.map(Vec3::from);
-        let pixel = |i: usize, p: &Vec3| camera().project(&self.truth[i].transform_point(p));
+        let pixel =
+            |i: usize, p: &Vec3| camera().project(&self.truth[i].transform_point(p)).map(<[f64; 2]>::from);
         let ends_in = |i: usize| (i, [pixel(i, &ends[0]), pixel(i, &ends[1])]);
         KnownLength { metres: (ends[0] - ends[1]).norm(), ends: [0, 3, 6].map(ends_in).to_vec() }
     }
