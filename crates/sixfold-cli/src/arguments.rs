@@ -109,7 +109,7 @@ pub(crate) enum Command {
         sixfold calibrate photographs --out out/calibration\n  \
         sixfold calibrate photographs --camera out/calibration/camera.json --out out/poses")]
     Calibrate(CalibrateArguments),
-    /// Learn a new object from photographs of it on the printed board, and store it under a name
+    /// Learn a new object from photographs of it, on the printed board or without one, and store it under a name
     #[command(hide = !NETWORKS, after_help = TEACH_HELP)]
     Teach(Box<TeachArguments>),
     /// Start a server with web pages and an HTTP API for objects, poses and grasps

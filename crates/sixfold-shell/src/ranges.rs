@@ -66,6 +66,15 @@ pub fn depth_scale(text: &str) -> Result<f64, String> {
     scale.ok_or_else(|| format!("found {text}, expected millimetres above 0, at most 1000"))
 }
 
+/// Parses a measured length in metres.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn length(text: &str) -> Result<f64, String> {
+    let length = text.parse().ok().filter(|length: &f64| (0.005..=5.0).contains(length));
+    length.ok_or_else(|| format!("found {text}, expected metres, 0.005 to 5"))
+}
+
 /// Parses the noise of a surface in millimetres.
 ///
 /// # Errors

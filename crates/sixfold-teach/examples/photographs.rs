@@ -1,5 +1,6 @@
 //! Writes simulated photographs of a mesh on the board, to try `sixfold teach` and the page Teach without a camera:
-//! `cargo run --release -p sixfold-teach --example photographs -- MESH UNIT OUT [NUMBER]`.
+//! `cargo run --release -p sixfold-teach --example photographs -- MESH UNIT OUT [NUMBER [cloth]]`.
+//! With `cloth` it stands on a patterned cloth in place of the board, and the options for `sixfold teach --no-board` are printed.
 //!
 //! `OUT/photographs/00.jpg ...` are the photographs, `OUT/camera.json` their camera; `OUT/scene` holds one more photograph with depth, to
 //! find the object in, and `OUT/truth.json` the true poses.
@@ -9,16 +10,16 @@ use std::path::Path;
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::json;
 use sixfold_board::{Board, Paper};
-use sixfold_geometry::{Camera, Image, Pose, RgbImage};
+use sixfold_geometry::{Camera, Image, Pose, RgbImage, Vec3};
 use sixfold_mesh::{Unit, read_mesh};
-use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
+use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, patterned};
 
 type Failure = Box<dyn std::error::Error>;
 
 fn main() -> Result<(), Failure> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [mesh, unit, out, number @ ..] = arguments.as_slice() else {
-        return Err("expected MESH UNIT OUT [NUMBER]".into());
+        return Err("expected MESH UNIT OUT [NUMBER [cloth]]".into());
     };
     let unit: Unit = unit.parse()?;
     let mesh = read_mesh(Path::new(mesh), unit)?;
@@ -30,7 +31,11 @@ fn main() -> Result<(), Failure> {
     let between = SimulationOptions { photographs: photographs + 1, ..options.clone() };
     let ground = Image::from_fn(64, 64, |x, y| [90 + 30 * ((x / 8 + y / 8) % 2) as u8, 85, 70]);
     let board = Board::new(Paper::A4);
-    let capture = SimulatedCapture::new(&mesh, &board, &ground, &options, 3);
+    let cloth = number.get(1).map(|_| patterned(2048, 3));
+    let capture = match &cloth {
+        Some(cloth) => SimulatedCapture::without_board(&mesh, (cloth, 0.6), &ground, &options, 3),
+        None => SimulatedCapture::new(&mesh, &board, &ground, &options, 3),
+    };
     let scene = SimulatedCapture::new(&mesh, &board, &ground, &between, 3);
     let out = Path::new(out);
     std::fs::create_dir_all(out.join("photographs"))?;
@@ -42,6 +47,16 @@ fn main() -> Result<(), Failure> {
     let last = photographs;
     write_jpeg(&out.join("scene/rgb.jpg"), &scene.photograph(last).ok_or("no such photograph")?)?;
     sixfold_io::write_depth(&out.join("scene/depth.png"), &scene.depth(last).ok_or("no depth")?, 1e-3)?;
+    if cloth.is_some() {
+        // Two points of the cloth, to the pixel, as somebody would mark them.
+        let pixel = |i: usize, x: f64, y: f64| {
+            let p = capture.camera_from_board[i].transform_point(&Vec3::new(x, y, 0.0));
+            camera.project(&p).map_or(String::from("-"), |p| format!("{:.0},{:.0}", p.x, p.y))
+        };
+        let ends = [0, photographs / 3, photographs / 2]
+            .map(|i| format!("{i:02}.jpg:{}:{}", pixel(i, -0.08, -0.06), pixel(i, 0.08, 0.06)));
+        println!("--no-board --length 0.2 --ends {}", ends.join(" "));
+    }
     let numbers = json!({ "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "width": camera.width, "height": camera.height, "depth_scale": 1.0 });
     std::fs::write(out.join("camera.json"), numbers.to_string())?;

@@ -53,7 +53,7 @@ fn simulated(mesh: &Path, unit: Unit, seed: u64, ground: &[&str]) -> Result<(), 
         let mut error = || Vec2::new(f64::from(normal(&mut random)), f64::from(normal(&mut random)));
         let ends = ends.map(|end| {
             let pixel = options.camera.project(&pose.transform_point(&end))?;
-            Some(options.camera.distort_point(&pixel) + error())
+            Some((options.camera.distort_point(&pixel) + error()).into())
         });
         (i, ends)
     };
@@ -79,7 +79,9 @@ fn bop(dataset: &Path, scene: u32, object: u32, images: &[u32]) -> Result<(), Fa
         truth.push(all.iter().find(|t| t.obj_id == object).map(|t| t.camera_from_object));
     }
     // Scores need no length; the reconstruction does: 0.1 m along x of the object's frame, as its ground truth shows it.
-    let end = |pose: &Pose, x: f64| camera.project(&pose.transform_point(&Vec3::new(x, 0.0, 0.0)));
+    let end = |pose: &Pose, x: f64| {
+        camera.project(&pose.transform_point(&Vec3::new(x, 0.0, 0.0))).map(<[f64; 2]>::from)
+    };
     let marked = truth.iter().enumerate().filter_map(|(i, pose)| Some((i, pose.as_ref()?)));
     let ends = marked.map(|(i, pose)| (i, [end(pose, -0.05), end(pose, 0.05)])).collect();
     let found = located(&photographs, Some(&camera), Some(&KnownLength { metres: 0.1, ends }))?;

@@ -39,7 +39,8 @@ pub enum TeachError {
     },
     /// No photograph shows the board.
     #[error(
-        "no photograph shows a board of `sixfold board`{reasons}: lay the object on the printed board, or give poses"
+        "no photograph shows a board of `sixfold board`{reasons}: lay the object on the printed board, give poses, or --no-board where its surroundings have \
+         texture"
     )]
     NoBoard {
         /// Why; empty or `; FILE: REASON; ...`.

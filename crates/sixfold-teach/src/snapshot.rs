@@ -17,6 +17,7 @@ use crate::record::Posed;
 use crate::reduce::reduced_photograph;
 use crate::shape::Capture;
 use crate::teaching::{By, Photograph, ShapeFacts, TeachOptions, World};
+use crate::unboarded::KnownLength;
 use crate::view::PosedPhotograph;
 
 /// The only version of `teaching.json` there is.
@@ -35,6 +36,9 @@ pub(crate) struct State {
     pub world: World,
     /// A camera that was given.
     pub given_camera: Option<Camera>,
+    /// A length that was given, where there is no board.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub length: Option<KnownLength>,
     pub photographs: Vec<Photograph>,
     /// How often something was changed.
     #[serde(default)]

@@ -107,6 +107,9 @@ pub enum World {
     Board,
     /// Poses are given with [`Teaching::set_pose`], in a frame of the giver's choice.
     Given,
+    /// What is around the object, which has to have texture: poses are found from local features, metres from
+    /// [a length](Teaching::set_length) or from depth. z points up.
+    Features,
 }
 
 /// What is known before the first photograph.
@@ -123,7 +126,7 @@ pub struct TeachOptions {
 /// A folder in which an object is taught. One process at a time changes it.
 #[derive(Debug)]
 pub struct Teaching {
-    known: Snapshot,
+    pub(crate) known: Snapshot,
     _lock: WriteLock,
 }
 
@@ -141,14 +144,14 @@ fn as_kept<T: Serialize + DeserializeOwned>(value: &T) -> Option<T> {
 }
 
 /// Whether two values are the same once both were kept.
-fn is_same<T: Serialize + DeserializeOwned + PartialEq>(a: &T, b: &T) -> bool {
+pub(crate) fn is_same<T: Serialize + DeserializeOwned + PartialEq>(a: &T, b: &T) -> bool {
     a == b
         || as_kept(a) == as_kept(b)
         || as_kept(a).is_some_and(|a| a == *b)
         || as_kept(b).is_some_and(|b| *a == b)
 }
 
-fn rows(pose: &Pose) -> [[f64; 4]; 4] {
+pub(crate) fn rows(pose: &Pose) -> [[f64; 4]; 4] {
     let m = pose.to_matrix();
     std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }
@@ -171,6 +174,7 @@ impl Teaching {
                 ruler: options.ruler,
                 world: options.world,
                 given_camera: options.camera,
+                length: None,
                 photographs: vec![],
                 revision: 0,
                 located: None,
@@ -198,7 +202,7 @@ impl Teaching {
         Ok(teaching)
     }
 
-    fn save(&mut self) -> Result<(), TeachError> {
+    pub(crate) fn save(&mut self) -> Result<(), TeachError> {
         self.known.state.revision += 1;
         let path = self.known.folder.join("teaching.json");
         let text = serde_json::to_string_pretty(&self.known.state)
@@ -277,7 +281,8 @@ impl Teaching {
             .and_then(|()| write_atomically(&path, bytes))
             .map_err(|source| TeachError::Io { path, source })?;
         self.known.state.photographs[number].depth = depth;
-        self.forget_from(Step::Masks);
+        let says_scale = self.known.state.world == World::Features && self.known.state.length.is_none();
+        self.forget_from(if says_scale { Step::Poses } else { Step::Masks });
         self.save()
     }
 
@@ -286,12 +291,16 @@ impl Teaching {
     /// # Errors
     /// [`TeachError`].
     pub fn locate(&mut self, progress: &dyn Progress) -> Result<(), TeachError> {
+        if self.known.state.located.is_some() && self.lacks_poses() {
+            self.forget_from(Step::Poses);
+        }
         if self.known.state.located.is_some() {
             return Ok(());
         }
         match self.known.state.world {
             World::Board => self.locate_by_board(progress),
             World::Given => self.take_given_poses(),
+            World::Features => self.locate_by_features(progress),
         }
     }
 
@@ -619,7 +628,7 @@ impl Teaching {
     }
 
     /// Results that a change makes wrong are forgotten; what a person gave stays.
-    fn forget_from(&mut self, step: Step) {
+    pub(crate) fn forget_from(&mut self, step: Step) {
         let state = &mut self.known.state;
         state.outdated = state.shape.take().or(state.outdated);
         if step <= Step::Masks {
@@ -642,7 +651,7 @@ impl Teaching {
 
 /// From where results are forgotten.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Step {
+pub(crate) enum Step {
     Poses,
     Masks,
     Mesh,

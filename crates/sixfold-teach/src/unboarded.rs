@@ -2,6 +2,7 @@
 //! from motion, and metres from one known length or from measured depth.
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Camera, DepthImage, Image, Pose, Progress, RgbImage, Vec2, Vec3, stats::median};
 use sixfold_nn::keypoints::{KeypointFinder, KeypointOptions, Keypoints};
 use sixfold_sfm::{Features, Reconstruction, SfmError, SfmOptions, matched, reconstruct, triangulated};
@@ -94,12 +95,13 @@ pub struct SeenFeatures {
 }
 
 /// A known length: that between two points which somebody marked.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct KnownLength {
     /// The length, metres.
     pub metres: f64,
     /// Number of a photograph, and where it shows the two points, raw pixels; `None` where it does not show one.
-    pub ends: Vec<(usize, [Option<Vec2>; 2])>,
+    pub ends: Vec<(usize, [Option<[f64; 2]>; 2])>,
 }
 
 /// Photographs put together, in metres: z up; the origin is below the point at which the cameras look.
@@ -240,9 +242,9 @@ fn check_ends(seen: &[SeenFeatures], length: &KnownLength) -> Result<(), TeachEr
             return Err(TeachError::NoPhotograph { index: *i, photographs: seen.len() });
         };
         let (w, h) = (s.size.0 as f64, s.size.1 as f64);
-        let inside = |p: &Vec2| p.x >= -0.5 && p.y >= -0.5 && p.x <= w - 0.5 && p.y <= h - 0.5;
-        if let Some(p) = ends.iter().flatten().find(|p| !inside(p)) {
-            let what = format!("{}: found {:.0},{:.0}, the photograph has {w}x{h} pixels", s.name, p.x, p.y);
+        let inside = |[x, y]: &[f64; 2]| (-0.5..=w - 0.5).contains(x) && (-0.5..=h - 0.5).contains(y);
+        if let Some([x, y]) = ends.iter().flatten().find(|p| !inside(p)) {
+            let what = format!("{}: found {x:.0},{y:.0}, the photograph has {w}x{h} pixels", s.name);
             return Err(TeachError::Ends { what });
         }
     }
@@ -294,7 +296,7 @@ fn marked(
     let (mut rays, mut shown) = (vec![], vec![]);
     for (i, ends) in &length.ends {
         let (Some(pixel), Ok(pose)) = (ends[end], &scene.camera_from_world[*i]) else { continue };
-        let Some(straight) = scene.camera.undistort_point(&pixel) else { continue };
+        let Some(straight) = scene.camera.undistort_point(&Vec2::from(pixel)) else { continue };
         rays.push((*pose, pinhole.unproject(&straight, 1.0).xy()));
         shown.push((*i, straight));
     }
@@ -414,7 +416,9 @@ mod tests {
 
     fn marked_in(scene: &Reconstruction, ends: [Vec3; 2], photographs: &[usize]) -> KnownLength {
         let pixel = |i: usize, p: &Vec3| {
-            camera().project(&scene.camera_from_world[i].as_ref().unwrap().transform_point(p))
+            camera()
+                .project(&scene.camera_from_world[i].as_ref().unwrap().transform_point(p))
+                .map(<[f64; 2]>::from)
         };
         let ends = photographs.iter().map(|i| (*i, [pixel(*i, &ends[0]), pixel(*i, &ends[1])])).collect();
         KnownLength { metres: 0.1, ends }
@@ -432,13 +436,13 @@ mod tests {
             assert!(error.to_string().starts_with("--ends: ") && error.to_string().contains(part), "{error}");
         };
         let mut moved = length.clone();
-        moved.ends[1].1[0] = moved.ends[1].1[0].map(|p| p + Vec2::new(60.0, 40.0));
+        moved.ends[1].1[0] = moved.ends[1].1[0].map(|[x, y]| [x + 60.0, y + 40.0]);
         refused(&scene, &moved, "a.jpg: the first point is marked");
         refused(&scene, &marked_in(&scene, ends, &[1]), "first point is marked in 1 photographs");
         refused(&scene, &marked_in(&scene, ends, &[1, 1]), "less than 5 degrees apart");
         refused(&scene, &marked_in(&scene, [ends[0]; 2], &[0, 1]), "same one");
         let mut beyond = length.clone();
-        beyond.ends[0].1[1] = Some(Vec2::new(700.0, 20.0));
+        beyond.ends[0].1[1] = Some([700.0, 20.0]);
         refused(&scene, &beyond, "a.jpg: found 700,20, the photograph has 640x480 pixels");
         scene.camera_from_world[2] = Err(sixfold_sfm::LeftOut::FewInliers { found: 3, of: 40 });
         refused(&scene, &length, "whose pose is known, expected at least 2; a.jpg: 3 of 40 features");

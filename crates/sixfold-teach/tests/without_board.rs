@@ -4,7 +4,10 @@ use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3, stats::median};
 use sixfold_mesh::Mesh;
 use sixfold_nn::keypoints::KeypointFinder;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, patterned};
-use sixfold_teach::{KnownLength, PutTogether, SeenFeatures, TeachError, features_of, put_together};
+use sixfold_teach::{
+    KnownLength, PutTogether, SeenFeatures, TeachError, TeachOptions, Teaching, World, features_of,
+    put_together,
+};
 
 const PHOTOGRAPHS: usize = 12;
 /// Two corners of a rectangle on the cloth.
@@ -42,15 +45,27 @@ struct Taken {
     seen: Vec<SeenFeatures>,
 }
 
-fn taken() -> Taken {
-    let options = SimulationOptions {
+fn few_pixels() -> SimulationOptions {
+    SimulationOptions {
         photographs: PHOTOGRAPHS,
         camera: camera(),
         distance: [0.4, 0.48],
         motion: 0.5,
         blur: 0.5,
         ..SimulationOptions::default()
-    };
+    }
+}
+
+/// The length between two corners, marked in three photographs.
+fn length(truth: &[Pose], photographs: [usize; 3]) -> KnownLength {
+    let ends = ENDS.map(Vec3::from);
+    let pixel = |i: usize, p: &Vec3| camera().project(&truth[i].transform_point(p)).map(<[f64; 2]>::from);
+    let ends_in = |i: usize| (i, [pixel(i, &ends[0]), pixel(i, &ends[1])]);
+    KnownLength { metres: (ends[0] - ends[1]).norm(), ends: photographs.map(ends_in).to_vec() }
+}
+
+fn taken() -> Taken {
+    let options = few_pixels();
     let (mesh, cloth, table) = (brick(), patterned(1024, 2), RgbImage::filled(8, 8, [110, 105, 95]));
     let capture = SimulatedCapture::without_board(&mesh, (&cloth, 0.5), &table, &options, 5);
     let finder = KeypointFinder::shipped().unwrap();
@@ -67,13 +82,6 @@ fn without_depth(_: usize) -> Result<Option<DepthImage>, TeachError> {
 }
 
 impl Taken {
-    fn length(&self) -> KnownLength {
-        let ends = ENDS.map(Vec3::from);
-        let pixel = |i: usize, p: &Vec3| camera().project(&self.truth[i].transform_point(p));
-        let ends_in = |i: usize| (i, [pixel(i, &ends[0]), pixel(i, &ends[1])]);
-        KnownLength { metres: (ends[0] - ends[1]).norm(), ends: [0, 3, 6].map(ends_in).to_vec() }
-    }
-
     fn put(&self, length: Option<&KnownLength>) -> Result<PutTogether, TeachError> {
         put_together(&self.seen, None, length, &without_depth, &())
     }
@@ -98,7 +106,7 @@ fn poses_scale_and_floor_are_found_without_the_camera_and_what_cannot_be_is_said
     let mut taken = taken();
     // One of another camera is left out, and the others are put together.
     taken.seen[4].size = (480, 640);
-    let length = taken.length();
+    let length = length(&taken.truth, [0, 3, 6]);
     let found = taken.put(Some(&length)).unwrap();
     let reason = found.camera_from_world[4].as_ref().unwrap_err();
     assert!(reason.contains("480x640 pixels, most photographs have 640x480"), "{reason}");
@@ -134,4 +142,40 @@ fn assert_refused(taken: Taken, length: &KnownLength) {
     let bare = SeenFeatures { name: "bare.jpg".to_owned(), size: (640, 480), features: Default::default() };
     let bare = Taken { seen: vec![bare; 5], ..one };
     refused(&bare, Some(&two), &["0 photographs", "texture", "bare.jpg: 0 features"]);
+}
+
+#[test]
+fn a_teaching_keeps_the_poses_and_forgets_them_for_another_length() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SimulationOptions { photographs: 6, around: 120.0, ..few_pixels() };
+    let (mesh, cloth, table) = (brick(), patterned(1024, 2), RgbImage::filled(8, 8, [110, 105, 95]));
+    let capture = SimulatedCapture::without_board(&mesh, (&cloth, 0.5), &table, &options, 5);
+    let teach = TeachOptions { world: World::Features, camera: Some(camera()), ruler: None };
+    let mut teaching = Teaching::open(folder.path().join("t"), &teach).unwrap();
+    for i in 0..6 {
+        let file = folder.path().join(format!("{i}.png"));
+        sixfold_io::write_rgb(&file, &capture.photograph(i).unwrap()).unwrap();
+        teaching.add_photograph(&format!("{i}.png"), &std::fs::read(&file).unwrap()).unwrap();
+    }
+    assert!(matches!(teaching.locate(&()), Err(TeachError::NoScale)));
+    let length = length(&capture.camera_from_board, [0, 2, 4]);
+    teaching.set_length(Some(length.clone())).unwrap();
+    let stop_at = |last: usize| move |done: usize, _: usize| done < last;
+    assert!(matches!(teaching.locate(&stop_at(3)), Err(TeachError::Stopped)));
+    assert!(matches!(teaching.locate(&stop_at(7)), Err(TeachError::Stopped)));
+    teaching.locate(&()).unwrap();
+    let height = |teaching: &Teaching| teaching.camera_from_board(5).unwrap().inverse().translation().z;
+    let (there, before) = (capture.camera_from_board[5].inverse().translation().z, height(&teaching));
+    assert!((before - there).abs() < 0.01, "{before} {there}");
+    assert!(teaching.floor().is_some_and(|floor| floor.normal == Vec3::z()) && teaching.board().is_none());
+    drop(teaching);
+    // Nothing is searched again, so nothing can be stopped.
+    let mut teaching = Teaching::open(folder.path().join("t"), &teach).unwrap();
+    teaching.set_length(Some(length.clone())).unwrap();
+    teaching.locate(&stop_at(0)).unwrap();
+    let twice = KnownLength { metres: 2.0 * length.metres, ..length };
+    teaching.set_length(Some(twice)).unwrap();
+    assert!(teaching.camera_from_board(5).is_none());
+    teaching.locate(&()).unwrap();
+    assert!((height(&teaching) / before - 2.0).abs() < 1e-6, "{} {before}", height(&teaching));
 }

@@ -1,6 +1,7 @@
-//! `sixfold teach`: a new object from photographs of it on the printed board.
+//! `sixfold teach`: a new object from photographs of it, on the printed board or without one.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
@@ -16,13 +17,14 @@ use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Bar;
 use sixfold_shell::ranges;
 use sixfold_shell::symmetries::described;
-use sixfold_teach::{By, SalientSegmenter, ShapeOptions, TeachOptions, Teaching};
+use sixfold_teach::{By, KnownLength, SalientSegmenter, ShapeOptions, TeachOptions, Teaching, World};
 use sixfold_views::estimator::ViewsEstimator;
 
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold board --out board.pdf                         # print it, stand the object on it, photograph it from all sides\n  \
     sixfold teach mug --photographs photographs\n  \
     sixfold teach mug --photographs colour --depth depth --depth-scale 1 --camera camera.json\n  \
+    sixfold teach mug --photographs photographs --no-board --length 0.12 --ends a.jpg:812,640:1010,655 b.jpg:700,655:934,628\n  \
     sixfold teach mug --photographs photographs.json      # with poses, masks and depth from elsewhere\n  \
     sixfold estimate --rgb image.png --camera camera.json --object mug --method views --out out";
 
@@ -30,7 +32,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
 pub(crate) struct TeachArguments {
     /// Name of the object: letters, digits, - and _
     pub name: String,
-    /// Photographs of the object on the board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one JSON file that lists
+    /// Photographs of the object, on the board but for --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one JSON file that lists
     /// photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     pub photographs: Vec<PathBuf>,
@@ -40,12 +42,23 @@ pub(crate) struct TeachArguments {
     /// Millimetres per unit of the depth images
     #[arg(long, value_name = "MM", requires = "depth", value_parser = ranges::depth_scale)]
     pub depth_scale: Option<f64>,
-    /// Camera of the photographs (default: computed from the board in them)
+    /// Camera of the photographs (default: computed from them)
     #[arg(long, value_name = "FILE")]
     pub camera: Option<PathBuf>,
     /// Measured length of the printed ruler, millimetres (default: 100)
     #[arg(long, value_name = "MM")]
     pub ruler: Option<f64>,
+    /// The photographs show no board: poses from what is around the object, which needs texture and stays in place; needs
+    /// --length, or depth
+    #[arg(long, conflicts_with = "ruler")]
+    pub no_board: bool,
+    /// Measured length between the two points of --ends, metres
+    #[arg(long, value_name = "METRES", requires_all = ["no_board", "ends"], value_parser = ranges::length)]
+    pub length: Option<f64>,
+    /// Pixels at which a photograph shows both points of --length, for two or more photographs, from different sides; - for a
+    /// point that it does not show
+    #[arg(long, num_args = 1.., value_name = "PHOTOGRAPH:X,Y:X,Y", requires = "length")]
+    pub ends: Vec<Ends>,
     /// Mesh of the object, to align with the photographs; without colours it gets theirs
     #[arg(long, value_name = "FILE", requires = "unit", conflicts_with = "hull_only")]
     pub mesh: Option<PathBuf>,
@@ -66,6 +79,35 @@ pub(crate) struct TeachArguments {
     pub out: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+/// Where a photograph shows two points.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Ends {
+    photograph: String,
+    points: [Option<[f64; 2]>; 2],
+}
+
+impl FromStr for Ends {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Ends, String> {
+        let wrong = || format!("found {text}, expected PHOTOGRAPH:X,Y:X,Y with pixels, or - for a point");
+        let point = |text: &str| match text {
+            "-" => Some(None),
+            _ => {
+                let (x, y) = text.split_once(',')?;
+                let number = |text: &str| text.trim().parse().ok().filter(|v: &f64| v.is_finite());
+                Some(Some([number(x)?, number(y)?]))
+            }
+        };
+        let mut parts = text.rsplitn(3, ':');
+        let (Some(second), Some(first), Some(photograph)) = (parts.next(), parts.next(), parts.next()) else {
+            return Err(wrong());
+        };
+        let points = [point(first).ok_or_else(wrong)?, point(second).ok_or_else(wrong)?];
+        Ok(Ends { photograph: photograph.to_owned(), points })
+    }
 }
 
 #[derive(Serialize)]
@@ -138,15 +180,15 @@ fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         [file] if file.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => {
             with_poses(a, file, out)
         }
-        _ => on_board(a, out),
+        _ => without_poses(a, out),
     }
 }
 
 /// Photographs with poses, from a file.
 fn with_poses(a: &TeachArguments, file: &Path, out: &Path) -> Result<Teaching> {
-    if a.ruler.is_some() || a.camera.is_some() || !a.depth.is_empty() {
+    if a.ruler.is_some() || a.camera.is_some() || !a.depth.is_empty() || a.no_board {
         bail!(
-            "--ruler, --camera and --depth belong to photographs of the board: {} names what it has",
+            "--ruler, --camera, --depth and --no-board belong to photographs without poses: {} names what it has",
             file.display()
         );
     }
@@ -154,8 +196,8 @@ fn with_poses(a: &TeachArguments, file: &Path, out: &Path) -> Result<Teaching> {
     Ok(Teaching::open_file(out, file, mesh.as_ref())?)
 }
 
-/// Photographs of the object on the board.
-fn on_board(a: &TeachArguments, out: &Path) -> Result<Teaching> {
+/// Photographs of the object, on the board or without one.
+fn without_poses(a: &TeachArguments, out: &Path) -> Result<Teaching> {
     let ruler = ruler_in_metres(a.ruler)?;
     let files = photograph_files(&a.photographs)?;
     let depth = if a.depth.is_empty() { vec![] } else { photograph_files(&a.depth)? };
@@ -170,7 +212,9 @@ fn on_board(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         _ => None,
     };
     let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
-    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera, ..TeachOptions::default() })?;
+    let world = if a.no_board { World::Features } else { World::Board };
+    let length = a.length.map(|metres| known_length(metres, &a.ends, &files)).transpose()?;
+    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera, world })?;
     teaching.set_mesh(mesh.as_ref())?;
     for (i, file) in files.iter().enumerate() {
         let bytes = read_regular(file, limits::IMAGE).with_context(|| file.display().to_string())?;
@@ -182,7 +226,35 @@ fn on_board(a: &TeachArguments, out: &Path) -> Result<Teaching> {
     }
     let given: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
     teaching.leave_out_others(&given)?;
+    if a.no_board {
+        let in_folder = |i: usize| teaching.photographs().iter().position(|p| p.name == given[i]);
+        let length = length.map(|length| KnownLength {
+            ends: length.ends.iter().filter_map(|(i, ends)| Some((in_folder(*i)?, *ends))).collect(),
+            ..length
+        });
+        teaching.set_length(length)?;
+    }
     Ok(teaching)
+}
+
+/// The length with numbers of the files, each of which `--ends` names by its path or its name.
+fn known_length(metres: f64, ends: &[Ends], files: &[PathBuf]) -> Result<KnownLength> {
+    let mut numbered = vec![];
+    for Ends { photograph, points } in ends {
+        let named = |file: &Path| {
+            file == Path::new(photograph) || file.file_name().is_some_and(|name| name == photograph.as_str())
+        };
+        let found: Vec<usize> = (0..files.len()).filter(|i| named(&files[*i])).collect();
+        match found.as_slice() {
+            [number] => numbered.push((*number, *points)),
+            [] => bail!(
+                "--ends: found {photograph}, expected the name of one of the {} photographs",
+                files.len()
+            ),
+            _ => bail!("--ends: {} photographs are named {photograph}: give the path", found.len()),
+        }
+    }
+    Ok(KnownLength { metres, ends: numbered })
 }
 
 /// What methods derive from an object: now, not at the first estimate.

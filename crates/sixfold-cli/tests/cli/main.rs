@@ -35,6 +35,7 @@ mod support;
 mod synthesize;
 #[cfg(feature = "networks")]
 mod teach;
+mod teach_without_board;
 #[cfg(feature = "networks")]
 mod trainings;
 #[cfg(not(feature = "networks"))]

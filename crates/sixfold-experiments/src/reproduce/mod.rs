@@ -8,6 +8,7 @@ mod nol;
 mod pix2pose;
 mod teach;
 mod teach_dataset;
+mod teach_photographs;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};

@@ -22,8 +22,9 @@ use sixfold_render::{DepthSensor, Light, Material, SceneObject, VisibilityBuffer
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
-use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, ground_of};
-use sixfold_teach::{SalientSegmenter, ShapeOptions, TeachOptions, Teaching};
+use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, ground_of, patterned};
+
+use super::teach_photographs::{board_from_world, errors, marked_length, teaching, write_photographs};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
@@ -33,6 +34,8 @@ pub(super) const AFTER_HELP: &str = "Example:\n  \
 const PATCHES: f64 = 90.0;
 /// New images of each object.
 const NEW_IMAGES: usize = 5;
+/// Side of the cloth in place of a board, metres.
+const CLOTH: f64 = 0.6;
 /// A pose is right within this fraction of the diameter.
 const RIGHT: f64 = 0.1;
 
@@ -53,6 +56,10 @@ pub(crate) struct ReproduceTeachArguments {
     /// Seed of the photographs
     #[arg(long, value_name = "SEED", default_value_t = 7)]
     seed: u64,
+    /// The object stands on a patterned cloth of 0.6 m in place of the board; a length of 0.29 m is marked in three photographs,
+    /// to a pixel. New images are not searched
+    #[arg(long)]
+    no_board: bool,
     /// Folder for the results
     #[arg(long, value_name = "DIR", default_value = "out/reproduce-teach")]
     out: PathBuf,
@@ -72,6 +79,11 @@ struct Row {
     name: String,
     photographs: usize,
     seed: u64,
+    #[serde(default)]
+    no_board: bool,
+    /// How many of the photographs have a pose.
+    #[serde(default)]
+    with_pose: usize,
     diameter_mm: f64,
     camera_mm: f64,
     camera_deg: f64,
@@ -163,7 +175,7 @@ pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<O
 
 fn kept(file: &Path, a: &ReproduceTeachArguments) -> Option<Row> {
     let row: Row = serde_json::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
-    (row.photographs == a.photographs && row.seed == a.seed).then_some(row)
+    (row.photographs == a.photographs && row.seed == a.seed && row.no_board == a.no_board).then_some(row)
 }
 
 /// A mesh with colours: smooth patches where it has none.
@@ -190,25 +202,17 @@ fn measured(
     ground: &RgbImage,
 ) -> Result<Row> {
     let options = SimulationOptions { photographs: a.photographs, ..SimulationOptions::default() };
-    let board = Board::new(Paper::A4);
-    let capture = SimulatedCapture::new(mesh, &board, ground, &options, a.seed);
+    let cloth = patterned(2048, a.seed);
+    let capture = if a.no_board {
+        SimulatedCapture::without_board(mesh, (&cloth, CLOTH), ground, &options, a.seed)
+    } else {
+        SimulatedCapture::new(mesh, &Board::new(Paper::A4), ground, &options, a.seed)
+    };
+    let length = a.no_board.then(|| marked_length(&capture, &options.camera, a.seed));
     let files = a.out.join(name);
-    for i in 0..a.photographs {
-        let Some(image) = capture.photograph(i) else { break };
-        let file = files.join("photographs").join(format!("{i:02}.jpg"));
-        write_atomically(&file, &jpeg(&image)?)?;
-    }
+    write_photographs(&capture, &files)?;
     let start = Instant::now();
-    let mut teaching = Teaching::open(files.join("teaching"), &TeachOptions::default())?;
-    for i in 0..a.photographs {
-        let file = files.join("photographs").join(format!("{i:02}.jpg"));
-        teaching.add_photograph(&format!("{i:02}.jpg"), &std::fs::read(&file)?)?;
-    }
-    let shape = ShapeOptions::default();
-    teaching.locate(&())?;
-    teaching.find_masks(&SalientSegmenter::shipped()?, &shape, &())?;
-    teaching.reconstruct(&shape, &())?;
-    sixfold_io::write_rgb(&files.join("photographs.png"), &teaching.picture()?)?;
+    let teaching = teaching(&files, a.photographs, length)?;
     let taught = teaching.mesh()?;
     let noise = SymmetryOptions { noise: 0.004 * taught.diameter(), ..SymmetryOptions::default() };
     let sure = sure_symmetries(&find_symmetries(&taught, &noise)?, true);
@@ -216,18 +220,11 @@ fn measured(
     let of_truth = sure_symmetries(&find_symmetries(mesh, &SymmetryOptions::default())?, true);
     let facts = teaching.shape().context("no mesh was made")?;
     let rows = facts.board_from_object;
-    let board_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
-    let (mut shifts, mut rotations, mut ious) = (vec![], vec![], vec![]);
-    for (i, truth) in capture.camera_from_board.iter().enumerate() {
-        let Some(found) = teaching.camera_from_board(i) else { continue };
-        shifts.push(1000.0 * (found.inverse().translation() - truth.inverse().translation()).norm());
-        rotations.push(found.rotation_angle_to(truth).to_degrees());
-        if let (Some(mask), Some(there)) = (teaching.mask(i)?, capture.mask(i)) {
-            let pairs = || mask.as_slice().iter().zip(there.as_slice());
-            let both = pairs().filter(|(a, b)| **a && **b).count();
-            ious.push(both as f64 / pairs().filter(|(a, b)| **a || **b).count() as f64);
-        }
-    }
+    let world_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
+    // Without a board the world's frame is another one: that in which the cameras stand best where they were.
+    let board_from_world = if a.no_board { board_from_world(&teaching, &capture)? } else { Pose::identity() };
+    let board_from_taught = compose(&board_from_world, &world_from_taught);
+    let errors = errors(&teaching, &capture, &board_from_world)?;
     let there = mesh.transformed(&capture.board_from_object);
     let seen = seen_points(&there, &capture, &options.camera);
     let [mesh_mm, truth_mm] = distances(&taught.transformed(&board_from_taught), &there, &seen);
@@ -239,25 +236,31 @@ fn measured(
     let taught = Object::of_mesh(name, taught, info);
     let known = Object::of_mesh(name, mesh.clone(), ModelInfo::of_mesh(mesh));
     let (ppf, auto) = (PpfEstimator::default(), AutoMembers::default().estimator()?);
-    let [found, _] = scene.found(&ppf, &taught, &taught_from_true, symmetric)?;
-    let [found_with_true_mesh, _] = scene.found(&ppf, &known, &Pose::identity(), symmetric)?;
-    let [found_auto, wrong_auto] = scene.found(&auto, &taught, &taught_from_true, symmetric)?;
-    let [found_auto_with_true_mesh, _] = scene.found(&auto, &known, &Pose::identity(), symmetric)?;
+    let images = if a.no_board { 0 } else { NEW_IMAGES };
+    let search = |estimator: &dyn PoseEstimator, object: &Object, from_true: &Pose| {
+        if images == 0 { Ok([0, 0]) } else { scene.found(estimator, object, from_true, symmetric) }
+    };
+    let [found, _] = search(&ppf, &taught, &taught_from_true)?;
+    let [found_with_true_mesh, _] = search(&ppf, &known, &Pose::identity())?;
+    let [found_auto, wrong_auto] = search(&auto, &taught, &taught_from_true)?;
+    let [found_auto_with_true_mesh, _] = search(&auto, &known, &Pose::identity())?;
     Ok(Row {
         name: name.to_owned(),
         photographs: a.photographs,
         seed: a.seed,
+        no_board: a.no_board,
+        with_pose: errors.with_pose,
         diameter_mm: 1000.0 * mesh.diameter(),
-        camera_mm: median(&mut shifts).unwrap_or(f64::NAN),
-        camera_deg: median(&mut rotations).unwrap_or(f64::NAN),
-        mask_iou: median(&mut ious).unwrap_or(f64::NAN),
+        camera_mm: errors.camera_mm,
+        camera_deg: errors.camera_deg,
+        mask_iou: errors.mask_iou,
         mesh_mm,
         truth_mm,
         with_depth: facts.with_depth,
         symmetries: [sure.1.len(), sure.0.len()],
         symmetries_true: [of_truth.1.len(), of_truth.0.len()],
         found,
-        images: NEW_IMAGES,
+        images,
         found_with_true_mesh,
         found_auto,
         found_auto_with_true_mesh,
@@ -266,17 +269,8 @@ fn measured(
     })
 }
 
-fn compose(a: &Pose, b: &Pose) -> Pose {
+pub(super) fn compose(a: &Pose, b: &Pose) -> Pose {
     Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
-}
-
-fn jpeg(image: &RgbImage) -> Result<Vec<u8>> {
-    let (w, h) = image.size();
-    let copy =
-        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
-    let mut bytes = vec![];
-    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 90).encode_image(&copy)?;
-    Ok(bytes)
 }
 
 /// Points of the true surface that a photograph shows.

@@ -1,0 +1,94 @@
+//! The first step of a teaching without a board: features of all photographs, then their poses; and the length that says how large
+//! everything is.
+
+use sixfold_geometry::Progress;
+use sixfold_io::{read_depth, read_rgb};
+use sixfold_nn::keypoints::KeypointFinder;
+
+use crate::error::TeachError;
+use crate::shape::step;
+use crate::teaching::{By, Step, Teaching, World, is_same, rows};
+use crate::unboarded::{KnownLength, PutTogether, SeenFeatures, features_of, put_together};
+
+impl Teaching {
+    /// Gives the length between two points that somebody marked, by the numbers of the photographs; `None` to take the scale from
+    /// measured depth. Without a board only; poses are found again where it is another one.
+    ///
+    /// # Errors
+    /// [`TeachError::NoPhotograph`], [`TeachError::Io`].
+    pub fn set_length(&mut self, length: Option<KnownLength>) -> Result<(), TeachError> {
+        for (number, _) in length.iter().flat_map(|l| &l.ends) {
+            self.check_number(*number)?;
+        }
+        if is_same(&self.known.state.length, &length) {
+            return Ok(());
+        }
+        self.known.state.length = length;
+        if self.known.state.world == World::Features {
+            self.forget_from(Step::Poses);
+        }
+        self.save()
+    }
+
+    /// Whether a photograph that is used was not there when poses were found.
+    pub(crate) fn lacks_poses(&self) -> bool {
+        let lacks = |p: &crate::teaching::Photograph| {
+            !p.left_out_by_person && p.left_out.is_none() && p.camera_from_board.is_none()
+        };
+        self.known.state.world == World::Features && self.photographs().iter().any(lacks)
+    }
+
+    /// Finds camera, poses and floor from features. Progress counts a photograph's features as much as everything that follows for it.
+    pub(crate) fn locate_by_features(&mut self, progress: &dyn Progress) -> Result<(), TeachError> {
+        let used: Vec<usize> =
+            (0..self.photographs().len()).filter(|i| !self.photographs()[*i].left_out_by_person).collect();
+        let count = used.len();
+        let length = self.length_of(&used)?;
+        let depth_of = |i: usize| match &self.photographs()[used[i]].depth {
+            Some((file, unit)) => Ok(Some(read_depth(&self.path("depth", file), *unit)?)),
+            None => Ok(None),
+        };
+        // Before anything takes time.
+        if length.is_none() && used.iter().all(|i| self.photographs()[*i].depth.is_none()) {
+            return Err(TeachError::NoScale);
+        }
+        let finder = KeypointFinder::shipped().map_err(|e| TeachError::Masks(e.into()))?;
+        let mut seen = vec![];
+        for (done, number) in used.iter().enumerate() {
+            step(progress, done, 2 * count)?;
+            let photograph = &self.photographs()[*number];
+            let image = read_rgb(&self.path("photographs", &photograph.file))?;
+            let features = features_of(&finder, &image)?;
+            seen.push(SeenFeatures { name: photograph.name.clone(), size: image.size(), features });
+        }
+        let rest =
+            |done: usize, total: usize| progress.report(count + done * count / total.max(1), 2 * count);
+        let camera = self.known.state.given_camera;
+        let found = put_together(&seen, camera.as_ref(), length.as_ref(), &depth_of, &rest)?;
+        self.keep_poses(&used, found)
+    }
+
+    /// The length with the numbers of the photographs that are used.
+    fn length_of(&self, used: &[usize]) -> Result<Option<KnownLength>, TeachError> {
+        let Some(length) = &self.known.state.length else { return Ok(None) };
+        let number = |i: &usize| used.iter().position(|number| number == i);
+        let ends = length.ends.iter().filter_map(|(i, ends)| Some((number(i)?, *ends))).collect();
+        Ok(Some(KnownLength { metres: length.metres, ends }))
+    }
+
+    fn keep_poses(&mut self, used: &[usize], found: PutTogether) -> Result<(), TeachError> {
+        for (number, pose) in used.iter().zip(found.camera_from_world) {
+            let (pose, reason) = match pose {
+                Ok(pose) => (Some(rows(&pose)), None),
+                Err(reason) => (None, Some(reason)),
+            };
+            // Also where a person had corrected one: that was in another frame.
+            let photograph = &mut self.known.state.photographs[*number];
+            photograph.pose_by = pose.map(|_| By::Program);
+            (photograph.camera_from_board, photograph.left_out) = (pose, reason);
+        }
+        self.known.state.floor = found.floor.map(|height| [0.0, 0.0, 1.0, height]);
+        self.known.state.located = Some((None, found.camera, found.rms));
+        self.save()
+    }
+}
