@@ -2,6 +2,7 @@
 //! and without their meshes, held against these meshes; and found in the other images.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -128,8 +129,8 @@ pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Out
     for scene in &scenes {
         for im_id in scene.image_ids() {
             for truth in &scene.image(im_id)?.ground_truth {
-                if !meshes.contains_key(&truth.obj_id) {
-                    meshes.insert(truth.obj_id, dataset.model(truth.obj_id, Models::Rendering)?);
+                if let Entry::Vacant(place) = meshes.entry(truth.obj_id) {
+                    place.insert(dataset.model(truth.obj_id, Models::Rendering)?);
                 }
             }
         }
