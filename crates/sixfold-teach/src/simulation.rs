@@ -79,7 +79,7 @@ impl<'a> SimulatedCapture<'a> {
     }
 
     /// An object that stands on a square cloth in place of a board: `cloth` covers `side` metres, for example
-    /// [`patterned`](crate::simulation::patterned). Same seed, same images; poses are those of [`SimulatedCapture::new`].
+    /// [`patterned`]. Same seed, same images; poses are those of [`SimulatedCapture::new`].
     pub fn without_board(
         mesh: &'a Mesh,
         (cloth, side): (&RgbImage, f64),
