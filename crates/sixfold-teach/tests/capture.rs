@@ -527,3 +527,54 @@ fn poses_that_are_missing_or_fit_nothing_are_named() {
     let error = teaching.find_masks(&Salient::new(), &coarse(), &()).unwrap_err();
     assert!(error.to_string().contains("check the poses"), "{error}");
 }
+
+#[test]
+fn a_file_of_posed_photographs_is_read_with_its_floor_and_wrong_ones_are_named() {
+    let truth = photographs();
+    let dir = tempfile::tempdir().unwrap();
+    let camera = serde_json::to_string(&options().camera).unwrap();
+    std::fs::write(dir.path().join("camera.json"), camera).unwrap();
+    let mut entries = vec![];
+    for i in 0..truth.files.len() {
+        std::fs::write(dir.path().join(format!("{i}.png")), &truth.files[i]).unwrap();
+        sixfold_io::write_mask(&dir.path().join(format!("{i}_mask.png")), &truth.masks[i]).unwrap();
+        let pose = &truth.camera_from_board[i];
+        let (r, t) = (pose.rotation_matrix(), 1000.0 * pose.translation());
+        let rotation: Vec<f64> = (0..9).map(|k| r[(k / 3, k % 3)]).collect();
+        entries.push(serde_json::json!({
+            "image": format!("{i}.png"), "camera": "camera.json", "mask": format!("{i}_mask.png"),
+            "cam_R_m2c": rotation, "cam_t_m2c": [t.x, t.y, t.z]
+        }));
+    }
+    let file = dir.path().join("photographs.json");
+    let write = |value: serde_json::Value| std::fs::write(&file, value.to_string()).unwrap();
+    let open = || Teaching::open_file(dir.path().join("teaching"), &file, None);
+    let floor = serde_json::json!({"normal": [0, 0, 2], "point": [0, 0, 10]});
+    write(serde_json::json!({"floor": floor, "photographs": entries}));
+    let mut teaching = open().unwrap();
+    teaching.locate(&()).unwrap();
+    teaching.find_masks(&Salient::new(), &coarse(), &()).unwrap();
+    teaching.reconstruct(&ShapeOptions { stereo: false, ..coarse() }, &()).unwrap();
+    let (low, high) = box_of(&teaching);
+    assert!((low.z - 0.01).abs() < 3e-3, "10 mm above the board is what the file says: {low}");
+    assert!((high.z - 0.1).abs() < 0.02, "{high}");
+    drop(teaching);
+    // The same file again begins nothing again.
+    assert!(open().unwrap().shape().is_some());
+    let mut wrong = entries.clone();
+    wrong[1]["cam_R_m2c"][0] = 3.0.into();
+    let mut other = entries.clone();
+    other[2]["depth"] = "2.png".into();
+    let cases = [
+        (serde_json::json!({"photographs": wrong}), "photographs[1].cam_R_m2c"),
+        (serde_json::json!({"photographs": other}), "photographs[2].depth_scale"),
+        (serde_json::json!({"floor": {"normal": [0, 0, 0]}, "photographs": entries}), "floor.normal"),
+        (serde_json::json!({"photographs": []}), "field photographs"),
+        (serde_json::json!({"pictures": []}), "pictures"),
+    ];
+    for (value, field) in cases {
+        write(value);
+        let error = open().map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains("photographs.json") && error.contains(field), "{error}");
+    }
+}

@@ -1,7 +1,6 @@
 //! `sixfold teach`: a new object from photographs of it, on the printed board or without one.
 
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
@@ -12,7 +11,7 @@ use sixfold_mesh::{Unit, Verdict, read_mesh};
 use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
 use sixfold_ppf::PpfEstimator;
 use sixfold_shell::Outcome;
-use sixfold_shell::board::{photograph_files, ruler_in_metres};
+use sixfold_shell::board::{Ends, photograph_files, ruler_in_metres};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Bar;
 use sixfold_shell::ranges;
@@ -79,35 +78,6 @@ pub(crate) struct TeachArguments {
     pub out: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArguments,
-}
-
-/// Where a photograph shows two points.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Ends {
-    photograph: String,
-    points: [Option<[f64; 2]>; 2],
-}
-
-impl FromStr for Ends {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Ends, String> {
-        let wrong = || format!("found {text}, expected PHOTOGRAPH:X,Y:X,Y with pixels, or - for a point");
-        let point = |text: &str| match text {
-            "-" => Some(None),
-            _ => {
-                let (x, y) = text.split_once(',')?;
-                let number = |text: &str| text.trim().parse().ok().filter(|v: &f64| v.is_finite());
-                Some(Some([number(x)?, number(y)?]))
-            }
-        };
-        let mut parts = text.rsplitn(3, ':');
-        let (Some(second), Some(first), Some(photograph)) = (parts.next(), parts.next(), parts.next()) else {
-            return Err(wrong());
-        };
-        let points = [point(first).ok_or_else(wrong)?, point(second).ok_or_else(wrong)?];
-        Ok(Ends { photograph: photograph.to_owned(), points })
-    }
 }
 
 #[derive(Serialize)]
@@ -213,7 +183,10 @@ fn without_poses(a: &TeachArguments, out: &Path) -> Result<Teaching> {
     };
     let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
     let world = if a.no_board { World::Features } else { World::Board };
-    let length = a.length.map(|metres| known_length(metres, &a.ends, &files)).transpose()?;
+    let length = a
+        .length
+        .map(|metres| anyhow::Ok(KnownLength { metres, ends: Ends::numbered(&a.ends, &files)? }))
+        .transpose()?;
     let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera, world })?;
     teaching.set_mesh(mesh.as_ref())?;
     for (i, file) in files.iter().enumerate() {
@@ -235,26 +208,6 @@ fn without_poses(a: &TeachArguments, out: &Path) -> Result<Teaching> {
         teaching.set_length(length)?;
     }
     Ok(teaching)
-}
-
-/// The length with numbers of the files, each of which `--ends` names by its path or its name.
-fn known_length(metres: f64, ends: &[Ends], files: &[PathBuf]) -> Result<KnownLength> {
-    let mut numbered = vec![];
-    for Ends { photograph, points } in ends {
-        let named = |file: &Path| {
-            file == Path::new(photograph) || file.file_name().is_some_and(|name| name == photograph.as_str())
-        };
-        let found: Vec<usize> = (0..files.len()).filter(|i| named(&files[*i])).collect();
-        match found.as_slice() {
-            [number] => numbered.push((*number, *points)),
-            [] => bail!(
-                "--ends: found {photograph}, expected the name of one of the {} photographs",
-                files.len()
-            ),
-            _ => bail!("--ends: {} photographs are named {photograph}: give the path", found.len()),
-        }
-    }
-    Ok(KnownLength { metres, ends: numbered })
 }
 
 /// What methods derive from an object: now, not at the first estimate.

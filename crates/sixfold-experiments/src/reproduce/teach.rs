@@ -290,16 +290,19 @@ fn seen_points(there: &Mesh, capture: &SimulatedCapture<'_>, camera: &Camera) ->
     points.into_iter().zip(seen).filter(|(_, seen)| *seen).map(|(p, _)| p).collect()
 }
 
+/// Mean distance of points from the nearest of others, millimetres.
+pub(super) fn mean_millimetres<'a>(from: impl Iterator<Item = &'a Vec3>, to: &[Vec3]) -> f64 {
+    let tree = KdTree::new(to);
+    let all: Vec<f64> = from.filter_map(|p| tree.nearest(p)).map(|n| n.distance).collect();
+    1000.0 * all.iter().sum::<f64>() / all.len().max(1) as f64
+}
+
 /// Mean distances in millimetres: of the mesh where it is above the sheet to the truth, and of the truth where it is seen to the mesh.
 fn distances(found: &Mesh, there: &Mesh, seen: &[Vec3]) -> [f64; 2] {
     let (found, truth) = (found.sample_surface(100_000, 1).points, there.sample_surface(100_000, 3).points);
-    let mean = |from: &[Vec3], to: &[Vec3]| {
-        let tree = KdTree::new(to);
-        let all: Vec<f64> =
-            from.iter().filter(|p| p.z > 0.003).filter_map(|p| tree.nearest(p)).map(|n| n.distance).collect();
-        1000.0 * all.iter().sum::<f64>() / all.len().max(1) as f64
-    };
-    [mean(&found, &truth), mean(seen, &found)]
+    let above = found.iter().filter(|p| p.z > 0.003);
+    let seen = seen.iter().filter(|p| p.z > 0.003);
+    [mean_millimetres(above, &truth), mean_millimetres(seen, &found)]
 }
 
 /// New images of an object that stands among others.

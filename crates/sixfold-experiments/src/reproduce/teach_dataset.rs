@@ -13,7 +13,7 @@ use sixfold_bop::{
 };
 use sixfold_data::{FloorEntry, PhotographEntry, PhotographFile};
 use sixfold_estimator::{Object, PoseEstimator, Query, Region};
-use sixfold_geometry::{Camera, KdTree, Mask, Plane, Pose, Vec3, stats::median};
+use sixfold_geometry::{Camera, Mask, Plane, Pose, Vec3, stats::median};
 use sixfold_io::write_mask_and_hidden;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_shell::Outcome;
@@ -22,6 +22,8 @@ use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::ranges::in_range;
 use sixfold_teach::{MOST_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
+
+use super::teach::{compose, mean_millimetres};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach-dataset --dataset lmo --objects 5 6 8 9 12 --out out/reproduce-teach-dataset\n\n\
@@ -65,10 +67,25 @@ pub(crate) struct TeachDatasetArguments {
     out: PathBuf,
 }
 
+/// What a row depends on.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Asked {
+    photographs: usize,
+    min_visible: f64,
+    images: usize,
+}
+
+impl Asked {
+    fn of(a: &TeachDatasetArguments) -> Asked {
+        Asked { photographs: a.photographs, min_visible: a.min_visible, images: a.images }
+    }
+}
+
 /// One object; lengths in millimetres.
 #[derive(Debug, Serialize, Deserialize)]
 struct Row {
     object: u32,
+    asked: Asked,
     /// Images that taught it, as scene/image.
     taught_from: Vec<String>,
     diameter_mm: f64,
@@ -169,7 +186,7 @@ pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Out
 
 fn kept(file: &Path, a: &TeachDatasetArguments) -> Option<Row> {
     let row: Row = serde_json::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
-    (row.taught_from.len() <= a.photographs && row.images <= a.images).then_some(row)
+    (row.asked == Asked::of(a)).then_some(row)
 }
 
 /// All images that show an object.
@@ -306,6 +323,7 @@ fn measured(
     let search = Search { mesh, symmetric, diameter: info.diameter, scenes, images: &others };
     Ok(Row {
         object: id,
+        asked: Asked::of(a),
         taught_from: used.iter().map(|s| s.name()).collect(),
         diameter_mm: 1000.0 * info.diameter,
         mesh_mm,
@@ -320,15 +338,16 @@ fn measured(
 /// Where is up in the object's frame: the normal of the plane on which the other annotated objects of each image stand, as a printed
 /// board would say it; the median of the images. The object's true mesh is not used.
 fn up(scenes: &[Scene], id: u32, used: &[&Seen], meshes: &BTreeMap<u32, Mesh>) -> Result<Option<FloorEntry>> {
+    let points: BTreeMap<u32, Vec<Vec3>> =
+        meshes.iter().map(|(id, mesh)| (*id, mesh.sample_surface(BODY_POINTS, 7).points)).collect();
     let mut normals = vec![];
     for seen in used {
         let Some(scene) = scenes.iter().find(|s| s.scene_id == seen.scene) else { continue };
         let object_from_camera = seen.pose.inverse();
         let mut bodies = vec![];
         for truth in scene.image(seen.image)?.ground_truth.iter().filter(|t| t.obj_id != id) {
-            let Some(mesh) = meshes.get(&truth.obj_id) else { continue };
+            let Some(points) = points.get(&truth.obj_id) else { continue };
             let pose = object_from_camera * truth.camera_from_object;
-            let points = mesh.sample_surface(BODY_POINTS, 7).points;
             bodies.push(points.iter().map(|p| pose.transform_point(p)).collect::<Vec<Vec3>>());
         }
         normals.extend(standing_plane(&bodies, &object_from_camera.translation()).map(|plane| plane.normal));
@@ -383,12 +402,7 @@ fn distances(found: &Mesh, truth: &Mesh, used: &[&Seen]) -> [f64; 2] {
     }
     let shown: Vec<Vec3> = points.into_iter().zip(is_seen).filter(|(_, s)| *s).map(|(p, _)| p).collect();
     let (found, truth) = (found.sample_surface(100_000, 1).points, truth.sample_surface(100_000, 3).points);
-    let mean = |from: &[Vec3], to: &[Vec3]| {
-        let tree = KdTree::new(to);
-        let all: Vec<f64> = from.iter().filter_map(|p| tree.nearest(p)).map(|n| n.distance).collect();
-        1000.0 * all.iter().sum::<f64>() / all.len().max(1) as f64
-    };
-    [mean(&found, &truth), mean(&shown, &found)]
+    [mean_millimetres(found.iter(), &truth), mean_millimetres(shown.iter(), &found)]
 }
 
 /// Images in which an object is searched.
@@ -417,11 +431,7 @@ impl Search<'_> {
             let Some(best) = estimator.estimate(prepared.as_ref(), &query)?.into_iter().next() else {
                 continue;
             };
-            let found = best.camera_from_object;
-            let camera_from_true = Pose::new(
-                found.rotation() * known_from_true.rotation(),
-                found.transform_point(&known_from_true.translation()),
-            );
+            let camera_from_true = compose(&best.camera_from_object, known_from_true);
             let error = add_s(&points, self.symmetric, camera_from_true, seen.pose);
             right += usize::from(error < RIGHT * self.diameter);
         }

@@ -1,6 +1,7 @@
 //! A camera, and where it was, from photographs of the printed board, as it is listed in files and drawn: what every command on
 //! such photographs does.
 
+mod ends;
 mod photographs;
 mod pictures;
 
@@ -14,6 +15,7 @@ use sixfold_io::CameraFile;
 
 use crate::output::pose_rows;
 
+pub use self::ends::{Ends, TwoPixels};
 use self::photographs::leave_out_other_sizes;
 pub use self::photographs::{Photograph, photograph_files, read_photographs};
 
