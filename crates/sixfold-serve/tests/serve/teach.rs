@@ -328,7 +328,7 @@ fn what_teaches_nothing_is_refused_with_what_to_do() {
         (named("a"), 422, "photographs", "nothing"),
         (photograph(Form::default()), 422, "name", "nothing"),
         (photograph(named("../a")), 400, "name", "letters"),
-        (photograph(named("duck")), 409, "name", "there already"),
+        (photograph(named("duck")), 409, "name", "exists already"),
         (named("a").file("photographs", "a.jpg", b"text"), 422, "photographs", "a.jpg: "),
         (named("a").file("photographs", "a.zip", &zip), 422, "photographs", "neither PNG nor JPEG"),
         (named("a").file("photographs", "../../a.png", &truth.files[0]), 400, "photographs", "../../a.png"),
