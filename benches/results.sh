@@ -265,7 +265,7 @@ part_demo() {
 part_single() {
     local one=OUT/samples/test/000002 other=OUT/samples/test/001002 model=OUT/samples/models/obj_0000
     typed "cp -r data/demo OUT/samples"
-    typed "sixfold estimate --depth $one/depth/000003.png --camera OUT/samples/camera.json --object ${model}08.ply ${model}09.ply --unit mm --out OUT/single-ppf --json OUT/single-ppf.json"
+    typed "sixfold estimate --method ppf --depth $one/depth/000003.png --camera OUT/samples/camera.json --object ${model}08.ply ${model}09.ply --unit mm --out OUT/single-ppf --json OUT/single-ppf.json"
     typed "sixfold estimate --method mttm --depth $other/depth/000248.png --camera OUT/samples/camera.json --object ${model}05.ply --unit mm --out OUT/single-mttm --json OUT/single-mttm.json"
     typed "sixfold estimate --method mttm --matcher points --templates-only --depth $other/depth/000248.png --camera OUT/samples/camera.json --object ${model}05.ply --unit mm --out OUT/single-templates --json OUT/single-templates.json"
     typed "sixfold estimate --method pix2pose --weights weights/pix2pose-lmo.safetensors --object-id 8 --rgb $one/rgb/000003.png --camera OUT/samples/camera.json --object ${model}08.ply --unit mm --box 330,120,110,150 --out OUT/single-pix2pose --json OUT/single-pix2pose.json"
@@ -288,8 +288,8 @@ by_depth() {
 # Point pair features, in the whole image and in boxes.
 ppf() {
     simulate "$1"
-    by_depth "$1" ppf ""
-    by_depth "$1" ppf-boxes "--boxes gt"
+    by_depth "$1" ppf "--method ppf"
+    by_depth "$1" ppf-boxes "--method ppf --boxes gt"
     freeze "ppf_$1" 0 "poses=ppf-$1.csv" "scores=ppf-$1.json" "poses_in_boxes=ppf-boxes-$1.csv" "scores_in_boxes=ppf-boxes-$1.json"
 }
 part_ppf_kinect() { ppf kinect; }
@@ -329,13 +329,16 @@ part_clutter() {
         poses_around=clutter-around.csv scores_around=clutter-around.json
 }
 
-# Probabilities: simulated scenes that were not fitted to, with absent objects, and the sample images.
+# Probabilities: simulated scenes that were not fitted to, with absent objects, and the sample images; poses beside those of the single
+# methods (ppf_kinect, and templates in the same images).
 part_auto() {
     local scenes=OUT/auto-scenes
+    simulate kinect
+    by_depth kinect auto ""
     typed "sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 16 --views 1 --sensor xtion --seed 202 --no-masks --out $scenes"
     typed "sixfold reproduce auto --dataset $scenes --absent 6 --disturb --given depth --out OUT/auto-depth --json OUT/auto-depth.json"
     typed "sixfold reproduce auto --dataset data/demo --given depth both --out OUT/auto-demo --json OUT/auto-demo.json"
-    freeze auto 202 simulated=auto-depth.json samples=auto-demo.json
+    freeze auto 202 simulated=auto-depth.json samples=auto-demo.json poses_kinect=auto-kinect.csv scores_kinect=auto-kinect.json
 }
 
 # Objects taught from simulated photographs.

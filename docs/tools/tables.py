@@ -220,7 +220,7 @@ def headline():
     classes = value("grasp", "measured.classes")
     rows = [
         ("poses from depth, no training", "recall, ADD(-S)", value("ppf_kinect", "scores.add_s_recall.mean"), time("times_ppf"),
-         "sixfold estimate"),
+         "sixfold estimate --method ppf"),
         ("the same by templates", "recall, ADD(-S)", value("mttm_xtion", "scores.add_s_recall.mean"), None,
          "sixfold estimate --method mttm"),
         ("poses from colour, trained on 16 images", "recall, ADD(-S)", value("pix2pose", "scores.add_s_recall.mean"), time("times_pix2pose"),

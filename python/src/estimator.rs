@@ -123,7 +123,7 @@ impl Searched {
 ///
 /// method: "ppf", point pair features on depth, no training; "mttm", templates in depth, no training; "pix2pose", object
 /// coordinates from colour by a trained network, in boxes; "views", rendered views of the mesh matched with the colours, in boxes,
-/// no training; "auto", all methods that the images allow, one after the other until one is sure, each pose with its probability. weights: pix2pose's network (needed), or another one for mttm and views than that of the package; for auto those of pix2pose, which is else left out.
+/// no training; "auto", the default, all methods that the images allow, one after the other until one is sure, each pose with its probability. weights: pix2pose's network (needed), or another one for mttm and views than that of the package; for auto those of pix2pose, which is else left out.
 /// budget (auto): seconds for an object after which no further method is asked; poses then depend on how fast the machine is. keep_plane (ppf, mttm, auto): search points on the table plane too. matcher (mttm): "points", "network" or
 /// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. templates (mttm): "above", what
 /// stands on a table, z axis up, or "around", anything in any orientation, slower (above unless given). refine (pix2pose, views): align the
@@ -150,7 +150,7 @@ pub(crate) struct PyEstimator {
 #[pymethods]
 impl PyEstimator {
     #[new]
-    #[pyo3(signature = (method, *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, budget=None, seed=0))]
+    #[pyo3(signature = (method="auto", *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, budget=None, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,

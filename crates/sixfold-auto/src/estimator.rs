@@ -10,7 +10,7 @@ use sixfold_estimator::{
     EstimatorError, MinConfidence, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
     downcast,
 };
-use sixfold_geometry::Pose;
+use sixfold_geometry::{Pose, RgbImage};
 use sixfold_mesh::Mesh;
 
 use crate::calibration::{Calibration, CalibrationError};
@@ -27,6 +27,9 @@ const SYMMETRY_STEP: f64 = 0.05;
 const MORE: usize = 2;
 /// With a pose this probable for every instance no further method is asked; chosen by hand, not swept.
 const SURE: f64 = 0.9;
+/// A colour image whose brightest and darkest values differ by no more than this, in each channel, shows nothing: a covered lens, a filled image.
+/// Chosen by hand; not swept.
+const FLAT: u8 = 8;
 /// Below this probability a pose is not reported by default.
 const REPORTED: f64 = 0.5;
 
@@ -84,7 +87,7 @@ impl AutoEstimator {
     /// The first method that knows an object without a mesh, with what it knows.
     fn without_mesh(&self, object: &AutoObject) -> Result<Option<Knowing<'_>>, EstimatorError> {
         for (number, member) in self.members.iter().enumerate() {
-            if let Ok(prepared) = object.prepared(number, member.as_ref())? {
+            if let (Ok(prepared), _) = object.prepared(number, member.as_ref())? {
                 return Ok(Some((member.as_ref(), prepared)));
             }
         }
@@ -128,10 +131,16 @@ impl AutoEstimator {
         done: impl FnOnce(Pool<'_>, Vec<String>) -> Result<T, EstimatorError>,
     ) -> Result<T, EstimatorError> {
         let mut notes = vec![];
-        let color = query.rgb.filter(|image| image.size() == (query.camera.width, query.camera.height));
-        if query.rgb.is_some() && color.is_none() {
-            notes.push("the colour image has another size than the camera: colours are not used".to_owned());
-        }
+        let color = match query
+            .rgb
+            .map(|image| (image, unusable(image, (query.camera.width, query.camera.height))))
+        {
+            Some((_, Some(why))) => {
+                notes.push(format!("the colour image {why}: colours are not used"));
+                None
+            }
+            given => given.map(|(image, _)| image),
+        };
         let gradients = color.map(|image| {
             let kept: Arc<OnceLock<ColorGradients>> = query.memo.get_or_default();
             kept.get_or_init(|| ColorGradients::new(image));
@@ -168,14 +177,23 @@ impl AutoEstimator {
             if pool.asked > 0 && (late || (!self.ask_all && sure >= query.max_instances)) {
                 break;
             }
-            let prepared = match object.prepared(number, member.as_ref())? {
-                Ok(prepared) => prepared,
+            let (known, first) = object.prepared(number, member.as_ref())?;
+            let prepared = match known {
+                Ok(prepared) => {
+                    if first {
+                        notes.extend(prepared.notes().iter().cloned());
+                    }
+                    prepared
+                }
                 Err(lack) => {
                     notes.push(lack);
                     continue;
                 }
             };
             pool.add(member.as_ref(), member.estimate(prepared.as_ref().as_ref(), &asked)?);
+        }
+        if possible == 0 && !notes.is_empty() {
+            return Err(EstimatorError::method(notes.join("; ")));
         }
         if possible == 0 {
             let names: Vec<&str> = self.members.iter().map(|m| m.name()).collect();
@@ -194,6 +212,19 @@ impl AutoEstimator {
         }
         done(pool, notes)
     }
+}
+
+/// Why nothing can be read from a colour image, if so.
+fn unusable(image: &RgbImage, camera: (usize, usize)) -> Option<&'static str> {
+    if image.size() != camera {
+        return Some("has another size than the camera");
+    }
+    let flat = |channel: usize| {
+        let values = || image.as_slice().iter().map(|pixel| pixel[channel]);
+        let (lowest, highest) = (values().min().unwrap_or(0), values().max().unwrap_or(0));
+        highest - lowest <= FLAT
+    };
+    (0..3).all(flat).then_some("has one colour everywhere")
 }
 
 /// The error for an object that no method can look for.
@@ -267,21 +298,21 @@ impl Surface {
 }
 
 impl AutoObject {
-    /// The object as method number `number` knows it, or why it cannot be asked.
-    fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<Known, EstimatorError> {
+    /// The object as method number `number` knows it, or why it cannot be asked; and whether it was prepared just now.
+    fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<(Known, bool), EstimatorError> {
         let Some(place) = self.members.get(number) else {
             return Err(EstimatorError::Foreign { method: METHOD });
         };
         let mut kept = place.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(kept) = kept.as_ref() {
-            return Ok(kept.clone());
+            return Ok((kept.clone(), false));
         }
         let prepared = method
             .prepare(&self.object)
             .map(Arc::new)
             .map_err(|error| format!("--method {} was not asked: {error}", method.name()));
         *kept = Some(prepared.clone());
-        Ok(prepared)
+        Ok((prepared, true))
     }
 }
 

@@ -10,6 +10,7 @@ pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "estimate", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "estimate", options: &["depth_scale"], when: &[Without("depth")] },
     Idle { command: "estimate", options: &["object_id"], when: &[Is("method", &["ppf", "mttm"]), Without("detector")] },
+    Idle { command: "estimate", options: &["object_id"], when: &[Is("method", &["auto"]), Without("weights"), Without("detector")] },
     Idle { command: "estimate", options: &["detector"], when: &[IsNot("boxes", "detect")] },
     Idle { command: "estimate", options: &["weights"], when: &[Is("method", &["mttm"]), Is("matcher", &["points"])] },
     Idle { command: "estimate", options: &["cache"], when: &[With("no_cache")] },

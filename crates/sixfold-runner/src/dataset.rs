@@ -333,6 +333,10 @@ impl DatasetRun<'_> {
             let prepare = |d| PreparedDepth::new(&d, &camera, &options).map_err(EstimatorError::from);
             depth = read.map(prepare).transpose()?;
         }
+        if rgb.is_none() && depth.is_none() {
+            let advice = "simulate its depth with `sixfold simulate-depth`";
+            return Err(EstimatorError::Input { what: "image, of depth or of colour", method, advice }.into());
+        }
         Ok(Input { camera, rgb, depth })
     }
 }

@@ -127,13 +127,18 @@ impl Methods {
         folder: PathBuf,
         pix2pose: Option<PathBuf>,
     ) -> Result<Methods, ServeError> {
-        let mut methods = vec![
-            Method::new("ppf", "point pair features on depth, no training", || {
-                Ok(Arc::new(PpfEstimator::default()))
-            }),
-            Method::new("mttm", "templates in depth, no training", mttm),
-        ];
-        methods.extend(with_networks::methods(pix2pose)?);
+        let mut methods = with_networks::methods(pix2pose)?;
+        // After the method that asks all others, which is the default.
+        let first = methods.len().min(1);
+        methods.splice(
+            first..first,
+            [
+                Method::new("ppf", "point pair features on depth, no training", || {
+                    Ok(Arc::new(PpfEstimator::default()))
+                }),
+                Method::new("mttm", "templates in depth, no training", mttm),
+            ],
+        );
         Ok(Methods {
             store,
             folder,
@@ -286,8 +291,8 @@ mod with_networks {
             Ok(Arc::new(AutoMembers { pix2pose, ..AutoMembers::default() }.estimator()?) as Estimator)
         };
         let mut methods = vec![
-            Method::new("views", "rendered views matched with a colour image, no training", views),
             Method::new("auto", "all methods, their poses judged together, with probabilities", auto),
+            Method::new("views", "rendered views matched with a colour image, no training", views),
         ];
         if let Some(file) = pix2pose {
             let build = move || {

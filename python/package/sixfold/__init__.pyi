@@ -370,7 +370,7 @@ class Estimator:
 
     def __new__(
         cls,
-        method: Literal["ppf", "mttm", "pix2pose", "views", "auto"],
+        method: Literal["ppf", "mttm", "pix2pose", "views", "auto"] = "auto",
         *,
         weights: Path | None = None,
         keep_plane: bool = False,

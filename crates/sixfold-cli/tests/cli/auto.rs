@@ -1,6 +1,7 @@
 //! `sixfold estimate --method auto`.
 
 use serde_json::Value;
+use sixfold_geometry::RgbImage;
 use sixfold_io::write_rgb;
 use sixfold_mesh::{PlyFormat, Unit, write_ply};
 
@@ -28,7 +29,7 @@ fn says_how_probable_a_pose_is_and_what_is_not_there() {
     let table = sixfold(dir, &format!("{DEPTH} --object part.ply")).expect(0).stdout;
     assert!(table.starts_with("object") && table.contains(" probability "), "{table}");
     // Methods that know no probability say none.
-    let table = sixfold(dir, &format!("{} ", OneImage::ARGUMENTS)).expect(0).stdout;
+    let table = sixfold(dir, &format!("{} --method ppf", OneImage::ARGUMENTS)).expect(0).stdout;
     assert!(table.contains(" confidence ") && !table.contains("probability"), "{table}");
     // What is not there is nothing found.
     sixfold(dir, &format!("{DEPTH} --object other.ply")).expect(1);
@@ -42,7 +43,18 @@ fn write_other_part(dir: &std::path::Path) {
 fn the_same_on_any_number_of_threads() {
     let case = OneImage::new();
     let args = format!("{DEPTH} --rgb rgb.png --object part.ply --json");
-    // A colour image that does not show the object speaks against it, whatever depth says.
+    // A colour image without anything in it says nothing.
+    let flat = sixfold(case.path(), &args).expect(0);
+    assert!(
+        flat.stderr.contains("the colour image has one colour everywhere: colours are not used"),
+        "{}",
+        flat.stderr
+    );
+    assert!(flat.json()["poses"][0]["evidence"]["edges"].is_null());
+    // One that shows something else speaks against the object, whatever depth says.
+    let squares =
+        RgbImage::from_fn(WIDTH, HEIGHT, |x, y| [if (x / 16 + y / 16) % 2 == 0 { 30 } else { 220 }; 3]);
+    write_rgb(&case.path().join("rgb.png"), &squares).unwrap();
     sixfold(case.path(), &args).expect(1);
     write_rgb(&case.path().join("rgb.png"), &picture_of(&[(&part(), case.truth)])).unwrap();
     let at = |more: &str| -> Value {

@@ -359,7 +359,16 @@ fn options_that_would_be_ignored_are_refused() {
             "--depth-scale",
             "without --depth",
         ),
-        ("estimate ONE FOUND --object-id 3", "--object-id", "with --method ppf without --detector"),
+        (
+            "estimate ONE FOUND --object-id 3",
+            "--object-id",
+            "with --method auto without --weights without --detector",
+        ),
+        (
+            "estimate --method ppf ONE FOUND --object-id 3",
+            "--object-id",
+            "with --method ppf without --detector",
+        ),
         (
             "estimate --method mttm ONE FOUND --object-id 3",
             "--object-id",

@@ -107,7 +107,8 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
         answer.stderr
     );
     // Others cannot look for it.
-    fails(dir, "estimate --depth depth.png --camera camera.json --object seen", &["seen", "no mesh", "mttm"]);
+    let other = "estimate --method ppf --depth depth.png --camera camera.json --object seen";
+    fails(dir, other, &["seen", "no mesh", "mttm"]);
 }
 
 #[test]

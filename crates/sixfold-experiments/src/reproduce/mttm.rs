@@ -131,7 +131,7 @@ const WAYS: [Way; 11] = [
     },
 ];
 /// The row of another method.
-const PPF: (&str, &str) = ("ppf", "point pair features (`sixfold estimate`'s default)");
+const PPF: (&str, &str) = ("ppf", "point pair features");
 
 /// What was measured of one target in one way.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]

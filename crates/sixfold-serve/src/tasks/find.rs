@@ -80,7 +80,7 @@ pub(crate) struct FindForm {
     depth_scale: Option<f64>,
     /// Names of stored objects, separated by commas or sent several times.
     objects: Vec<String>,
-    /// ppf, mttm, views, auto or pix2pose (default: ppf).
+    /// auto, ppf, mttm, views or pix2pose (default: auto; ppf in a program without networks).
     method: Option<String>,
     /// Most instances of each object (default: 1).
     instances: Option<u32>,

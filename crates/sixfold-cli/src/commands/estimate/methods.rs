@@ -81,15 +81,15 @@ pub(crate) trait MethodArguments: Args {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>>;
 }
 
-/// All methods; the first is the default.
+/// All methods; the first is the default: all of them together, and without networks point pair features.
 pub(crate) static METHODS: &[Method] = &[
+    #[cfg(feature = "networks")]
+    networks::AUTO,
     Method::of::<PpfArguments>("ppf", "point pair features on depth, no training"),
     #[cfg(feature = "networks")]
     networks::PIX2POSE,
     #[cfg(feature = "networks")]
     networks::VIEWS,
-    #[cfg(feature = "networks")]
-    networks::AUTO,
     Method::of::<MttmArguments>(
         "mttm",
         "templates in depth, from a mesh or from depth images of the object, no training",
