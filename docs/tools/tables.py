@@ -112,6 +112,8 @@ def depth():
         (["templates", sensor, where], f"mttm_{sensor}", path)
         for sensor in ("kinect", "xtion")
         for where, path in (("whole image", "scores"), ("ground-truth boxes", "scores_in_boxes"))
+    ] + [
+        (["all methods (auto), with colour", "kinect", "whole image"], "auto", "scores_kinect")
     ] + [(["templates, points alone", sensor, "whole image"], f"mttm_{sensor}", "scores_by_points") for sensor in ("kinect", "xtion")]
     return scores(rows, ["method", "simulated sensor", "searched in"],
                   ["targets", "ar", "ar_vsd", "ar_mssd", "ar_mspd", "add_s_recall.mean"])

@@ -4,7 +4,7 @@ use std::io::Write;
 
 use serde_json::Value;
 
-use crate::support::{Form, TestServer, connect, frame, read, send};
+use crate::support::{Form, TestServer, connect, frame, read, search, send};
 use sixfold_serve::ServerOptions;
 
 /// A form that is refused: the status, the field, and a word of the message.
@@ -192,7 +192,7 @@ fn bad_fields_are_named() {
     assert_eq!(server.get("/v1/jobs").expect(200).json()["jobs"].as_array().unwrap().len(), 0);
     server.get("/v1/objects/new").expect(404);
     assert!(!server.folder.path().join("new").exists());
-    server.result_of("/v1/find", &frame().text("objects", "duck")).expect(200);
+    server.result_of("/v1/find", &search("duck")).expect(200);
 }
 
 #[test]
@@ -252,7 +252,7 @@ fn a_full_queue_and_slow_clients_are_told_so() {
         request_timeout: std::time::Duration::from_secs(1),
         ..o
     });
-    let form = frame().text("objects", "ape,cat,driller,duck");
+    let form = search("ape,cat,driller,duck");
     let replies: Vec<u16> = (0..6).map(|_| server.post("/v1/find", &form).status).collect();
     assert!(replies.contains(&202) && replies.contains(&429), "{replies:?}");
     // Half a form, and then nothing.

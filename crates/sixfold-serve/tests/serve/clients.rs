@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::support::{OBJECTS, TestServer, expected, frame};
+use crate::support::{OBJECTS, TestServer, expected, search};
 
 /// How long clients ask at least.
 const LONG_ENOUGH: Duration = Duration::from_secs(4);
@@ -21,7 +21,7 @@ fn eight_clients_at_once_get_their_own_answers() {
                 let mut answers = 0;
                 while answers == 0 || began.elapsed() < LONG_ENOUGH {
                     let (name, _) = OBJECTS[(i + answers) % OBJECTS.len()];
-                    let form = frame().text("objects", name);
+                    let form = search(name);
                     let result = server.result_of("/v1/find", &form).expect(200).json();
                     assert_eq!(result["poses"][0]["object"], name);
                     assert_eq!(result["poses"][0]["camera_from_object"], expected(name), "{name}");

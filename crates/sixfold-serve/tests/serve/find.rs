@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use crate::support::{Form, TestServer, events, expected, frame, read, send};
+use crate::support::{Form, TestServer, events, expected, frame, read, search, send};
 
 fn pixels(png: &[u8]) -> (usize, usize) {
     sixfold_io::ImageFile::of_bytes(std::path::Path::new("overlay"), png).size().unwrap()
@@ -42,9 +42,20 @@ fn objects_are_found_as_without_a_server() {
         .text("cx", "325.2611")
         .text("cy", "242.04899")
         .text("depth_scale", "1")
-        .text("objects", "duck");
+        .text("objects", "duck")
+        .text("method", "ppf");
     let again = server.result_of("/v1/find", &numbers).expect(200).json();
     assert_eq!(again["poses"][0]["camera_from_object"], expected("duck"));
+}
+
+#[test]
+fn without_a_method_the_first_one_is_taken() {
+    let server = TestServer::new();
+    let found = server.result_of("/v1/find", &frame().text("objects", "duck")).expect(200).json();
+    let with_networks = cfg!(feature = "networks");
+    assert_eq!(found["method"], if with_networks { "auto" } else { "ppf" });
+    let probability = found["poses"][0]["probability"].as_f64();
+    assert!(if with_networks { probability > Some(0.5) } else { probability.is_none() }, "{found}");
 }
 
 #[test]
@@ -55,13 +66,13 @@ fn a_box_and_a_mask_say_where_to_look() {
     let t = |row: usize| pose[row][3].as_f64().unwrap();
     let at = [572.4114 * t(0) / t(2) + 325.2611, 573.57043 * t(1) / t(2) + 242.04899];
     let near = format!("{},{},90,90", at[0] - 45.0, at[1] - 45.0);
-    let found = find(frame().text("objects", "duck").text("box", &near));
+    let found = find(search("duck").text("box", &near));
     let moved: f64 = (0..3)
         .map(|i| (found["poses"][0]["camera_from_object"][i][3].as_f64().unwrap() - t(i)).powi(2))
         .sum();
     assert!(moved.sqrt() < 0.01, "{found}");
     // Where it is not, it is not found.
-    let away = find(frame().text("objects", "duck").text("box", "560,400,60,60"));
+    let away = find(search("duck").text("box", "560,400,60,60"));
     assert_eq!(away["not_found"], json!(["duck"]), "{away}");
 }
 
@@ -84,7 +95,7 @@ fn grasps_are_proposed_and_drawn() {
 #[test]
 fn waiting_and_running_jobs_are_cancelled_and_finished_ones_removed() {
     let server = TestServer::new();
-    let form = frame().text("objects", "ape,cat,driller,duck");
+    let form = search("ape,cat,driller,duck");
     let post = || server.post("/v1/find", &form).expect(202).json()["id"].as_str().unwrap().to_owned();
     let (first, second) = (post(), post());
     let cancel = |id: &str| send(server.address, "POST", &format!("/v1/jobs/{id}/cancel"), &[], b"");

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::support::{Form, OBJECTS, TestServer, frame, read, send};
+use crate::support::{Form, OBJECTS, TestServer, read, search, send};
 
 #[test]
 fn objects_are_listed_and_rendered() {
@@ -38,7 +38,7 @@ fn an_uploaded_mesh_is_stored_found_replaced_and_removed() {
     assert_eq!(stored["record"]["source"], "Duck.PLY");
     let files = server.get("/v1/objects/my-duck").expect(200).json()["files"].to_string();
     assert!(files.contains("ppf.bin"), "{files}");
-    let found = server.result_of("/v1/find", &frame().text("objects", "my-duck")).expect(200).json();
+    let found = server.result_of("/v1/find", &search("my-duck")).expect(200).json();
     assert_eq!(found["poses"][0]["object"], "my-duck");
     let problem = server.post("/v1/objects", &form).expect(409).json();
     assert_eq!(problem["field"], "name");
@@ -52,7 +52,7 @@ fn an_uploaded_mesh_is_stored_found_replaced_and_removed() {
         .file("mesh", "driller.ply", &other);
     let stored = server.result_of("/v1/objects", &form).expect(200).json();
     assert_eq!(stored["record"]["symmetries_continuous"].as_array().unwrap().len(), 1);
-    let found = server.result_of("/v1/find", &frame().text("objects", "my-duck,driller")).expect(200).json();
+    let found = server.result_of("/v1/find", &search("my-duck,driller")).expect(200).json();
     let at = |i: usize| found["poses"][i]["camera_from_object"][2][3].as_f64().unwrap();
     assert!((at(0) - at(1)).abs() < 0.03, "{found}");
     let remove = || send(server.address, "DELETE", "/v1/objects/my-duck", &[], b"");

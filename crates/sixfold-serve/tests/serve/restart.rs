@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::AtomicBool;
 
-use crate::support::{TestServer, events, expected, fill, frame, options, result};
+use crate::support::{TestServer, events, expected, fill, options, result, search};
 use sixfold_serve::Server;
 
 const FOLDER: &str = "SIXFOLD_SERVE_TEST_FOLDER";
@@ -41,7 +41,7 @@ fn what_was_asked_for_survives_a_kill() {
     fill(&folder.path().join("objects"));
     let (mut process, address) = to_be_killed(folder.path());
     let post = |objects: &str| {
-        let job = frame().text("objects", objects).post(address, "/v1/find").expect(202).json();
+        let job = search(objects).post(address, "/v1/find").expect(202).json();
         job["id"].as_str().unwrap().to_owned()
     };
     let done = post("duck");
@@ -66,7 +66,7 @@ fn what_was_asked_for_survives_a_kill() {
         expected("duck")
     );
     // Ended in order, too, nothing is lost.
-    let id = frame().text("objects", "ape,duck").post(server.address, "/v1/find").expect(202).json();
+    let id = search("ape,duck").post(server.address, "/v1/find").expect(202).json();
     let folder = server.end();
     let server = TestServer::within(folder, |o| o);
     let found = server.result(id["id"].as_str().unwrap()).expect(200).json();

@@ -222,6 +222,11 @@ pub fn frame() -> Form {
         .file("camera", "camera.json", &read("camera.json"))
 }
 
+/// The same with objects to look for by point pair features, the fastest method.
+pub fn search(objects: &str) -> Form {
+    frame().text("objects", objects).text("method", "ppf")
+}
+
 /// The pose of an object in the demo's frame 3, as the library finds it without a server.
 pub fn expected(name: &str) -> Value {
     static POSES: OnceLock<Value> = OnceLock::new();
