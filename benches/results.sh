@@ -16,7 +16,7 @@
 # Needs bash, python3, paths without spaces, and about 30 minutes of one core.
 set -euo pipefail
 
-PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose views auto detector grasp experience nol)
+PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose pix2pose_icp views auto detector grasp experience nol)
 # Asked for by name only: chapter 6 in small, about eight minutes more; twelve objects taught, about fifteen.
 MORE=(dgcm teach)
 
@@ -356,6 +356,22 @@ part_pix2pose() {
     typed "sixfold eval $common --no-vsd --results OUT/pix2pose-detected.csv --json OUT/pix2pose-detected.json"
     freeze pix2pose 0 poses=pix2pose.csv scores=pix2pose.json \
         poses_in_detected_boxes=pix2pose-detected.csv scores_in_detected_boxes=pix2pose-detected.json
+}
+
+# Tables 3.7 and 3.8: colour alone and with ICP, as published and ours, on simulated depth in ground-truth boxes.
+part_pix2pose_icp() {
+    local name options files=() frames=OUT/sim-rgbd model="--method pix2pose --weights weights/pix2pose-lmo.safetensors"
+    local common="--dataset $frames --targets OUT/every-8th-untrained.json"
+    typed "sixfold simulate-depth --dataset DIR/lmo --sensor kinect --rgb --images $(images "$work/every-8th-untrained.json") --out $frames"
+    for name in published published_icp ours ours_icp; do
+        options=""
+        [[ $name != published* ]] || options+=" --preset published"
+        [[ $name != *_icp ]] || options+=" --icp"
+        typed "sixfold estimate $model$options $common --boxes gt --out OUT/pix2pose-$name.csv"
+        typed "sixfold eval $common --results OUT/pix2pose-$name.csv --json OUT/pix2pose-$name.json"
+        files+=("scores_$name=pix2pose-$name.json" "poses_$name=pix2pose-$name.csv")
+    done
+    freeze pix2pose_icp 0 "${files[@]}"
 }
 
 # Poses from colour without training for the object, in ground-truth boxes of all targets.

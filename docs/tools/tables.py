@@ -152,6 +152,12 @@ def colour():
                   ["method", "boxes"], ["targets", "ar_mssd", "ar_mspd", "add_s_recall.mean"])
 
 
+def pix2pose_icp():
+    rows = [([how, what], "pix2pose_icp", f"scores_{key}") for how, name in (("--preset published", "published"), ("ours", "ours"))
+            for what, key in (("colour", name), ("colour, then ICP", f"{name}_icp"))]
+    return scores(rows, ["Pix2Pose", "input"], ["targets", "ar", "ar_vsd", "ar_mssd", "ar_mspd", "add_s_recall.mean"])
+
+
 def evaluator():
     expected = {"AR_MSSD": "ar_mssd", "AR_MSPD": "ar_mspd", "ADD(-S) recall": "add_s_recall.mean"}
     return ["score of MegaPose's published estimates", "Sixfold"], \
@@ -255,8 +261,56 @@ def teach():
             "depth: found of 5", "with the true mesh", "auto: found of 5", "with the true mesh", "reported, wrong"], body, ["teach"]
 
 
+def ours(path):
+    """A measured value of docs/published.json: FILE:KEYS of a file of results, or FILE[ROW][COLUMN] of one by hand."""
+    if path is None:
+        return None
+    if cell := re.fullmatch(r"(\w+)\[(\d+)\]\[(\d+)\]", path):
+        name, row, column = cell.groups()
+        rows = load(name)["rows"]
+        if int(row) >= len(rows) or int(column) >= len(rows[int(row)]):
+            raise SystemExit(f"tables.py: {name} has no {path}")
+        return rows[int(row)][int(column)]
+    name, _, keys = path.partition(":")
+    return value(name, keys)
+
+
+def chapter(number):
+    """A chapter's published numbers beside ours, from docs/published.json."""
+    body = [[table, what, published, ours(path), where] for table, what, published, path, where in published_rows()[number]["rows"]]
+    return ["table", "quantity", "published", "ours", "ours measured on"], body, []
+
+
+def published_rows():
+    return json.loads((ROOT / "docs/published.json").read_text(), parse_float=Literal)
+
+
+def published_commands(number):
+    """The commands of a chapter's tables."""
+    parts = [f"# {table}\n" + "\n".join(lines) for table, *lines in published_rows()[number]["commands"]]
+    body = "\n".join(parts)
+    return f"<details><summary>Commands, chapter {number}</summary>\n\n```sh\n{body}\n```\n\n</details>\n"
+
+
+def chapter_3():
+    return chapter("3")
+
+
+def chapter_4():
+    return chapter("4")
+
+
+def chapter_5():
+    return chapter("5")
+
+
+def chapter_6():
+    return chapter("6")
+
+
+CHAPTERS = {"chapter_3": "3", "chapter_4": "4", "chapter_5": "5", "chapter_6": "6"}
 TABLES = {table.__name__: table for table in
-          (depth, demo, templates, piles, colour, evaluator, detection, probability, new_poses, new_views, grasps, teach, times, headline)}
+          (chapter_3, chapter_4, chapter_5, chapter_6, pix2pose_icp, depth, demo, templates, piles, colour, evaluator, detection, probability, new_poses, new_views, grasps, teach, times, headline)}
 
 
 def rendered(name):
@@ -275,6 +329,8 @@ def rendered(name):
             commits.setdefault(load(file)["commit"], []).append(f"`{file}`")
         from_files = "; ".join(f"{', '.join(names)} at commit {commit}" for commit, names in commits.items())
         return f"{body}\nValues from `results/*.json`: {from_files}.\n"
+    if name in CHAPTERS:
+        return f"{body}\n{published_commands(CHAPTERS[name])}"
     return f"{body}\n{''.join(source(file) for file in files)}"
 
 

@@ -7,7 +7,7 @@ use numpy::PyArray1;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use sixfold::bop::{
-    Estimate, EvalOptions, ModelPoints, Models, VsdError, VsdOptions, evaluate, evaluate_detection,
+    Estimate, EvalOptions, ModelPoints, Models, Taus, VsdError, VsdOptions, evaluate, evaluate_detection,
     write_recall_curves,
 };
 use sixfold::geometry::Pose;
@@ -206,7 +206,7 @@ fn vsd_error(error: VsdError) -> PyErr {
 fn vsd_options(taus: Option<&Bound<'_, PyAny>>, delta: f64) -> PyResult<VsdOptions> {
     let mut options = VsdOptions { delta, ..VsdOptions::default() };
     if let Some(taus) = taus {
-        options.taus = arrays::numbers("taus", taus)?;
+        options.taus = Taus::Diameters(arrays::numbers("taus", taus)?);
     }
     if !(delta.is_finite() && delta >= 0.0) {
         return Err(bad("delta", "metres, zero or more", delta.to_string()));

@@ -74,7 +74,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         cases.push(json!({
             "case": format!("{case:02}"), "width": camera.width, "height": camera.height, "fx": camera.fx,
             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "diameter": diameter, "delta": options.delta,
-            "taus": options.taus, "errors": errors,
+            "taus": options.taus.values(), "errors": errors,
         }));
     }
     std::fs::write(folder.join("cases.json"), serde_json::to_string_pretty(&cases)?)?;

@@ -18,7 +18,7 @@ use crate::scene_files::{
     parse_scene_gt_info, parse_targets,
 };
 
-/// Which of a dataset's model folders.
+/// Which of a dataset's model folders, where none was chosen by [`BopDataset::with_models`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Models {
     /// `models_eval` where there is one (uniformly resampled, without inner faces), otherwise `models`.
@@ -41,6 +41,8 @@ pub struct BopDataset {
     split_dir: PathBuf,
     size: Option<StatedSize>,
     scenes: BTreeMap<u32, PathBuf>,
+    /// The chosen folder of models.
+    models: Option<PathBuf>,
     /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
     infos: Arc<[OnceLock<NamedInfos>; 2]>,
 }
@@ -57,7 +59,7 @@ impl BopDataset {
             let name = dir.file_name().and_then(|n| n.to_str()).and_then(|n| n.parse().ok());
             let scenes = BTreeMap::from([(name.unwrap_or(0), dir.to_owned())]);
             let (root, split_dir) = (dir.to_owned(), dir.to_owned());
-            return Ok(BopDataset { root, split_dir, size, scenes, infos: Arc::default() });
+            return Ok(BopDataset { root, split_dir, size, scenes, models: None, infos: Arc::default() });
         }
         if !dir.is_dir() {
             return Err(DatasetError::Missing {
@@ -87,12 +89,34 @@ impl BopDataset {
         if scenes.is_empty() {
             return Err(missing("a scene folder"));
         }
-        Ok(BopDataset { root: dir.to_owned(), split_dir, size, scenes, infos: Arc::default() })
+        let root = dir.to_owned();
+        Ok(BopDataset { root, split_dir, size, scenes, models: None, infos: Arc::default() })
+    }
+
+    /// The same dataset with the models of one of its folders for all uses, such as T-LESS's `models_cad` or `models_reconst`.
+    ///
+    /// # Errors
+    /// [`DatasetError::Missing`] when there is no such folder.
+    pub fn with_models(self, folder: &str) -> Result<Self, DatasetError> {
+        let dir = self.root.join(folder);
+        if !dir.is_dir() {
+            return Err(DatasetError::Missing {
+                path: dir,
+                what: "the folder of models",
+                advice: "choose one that the dataset has, such as models, models_eval, models_cad or models_reconst",
+            });
+        }
+        Ok(BopDataset { models: Some(dir), infos: Arc::default(), ..self })
     }
 
     /// The dataset's folder.
     pub fn root(&self) -> &Path {
         &self.root
+    }
+
+    /// The split's name: that of its folder.
+    pub fn split(&self) -> String {
+        self.split_dir.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
     }
 
     /// The scenes of the split, ascending.
@@ -118,8 +142,11 @@ impl BopDataset {
         Scene::read(scene_id, dir, self.size.clone())
     }
 
-    /// The folder of models that will be used, if the dataset has one.
+    /// The folder of models that will be used, if the dataset has one: the chosen one, otherwise that of the use.
     pub fn models_dir(&self, models: Models) -> Option<PathBuf> {
+        if let Some(chosen) = &self.models {
+            return Some(chosen.clone());
+        }
         let names: &[&str] = match models {
             Models::Evaluation => &["models_eval", "models"],
             Models::Rendering => &["models", "models_eval"],
@@ -195,21 +222,20 @@ impl BopDataset {
     /// [`DatasetError`] when a file is missing or broken.
     pub fn targets(&self, file: Option<&Path>) -> Result<Vec<Target>, DatasetError> {
         let default = self.targets_file();
-        let path = match file.or(default.as_deref()) {
-            Some(path) => path,
-            None => {
-                let mut targets = Vec::new();
-                for scene_id in self.scene_ids() {
-                    for im_id in self.scene(scene_id)?.image_ids() {
-                        targets.push(Target { scene_id, im_id, object: None });
-                    }
-                }
-                return self.object_targets(&targets);
-            }
-        };
+        let Some(path) = file.or(default.as_deref()) else { return self.all_targets() };
         let text = sixfold_io::read_regular(path, sixfold_io::limits::LARGE_TEXT)
             .map_err(|source| DatasetError::Read { path: path.to_owned(), source })?;
         parse_targets(&text, path)
+    }
+
+    /// Every ground-truth pose of the split that is at least 10 % visible (or of unknown visibility), whatever targets files there are.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when a scene is broken.
+    pub fn all_targets(&self) -> Result<Vec<Target>, DatasetError> {
+        let images = self.images(None)?;
+        let targets = images.into_iter().map(|(scene_id, im_id)| Target { scene_id, im_id, object: None });
+        self.object_targets(&targets.collect::<Vec<_>>())
     }
 
     /// The images (scene, image) of the targets in `file`, ascending, or all of the split without a file.

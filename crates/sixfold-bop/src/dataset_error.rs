@@ -158,6 +158,9 @@ pub enum DatasetError {
         /// The object.
         obj_id: u32,
     },
+    /// Whoever received the progress asked to stop.
+    #[error("stopped")]
+    Stopped,
     /// A model or `models_info.json` is broken.
     #[error(transparent)]
     Model(Box<dyn std::error::Error + Send + Sync>),

@@ -18,7 +18,7 @@ use thiserror::Error;
 
 use crate::dataset::{BopDataset, Models, Scene};
 use crate::dataset_error::DatasetError;
-use crate::errors::{Placement, VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
+use crate::errors::{Placement, Taus, VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
 use crate::points::ModelPoints;
 use crate::results::Estimate;
 use crate::scene_files::{GroundTruth, Target, TargetObject};
@@ -34,6 +34,8 @@ pub struct EvalOptions {
     pub max_symmetry_step: f64,
     /// VSD's tolerances.
     pub vsd: VsdOptions,
+    /// A pose is right by VSD if its error is below a threshold; recall is the mean over these.
+    pub vsd_thresholds: Vec<f64>,
     /// Compute VSD at all: it renders every estimate and every target.
     pub compute_vsd: bool,
     /// Which poses are targets: `None` takes the `inst_count` most visible ones (BOP'19), a number takes those with
@@ -50,6 +52,7 @@ impl Default for EvalOptions {
         EvalOptions {
             max_symmetry_step: 0.01,
             vsd: VsdOptions::default(),
+            vsd_thresholds: fractions_05_to_50(),
             compute_vsd: true,
             visib_gt_min: None,
             curve_steps: 50,
@@ -85,6 +88,9 @@ pub enum EvalError {
 
 /// The delta of ITODD in the BOP Challenge, metres; of all others it is the default.
 const ITODD: (&str, f64) = ("itodd", 0.005);
+/// Threshold of VSD and least visible fraction of a pose that is to be found, in the benchmark of 2018 (Hodan, Michel et al. 2018,
+/// section 4.2) and in table 3.6 of the dissertation.
+const PUBLISHED: (f64, f64) = (0.3, 0.1);
 
 impl EvalOptions {
     /// Those of the BOP Challenge for the dataset in a folder, which is known by its name.
@@ -94,6 +100,41 @@ impl EvalOptions {
             options.vsd.delta = ITODD.1;
         }
         options
+    }
+
+    /// Those of the benchmark of 2018, by which the dissertation scores T-LESS (section 3.4.4): VSD below 0.3 with a tolerance of
+    /// 20 mm, of every pose that is at least 10 % visible.
+    pub fn published() -> EvalOptions {
+        let (threshold, visible) = PUBLISHED;
+        EvalOptions {
+            vsd: VsdOptions::published(),
+            vsd_thresholds: vec![threshold],
+            visib_gt_min: Some(visible),
+            ..EvalOptions::default()
+        }
+    }
+
+    /// How VSD is averaged, in words; `None` as in the BOP Challenge, where it counts for AR.
+    fn vsd_protocol(&self) -> Option<String> {
+        let usual = EvalOptions::default();
+        let same = self.vsd.taus == usual.vsd.taus
+            && self.vsd_thresholds == usual.vsd_thresholds
+            && self.vsd.missing_is_visible == usual.vsd.missing_is_visible;
+        if same {
+            return None;
+        }
+        let list = |values: &[f64], factor: f64| {
+            let texts: Vec<String> =
+                values.iter().map(|v| format!("{}", (v * factor * 1e6).round() / 1e6)).collect();
+            texts.join(", ")
+        };
+        let taus = match &self.vsd.taus {
+            Taus::Diameters(values) => format!("{} diameters", list(values, 1.0)),
+            Taus::Metres(values) => format!("{} mm", list(values, 1000.0)),
+        };
+        let missing =
+            if self.vsd.missing_is_visible { "" } else { ", nothing visible where depth is missing" };
+        Some(format!("VSD below {} at tolerances of {taus}{missing}", list(&self.vsd_thresholds, 1.0)))
     }
 
     /// Tests every field.
@@ -108,9 +149,19 @@ impl EvalOptions {
         test((1e-4..=1.0).contains(&step), "max_symmetry_step", step, "a fraction from 0.0001 to 1")?;
         let delta = self.vsd.delta;
         test(delta.is_finite() && delta >= 0.0, "vsd.delta", delta, "metres, zero or more")?;
-        test(!self.vsd.taus.is_empty(), "vsd.taus", 0.0, "at least one tau")?;
-        for &tau in &self.vsd.taus {
-            test(tau.is_finite() && tau > 0.0, "vsd.taus", tau, "fractions of the diameter above zero")?;
+        let taus = self.vsd.taus.values();
+        test(!taus.is_empty(), "vsd.taus", 0.0, "at least one tau")?;
+        for &tau in taus {
+            test(
+                tau.is_finite() && tau > 0.0,
+                "vsd.taus",
+                tau,
+                "fractions of the diameter, or metres, above zero",
+            )?;
+        }
+        test(!self.vsd_thresholds.is_empty(), "vsd_thresholds", 0.0, "at least one threshold")?;
+        for &threshold in &self.vsd_thresholds {
+            test((0.0..=1.0).contains(&threshold), "vsd_thresholds", threshold, "errors from 0 to 1")?;
         }
         let visible = self.visib_gt_min.unwrap_or(0.0);
         test((0.0..=1.0).contains(&visible), "visib_gt_min", visible, "a fraction from 0 to 1")?;
@@ -165,8 +216,11 @@ pub struct ObjectScores {
 pub struct Evaluation {
     /// Mean of the three average recalls.
     pub ar: Option<f64>,
-    /// Average recall of VSD, over taus and thresholds .05 to .5.
+    /// Average recall of VSD, over taus and thresholds; of one each, the recall.
     pub ar_vsd: Option<f64>,
+    /// How VSD counts, where it is not as in the BOP Challenge.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vsd_protocol: Option<String>,
     /// Average recall of MSSD, over thresholds .05 to .5 diameters.
     pub ar_mssd: Option<f64>,
     /// Average recall of MSPD, over thresholds 5 to 50 px at an image width of 640.
@@ -443,7 +497,8 @@ fn visible_surface(
         frame.depth()
     };
     let mut truth: Vec<Option<DepthImage>> = vec![None; task.poses.len()];
-    let mut by_tau = vec![vec![vec![1.0; task.poses.len()]; task.estimates.len()]; options.taus.len()];
+    let taus = options.taus.values().len();
+    let mut by_tau = vec![vec![vec![1.0; task.poses.len()]; task.estimates.len()]; taus];
     for (i, estimate) in task.estimates.iter().enumerate() {
         let mut rendered = None;
         for (g, pose) in task.poses.iter().map(|p| &p.camera_from_object).enumerate() {
@@ -630,9 +685,9 @@ pub fn evaluate(
         let by_tau = |tau: usize, threshold: f64| {
             count(&scored, |e| e.vsd.as_ref().map_or(&e.mssd, |v| &v[tau]), threshold)
         };
-        let taus = options.vsd.taus.len();
+        let taus = options.vsd.taus.values().len();
         let all: Vec<Counts> = (0..taus)
-            .flat_map(|tau| fractions.iter().map(move |&t| (tau, t)))
+            .flat_map(|tau| options.vsd_thresholds.iter().map(move |&t| (tau, t)))
             .map(|(a, b)| by_tau(a, b))
             .collect();
         (ar_vsd, vsd_of) = average(&all);
@@ -689,9 +744,13 @@ pub fn evaluate(
         reasons.insert("ar_vsd".to_owned(), reason.clone());
         reasons.entry("ar".to_owned()).or_insert_with(|| format!("needs ar_vsd: {reason}"));
     }
+    let vsd_protocol = options.vsd_protocol();
+    if vsd_protocol.is_some() {
+        reasons.entry("ar".to_owned()).or_insert_with(|| "needs VSD as in the BOP Challenge".to_owned());
+    }
     let (ar_vsd, ar_mssd, ar_mspd) = (keep(ar_vsd), keep(ar_mssd), keep(ar_mspd));
     let ar = match (ar_vsd, ar_mssd, ar_mspd) {
-        (Some(a), Some(b), Some(c)) => Some((a + b + c) / 3.0),
+        (Some(a), Some(b), Some(c)) if vsd_protocol.is_none() => Some((a + b + c) / 3.0),
         _ => None,
     };
     let average_time_per_image = match average_time(estimates) {
@@ -710,6 +769,7 @@ pub fn evaluate(
     Ok(Evaluation {
         ar,
         ar_vsd,
+        vsd_protocol,
         ar_mssd,
         ar_mspd,
         add_s_recall,

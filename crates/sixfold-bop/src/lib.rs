@@ -14,6 +14,7 @@ mod dataset;
 mod dataset_error;
 mod errors;
 mod evaluate;
+pub mod import;
 mod json;
 mod plot;
 mod points;
@@ -36,8 +37,8 @@ pub use coco_truth::{DetectionScores, FoundAtHalf, VisibleTruth, found_at_half, 
 pub use dataset::{BopDataset, MaskKind, Models, Scene, SceneImage};
 pub use dataset_error::{DatasetError, Place};
 pub use errors::{
-    Placement, VsdError, VsdOptions, add, add_s, adi, mspd, mssd, projection_error, rotation_error,
-    translation_error, vsd,
+    PUBLISHED_TAU, Placement, Taus, VsdError, VsdOptions, add, add_s, adi, mspd, mssd, projection_error,
+    rotation_error, translation_error, vsd,
 };
 pub use evaluate::{
     Curves, DetectionEvaluation, EvalError, EvalOptions, Evaluation, ObjectScores, RecallCurves, evaluate,

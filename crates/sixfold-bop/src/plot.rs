@@ -146,6 +146,7 @@ mod tests {
         Evaluation {
             ar: None,
             ar_vsd: None,
+            vsd_protocol: None,
             ar_mssd: Some(recall),
             ar_mspd: Some(recall),
             add_s_recall: BTreeMap::new(),

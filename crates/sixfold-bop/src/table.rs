@@ -17,7 +17,8 @@ pub fn score_table(e: &Evaluation) -> String {
         let [object, targets, vsd, mssd, mspd, add] = columns;
         let _ = writeln!(text, "{object:>8} {targets:>8} {vsd:>8} {mssd:>8} {mspd:>8} {add:>12}");
     };
-    line(["object", "targets", "AR_VSD", "AR_MSSD", "AR_MSPD", "ADD(-S)<0.1d"]);
+    let vsd = if e.vsd_protocol.is_some() { "VSD" } else { "AR_VSD" };
+    line(["object", "targets", vsd, "AR_MSSD", "AR_MSPD", "ADD(-S)<0.1d"]);
     let mut objects: Vec<_> = e.objects.iter().collect();
     objects.sort_by_key(|(id, _)| id.parse::<u32>().unwrap_or(u32::MAX));
     for (id, o) in objects {
@@ -27,6 +28,9 @@ pub fn score_table(e: &Evaluation) -> String {
     let mean = e.add_s_recall.get("mean").copied().flatten();
     let [vsd, mssd, mspd, add] = [e.ar_vsd, e.ar_mssd, e.ar_mspd, mean].map(digits);
     line(["all", &e.targets.to_string(), &vsd, &mssd, &mspd, &add]);
+    if let Some(protocol) = &e.vsd_protocol {
+        let _ = writeln!(text, "VSD: recall of {protocol}");
+    }
     let [ar, add, add_s] = [e.ar, e.add_auc, e.add_s_auc].map(digits);
     let _ = writeln!(text, "AR {ar}   AUC of ADD {add}, of ADD-S {add_s} (to 10 cm)");
     for (score, reason) in &e.reasons {

@@ -114,7 +114,7 @@ impl GroundTruthInfo {
 }
 
 /// First pixel, and last minus first pixel, as BOP writes boxes into `scene_gt_info.json`.
-fn bounding_box(mask: &Mask, left: usize, top: usize) -> Option<Rect> {
+pub(crate) fn bounding_box(mask: &Mask, left: usize, top: usize) -> Option<Rect> {
     let (mut low, mut high) = ([usize::MAX; 2], [0; 2]);
     for y in 0..mask.height() {
         for (x, _) in mask.row(y).iter().enumerate().filter(|(_, p)| **p) {

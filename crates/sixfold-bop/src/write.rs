@@ -73,6 +73,11 @@ impl SceneWriter {
         }
     }
 
+    /// The scene's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
     /// Writes the image files and keeps the text for [`SceneWriter::finish`].
     ///
     /// # Errors

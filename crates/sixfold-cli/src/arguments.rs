@@ -17,6 +17,7 @@ use crate::commands::estimate::arguments::{AFTER_HELP as ESTIMATE_HELP, Estimate
 use crate::commands::eval::EvalArguments;
 use crate::commands::experiments::Forwarded;
 use crate::commands::grasp::arguments::GraspArguments;
+use crate::commands::import::ImportArguments;
 use crate::commands::object::arguments::ObjectArguments;
 use crate::commands::render::RenderArguments;
 use crate::commands::serve::ServeArguments;
@@ -86,6 +87,12 @@ pub(crate) enum Command {
         after_help = crate::commands::simulate_scenes::arguments::AFTER_HELP
     )]
     SimulateScenes(Box<crate::commands::simulate_scenes::arguments::SimulateScenesArguments>),
+    /// Convert a dataset of another format into a BOP dataset
+    #[command(after_help = "Examples:\n  \
+        sixfold import ho3d HO3D_v3 --models YCB_Video_Models/models --every 30 --out ho3d\n  \
+        sixfold import smot SMOT --split train --out smot\n  \
+        sixfold import nol obj_01.hdf5 --camera camera_SMOT.json --out nol-source")]
+    Import(ImportArguments),
     /// Make a training set of new views from at most sixteen cluttered photographs with rough poses
     #[command(hide = !NETWORKS, after_help = SYNTHESIZE_HELP)]
     Synthesize(Box<SynthesizeArguments>),

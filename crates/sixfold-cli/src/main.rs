@@ -38,6 +38,7 @@ fn main() -> ExitCode {
         Command::SimulateDepth(a) => commands::simulate::run(a),
         #[cfg(feature = "physics")]
         Command::SimulateScenes(a) => commands::simulate_scenes::run(a),
+        Command::Import(a) => commands::import::run(a),
         Command::Train(a) => commands::train::run(a),
         Command::Reproduce(_) => commands::experiments::run(),
         Command::Object(a) => commands::object::run(a),

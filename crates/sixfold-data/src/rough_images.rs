@@ -134,13 +134,25 @@ impl RoughImages {
         frames: Option<&Path>,
         options: &RoughImageOptions<'_>,
     ) -> Result<RoughImages, TrainingSetError> {
-        let dataset = BopDataset::open(root, split)?;
+        RoughImages::of_opened(&BopDataset::open(root, split)?, ids, frames, options)
+    }
+
+    /// The same of an opened dataset, with the models that were chosen for it.
+    ///
+    /// # Errors
+    /// [`TrainingSetError`].
+    pub fn of_opened(
+        dataset: &BopDataset,
+        ids: &[u32],
+        frames: Option<&Path>,
+        options: &RoughImageOptions<'_>,
+    ) -> Result<RoughImages, TrainingSetError> {
         let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
         let ids: Vec<u32> = if ids.is_empty() { infos.0.keys().copied().collect() } else { ids.to_vec() };
         if ids.is_empty() {
-            return Err(TrainingSetError::NoObjects { root: root.to_owned() });
+            return Err(TrainingSetError::NoObjects { root: dataset.root().to_owned() });
         }
-        let frames = frames_of(&dataset, frames)?;
+        let frames = frames_of(dataset, frames)?;
         let mut objects = BTreeMap::new();
         for id in ids {
             let mesh = dataset.model(id, Models::Rendering)?;
@@ -150,7 +162,7 @@ impl RoughImages {
         let mut all = RoughImages::default();
         let mut disturber = Disturber::new(options);
         for (number, frame) in frames.iter().enumerate() {
-            all.add_frame(&dataset, (number, *frame), &mut objects, &mut disturber, options)?;
+            all.add_frame(dataset, (number, *frame), &mut objects, &mut disturber, options)?;
         }
         all.leave_out_unseen(objects, frames.len(), options.min_visibility);
         if options.detect.is_some() {

@@ -72,10 +72,23 @@ impl TrainingSet {
         frames: &FrameSelection,
         min_visibility: f64,
     ) -> Result<TrainingSet, TrainingSetError> {
+        TrainingSet::of_opened(&BopDataset::open(root, split)?, ids, frames, min_visibility)
+    }
+
+    /// The same of an opened dataset, with the models that were chosen for it.
+    ///
+    /// # Errors
+    /// [`TrainingSetError`].
+    pub fn of_opened(
+        dataset: &BopDataset,
+        ids: &[u32],
+        frames: &FrameSelection,
+        min_visibility: f64,
+    ) -> Result<TrainingSet, TrainingSetError> {
+        let (root, split) = (dataset.root(), dataset.split());
         if let Some(id) = ids.iter().enumerate().find(|(i, id)| ids[..*i].contains(id)).map(|(_, id)| *id) {
             return Err(TrainingSetError::NamedTwice { id });
         }
-        let dataset = BopDataset::open(root, split)?;
         let infos = dataset.models_info(Models::Rendering)?.unwrap_or_default();
         let ids: Vec<u32> = if ids.is_empty() { infos.0.keys().copied().collect() } else { ids.to_vec() };
         if ids.is_empty() {
@@ -95,19 +108,16 @@ impl TrainingSet {
             FrameSelection::Listed(frames) => frames.clone(),
             FrameSelection::RendersOnly => vec![],
             FrameSelection::All => {
-                let all = frames_with_colour(&dataset)?;
+                let all = frames_with_colour(dataset)?;
                 if all.is_empty() {
-                    return Err(TrainingSetError::NoImages {
-                        root: root.to_owned(),
-                        split: split.to_owned(),
-                    });
+                    return Err(TrainingSetError::NoImages { root: root.to_owned(), split });
                 }
                 all
             }
         };
         frames.sort_unstable();
         frames.dedup();
-        let images = read_posed_images(&dataset, &frames, &ids, min_visibility)?;
+        let images = read_posed_images(dataset, &frames, &ids, min_visibility)?;
         if images.is_empty() && !renders_only {
             let (root, percent) = (root.to_owned(), 100.0 * min_visibility);
             return Err(TrainingSetError::NothingVisible { root, frames: frames.len(), percent });

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use sixfold_align::VerificationMesh;
+use sixfold_bop::import::parsers;
 use sixfold_bop::{
     CocoGroundTruth, IouType, ReadDetections, Rle, evaluate_coco, parse_detections, parse_results,
     parse_scene_camera, parse_scene_gt, parse_scene_gt_info, parse_targets,
@@ -178,6 +179,17 @@ pub(crate) fn results(bytes: &[u8]) {
     }
     let lines = bytes.iter().filter(|b| matches!(b, b'\n' | b'\r')).count() + 1;
     assert!(estimates.len() + bad.len() <= lines, "no more rows than lines");
+}
+
+/// Meta files of HO-3D: data, whatever they would call.
+pub(crate) fn pickle(bytes: &[u8]) {
+    parsers::pickle(bytes);
+}
+
+/// Source images of NOL: no more numbers than the file has bytes for.
+pub(crate) fn hdf5(bytes: &[u8]) {
+    let count = parsers::hdf5(bytes, &["faces"]).unwrap_or(0);
+    assert!(count <= bytes.len(), "every number takes a byte");
 }
 
 pub(crate) fn camera(bytes: &[u8]) {

@@ -37,6 +37,8 @@ pub fn readers() -> Vec<Reader> {
         fast("coco", seeds::coco, checks::coco),
         fast("rle", seeds::rle, checks::rle),
         fast("results", seeds::results, checks::results),
+        fast("pickle", seeds::pickle, checks::pickle),
+        fast("hdf5", seeds::hdf5, checks::hdf5),
         fast("camera", seeds::camera, checks::camera),
         slow(2, fast("images", seeds::images, checks::images)),
         slow(20, summed(fast("ppf", seeds::ppf, checks::ppf))),

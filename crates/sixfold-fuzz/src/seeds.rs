@@ -169,6 +169,48 @@ pub(crate) fn results() -> Vec<Vec<u8>> {
     ])
 }
 
+/// Meta files of HO-3D: by Python 2, in text, and by Python 3 with a function of its own.
+pub(crate) fn pickle() -> Vec<Vec<u8>> {
+    let array = "cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I3\nI1\ntcnumpy\ndtype\n\
+        (S'f4'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntbI00\nS'\\x00\\x00\\x80?\\x00\\x00\\x00@\\x00\\x00@@'\ntb";
+    let text = format!("(dp0\nS'objName'\np1\nS'003_cracker_box'\np2\nsS'objRot'\n{array}sS'camMat'\nNs.");
+    let binary = b"\x80\x04\x95\x40\0\0\0\0\0\0\0}\x94(\x8c\x07objName\x94\x8c\x03004\x94\x8c\x06objRot\x94N\x8c\x01h\x94\
+        \x8c\x05posix\x94\x8c\x06system\x94\x93\x94\x8c\x04true\x94\x85\x94R\x94u.";
+    vec![text.into_bytes(), binary.to_vec()]
+}
+
+/// An HDF5 file with one dataset of 3x1 integers of 64 bits, `faces`.
+pub(crate) fn hdf5() -> Vec<Vec<u8>> {
+    let mut file = vec![0u8; 600];
+    let mut put = |at: usize, bytes: &[u8]| file[at..at + bytes.len()].copy_from_slice(bytes);
+    let number = |n: u64| n.to_le_bytes();
+    // Superblock with the root's header at 96.
+    put(0, b"\x89HDF\r\n\x1a\n\0\0\0\0\0\x08\x08\0\x04\0\x10\0");
+    put(64, &number(96));
+    // Root: one message, the symbol table with its tree at 136 and its heap at 200.
+    put(96, b"\x01\0\x01\0\x01\0\0\0\x18\0\0\0\0\0\0\0\x11\0\x10\0\0\0\0\0");
+    put(120, &number(136));
+    put(128, &number(200));
+    put(136, b"TREE\0\0\x01\0");
+    put(168, &number(280));
+    put(200, b"HEAP\0\0\0\0");
+    put(208, &number(24));
+    put(224, &number(240));
+    put(248, b"faces\0");
+    put(280, b"SNOD\x01\0\x01\0");
+    put(288, &number(8));
+    put(296, &number(340));
+    // The dataset: three messages of 24, 16 and 24 bytes.
+    put(340, b"\x01\0\x03\0\x01\0\0\0\x58\0\0\0\0\0\0\0");
+    put(356, b"\x01\0\x18\0\0\0\0\0\x01\x02\0\0\0\0\0\0\x03\0\0\0\0\0\0\0\x01\0\0\0\0\0\0\0");
+    put(388, b"\x03\0\x10\0\0\0\0\0\x10\x08\0\0\x08\0\0\0\0\0\x40\0\0\0\0\0");
+    put(412, b"\x08\0\x18\0\0\0\0\0\x03\x01");
+    put(422, &number(500));
+    put(430, &number(24));
+    put(500, &number(7));
+    vec![file]
+}
+
 pub(crate) fn camera() -> Vec<Vec<u8>> {
     texts(&[
         r#"{"width": 640, "height": 480, "fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "depth_scale": 1.0}"#,

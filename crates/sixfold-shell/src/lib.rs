@@ -8,6 +8,7 @@
 pub mod screen;
 
 pub mod board;
+pub mod datasets;
 pub mod depth_views;
 pub mod folder;
 pub mod found;

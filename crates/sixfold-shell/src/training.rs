@@ -15,8 +15,10 @@ use sixfold_nn::training::Outcome;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
 
+use crate::datasets;
 use crate::objects;
 use crate::progress::{Progress, interrupted};
+use crate::ranges::folder_name;
 
 /// What a training learns from.
 #[derive(Debug, Args)]
@@ -27,6 +29,9 @@ pub struct MaterialArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it)
+    #[arg(long, value_name = "FOLDER", requires = "dataset", conflicts_with = "objects", value_parser = folder_name)]
+    pub models: Option<String>,
     /// Frames of the split to use as photographs: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "objects")]
     pub frames: Option<PathBuf>,
@@ -62,7 +67,8 @@ pub fn training_set(a: &MaterialArguments, min_visibility: f64) -> Result<Traini
             None if a.renders_only => FrameSelection::RendersOnly,
             None => FrameSelection::All,
         };
-        return TrainingSet::of_dataset(root, &a.split, &a.ids, &frames, min_visibility).map_err(in_words);
+        let dataset = datasets::open(root, &a.split, a.models.as_deref())?;
+        return TrainingSet::of_opened(&dataset, &a.ids, &frames, min_visibility).map_err(in_words);
     }
     if a.objects.is_empty() {
         bail!("what is to be learnt? Give --dataset DIR, or --object NAME_OR_MESH for training on renders");

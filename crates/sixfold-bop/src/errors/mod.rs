@@ -13,4 +13,4 @@ pub use placement::Placement;
 pub use projection::{mspd, projection_error};
 pub use rotation_translation::{rotation_error, translation_error};
 pub use surface::{add, add_s, adi, mssd};
-pub use vsd::{VsdError, VsdOptions, vsd};
+pub use vsd::{PUBLISHED_TAU, Taus, VsdError, VsdOptions, vsd};

@@ -1,5 +1,6 @@
-//! Visible Surface Discrepancy (Hodan, Michel et al. 2018, equation 1), as the BOP Challenge 2019 and later use it:
-//! step cost, visibility "bop19" (missing test depth counts as visible), distances normalised by the diameter.
+//! Visible Surface Discrepancy (Hodan, Michel et al. 2018, equation 1), as the BOP Challenge 2019 and later use it
+//! (step cost, visibility "bop19": missing test depth counts as visible, distances normalised by the diameter), and as
+//! the benchmark of 2018 and the dissertation do (section 3.4.4).
 
 use sixfold_geometry::{Camera, DepthImage};
 use thiserror::Error;
@@ -9,13 +10,51 @@ use thiserror::Error;
 pub struct VsdOptions {
     /// Tolerance of the visibility test in metres: 15 mm in all BOP datasets but ITODD (5 mm).
     pub delta: f64,
-    /// Misalignment tolerances as fractions of the diameter.
-    pub taus: Vec<f64>,
+    /// Misalignment tolerances.
+    pub taus: Taus,
+    /// Whether a model is visible where the test image has no depth: so since 2019 ("bop19"), not in 2018 ("bop18").
+    pub missing_is_visible: bool,
 }
+
+/// Misalignment tolerances of VSD, at least one.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Taus {
+    /// As fractions of the object's diameter.
+    Diameters(Vec<f64>),
+    /// In metres, the same for all objects.
+    Metres(Vec<f64>),
+}
+
+impl Taus {
+    /// The numbers, in their unit.
+    pub fn values(&self) -> &[f64] {
+        let (Taus::Diameters(values) | Taus::Metres(values)) = self;
+        values
+    }
+}
+
+/// Misalignment tolerance of the benchmark of 2018 (Hodan, Michel et al. 2018, section 4.2) and of table 3.6 of the dissertation,
+/// metres.
+pub const PUBLISHED_TAU: f64 = 0.020;
 
 impl Default for VsdOptions {
     fn default() -> Self {
-        VsdOptions { delta: crate::visibility::VISIBILITY_DELTA, taus: crate::score::fractions_05_to_50() }
+        VsdOptions {
+            delta: crate::visibility::VISIBILITY_DELTA,
+            taus: Taus::Diameters(crate::score::fractions_05_to_50()),
+            missing_is_visible: true,
+        }
+    }
+}
+
+impl VsdOptions {
+    /// Those of the benchmark of 2018 and of the dissertation: a tolerance of 20 mm, nothing visible where depth is missing.
+    pub fn published() -> Self {
+        VsdOptions {
+            taus: Taus::Metres(vec![PUBLISHED_TAU]),
+            missing_is_visible: false,
+            ..VsdOptions::default()
+        }
     }
 }
 
@@ -83,8 +122,13 @@ pub fn vsd(
     let columns: Vec<f64> = (0..camera.width).map(|x| ((x as f64 - camera.cx) / camera.fx).powi(2)).collect();
     let mut union = 0u64;
     let mut common = 0u64;
-    // Pixels visible in both whose normalised distance is below tau, by tau.
-    let mut close = vec![0u64; options.taus.len()];
+    // Pixels visible in both whose distance is below tau, by tau.
+    let taus = options.taus.values();
+    let unit = match options.taus {
+        Taus::Diameters(_) => diameter,
+        Taus::Metres(_) => 1.0,
+    };
+    let mut close = vec![0u64; taus.len()];
     for y in 0..camera.height {
         let row = ((y as f64 - camera.cy) / camera.fy).powi(2) + 1.0;
         let pixels = estimate.row(y).iter().zip(ground_truth.row(y)).zip(test.row(y)).zip(&columns);
@@ -95,7 +139,10 @@ pub fn vsd(
             }
             let ray = (column + row).sqrt();
             let (e, g) = (f64::from(e) * ray, f64::from(g) * ray);
-            let visible = |d: f64| !is_depth(t) || d - f64::from(t) * ray <= options.delta;
+            let visible = |d: f64| match is_depth(t) {
+                true => d - f64::from(t) * ray <= options.delta,
+                false => options.missing_is_visible,
+            };
             let visible_g = has_g && visible(g);
             // A pixel of the estimate on the visible ground truth is visible even behind it: otherwise an
             // estimate could hide (Hodan et al. 2016, equation 14).
@@ -103,15 +150,15 @@ pub fn vsd(
             union += u64::from(visible_g || visible_e);
             if visible_g && visible_e {
                 common += 1;
-                let distance = (g - e).abs() / diameter;
-                for (count, &tau) in close.iter_mut().zip(&options.taus) {
+                let distance = (g - e).abs() / unit;
+                for (count, &tau) in close.iter_mut().zip(taus) {
                     *count += u64::from(distance < tau);
                 }
             }
         }
     }
     if union == 0 {
-        return Ok(vec![1.0; options.taus.len()]);
+        return Ok(vec![1.0; taus.len()]);
     }
     // Costs of the common pixels plus all pixels visible in one only.
     Ok(close.iter().map(|&n| ((common - n) + (union - common)) as f64 / union as f64).collect())
@@ -132,7 +179,7 @@ mod tests {
     }
 
     fn compute(e: [f32; 10], g: [f32; 10], t: [f32; 10]) -> Vec<f64> {
-        let options = VsdOptions { delta: 0.015, taus: vec![0.05, 0.5] };
+        let options = VsdOptions { taus: Taus::Diameters(vec![0.05, 0.5]), ..VsdOptions::default() };
         vsd(&depth(e), &depth(g), &depth(t), &camera(), 0.1, &options).unwrap()
     }
 
@@ -194,11 +241,31 @@ mod tests {
     }
 
     #[test]
+    fn as_published_by_hand() {
+        // The tolerance is 20 mm whatever the diameter: 19 mm are close, 21 mm are not.
+        let published = |e: [f32; 10], g: [f32; 10], t: [f32; 10], diameter: f64| {
+            vsd(&depth(e), &depth(g), &depth(t), &camera(), diameter, &VsdOptions::published()).unwrap()
+        };
+        let g = [OUT, 1.0, 1.0, 1.0, 1.0, OUT, OUT, OUT, OUT, OUT];
+        let e = [OUT, 1.019, 1.019, 1.019, 1.021, OUT, OUT, OUT, OUT, OUT];
+        for diameter in [0.05, 0.5] {
+            assert_eq!(published(e, g, g, diameter), vec![0.25]);
+        }
+        // Of four pixels of the ground truth one has no depth: three count. The estimate misses one of them, and has one more where
+        // depth is missing, which counts for nothing: 1 of 3. Since 2019 both count: 2 of 5.
+        let t = [OUT, OUT, 1.0, 1.0, 1.0, OUT, 2.0, 2.0, 2.0, 2.0];
+        let e = [OUT, 1.0, 1.0, 1.0, OUT, 1.0, OUT, OUT, OUT, OUT];
+        assert_eq!(published(e, g, t, 0.1), vec![1.0 / 3.0]);
+        assert_eq!(compute(e, g, t), vec![0.4, 0.4]);
+    }
+
+    #[test]
     fn distances_are_along_the_ray() {
         // At 45 degrees a depth error of 60 mm is 85 mm along the ray: above 0.7 diameters of 0.1 m.
         let camera = Camera::new(1.0, 1.0, 0.0, 0.0, 2, 1).unwrap();
         let image = |z: f32| Image::from_vec(2, 1, vec![0.0, z]).unwrap();
-        let options = VsdOptions { delta: 0.1, taus: vec![0.7, 0.9] };
+        let options =
+            VsdOptions { delta: 0.1, taus: Taus::Diameters(vec![0.7, 0.9]), ..VsdOptions::default() };
         let found = vsd(&image(1.06), &image(1.0), &image(1.0), &camera, 0.1, &options).unwrap();
         assert_eq!(found, vec![1.0, 0.0]);
     }

@@ -6,17 +6,18 @@ use anyhow::{Result, anyhow};
 use clap::Args;
 use serde::Serialize;
 use sixfold_bop::{
-    Adjustment, BopDataset, DetectionEvaluation, EvalOptions, Evaluation, VisibleTruth,
+    Adjustment, BopDataset, DetectionEvaluation, EvalOptions, Evaluation, Taus, VisibleTruth,
     detection_score_table, evaluate, evaluate_detection, read_results, read_results_lenient,
     score_detections, score_table, write_recall_curves,
 };
 
 use sixfold_shell::Outcome;
+use sixfold_shell::datasets;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::Bar;
-use sixfold_shell::ranges::in_range;
+use sixfold_shell::ranges::{folder_name, in_range};
 
 #[derive(Debug, Args)]
 pub(crate) struct EvalArguments {
@@ -26,9 +27,16 @@ pub(crate) struct EvalArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Targets file (default: the dataset's test_targets_bop19.json, or all ground truth)
-    #[arg(long, value_name = "FILE")]
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models_eval, or models without it)
+    #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
+    pub models: Option<String>,
+    /// Targets file, or all: every annotated pose that is at least 10 % visible (default: the dataset's test_targets_bop19.json, or all
+    /// without it; with --preset published all)
+    #[arg(long, value_name = "FILE|all")]
     pub targets: Option<PathBuf>,
+    /// Score only these objects (default: all)
+    #[arg(long, value_name = "ID", value_delimiter = ',', conflicts_with_all = ["detections", "detection_ap"])]
+    pub ids: Vec<u32>,
     /// Results in the BOP CSV format
     #[arg(long, value_name = "FILE.csv", required_unless_present = "detections")]
     pub results: Option<PathBuf>,
@@ -56,6 +64,17 @@ pub(crate) struct EvalArguments {
     /// Leave out VSD, which renders every pose
     #[arg(long)]
     pub no_vsd: bool,
+    /// VSD as in the dissertation (table 3.6) and the benchmark of 2018: recall at an error below 0.3, tolerance 20 mm, nothing visible
+    /// where depth is missing, every pose that is at least 10 % visible
+    #[arg(long, value_parser = ["published"], conflicts_with_all = ["no_vsd", "detections"])]
+    pub preset: Option<String>,
+    /// VSD's tolerance of depth between the two poses, millimetres (default: 5 to 50 % of the diameter in ten steps; with --preset
+    /// published: 20)
+    #[arg(long, value_name = "MM", value_parser = vsd_tau, conflicts_with_all = ["no_vsd", "detections"])]
+    pub vsd_tau: Option<f64>,
+    /// VSD's error below which a pose is right, 0 to 1 (default: 0.05 to 0.5 in ten steps; with --preset published: 0.3)
+    #[arg(long, value_name = "ERROR", value_parser = score, conflicts_with_all = ["no_vsd", "detections"])]
+    pub vsd_threshold: Option<f64>,
     /// VSD's tolerance of depth in visibility, millimetres (default: as in the BOP Challenge, 5 for a dataset folder named itodd, 15
     /// for all others)
     #[arg(long, value_name = "MM", conflicts_with_all = ["no_vsd", "detections"])]
@@ -73,6 +92,12 @@ fn score(text: &str) -> Result<f64, String> {
     if (0.0..=1.0).contains(&score) { Ok(score) } else { Err(format!("found {score}, expected 0 to 1")) }
 }
 
+/// A tolerance of VSD in millimetres.
+fn vsd_tau(text: &str) -> Result<f64, String> {
+    let tau = text.parse().ok().filter(|tau: &f64| *tau > 0.0 && *tau <= 1000.0);
+    tau.ok_or_else(|| format!("found {text}, expected millimetres above 0, at most 1000"))
+}
+
 /// What all objects are called where their names count for nothing.
 const ANY_OBJECT: u32 = 0;
 
@@ -85,7 +110,7 @@ struct Whole {
 }
 
 pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
-    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let dataset = datasets::open(&a.dataset, &a.split, a.models.as_deref())?;
     if a.detections.is_some() {
         return coco(a, &dataset);
     }
@@ -102,14 +127,14 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
             row.expected
         );
     }
-    let mut targets = dataset.targets(a.targets.as_deref())?;
+    let mut targets = match (&a.targets, &a.preset) {
+        (None, Some(_)) => dataset.all_targets()?,
+        (file, _) => datasets::targets(&dataset, file.as_deref())?,
+    };
     let left_out = excepted(&dataset, a.except.as_deref())?;
     targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
-    let mut options = EvalOptions { compute_vsd: !a.no_vsd, ..EvalOptions::for_dataset(&a.dataset) };
-    if let Some(millimetres) = a.vsd_delta {
-        in_range("--vsd-delta", millimetres, 0.0..=1000.0)?;
-        options.vsd.delta = 1e-3 * millimetres;
-    }
+    let targets = datasets::of_objects(&dataset, targets, &a.ids)?;
+    let options = options(a)?;
     let bar = Bar::new("images");
     let localisation = evaluate(&dataset, &estimates, &targets, &options, &bar)?;
     bar.finish();
@@ -133,6 +158,24 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
     } else {
         Outcome::NothingFound
     }))
+}
+
+/// How the options say that poses are scored.
+fn options(a: &EvalArguments) -> Result<EvalOptions> {
+    let usual = EvalOptions::for_dataset(&a.dataset);
+    let mut options = if a.preset.is_some() { EvalOptions::published() } else { usual };
+    options.compute_vsd = !a.no_vsd;
+    if let Some(millimetres) = a.vsd_delta {
+        in_range("--vsd-delta", millimetres, 0.0..=1000.0)?;
+        options.vsd.delta = 1e-3 * millimetres;
+    }
+    if let Some(millimetres) = a.vsd_tau {
+        options.vsd.taus = Taus::Metres(vec![1e-3 * millimetres]);
+    }
+    if let Some(threshold) = a.vsd_threshold {
+        options.vsd_thresholds = vec![threshold];
+    }
+    Ok(options)
 }
 
 /// Box and mask AP of detections, in COCO's terms.

@@ -12,6 +12,7 @@ pub(crate) mod estimate;
 pub(crate) mod eval;
 pub(crate) mod experiments;
 pub(crate) mod grasp;
+pub(crate) mod import;
 pub(crate) mod object;
 pub(crate) mod render;
 pub(crate) mod serve;

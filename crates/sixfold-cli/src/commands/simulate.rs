@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use sixfold_bop::{BopDataset, DepthSimulation, Models, SceneWriter, Target, write_camera, write_targets};
+use sixfold_bop::{DepthSimulation, Models, SceneWriter, Target, write_camera, write_targets};
 use sixfold_render::DepthSensor;
 
 use sixfold_shell::Outcome;
+use sixfold_shell::datasets;
 use sixfold_shell::folder::{Contents, DatasetFolder, OutputFolder, copy_files};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
@@ -49,6 +50,10 @@ pub(crate) struct SimulateArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test", value_parser = folder_name)]
     pub split: String,
+    /// Folder of the dataset's models to render and copy, such as models_cad or models_reconst of T-LESS (default: models, or models_eval
+    /// without it)
+    #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
+    pub models: Option<String>,
     /// New dataset folder
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -79,14 +84,14 @@ impl SimulateArguments {
     fn deciding(&self) -> Value {
         json!({
             "dataset": self.dataset, "split": self.split, "sensor": format!("{:?}", self.sensor), "rgb": self.rgb,
-            "images": self.images, "no-table": self.no_table, "seed": self.seed,
+            "models": self.models, "images": self.images, "no-table": self.no_table, "seed": self.seed,
         })
     }
 }
 
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
-    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let dataset = datasets::open(&a.dataset, &a.split, a.models.as_deref())?;
     // Written last: without it a run was stopped, and this one makes all of it again.
     let targets_file = a.out.join("test_targets_bop19.json");
     if targets_file.exists() {

@@ -32,17 +32,7 @@ fn itodd_has_a_delta_of_its_own() {
     let dir = tiny.path();
     // Poses 12 mm behind the truth: what of them is visible depends on whether the delta is 5 or 15 mm.
     tiny.write_truth_as_results("results.csv");
-    let text = std::fs::read_to_string(dir.join("results.csv")).unwrap();
-    let moved = |line: &str| {
-        let mut fields: Vec<String> = line.split(',').map(str::to_owned).collect();
-        let mut t: Vec<f64> = fields[5].split(' ').map(|v| v.parse().unwrap()).collect();
-        t[2] += 12.0;
-        fields[5] = t.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-        fields.join(",")
-    };
-    let (head, rows) = text.split_once('\n').unwrap();
-    let rows: Vec<String> = rows.lines().map(moved).collect();
-    std::fs::write(dir.join("results.csv"), format!("{head}\n{}\n", rows.join("\n"))).unwrap();
+    move_results(dir, 12.0);
     let vsd = |arguments: &str| {
         let json = sixfold(dir, &format!("{arguments} --json")).expect(0).json();
         json["ar_vsd"].as_f64().unwrap()
@@ -55,6 +45,79 @@ fn itodd_has_a_delta_of_its_own() {
     assert_eq!(vsd(&itodd), five);
     assert_eq!(vsd(&format!("{itodd} --vsd-delta 15")), default);
     fails(dir, &format!("{itodd} --vsd-delta 5000"), &["--vsd-delta", "5000"]);
+}
+
+/// The results with every pose moved along the camera's axis, millimetres.
+fn move_results(dir: &std::path::Path, millimetres: f64) {
+    let text = std::fs::read_to_string(dir.join("results.csv")).unwrap();
+    let moved = |line: &str| {
+        let mut fields: Vec<String> = line.split(',').map(str::to_owned).collect();
+        let mut t: Vec<f64> = fields[5].split(' ').map(|v| v.parse().unwrap()).collect();
+        t[2] += millimetres;
+        fields[5] = t.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        fields.join(",")
+    };
+    let (head, rows) = text.split_once('\n').unwrap();
+    let rows: Vec<String> = rows.lines().map(moved).collect();
+    std::fs::write(dir.join("results.csv"), format!("{head}\n{}\n", rows.join("\n"))).unwrap();
+}
+
+#[test]
+fn vsd_as_published_is_recall_at_one_tolerance() {
+    let tiny = Tiny::new(true);
+    let dir = tiny.path();
+    let vsd = |options: &str| {
+        let run = sixfold(dir, &format!("{ARGUMENTS} --json {options}")).expect(0);
+        run.json()
+    };
+    // Half of the targets are asked for by the dataset's own file; as published all annotated poses count.
+    let targets = tiny.file("test_targets_bop19.json");
+    let text = std::fs::read_to_string(&targets).unwrap();
+    let lines: Vec<&str> = text.lines().filter(|l| l.contains("\"im_id\":0")).collect();
+    std::fs::write(&targets, format!("[{}]", lines.join("\n").trim_end_matches(','))).unwrap();
+    // Further away by 12 mm is within 20 mm, by 21 mm it is not; each pose is right or wrong as a whole.
+    tiny.write_truth_as_results("results.csv");
+    move_results(dir, -12.0);
+    let json = vsd("--preset published");
+    assert_eq!((json["ar_vsd"].as_f64(), json["targets"].as_u64()), (Some(1.0), Some(6)), "{json}");
+    assert!(json["ar"].is_null() && json["reasons"]["ar"].is_string(), "{json}");
+    let protocol = json["vsd_protocol"].as_str().unwrap();
+    assert!(["0.3", "20 mm", "missing"].iter().all(|part| protocol.contains(part)), "{protocol}");
+    assert_eq!(vsd("")["targets"], 2);
+    assert_eq!(vsd("--targets all")["targets"], 6);
+    assert!(vsd("")["vsd_protocol"].is_null());
+    let two = vsd("--targets all --ids 2");
+    assert_eq!((&two["targets"], two["objects"].as_object().unwrap().len()), (&3.into(), 1), "{two}");
+    fails(dir, &format!("{ARGUMENTS} --ids 3"), &["--ids", "none of these"]);
+    move_results(dir, -9.0);
+    assert_eq!(vsd("--preset published")["ar_vsd"], 0.0);
+    assert_eq!(vsd("--preset published --vsd-tau 40")["ar_vsd"], 1.0);
+    assert_eq!(vsd("--vsd-tau 40 --vsd-threshold 0.3")["ar_vsd"], 1.0);
+    let run = sixfold(dir, &format!("{ARGUMENTS} --preset published")).expect(0);
+    assert!(run.stdout.contains("tolerances of 20 mm") && !run.stdout.contains("AR_VSD"), "{}", run.stdout);
+    fails(dir, &format!("{ARGUMENTS} --vsd-tau 0"), &["--vsd-tau", "above 0"]);
+}
+
+#[test]
+fn models_of_another_folder_are_scored_with() {
+    let tiny = Tiny::new(true);
+    tiny.write_truth_as_results("results.csv");
+    // As T-LESS has them: no folder `models`. Object 1 is another shape in models_reconst, and a symmetric one there.
+    std::fs::rename(tiny.file("models"), tiny.file("models_cad")).unwrap();
+    fails(
+        tiny.path(),
+        &format!("{ARGUMENTS} --models models_reconst"),
+        &["--models", "models_reconst", "models_cad"],
+    );
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --models models_cad --json")).expect(0).json();
+    assert_eq!(json["ar"], 1.0, "{json}");
+    std::fs::create_dir(tiny.file("models_reconst")).unwrap();
+    let model = tiny.file("models_cad/obj_000002.ply");
+    std::fs::copy(&model, tiny.file("models_reconst/obj_000001.ply")).unwrap();
+    std::fs::copy(&model, tiny.file("models_reconst/obj_000002.ply")).unwrap();
+    // Of other models nothing is known: diameter and symmetries are in the folder's own file.
+    let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --models models_reconst --json")).expect(1).json();
+    assert!(json["reasons"]["ar"].as_str().unwrap().contains("models_info.json"), "{json}");
 }
 
 #[test]

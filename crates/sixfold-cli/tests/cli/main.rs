@@ -13,6 +13,7 @@ mod experience;
 #[cfg(unix)]
 mod experiments;
 mod folders;
+mod formats;
 mod grasp;
 mod hostile_meshes;
 mod image;

@@ -22,8 +22,10 @@ use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject, PpfOptions};
 use sixfold_render::render_depth;
 
 use sixfold_shell::Outcome;
+use sixfold_shell::datasets;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
+use sixfold_shell::ranges::folder_name;
 
 /// `sixfold reproduce mttm`.
 #[derive(Debug, Args)]
@@ -34,6 +36,10 @@ pub(crate) struct ReproduceMttmArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it; for
+    /// scores the other way about)
+    #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
+    pub models: Option<String>,
     /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
     #[arg(long, value_name = "FILE")]
     pub targets: Option<PathBuf>,
@@ -183,6 +189,8 @@ struct Inputs {
     version: String,
     dataset: String,
     split: String,
+    #[serde(default)]
+    models: Option<String>,
     ppf: bool,
     /// Fingerprint of the network.
     network: String,
@@ -198,7 +206,7 @@ struct Known {
 }
 
 pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Outcome> {
-    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let dataset = datasets::open(&a.dataset, &a.split, a.models.as_deref())?;
     let targets = dataset.object_targets(&dataset.targets(a.targets.as_deref())?)?;
     let model = match &a.weights {
         Some(file) => MttmModel::load(file).context("--weights")?,
@@ -209,6 +217,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
         version: env!("CARGO_PKG_VERSION").into(),
         dataset: a.dataset.display().to_string(),
         split: a.split.clone(),
+        models: a.models.clone(),
         ppf: !a.no_ppf,
         network: format!("{:016x}", model.fingerprint()),
     };

@@ -109,9 +109,16 @@ pub(crate) struct CommonArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
-    #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it)
+    #[arg(long, value_name = "FOLDER", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE, value_parser = ranges::folder_name)]
+    pub models: Option<String>,
+    /// Targets file of the dataset, or all: every annotated pose that is at least 10 % visible (default: its test_targets_bop19.json,
+    /// or all without it)
+    #[arg(long, value_name = "FILE|all", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub targets: Option<PathBuf>,
+    /// Objects of the dataset to search for (default: all targets)
+    #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
+    pub ids: Vec<u32>,
     /// Leave out these frames of the dataset, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub except: Option<PathBuf>,

@@ -7,6 +7,7 @@ use anyhow::{Result, anyhow, bail};
 use sixfold_bop::{BopDataset, Target};
 use sixfold_runner::{DatasetEvent, DatasetRun, ImageResult, RegionSource, RunError};
 use sixfold_shell::Outcome;
+use sixfold_shell::datasets;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::found::overlay_of;
 use sixfold_shell::frames::excepted;
@@ -24,11 +25,11 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     }
     // The files that they name are hashed before they are read: what changes in between is never taken for the same.
     let options = a.run_options();
-    let dataset = BopDataset::open(root, &common.split)?;
-    let mut targets = dataset.targets(common.targets.as_deref())?;
+    let dataset = datasets::open(root, &common.split, common.models.as_deref())?;
+    let mut targets = datasets::targets(&dataset, common.targets.as_deref())?;
     let left_out = excepted(&dataset, common.except.as_deref())?;
     targets.retain(|t| !left_out.contains(&(t.scene_id, t.im_id)));
-    let targets = dataset.object_targets(&targets)?;
+    let targets = dataset.object_targets(&datasets::of_objects(&dataset, targets, &common.ids)?)?;
     let (regions, mut skipped) = regions(common, &dataset, &targets)?;
     let estimator = a.method.build(a.of_method(), common)?;
     let images: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();

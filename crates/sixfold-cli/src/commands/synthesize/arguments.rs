@@ -66,6 +66,9 @@ pub(crate) struct SynthesizeArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it)
+    #[arg(long, value_name = "FOLDER", requires = "dataset", conflicts_with = "photographs", value_parser = ranges::folder_name)]
+    pub models: Option<String>,
     /// Frames of the split to use as photographs: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "photographs")]
     pub frames: Option<PathBuf>,
@@ -252,7 +255,7 @@ impl SynthesizeArguments {
     pub fn deciding(&self) -> Value {
         json!({
             "version": env!("CARGO_PKG_VERSION"),
-            "dataset": self.dataset, "split": self.split, "frames": self.frames, "ids": self.ids,
+            "dataset": self.dataset, "split": self.split, "models": self.models, "frames": self.frames, "ids": self.ids,
             "photographs": self.photographs, "new_split": self.new_split, "sources": self.sources,
             "per_view": self.per_view, "least_visible": self.least_visible,
             "weighting": format!("{:?}", self.weighting), "weights": self.weights,

@@ -8,6 +8,7 @@ use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_geometry::RgbImage;
 use sixfold_runner::detections;
+use sixfold_shell::datasets;
 use sixfold_shell::folder::Contents;
 
 use super::arguments::SynthesizeArguments;
@@ -26,7 +27,10 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
         detect: if detector.is_some() { Some(&detect) } else { None },
     };
     let images = match (&a.dataset, &a.photographs) {
-        (Some(root), _) => RoughImages::of_dataset((root, &a.split), &a.ids, a.frames.as_deref(), &options),
+        (Some(root), _) => {
+            let dataset = datasets::open(root, &a.split, a.models.as_deref())?;
+            RoughImages::of_opened(&dataset, &a.ids, a.frames.as_deref(), &options)
+        }
         (None, Some(file)) => {
             let id = match detector.as_ref().map(|d| d.model().classes()) {
                 None => 1,

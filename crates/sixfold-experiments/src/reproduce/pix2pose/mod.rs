@@ -26,8 +26,10 @@ use self::row::{Row, Setting};
 use super::kept::{kept_or_made, same_inputs};
 use sixfold_runner::RegionSource;
 use sixfold_shell::Outcome;
+use sixfold_shell::datasets;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::check_interrupt;
+use sixfold_shell::ranges::folder_name;
 use sixfold_shell::training::was_trained_on;
 
 #[derive(Debug, Args)]
@@ -38,6 +40,10 @@ pub(crate) struct ReproducePix2PoseArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it; for
+    /// scores the other way about)
+    #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
+    pub models: Option<String>,
     /// Frames that the model was trained on, which are left out: JSON as for `sixfold train pix2pose`
     #[arg(long, value_name = "FILE")]
     pub frames: PathBuf,
@@ -79,6 +85,7 @@ struct Inputs {
     version: &'static str,
     dataset: String,
     split: String,
+    models: Option<String>,
     weights: String,
     /// FNV-1a of the weight file.
     weights_hash: String,
@@ -149,7 +156,7 @@ const QUICK: usize = 8;
 
 pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Result<Outcome> {
     let pix2pose = Pix2Pose::load(&a.weights)?;
-    let dataset = BopDataset::open(&a.dataset, &a.split)?;
+    let dataset = datasets::open(&a.dataset, &a.split, a.models.as_deref())?;
     let trained_on: BTreeSet<(u32, u32)> =
         dataset.targets(Some(&a.frames))?.iter().map(|t| (t.scene_id, t.im_id)).collect();
     let targets = test_targets(a, &dataset, &trained_on, &pix2pose)?;
@@ -157,6 +164,7 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
         version: env!("CARGO_PKG_VERSION"),
         dataset: a.dataset.display().to_string(),
         split: a.split.clone(),
+        models: a.models.clone(),
         weights: a.weights.display().to_string(),
         weights_hash: format!(
             "{:016x}",

@@ -146,6 +146,7 @@ impl Training {
         let renders_only = self.of == Of::Fourfold;
         let material = training_set(
             &MaterialArguments {
+                models: a.models.clone().filter(|_| *dataset == *a.dataset),
                 dataset: Some(dataset.to_owned()),
                 split: a.split.clone(),
                 frames: (!renders_only).then(|| a.frames.clone()),
