@@ -97,14 +97,11 @@ impl TrialFile {
         let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
         let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path).map_err(io)?;
         let header = serde_json::to_string(options).map_err(|e| io(e.into()))?;
-        match whole.lines().next() {
-            Some(found) if found != header => {
-                let file = path.display().to_string();
-                let expected =
-                    format!("{header}: trials with other options; give the same ones, or another file");
-                return Err(TrialsError::Content { file, line: 1, found: found.to_owned(), expected });
-            }
-            _ => {}
+        if let Some(found) = whole.lines().next().filter(|found| *found != header) {
+            let file = path.display().to_string();
+            let expected =
+                format!("{header}: trials with other options; give the same ones, or another file");
+            return Err(TrialsError::Content { file, line: 1, found: found.to_owned(), expected });
         }
         file.set_len(whole.len() as u64).map_err(io)?;
         file.seek(SeekFrom::End(0)).map_err(io)?;

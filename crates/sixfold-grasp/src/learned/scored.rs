@@ -32,8 +32,11 @@ pub fn best_of_clusters(grasps: &[ScoredGrasp], options: &ClusterOptions) -> Vec
         let ScoredGrasp { grasp: best, score: best_score } = grasps[seed];
         let mut cluster = GraspCluster { best, best_score, members: 0, score: 0.0 };
         for &i in &order {
+            if !left[i] {
+                continue;
+            }
             let (distance, angle) = best.difference(&grasps[i].grasp);
-            if left[i] && distance <= options.distance && angle <= options.angle {
+            if distance <= options.distance && angle <= options.angle {
                 left[i] = false;
                 cluster.members += 1;
                 cluster.score += grasps[i].score;
