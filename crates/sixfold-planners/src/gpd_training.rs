@@ -94,3 +94,52 @@ impl Training for GpdTraining {
         vec![&mut self.learner]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, DepthImage, Mask, Plane, PointCloud, Vec3};
+    use sixfold_grasp::{AntipodalQuality, Grasp, GraspView, Gripper, gripper_pose};
+
+    use super::*;
+    use crate::network::GpdConfig;
+
+    /// A wall across the closing direction: held when it is near the centre between the pads.
+    fn sample(number: u64) -> Sample<ClosingRegion> {
+        let gripper = Gripper::built_in("jaws-140").unwrap();
+        let x = stream(1, number).random_range(-0.06..0.06);
+        let mut object = PointCloud::default();
+        for (i, k) in (-7..=7).flat_map(|i| (0..=10).map(move |k| (i, k))) {
+            object.points.push(Vec3::new(x, 0.003 * f64::from(i), 0.5 - 0.003 * f64::from(k)));
+            object.normals.push(Vec3::x());
+        }
+        let view = GraspView {
+            camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
+            depth: DepthImage::filled(64, 64, 0.0),
+            mask: Mask::filled(64, 64, false),
+            table: Some(Plane { normal: -Vec3::z(), offset: -0.6 }),
+            object,
+            obstacles: PointCloud::default(),
+            step: 0.003,
+            cut_by_edge: false,
+        };
+        let pose = gripper_pose(&Vec3::new(0.0, 0.0, 0.5), &Vec3::z(), &Vec3::x()).unwrap();
+        let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.5, observed: 1.0 };
+        let grasp = Grasp { camera_from_gripper: pose, opening: 0.14, width: 0.01, quality };
+        let seen = ClosingRegion::new(&view, &gripper, &grasp);
+        Sample { seen, held: x.abs() < 0.03, scene: number }
+    }
+
+    #[test]
+    fn walls_near_the_centre_are_told_from_others() {
+        let samples: Vec<Sample<ClosingRegion>> = (0..128).map(sample).collect();
+        let device = Device::flex().autodiff();
+        let options = crate::recipe::GpdRecipe::default().options();
+        let mut training = GpdTraining::new(GpdConfig.init(1, &device), options, device);
+        let batches = training.batches(&samples);
+        let losses: Vec<Losses> = (0..25).map(|step| training.step(batches(step), 1e-3)).collect();
+        let of = |name: &str| losses.iter().map(|l| l[name]).collect::<Vec<f64>>();
+        println!("{:.3?} {:.2?}", of("cross entropy"), of("classified correctly"));
+        assert!(of("cross entropy")[24] < 0.5 * of("cross entropy")[0], "{:?}", of("cross entropy"));
+        assert!(of("classified correctly")[24] > 0.85, "{:?}", of("classified correctly"));
+    }
+}

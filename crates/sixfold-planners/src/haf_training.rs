@@ -191,3 +191,64 @@ impl Training for HafTraining {
         vec![self]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use sixfold_grasp::learned::CELLS;
+    use sixfold_nn::training::{Outcome, fit};
+
+    use super::*;
+
+    /// Ridges across the hand that are held when they are near its centre and high, and noise.
+    fn samples() -> Vec<Sample<HeightGrid>> {
+        (0..300)
+            .map(|number| {
+                let mut random = stream(7, number);
+                let (at, height) = (random.random_range(1..CELLS - 1), random.random_range(0..2u32));
+                let mut cell = |x: usize| {
+                    let noise = 0.002 * random.random::<f32>();
+                    noise + if x.abs_diff(at) <= 1 { 0.02 + 0.02 * height as f32 } else { -0.03 }
+                };
+                let heights = std::array::from_fn(|_| std::array::from_fn(&mut cell));
+                let held = height == 1 && (4..10).contains(&at);
+                Sample { seen: HeightGrid::from_heights(heights), held, scene: number }
+            })
+            .collect()
+    }
+
+    fn trained(samples: &Arc<HafSamples>, folder: &Path, stop_at: Option<u64>) -> Option<HafTraining> {
+        let mut training = HafTraining::new(60, 3);
+        let stop = AtomicBool::new(false);
+        let outcome = fit(&mut training, samples, folder, &stop, |record| {
+            stop.store(stop_at.is_some_and(|step| record.step >= step), Ordering::Relaxed);
+        });
+        matches!(outcome.unwrap(), Outcome::Finished(())).then_some(training)
+    }
+
+    #[test]
+    fn ridges_near_the_centre_are_told_from_others_and_a_stopped_training_ends_the_same() {
+        let seen = samples();
+        let samples = Arc::new(HafSamples::new(&seen, 0));
+        let folder = tempfile::tempdir().unwrap();
+        let straight = trained(&samples, &folder.path().join("a"), None).unwrap();
+        let interrupted = folder.path().join("b");
+        assert!(trained(&samples, &interrupted, Some(25)).is_none());
+        let resumed = trained(&samples, &interrupted, None).unwrap();
+        assert_eq!(bits(&straight.weights), bits(&resumed.weights));
+        let model = samples.model(&straight.weights, serde_json::json!({}));
+        let right = seen.iter().filter(|s| (model.margin(&s.seen) > 0.0) == s.held).count();
+        assert!(right > 270, "{right} of 300");
+        // The model's own features give the margins of the training.
+        let margin = dot(&straight.weights, &samples.rows[0]);
+        assert!((f64::from(model.margin(&seen[0].seen)) - margin).abs() < 1e-2, "{margin}");
+        // Higher margins are likelier, and on average as likely as they held.
+        let scores: Vec<f64> = seen.iter().map(|s| model.score(&s.seen)).collect();
+        let held = seen.iter().filter(|s| s.held).count() as f64 / 300.0;
+        assert!((scores.iter().sum::<f64>() / 300.0 - held).abs() < 0.03);
+        assert!(model.probability[0] > 0.0);
+    }
+}

@@ -259,13 +259,13 @@ mod tests {
     #[test]
     fn a_stopped_set_is_completed_to_the_same_bytes() {
         let folder = tempfile::tempdir().unwrap();
-        let options = TrialSetOptions { scenes: 10, seed: 5 };
+        let options = TrialSetOptions { scenes: 5, seed: 5 };
         let whole = folder.path().join("whole.jsonl");
         let rows = complete(&whole, &options, &()).unwrap().unwrap();
-        assert_eq!(rows.len(), 10);
+        assert_eq!(rows.len(), 5);
         let count: usize = rows.iter().map(|r| r.candidates.len()).sum();
         let held = rows.iter().flat_map(|r| &r.candidates).filter(|c| c.held).count();
-        assert!(count > 60 && held > 0 && held < count, "{held} of {count}");
+        assert!(count > 20 && held > 0 && held < count, "{held} of {count}");
         // Stopped within a line.
         let bytes = std::fs::read(&whole).unwrap();
         let cut = folder.path().join("cut.jsonl");

@@ -61,3 +61,25 @@ impl Hardness {
         *world_from_gripper * Pose::exp(&[shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]].into())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::Vec3;
+
+    #[test]
+    fn the_hand_errs_in_the_hard_setting_alone_and_the_same_for_the_same_seed() {
+        let gripper = || Gripper::built_in("jaws-140").unwrap();
+        let sent = Pose::from_translation(Vec3::new(0.1, 0.2, 0.3));
+        let usual = Hardness::usual(gripper(), TrialOptions::default());
+        assert_eq!(usual.reached(&sent, 1), sent);
+        let hard = Hardness::hard(gripper(), TrialOptions::default());
+        assert_eq!(hard.reached(&sent, 1), hard.reached(&sent, 1));
+        let moved: Vec<f64> = (0..200).map(|seed| hard.reached(&sent, seed).distance_to(&sent)).collect();
+        // The mean length of three normal numbers with a deviation of 5 mm is 8 mm.
+        let mean = moved.iter().sum::<f64>() / 200.0;
+        assert!((mean - 0.008).abs() < 0.001, "{mean}");
+        assert_eq!((hard.gripper.friction, hard.real.friction), (gripper().friction, HARD_FRICTION));
+        assert_eq!((usual.options.trial.mass, hard.options.trial.mass), (0.2, HARD_MASS));
+    }
+}
