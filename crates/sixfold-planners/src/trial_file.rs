@@ -1,4 +1,4 @@
-//! The file of trials: the options in the first line, then a scene a line, so that a stopped run continues and both planners learn
+//! The file of trials: the seed in the first line, then a scene a line, so that a stopped run continues and both planners learn
 //! from the same trials.
 
 use std::fs::{File, OpenOptions};
@@ -85,7 +85,8 @@ pub(crate) struct TrialFile {
 }
 
 impl TrialFile {
-    /// Opens a file, or begins one. A line without an end, written when a run was stopped, is removed.
+    /// Opens a file, or begins one. A line without an end, written when a run was stopped, is removed. A file of fewer scenes is
+    /// continued, one of more serves as well.
     pub(crate) fn open(path: &Path, options: &TrialSetOptions) -> Result<TrialFile, TrialsError> {
         let io = |source| TrialsError::Io { file: path.display().to_string(), source };
         sixfold_io::make_folder_of(path).map_err(io)?;
@@ -96,7 +97,7 @@ impl TrialFile {
         };
         let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
         let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path).map_err(io)?;
-        let header = serde_json::to_string(options).map_err(|e| io(e.into()))?;
+        let header = serde_json::json!({ "trials": 1, "seed": options.seed }).to_string();
         if let Some(found) = whole.lines().next().filter(|found| *found != header) {
             let file = path.display().to_string();
             let expected =
@@ -135,8 +136,8 @@ impl TrialFile {
         TrialsError::Io { file: self.path.display().to_string(), source }
     }
 
-    /// All scenes.
-    pub(crate) fn read(&self) -> Result<Vec<SceneRow>, TrialsError> {
+    /// The first scenes.
+    pub(crate) fn read(&self, scenes: u64) -> Result<Vec<SceneRow>, TrialsError> {
         let text = std::fs::read_to_string(&self.path).map_err(|e| self.io(e))?;
         let parsed = |(number, line): (usize, &str)| {
             let wrong = |found: String| TrialsError::Content {
@@ -152,6 +153,6 @@ impl TrialFile {
                 && row.candidates.iter().all(|c| finite(&c.camera_from_gripper) && c.opening > 0.0);
             if fits { Ok(row) } else { Err(wrong(format!("scene {}", row.scene))) }
         };
-        text.lines().enumerate().skip(1).map(parsed).collect()
+        text.lines().enumerate().skip(1).take(scenes as usize).map(parsed).collect()
     }
 }

@@ -161,7 +161,7 @@ pub(crate) fn complete(
         }
     }
     progress.report(total, total);
-    rows.read().map(Some)
+    rows.read(options.scenes).map(Some)
 }
 
 /// An object of the trials, as it lies before it comes to rest.
@@ -273,6 +273,9 @@ mod tests {
         let threads = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         assert_eq!(threads.install(|| complete(&cut, &options, &())).unwrap().unwrap(), rows);
         assert_eq!(std::fs::read(&cut).unwrap(), bytes);
+        // Of more scenes than are asked for the first serve.
+        let fewer = TrialSetOptions { scenes: 3, ..options };
+        assert_eq!(complete(&cut, &fewer, &()).unwrap().unwrap(), rows[..3]);
         let other = TrialSetOptions { seed: 6, ..options };
         let error = complete(&cut, &other, &()).unwrap_err().to_string();
         assert!(error.contains("cut.jsonl") && error.contains("other options"), "{error}");
