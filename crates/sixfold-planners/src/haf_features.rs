@@ -9,7 +9,7 @@ use sixfold_grasp::learned::{CELLS, HeightFeature, HeightGrid, Region};
 
 use crate::samples::Sample;
 
-/// Features at random, of which the best are kept. The original has about 70,000; more than this chose no better (chosen by hand).
+/// Features at random, of which the best are kept. The original has about 70,000; chosen by hand, not swept.
 const CANDIDATES: u64 = 6000;
 /// Features that are kept, as in the original.
 pub(crate) const KEPT: usize = 300;
