@@ -59,7 +59,6 @@ fn planners_that_learned_propose_as_well() {
     }
     fs::write(case.path().join("w.json"), "{}").unwrap();
     fails(case.path(), &format!("{VIEW} --planner-weights w.json"), &["--planner-weights", "gpd or haf"]);
-    fails(case.path(), &format!("{VIEW} --planner claw"), &["claw", "antipodal"]);
 }
 
 #[test]
