@@ -12,6 +12,7 @@ use sixfold_dgcm::transfer::{
 use sixfold_experience::{Crop, Experience, ExperienceStore, SqliteStore};
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Mask, Mat3, Pose, Vec3};
+use sixfold_grasp::learned::ScoredGrasp;
 use sixfold_grasp::{
     AntipodalOptions, AntipodalQuality, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, ViewOptions,
     antipodal_grasps, centre_between_pads, gripper_pose,
@@ -107,10 +108,14 @@ fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
     let ours = propose(&fitter, &model, &mut memory, &ProposeOptions::default()).unwrap();
     assert!(ours.proposals.iter().any(|p| p.hypothesis != AlignmentHypothesis::Scaled));
     let published =
-        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, false).unwrap();
+        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, None).unwrap();
     assert!(published.ranked.iter().all(|r| r.kind == Kind::Experience));
+    let scored = |grasp: Grasp| ScoredGrasp { grasp, score: grasp.quality.total() };
+    let planned: Vec<ScoredGrasp> =
+        antipodal_grasps(&now.view, &gripper, &planner).unwrap().into_iter().map(scored).collect();
+    let planned = Some(planned.as_slice());
     let combined =
-        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, true).unwrap();
+        grasps_as_published(&now.view, &gripper, &planner, &model, &mut memory, None, planned).unwrap();
     assert!(combined.ranked.iter().all(|r| r.kind == Kind::Geometry));
     for r in &combined.ranked {
         let near = |p: &&sixfold_dgcm::transfer::Proposal| {

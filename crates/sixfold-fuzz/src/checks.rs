@@ -12,6 +12,7 @@ use sixfold_estimator::{Object, ObjectStore};
 #[cfg(feature = "networks")]
 use sixfold_experience::{ExperienceStore, Position, SqliteStore};
 use sixfold_geometry::{Pose, Vec2};
+use sixfold_grasp::learned::{HeightGrid, parse_haf, write_haf};
 use sixfold_grasp::parse_gripper;
 use sixfold_io::{CameraFile, ImageFile, max_pixels};
 use sixfold_mesh::{
@@ -345,6 +346,19 @@ pub(crate) fn gripper(bytes: &[u8]) {
         let lengths = [g.max_opening, g.finger_length, g.finger_width, g.finger_thickness, g.palm_width];
         let others = [g.palm_depth, g.palm_height, g.force, g.friction];
         assert!(lengths.iter().chain(&others).all(|v| v.is_finite() && *v > 0.0), "{g:?}");
+    }
+}
+
+pub(crate) fn haf(bytes: &[u8]) {
+    if let Ok(planner) = parse_haf(&String::from_utf8_lossy(bytes), "fuzz.json") {
+        let heights = |y: usize, x: usize| 0.01 * (x as f32 - y as f32);
+        let grid = HeightGrid::from_heights(std::array::from_fn(|y| std::array::from_fn(|x| heights(y, x))));
+        let score = planner.score(&grid);
+        assert!(score.is_nan() || (0.0..=1.0).contains(&score), "{score}");
+        assert_eq!(
+            parse_haf(&write_haf(&planner).unwrap(), "again.json").unwrap().features,
+            planner.features
+        );
     }
 }
 

@@ -46,6 +46,7 @@ pub fn readers() -> Vec<Reader> {
         slow(2, fast("object-record", seeds::object_record, checks::object_record)),
         slow(2, fast("object-mesh", seeds::object_mesh, checks::object_mesh)),
         fast("gripper", seeds::gripper, checks::gripper),
+        fast("haf", seeds::haf, checks::haf),
     ];
     #[cfg(feature = "networks")]
     all.extend([

@@ -340,6 +340,12 @@ pub(crate) fn gripper() -> Vec<Vec<u8>> {
 "force": 30.0, "friction": 0.5}"#])
 }
 
+pub(crate) fn haf() -> Vec<Vec<u8>> {
+    texts(&[r#"{"kind":"haf-linear-1","card":{"seed":0},"probability":[1.5,-0.25],"bias":0.125,"features":[
+{"weight":0.5,"regions":[[0,2,4,9,1.0]]},
+{"weight":-2.0,"regions":[[6,0,8,14,2.0],[0,0,6,14,-1.0],[8,0,14,14,-1.0]]}]}"#])
+}
+
 #[cfg(feature = "networks")]
 pub(crate) fn training_log() -> Vec<Vec<u8>> {
     let line = |step| {

@@ -164,7 +164,7 @@ fn search(
 }
 
 /// Objects are taken to be this thick behind what is seen of them, metres, where the palm is concerned.
-const THICKNESS: f64 = 0.02;
+pub(crate) const THICKNESS: f64 = 0.02;
 
 pub(crate) struct Planner<'a> {
     pub gripper: &'a Gripper,

@@ -3,6 +3,7 @@
 //! The dissertation executes the mean pose of the cluster with the highest summed score. A mean of free poses need not be
 //! free and its fingers need not stand across the object, so a cluster here is represented by its best member.
 
+use crate::learned::{ScoredGrasp, cluster_scored};
 use crate::{Grasp, OptionsError};
 
 /// How near two grasps are that count as one.
@@ -38,38 +39,22 @@ impl ClusterOptions {
 /// Grasps that mean the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GraspCluster {
-    /// The member with the highest quality.
+    /// The member with the highest quality, or score.
     pub best: Grasp,
+    /// Its quality, or its planner's score.
+    pub best_score: f64,
     /// How many proposals were joined.
     pub members: usize,
-    /// The sum of their qualities.
+    /// The sum of their qualities, or scores.
     pub score: f64,
 }
 
-/// Joins grasps, best first: the best grasp left takes all that are near to it. The clusters come in the order of their
-/// score, the highest first; equal ones in the order of their best members.
+/// Joins grasps by their quality, best first: the best grasp left takes all that are near to it. The clusters come in the order of
+/// their score, the highest first; equal ones in the order of their best members.
 pub fn cluster_grasps(grasps: &[Grasp], options: &ClusterOptions) -> Vec<GraspCluster> {
-    let mut order: Vec<usize> = (0..grasps.len()).collect();
-    order.sort_by(|&a, &b| grasps[b].quality.total().total_cmp(&grasps[a].quality.total()).then(a.cmp(&b)));
-    let mut left = vec![true; grasps.len()];
-    let mut clusters = vec![];
-    for &seed in &order {
-        if !left[seed] {
-            continue;
-        }
-        let mut cluster = GraspCluster { best: grasps[seed], members: 0, score: 0.0 };
-        for &i in &order {
-            let (distance, angle) = grasps[seed].difference(&grasps[i]);
-            if left[i] && distance <= options.distance && angle <= options.angle {
-                left[i] = false;
-                cluster.members += 1;
-                cluster.score += grasps[i].quality.total();
-            }
-        }
-        clusters.push(cluster);
-    }
-    clusters.sort_by(|a, b| b.score.total_cmp(&a.score));
-    clusters
+    let scored: Vec<ScoredGrasp> =
+        grasps.iter().map(|&grasp| ScoredGrasp { grasp, score: grasp.quality.total() }).collect();
+    cluster_scored(&scored, options)
 }
 
 #[cfg(test)]

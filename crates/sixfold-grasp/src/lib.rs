@@ -30,6 +30,7 @@ mod grasp;
 mod grasp_file;
 mod gripper;
 mod gripper_file;
+pub mod learned;
 mod view;
 
 pub use antipodal::{AntipodalOptions, OptionsError, antipodal_grasps};

@@ -19,6 +19,9 @@ use crate::training::{Outcome, Training, fit_on, restore};
 use crate::training_log::TrainingRecord;
 use crate::weights::{ModelCard, WeightsError, read_card};
 
+/// Name of a model's file, where its recipe has none of its own.
+const MODEL_FILE: &str = "model.safetensors";
+
 /// What a training reports while it runs.
 #[derive(Debug, Clone, Copy)]
 pub enum TrainingEvent<'a> {
@@ -55,7 +58,7 @@ impl<'a> Session<'a> {
 
     /// The model file.
     pub fn model(&self) -> PathBuf {
-        self.out.join("model.safetensors")
+        self.out.join(MODEL_FILE)
     }
 
     /// The folder of checkpoints, log and curves.
@@ -114,6 +117,11 @@ pub trait Recipe: Default {
 
     /// What was asked for, for the model's card.
     fn command(&self) -> &str;
+
+    /// Name of the model's file in [`Session::out`].
+    fn model_file(&self) -> &'static str {
+        MODEL_FILE
+    }
 
     /// Checks every option that can be checked without data.
     ///
@@ -267,7 +275,7 @@ fn finish<R: Recipe>(
     last: Option<TrainingRecord>,
     session: &mut Session<'_>,
 ) -> Result<Outcome<Trained<R::Report>>, TrainError> {
-    let (model, steps) = (session.model(), prepared.card.steps);
+    let (model, steps) = (session.out.join(recipe.model_file()), prepared.card.steps);
     std::fs::create_dir_all(session.out)
         .map_err(|source| WeightsError::Write { file: model.clone(), source })?;
     let Some(report) = recipe.finish(prepared, session)? else {

@@ -113,6 +113,18 @@ pub struct Scene {
 
 /// The scene of attempt `number`: pose, view point and noise are sampled from `seed` and `number` alone.
 pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u64, number: u64) -> Scene {
+    scene_at(mesh, |start| settle_at_centre(mesh, parts, start), options, seed, number)
+}
+
+/// [`scene`] where `rest` says how the object comes to rest that was let go at a pose, if it does: with what was kept of a scene
+/// that is a view of it without physics.
+pub fn scene_at(
+    mesh: &Mesh,
+    rest: impl FnOnce(&Pose) -> Option<Pose>,
+    options: &AttemptOptions,
+    seed: u64,
+    number: u64,
+) -> Scene {
     let mut random = stream(seed, number);
     let yaw = random.random_range(-std::f64::consts::PI..std::f64::consts::PI);
     let upright = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, yaw].into());
@@ -137,7 +149,7 @@ pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u
         noise,
         seconds: 0.0,
     };
-    let Some(rest) = settle_at_centre(mesh, parts, &start) else { return result };
+    let Some(rest) = rest(&start) else { return result };
     let (low, high) = mesh.transformed(&rest).bounding_box();
     result.world_from_object = rest;
     let point =

@@ -25,6 +25,7 @@
 
 mod attempt;
 mod error;
+mod hardness;
 mod parts;
 mod pile;
 mod settle;
@@ -34,8 +35,9 @@ mod trial;
 mod view;
 mod world;
 
-pub use attempt::{Attempt, AttemptOptions, AttemptOutcome, Scene, attempt, scene};
+pub use attempt::{Attempt, AttemptOptions, AttemptOutcome, Scene, attempt, scene, scene_at};
 pub use error::SimulationError;
+pub use hardness::Hardness;
 pub use parts::{ConvexParts, PartsOptions};
 pub use pile::{PileOptions, drop_objects};
 pub use settle::settle_at_centre;

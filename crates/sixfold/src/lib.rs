@@ -41,6 +41,8 @@ pub use sixfold_simulation as simulation;
 pub use sixfold_dgcm as dgcm;
 #[cfg(feature = "experience")]
 pub use sixfold_experience as experience;
+#[cfg(feature = "experience")]
+pub use sixfold_planners as planners;
 
 pub mod guide;
 pub mod prelude;

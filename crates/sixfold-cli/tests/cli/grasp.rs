@@ -36,6 +36,32 @@ fn grasps_are_proposed_with_and_without_a_mask_and_drawn() {
 }
 
 #[test]
+fn planners_that_learned_propose_as_well() {
+    let case = folder();
+    let planners: &[&str] = if cfg!(feature = "networks") { &["haf", "gpd"] } else { &["haf"] };
+    for planner in planners {
+        let view = format!("{VIEW} --mask mask.png --planner {planner} --json");
+        let found = sixfold(case.path(), &view).expect(0).json();
+        assert_eq!(found["method"], *planner);
+        let qualities: Vec<f64> =
+            found["grasps"].as_array().unwrap().iter().map(|g| g["quality"].as_f64().unwrap()).collect();
+        assert!(!qualities.is_empty() && qualities.iter().all(|q| (0.0..=1.0).contains(q)), "{qualities:?}");
+        assert!(*planner == "gpd" || qualities.is_sorted_by(|a, b| a >= b), "{qualities:?}");
+        assert!(found["grasps"][0].get("parts").is_none(), "contacts are not judged");
+        let again = sixfold(case.path(), &view).expect(0).json();
+        assert_eq!(again["grasps"], found["grasps"]);
+        fs::write(case.path().join("wrong.json"), "{}").unwrap();
+        fails(
+            case.path(),
+            &format!("{view} --planner-weights wrong.json"),
+            &["--planner-weights", "wrong.json"],
+        );
+    }
+    fs::write(case.path().join("w.json"), "{}").unwrap();
+    fails(case.path(), &format!("{VIEW} --planner-weights w.json"), &["--planner-weights", "gpd or haf"]);
+}
+
+#[test]
 fn an_object_too_large_for_the_gripper_gives_exit_status_1() {
     let case = folder();
     let tiny = r#"{"kind": "parallel-jaws", "name": "tiny", "max_opening": 0.006, "finger_length": 0.02,

@@ -147,4 +147,9 @@ fn dgcm_trains_and_proposes_as_published() {
         assert_eq!(grasp["experience"]["hypothesis"], "scaled", "{grasp}");
     }
     fails(dir, &format!("{view} --preset published"), &["--experiences"]);
+    // With the planner that the dissertation combines it with.
+    let combined = grasps("published-combined --planner gpd");
+    assert_eq!(combined["method"], "gpd and dgcm as published");
+    assert!(!kinds(&combined).is_empty() && kinds(&combined).iter().all(|k| k == "geometry"), "{combined}");
+    fails(dir, &format!("{with} --planner gpd"), &["--planner gpd", "--preset published-combined"]);
 }

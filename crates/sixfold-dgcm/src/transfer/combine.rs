@@ -7,6 +7,7 @@
 
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::learned::ScoredGrasp;
 use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 
 use super::{Proposal, Proposals};
@@ -115,20 +116,22 @@ fn mean_pose(poses: &[Pose]) -> Pose {
 }
 
 /// Ranks the planner's grasps as the dissertation does with its network ("GPD + DGCM-Net", section 6.3.2): the mean of the
-/// planner's score, brought to 0..1, and of the experience's score, which is the average of equation 6.6 over the proposals within
+/// planner's score (quality, or what a planner learned), brought to 0..1, and of the experience's score, which is the average of equation 6.6 over the proposals within
 /// 5 cm and 15 degrees, 0 where there are none.
 pub fn rank_as_published(
-    geometry: &[Grasp],
+    planned: &[ScoredGrasp],
     experience: &[Proposal],
     clusters: &ClusterOptions,
 ) -> Vec<Ranked> {
-    let mut candidates = candidates(geometry, experience, clusters);
-    candidates.retain(|c| c.kind == Kind::Geometry);
-    let qualities = || geometry.iter().map(|g| g.quality.total());
-    let (low, high) = (qualities().fold(f64::INFINITY, f64::min), qualities().fold(0.0, f64::max));
-    for c in &mut candidates {
+    let geometry: Vec<Grasp> = planned.iter().map(|p| p.grasp).collect();
+    // The planner's grasps come first, in their order.
+    let mut candidates = candidates(&geometry, experience, clusters);
+    candidates.truncate(planned.len());
+    let scores = || planned.iter().map(|p| p.score);
+    let (low, high) = (scores().fold(f64::INFINITY, f64::min), scores().fold(0.0, f64::max));
+    for (c, planned) in candidates.iter_mut().zip(planned) {
         let range = high - low;
-        c.geometry = if range > 0.0 { (c.grasp.quality.total() - low) / range } else { 1.0 };
+        c.geometry = if range > 0.0 { (planned.score - low) / range } else { 1.0 };
         let agreeing = || experience.iter().filter(|p| near(&c.grasp, &p.grasp, clusters)).map(|p| p.score);
         c.experience = agreeing().sum::<f64>() / agreeing().count().max(1) as f64;
         c.score = 0.5 * (c.geometry + c.experience);
@@ -439,7 +442,8 @@ mod tests {
         let geometry = [grasp(0.0, 0.0), grasp(0.3, 0.5), grasp(-0.3, 1.0)];
         // Two near to the second, whose mean counts, and one near to nothing.
         let proposals = [proposal(0.29, 0.6), proposal(0.33, 0.9), proposal(0.1, 1.0)];
-        let ranked = rank_as_published(&geometry, &proposals, &ClusterOptions::default());
+        let planned = geometry.map(|grasp| ScoredGrasp { grasp, score: grasp.quality.total() });
+        let ranked = rank_as_published(&planned, &proposals, &ClusterOptions::default());
         assert!(ranked.iter().all(|r| r.kind == Kind::Geometry && r.proposal.is_none()));
         let found: Vec<[f64; 4]> = ranked
             .iter()

@@ -1,5 +1,6 @@
 //! All grasps on what is seen now, those of experience and those of geometry, in one order.
 
+use sixfold_grasp::learned::ScoredGrasp;
 use sixfold_grasp::{
     AntipodalOptions, ClusterOptions, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps,
 };
@@ -59,7 +60,7 @@ pub fn grasps_from_experience(
 }
 
 /// As [`grasps_from_experience`], in the dissertation's form (sections 6.2.3 and 6.3.2): the network's transfer alone, its clusters
-/// by their summed scores; or, `with_planner`, the planner's grasps, whose scores are averaged with those of experience nearby.
+/// by their summed scores; or the grasps that a planner `planned`, whose scores are averaged with those of experience nearby.
 ///
 /// # Errors
 /// [`GraspsError`].
@@ -70,16 +71,15 @@ pub fn grasps_as_published(
     network: &DgcmModel,
     memory: &mut Memory,
     part: Option<&str>,
-    with_planner: bool,
+    planned: Option<&[ScoredGrasp]>,
 ) -> Result<RankedGrasps, GraspsError> {
     let options = ProposeOptions { part: part.map(str::to_owned), ..ProposeOptions::published() };
     let fitter = GraspFitter::new(view, gripper, planner)?;
     let found = propose(&fitter, network, memory, &options)?;
     let clusters = ClusterOptions::default();
-    let ranked = if with_planner {
-        rank_as_published(&antipodal_grasps(view, gripper, planner)?, &found.proposals, &clusters)
-    } else {
-        rank_experience_as_published(&found.proposals, &clusters)
+    let ranked = match planned {
+        Some(planned) => rank_as_published(planned, &found.proposals, &clusters),
+        None => rank_experience_as_published(&found.proposals, &clusters),
     };
     Ok(RankedGrasps { found, ranked })
 }

@@ -1,8 +1,4 @@
 //! `sixfold grasp compare`: geometry, experience and both, on the same simulated scenes (table 6.2).
-//!
-//! Seven ways to choose the grasp: the planner alone; experience alone (equation 6.6); the network alone and joined with the planner,
-//! both as published (section 6.3.2); the planner's grasps by quality and by the fraction of experience that agrees; the planner's
-//! grasps by what came of earlier attempts; and the grasps of both kinds by that.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -10,25 +6,22 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{
-    Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_agreement, rank_by_outcome,
-    rank_experience_as_published,
-};
+use sixfold_dgcm::transfer::{Memory, Ranked};
 use sixfold_experience::StorePlace;
-use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, GraspFitter, Gripper, antipodal_grasps, draw_grasps,
-};
+use sixfold_grasp::{AntipodalOptions, DrawnGrasp, Gripper, draw_grasps};
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{
-    AttemptOptions, AttemptOutcome, ConvexParts, PartsOptions, scene, try_grasp, wilson_interval_of_fraction,
+    AttemptOptions, AttemptOutcome, ConvexParts, PartsOptions, Scene, SimulatedView, scene, try_grasp,
+    wilson_interval_of_fraction,
 };
 
+use super::ways::{METHODS, Ways};
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, memory, model, store_place};
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
+use sixfold_shell::grasp::planner::Planner;
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::overlay;
@@ -37,10 +30,6 @@ use sixfold_shell::ranges::in_range;
 
 /// Images of this many scenes of each object are kept.
 const PICTURES: u64 = 2;
-/// The methods, in the order of the table.
-pub(crate) const METHODS: [&str; 7] =
-    ["geometry", "experience", "network", "published", "agreement", "outcomes", "both"];
-
 #[derive(Debug, Args)]
 pub(crate) struct CompareArguments {
     /// The store of experiences, a file or postgres://user@host/database
@@ -63,6 +52,12 @@ pub(crate) struct CompareArguments {
     pub physics: PhysicsArguments,
     #[command(flatten)]
     pub network: NetworkArguments,
+    /// Trained GPD: a file that `sixfold train planner` wrote (default: the one that comes with Sixfold)
+    #[arg(long, value_name = "FILE")]
+    pub gpd: Option<PathBuf>,
+    /// Trained HAF: a file that `sixfold train planner` wrote (default: the one that comes with Sixfold)
+    #[arg(long, value_name = "FILE")]
+    pub haf: Option<PathBuf>,
     /// Folder for trials.jsonl (from which a stopped run resumes), table.json and images of the first scenes
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -104,6 +99,7 @@ struct Recorded<'a> {
     hard: bool,
     seed: u64,
     network: String,
+    planners: [String; 2],
     experiences: usize,
     outcomes: usize,
     methods: [&'a str; METHODS.len()],
@@ -162,6 +158,8 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     let Hardness { gripper, real, options, .. } = &setting;
     let network = model(&a.network)?;
     let mut memory = memory(&a.experiences, &network)?;
+    let planners =
+        [Planner::gpd(a.gpd.as_deref()).context("--gpd")?, Planner::haf(a.haf.as_deref()).context("--haf")?];
     let objects = named_objects(&a.objects)?;
     let recorded = Recorded {
         objects: objects.iter().map(|o| o.1.as_str()).collect(),
@@ -170,6 +168,7 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         hard: a.hard,
         seed: a.seed,
         network: network.fingerprint(),
+        planners: planners.each_ref().map(Planner::fingerprint),
         experiences: memory.len(),
         outcomes: memory.outcomes(&gripper.name).attempts,
         methods: METHODS,
@@ -179,7 +178,8 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     let file = a.out.join("trials.jsonl");
     let (mut journal, mut rows) = Journal::open_groups::<Row>(&file, &recorded, METHODS.len())?;
     let mut progress = Progress::new("scenes", objects.len() * a.trials as usize);
-    let scenes = Scenes { a, setting: &setting, gripper, options, network: &network };
+    let ways = Ways { gripper, network: &network, planners: &planners };
+    let scenes = Scenes { a, setting: &setting, options, ways };
     for (class, name, mesh) in &objects {
         let done = |number: u64| rows.iter().any(|r| r.object == *name && r.number == number);
         let missing: Vec<u64> = (0..a.trials).filter(|n| !done(*n)).collect();
@@ -219,9 +219,8 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
 struct Scenes<'a> {
     a: &'a CompareArguments,
     setting: &'a Hardness,
-    gripper: &'a Gripper,
     options: &'a AttemptOptions,
-    network: &'a DgcmModel,
+    ways: Ways<'a>,
 }
 
 impl Scenes<'_> {
@@ -253,66 +252,14 @@ impl Scenes<'_> {
         let rows = METHODS.map(|m| Row { method: m.to_owned(), ..empty.clone() });
         let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows.to_vec()) };
         let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
-        let began = Instant::now();
-        let geometry = antipodal_grasps(view, self.gripper, &planner)?;
-        let of_geometry = began.elapsed().as_secs_f64();
-        let began = Instant::now();
-        let fitter = GraspFitter::new(view, self.gripper, &planner)?;
-        let of_fitter = began.elapsed().as_secs_f64();
-        let found = propose(&fitter, self.network, memory, &ProposeOptions::default())?;
-        let of_experience = began.elapsed().as_secs_f64();
-        let began = Instant::now();
-        let alone = propose(&fitter, self.network, memory, &ProposeOptions::published())?;
-        let of_network = of_fitter + began.elapsed().as_secs_f64();
-        let clusters = ClusterOptions::default();
-        let began = Instant::now();
-        let outcomes = memory.outcomes(&self.gripper.name);
-        let by_outcome = |proposals| rank_by_outcome(&geometry, proposals, &clusters, &fitter, &outcomes);
-        let both = by_outcome(&found.proposals);
-        let of_outcomes = began.elapsed().as_secs_f64();
-        let ranked = [
-            rank(&geometry, &[], &clusters),
-            rank(&[], &found.proposals, &clusters),
-            rank_experience_as_published(&alone.proposals, &clusters),
-            rank_as_published(&geometry, &alone.proposals, &clusters),
-            rank_by_agreement(&geometry, &found.proposals, &clusters),
-            by_outcome(&[]),
-            both,
-        ];
-        let seconds = [
-            of_geometry,
-            of_experience,
-            of_network,
-            of_geometry + of_network,
-            of_geometry + of_experience,
-            of_geometry + of_fitter + of_outcomes,
-            of_geometry + of_experience + of_outcomes,
-        ];
+        let answers = self.ways.answers(view, &planner, memory)?;
         let mut out = vec![];
-        for ((mut row, ranked), seconds) in rows.into_iter().zip(&ranked).zip(seconds) {
-            row.nearest = found.nearest.first().map(|m| m.distance);
-            row.candidates = (geometry.len(), found.proposals.len());
+        for (mut row, (ranked, seconds)) in rows.into_iter().zip(&answers.ranked) {
+            row.nearest = answers.nearest;
+            row.candidates = answers.candidates;
             row.seconds += seconds;
             if let Some(best) = ranked.first() {
-                let began = Instant::now();
-                let sent = seen.world_from_camera * best.grasp.camera_from_gripper;
-                for k in 0..self.a.tries {
-                    let tried = try_grasp(
-                        parts,
-                        &scene.world_from_object,
-                        &self.setting.real,
-                        &self.setting.reached(&sent, scene.noise.wrapping_add(k as u64)),
-                        best.grasp.opening,
-                        &self.options.trial,
-                    )?;
-                    let ending = AttemptOutcome::Tried(tried.outcome);
-                    row.held += usize::from(ending.is_success());
-                    if k == 0 {
-                        row.trial_seconds = began.elapsed().as_secs_f64();
-                        row.ending = outcome_name(ending);
-                    }
-                }
-                row.transferred = best.proposal.is_some();
+                self.attempt(&mut row, best, seen, &scene, parts)?;
                 if number < PICTURES {
                     self.picture(&row, seen, best)?;
                 }
@@ -322,15 +269,46 @@ impl Scenes<'_> {
         Ok(out)
     }
 
+    /// Tries a method's first grasp as often as was asked for.
+    fn attempt(
+        &self,
+        row: &mut Row,
+        best: &Ranked,
+        seen: &SimulatedView,
+        scene: &Scene,
+        parts: &ConvexParts,
+    ) -> Result<()> {
+        let began = Instant::now();
+        let sent = seen.world_from_camera * best.grasp.camera_from_gripper;
+        for k in 0..self.a.tries {
+            let tried = try_grasp(
+                parts,
+                &scene.world_from_object,
+                &self.setting.real,
+                &self.setting.reached(&sent, scene.noise.wrapping_add(k as u64)),
+                best.grasp.opening,
+                &self.options.trial,
+            )?;
+            let ending = AttemptOutcome::Tried(tried.outcome);
+            row.held += usize::from(ending.is_success());
+            if k == 0 {
+                row.trial_seconds = began.elapsed().as_secs_f64();
+                row.ending = outcome_name(ending);
+            }
+        }
+        row.transferred = best.proposal.is_some();
+        Ok(())
+    }
+
     /// The view with the gripper that was tried: green when it held more often than not, red when not.
-    fn picture(&self, row: &Row, seen: &sixfold_simulation::SimulatedView, best: &Ranked) -> Result<()> {
+    fn picture(&self, row: &Row, seen: &SimulatedView, best: &Ranked) -> Result<()> {
         let color = if 2 * row.held > self.a.tries { [60, 220, 80] } else { [235, 70, 60] };
         let grasp = &best.grasp;
         let drawn =
             [DrawnGrasp { camera_from_gripper: grasp.camera_from_gripper, opening: grasp.opening, color }];
         let background = overlay::depth_picture(&seen.depth);
-        let image = draw_grasps(&background, Some(&seen.depth), &seen.camera, self.gripper, &drawn)?;
-        let name = format!("{}-{}-{}.png", file_name(&row.object), row.number, row.method);
+        let image = draw_grasps(&background, Some(&seen.depth), &seen.camera, &self.setting.gripper, &drawn)?;
+        let name = format!("{}-{}-{}.png", file_name(&row.object), row.number, file_name(&row.method));
         Ok(write_rgb(&self.a.out.join(name), &image)?)
     }
 }

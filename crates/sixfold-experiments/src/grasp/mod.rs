@@ -2,6 +2,7 @@
 
 pub(crate) mod compare;
 mod measure;
+pub(crate) mod ways;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};

@@ -29,6 +29,7 @@ fn experience_is_compared_with_geometry() {
     assert!(table.code <= 1, "{}", table.stderr);
     let table = table.json();
     assert_eq!(table["classes"][0]["trials"], 2);
+    assert_eq!(table["classes"][0]["rates"].as_array().unwrap().len(), 11, "GPD and HAF, alone and combined");
     assert!(
         path.join("compare/part-0-both.png").exists() || path.join("compare/part-ply-0-both.png").exists()
     );
@@ -45,4 +46,13 @@ fn objects_of_a_list_have_units_of_their_own() {
         refused("--unit mm");
         refused("--store objects");
     }
+    // A synthetic object, the same each time; half of one is none.
+    let list = |text: &str| std::fs::write(dir.path().join("l.json"), text).unwrap();
+    list(r#"[{"class": "cup", "synthetic": {"family": "cup", "number": 1}}]"#);
+    let measure = "grasp measure --list l.json --trials 1 --json";
+    let first = sixfold(dir.path(), measure).json();
+    assert_eq!(first["objects"][0]["name"], "synthetic cup 1");
+    assert_eq!(first["objects"][0]["parts"], sixfold(dir.path(), measure).json()["objects"][0]["parts"]);
+    list(r#"[{"class": "cup", "mesh": "cup.ply", "synthetic": {"family": "cup", "number": 1}}]"#);
+    fails(dir.path(), measure, &["l.json", "class cup", "mesh and unit, or synthetic alone"]);
 }

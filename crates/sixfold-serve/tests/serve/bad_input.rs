@@ -90,7 +90,7 @@ fn of_images() -> Vec<Case> {
             "64x48",
         ),
         find(camera(form()), "depth", "depth image"),
-        find(camera(form().file("rgb", "c.png", &rgb())), "depth", "ppf"),
+        find(camera(form().file("rgb", "c.png", &rgb())).text("method", "ppf"), "depth", "ppf"),
         find(form().file("depth", "d.png", &depth()), "camera", "nothing"),
         find(
             form().file("depth", "d.png", &depth()).file("camera", "c.json", b"{\"fx\": 5"),

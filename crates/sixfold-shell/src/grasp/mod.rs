@@ -11,6 +11,7 @@ pub mod journal;
 pub mod learn;
 #[cfg(feature = "physics")]
 pub mod object_list;
+pub mod planner;
 pub mod proposals;
 #[cfg(feature = "experience")]
 pub mod store;

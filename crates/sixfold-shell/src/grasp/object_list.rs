@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::Deserialize;
+use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
+use sixfold_synth::shapes::{Family, member};
 
 use crate::objects;
 
@@ -14,14 +16,49 @@ use crate::objects;
 #[serde(deny_unknown_fields)]
 struct Listed {
     class: String,
-    mesh: PathBuf,
-    unit: Unit,
+    /// A mesh file and its unit, or a synthetic object.
+    #[serde(default)]
+    mesh: Option<PathBuf>,
+    #[serde(default)]
+    unit: Option<Unit>,
+    #[serde(default)]
+    synthetic: Option<Synthetic>,
     /// The axis of the mesh that points up when the object stands.
     #[serde(default)]
     up: Up,
     /// A part with a name, such as a handle: a box of the mesh as it stands (z up), metres.
     #[serde(default)]
     part: Option<PartBox>,
+}
+
+/// A member of a family of synthetic objects.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Synthetic {
+    family: Family,
+    /// Which of its members.
+    number: u64,
+}
+
+/// Seed of the synthetic objects of lists: none of them is one that `learn` or a training makes.
+const LISTED_SEED: u64 = 0x6c69_7374;
+
+impl Listed {
+    /// Name and mesh, standing.
+    fn object(&self, folder: &Path) -> Result<(String, Mesh)> {
+        match (&self.mesh, self.unit, &self.synthetic) {
+            (Some(file), Some(unit), None) => {
+                let mesh = read_mesh(folder.join(file), unit)?;
+                Ok((file.display().to_string(), mesh.transformed(&self.up.turn())))
+            }
+            (None, None, Some(made)) => {
+                let number = made.number.wrapping_mul(64).wrapping_add(made.family as u64);
+                let mesh = member(made.family, &mut stream(LISTED_SEED, number))?.mesh;
+                Ok((format!("synthetic {} {}", made.family.name(), made.number), mesh))
+            }
+            _ => bail!("class {}: expected mesh and unit, or synthetic alone", self.class),
+        }
+    }
 }
 
 /// A named part of an object: what lies within a box of its frame, metres.
@@ -71,7 +108,8 @@ pub struct ObjectsArguments {
     /// Unit of the mesh files: m, cm, mm, in
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm", "up": "z"}, ...]
+    /// List of objects in place of --object: JSON, [{"class": "mug", "mesh": "mug.ply", "unit": "mm", "up": "z"}, {"class": "cup",
+    /// "synthetic": {"family": "cup", "number": 1}}, ...]
     #[arg(long, value_name = "FILE", conflicts_with_all = ["objects", "unit"])]
     pub list: Option<PathBuf>,
     /// Folder that the list's meshes are in (default: the list's own)
@@ -121,8 +159,8 @@ pub fn objects_with_parts(a: &ObjectsArguments) -> Result<(Named, Vec<Option<Par
     let named: Result<Named> = listed
         .into_iter()
         .map(|l| {
-            let mesh = read_mesh(folder.join(&l.mesh), l.unit)?.transformed(&l.up.turn());
-            Ok((l.class, l.mesh.display().to_string(), mesh))
+            let (name, mesh) = l.object(&folder).with_context(|| list.display().to_string())?;
+            Ok((l.class, name, mesh))
         })
         .collect();
     Ok((named?, parts))

@@ -3,11 +3,10 @@
 use anyhow::Result;
 use serde::Serialize;
 use sixfold_geometry::{Camera, DepthImage, Plane, Pose, RgbImage};
-use sixfold_grasp::{
-    AntipodalOptions, AntipodalQuality, ClusterOptions, DrawnGrasp, Grasp, GraspView, Gripper,
-    antipodal_grasps, cluster_grasps, draw_grasps,
-};
+use sixfold_grasp::learned::ScoredGrasp;
+use sixfold_grasp::{AntipodalQuality, DrawnGrasp, Grasp, GraspCluster, Gripper, draw_grasps};
 
+use super::planner::Planner;
 use crate::labels::{Label, draw_labels};
 use crate::output::pose_rows;
 use crate::overlay::{caption, depth_picture};
@@ -38,9 +37,11 @@ pub struct Proposed {
     pub opening: f64,
     /// Distance of the contacts, metres.
     pub width: f64,
-    /// 0 to 1.
+    /// Of its contacts, or the success probability that a planner learned to predict, 0 to 1.
     pub quality: f64,
-    parts: AntipodalQuality,
+    /// What the quality of its contacts consists of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parts: Option<AntipodalQuality>,
     cluster_score: f64,
     /// Grasps that it stands for.
     pub cluster_members: usize,
@@ -71,7 +72,7 @@ impl Proposed {
             opening: grasp.opening,
             width: grasp.width,
             quality: grasp.quality.total(),
-            parts: grasp.quality,
+            parts: Some(grasp.quality),
             cluster_score: score,
             cluster_members: members,
             experience: None,
@@ -81,18 +82,20 @@ impl Proposed {
 }
 
 /// Grasps of the planner alone, the best first.
-///
-/// # Errors
-/// For options out of range.
-pub fn by_geometry(view: &GraspView, gripper: &Gripper, planner: &AntipodalOptions) -> Result<Vec<Proposed>> {
-    let grasps = antipodal_grasps(view, gripper, planner)?;
-    let clusters = cluster_grasps(&grasps, &ClusterOptions::default());
-    Ok(clusters.iter().map(|c| Proposed::new(&c.best, c.score, c.members)).collect())
+pub fn of_planner(planner: &Planner, grasps: &[ScoredGrasp]) -> Vec<Proposed> {
+    let clusters = planner.ranked(grasps);
+    let proposed = |c: &GraspCluster| Proposed {
+        quality: c.best_score,
+        parts: matches!(planner, Planner::Antipodal).then_some(c.best.quality),
+        ..Proposed::new(&c.best, c.score, c.members)
+    };
+    clusters.iter().map(proposed).collect()
 }
 
-/// Grasps of experience and of geometry, the best first.
+/// Grasps of experience and of geometry, the best first. The quality of grasps of a planner that learned is its score, brought to
+/// 0 to 1 over all of them.
 #[cfg(feature = "experience")]
-pub fn of_both(grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
+pub fn of_both(planner: &Planner, grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
     use sixfold_dgcm::transfer::Kind;
     let proposed = |r: &sixfold_dgcm::transfer::Ranked| {
         let proposal = r.proposal.map(|i| &grasps.found.proposals[i]);
@@ -106,7 +109,11 @@ pub fn of_both(grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
             hypothesis: proposal.map(|p| p.hypothesis.name()),
             share: r.experience,
         };
-        Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) }
+        let made = Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) };
+        match (planner, r.kind) {
+            (Planner::Antipodal, _) | (_, Kind::Experience) => made,
+            _ => Proposed { quality: r.geometry, parts: None, ..made },
+        }
     };
     grasps.ranked.iter().map(proposed).collect()
 }

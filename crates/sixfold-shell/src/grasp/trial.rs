@@ -2,19 +2,14 @@
 
 use anyhow::{Context, Result};
 use clap::Args;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-use sixfold_geometry::Pose;
-use sixfold_geometry::random::normal;
 use sixfold_grasp::Gripper;
-use sixfold_render::DepthSensor;
-use sixfold_simulation::{AttemptOptions, AttemptOutcome, TrialOptions};
+pub use sixfold_simulation::Hardness;
+use sixfold_simulation::{AttemptOutcome, TrialOptions};
 
 use super::gripper::gripper;
 
-/// Mass of an object in the usual setting and in the hard one, kg.
+/// Mass of an object in the usual setting, kg.
 const MASS: f64 = 0.2;
-const HARD_MASS: f64 = 0.5;
 
 /// Numbers of the simulated trial.
 #[derive(Debug, Args)]
@@ -47,57 +42,20 @@ pub fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
     Ok((gripper, options))
 }
 
-/// With what scenes are made and grasps are tried.
-pub struct Hardness {
-    /// The gripper as whoever proposes knows it.
-    pub gripper: Gripper,
-    /// The gripper as it is.
-    pub real: Gripper,
-    /// Sensor, planner and trial.
-    pub options: AttemptOptions,
-    /// Standard deviations of the hand's position (metres) and orientation (radians) from where it was sent.
-    pub error: Option<(f64, f64)>,
-}
-
-impl Hardness {
-    /// Where the hand goes when it is sent somewhere; the same deviation for the same seed.
-    pub fn reached(&self, world_from_gripper: &Pose, seed: u64) -> Pose {
-        let Some((position, orientation)) = self.error else { return *world_from_gripper };
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(u64::from(u32::MAX));
-        let mut draw = |deviation: f64| deviation * f64::from(normal(&mut random));
-        let shift = [draw(position), draw(position), draw(position)];
-        let turn = [draw(orientation), draw(orientation), draw(orientation)];
-        // In the hand's own frame, about its tips.
-        *world_from_gripper * Pose::exp(&[shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]].into())
-    }
-}
-
 /// The usual setting, or the hard one.
 ///
 /// # Errors
 /// As [`physics`].
 pub fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
-    let (gripper, mut trial) = physics(a)?;
-    let mut options = AttemptOptions::default();
-    let mut real = gripper.clone();
-    let mut error = None;
-    if hard {
-        // A --friction that was asked for is known to both.
-        real.friction = a.friction.unwrap_or(0.25);
-        trial.mass = a.mass.unwrap_or(HARD_MASS);
-        error = Some((0.005, 3f64.to_radians()));
-        let kinect = DepthSensor::kinect();
-        options.sensor = Some(DepthSensor {
-            axial_base: 2.0 * kinect.axial_base,
-            axial_growth: 2.0 * kinect.axial_growth,
-            lateral: 1.5 * kinect.lateral,
-            edge_loss: 0.8,
-            ..kinect
-        });
+    let (gripper, trial) = physics(a)?;
+    if !hard {
+        return Ok(Hardness::usual(gripper, trial));
     }
-    options.trial = trial;
-    Ok(Hardness { gripper, real, options, error })
+    let mut setting = Hardness::hard(gripper, trial);
+    // A --friction or --mass that was asked for holds.
+    setting.real.friction = a.friction.unwrap_or(setting.real.friction);
+    setting.options.trial.mass = a.mass.unwrap_or(setting.options.trial.mass);
+    Ok(setting)
 }
 
 /// The word for an ending in files and tables.

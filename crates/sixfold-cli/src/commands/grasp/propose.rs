@@ -17,9 +17,10 @@ use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::grasp::experience::{self, NetworkArguments, store_place};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::grasp::input::{self, Input, InputArguments};
+use sixfold_shell::grasp::planner::{Planner, PlannerArguments};
 #[cfg(feature = "experience")]
 use sixfold_shell::grasp::proposals::of_both;
-use sixfold_shell::grasp::proposals::{Proposed, Table, by_geometry, picture, print_table};
+use sixfold_shell::grasp::proposals::{Proposed, Table, of_planner, picture, print_table};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::ranges::count;
@@ -37,6 +38,8 @@ pub(crate) struct ProposeArguments {
     /// Maximum number of grasps
     #[arg(long, value_name = "N", default_value = "5", value_parser = count::<10_000>)]
     pub number: NonZeroUsize,
+    #[command(flatten)]
+    pub planner: PlannerArguments,
     /// Also use the experiences of this store, which `sixfold grasp learn` or `sixfold grasp store add` wrote: a file or
     /// postgres://user@host/database
     #[cfg(feature = "experience")]
@@ -79,6 +82,9 @@ pub(crate) enum Preset {
 
 pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let gripper = gripper(&a.gripper)?;
+    let planner = Planner::new(&a.planner)?;
+    #[cfg(feature = "experience")]
+    check_combination(a, &planner)?;
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.rgb.as_deref(), a.seed)?;
@@ -87,20 +93,21 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
         Some(view) => {
             let default = AntipodalOptions::default();
             let completion = default.completion.filter(|_| !a.seen_only);
-            let planner = AntipodalOptions { seed: a.seed, completion, ..default };
+            let options = AntipodalOptions { seed: a.seed, completion, ..default };
+            let alone = || anyhow::Ok(of_planner(&planner, &planner.grasps(view, &gripper, &options)?));
             #[cfg(feature = "experience")]
             let found = match &a.experiences {
-                Some(_) => with_experience(a, view, &gripper, &planner)?,
-                None => by_geometry(view, &gripper, &planner)?,
+                Some(_) => with_experience(a, view, &gripper, &planner, &options)?,
+                None => alone()?,
             };
             #[cfg(not(feature = "experience"))]
-            let found = by_geometry(view, &gripper, &planner)?;
+            let found = alone()?;
             found.into_iter().take(a.number.get()).collect()
         }
     };
     let seconds = began.elapsed().as_secs_f64();
     let whole = Whole {
-        method: method(a),
+        method: method(a, &planner),
         gripper: gripper.name.clone(),
         object_pixels: view.as_ref().map_or(0, |v| v.mask.as_slice().iter().filter(|m| **m).count()),
         table: view.as_ref().and_then(|v| v.table).map(Table::from),
@@ -122,7 +129,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
 
 #[derive(Serialize)]
 struct Whole {
-    method: &'static str,
+    method: String,
     gripper: String,
     object_pixels: usize,
     table: Option<Table>,
@@ -133,19 +140,35 @@ struct Whole {
 }
 
 #[cfg(feature = "experience")]
-fn method(a: &ProposeArguments) -> &'static str {
+fn method(a: &ProposeArguments, planner: &Planner) -> String {
+    let planner = planner.name();
     match (&a.experiences, &a.part) {
-        (Some(_), _) if a.preset == Some(Preset::Published) => "dgcm as published",
-        (Some(_), _) if a.preset == Some(Preset::PublishedCombined) => "antipodal and dgcm as published",
-        (None, _) => "antipodal",
-        (Some(_), None) => "antipodal and dgcm",
-        (Some(_), Some(_)) => "dgcm on a part",
+        (Some(_), _) if a.preset == Some(Preset::Published) => "dgcm as published".to_owned(),
+        (Some(_), _) if a.preset == Some(Preset::PublishedCombined) => {
+            format!("{planner} and dgcm as published")
+        }
+        (None, _) => planner.to_owned(),
+        (Some(_), None) => format!("{planner} and dgcm"),
+        (Some(_), Some(_)) => "dgcm on a part".to_owned(),
     }
 }
 
 #[cfg(not(feature = "experience"))]
-fn method(_: &ProposeArguments) -> &'static str {
-    "antipodal"
+fn method(_: &ProposeArguments, planner: &Planner) -> String {
+    planner.name().to_owned()
+}
+
+/// Outcomes rank grasps by the quality of their contacts, which the planners that learn do not compute.
+#[cfg(feature = "experience")]
+fn check_combination(a: &ProposeArguments, planner: &Planner) -> Result<()> {
+    let learned = !matches!(planner, Planner::Antipodal);
+    if learned && a.experiences.is_some() && a.preset != Some(Preset::PublishedCombined) {
+        anyhow::bail!(
+            "--planner {}: with --experiences it is combined as published; add --preset published-combined, or leave --planner out",
+            planner.name()
+        );
+    }
+    Ok(())
 }
 
 /// Grasps of both kinds, ranked together; with a part's name, those that hold what experience on it held.
@@ -154,17 +177,20 @@ fn with_experience(
     a: &ProposeArguments,
     view: &GraspView,
     gripper: &Gripper,
-    planner: &AntipodalOptions,
+    planner: &Planner,
+    options: &AntipodalOptions,
 ) -> Result<Vec<Proposed>> {
     let Some(place) = &a.experiences else { return Ok(vec![]) };
     let network = experience::model(&a.network)?;
     let mut memory = experience::memory(place, &network)?;
     let part = a.part.as_deref();
     let grasps = match a.preset {
-        None => grasps_from_experience(view, gripper, planner, &network, &mut memory, part)?,
+        None => grasps_from_experience(view, gripper, options, &network, &mut memory, part)?,
         Some(preset) => {
-            let with_planner = preset == Preset::PublishedCombined;
-            grasps_as_published(view, gripper, planner, &network, &mut memory, part, with_planner)?
+            let planned = (preset == Preset::PublishedCombined)
+                .then(|| planner.grasps(view, gripper, options))
+                .transpose()?;
+            grasps_as_published(view, gripper, options, &network, &mut memory, part, planned.as_deref())?
         }
     };
     experience::note_left_out(&memory.take_left_out(), &place.to_string());
@@ -172,7 +198,7 @@ fn with_experience(
         let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {place} holds no experience{wanted} that this network can use");
     }
-    Ok(of_both(&grasps))
+    Ok(of_both(planner, &grasps))
 }
 
 fn report_grasps(whole: &Whole, folder: Option<&std::path::Path>) {

@@ -9,6 +9,8 @@ mod mttm;
 mod nol;
 mod options;
 mod pix2pose;
+#[cfg(feature = "physics")]
+mod planner;
 mod proposals;
 mod refiner;
 #[cfg(test)]
@@ -35,6 +37,8 @@ pub(crate) use self::dgcm::TrainDgcmArguments;
 pub(crate) use self::mttm::TrainMttmArguments;
 pub(crate) use self::nol::TrainNolArguments;
 pub(crate) use self::pix2pose::{TrainPix2PoseArguments, train_pix2pose};
+#[cfg(feature = "physics")]
+pub(crate) use self::planner::TrainPlannerArguments;
 pub(crate) use self::proposals::TrainProposalsArguments;
 pub(crate) use self::refiner::TrainRefinerArguments;
 pub(crate) use self::views::TrainViewsArguments;
@@ -92,6 +96,13 @@ pub(crate) enum TrainCommand {
                       After a stop, the same command resumes."
     )]
     Proposals(Box<TrainProposalsArguments>),
+    /// Train a grasp planner, GPD or HAF, on grasps of procedural objects that are tried in a physics engine
+    #[cfg(feature = "physics")]
+    #[command(after_help = "Examples:\n  \
+        sixfold train planner --planner gpd --trials out/trials.jsonl --out out/gpd\n  \
+        sixfold train planner --planner haf --trials out/trials.jsonl --out out/haf\n\n\
+        After a stop, the same command resumes.")]
+    Planner(Box<TrainPlannerArguments>),
 }
 
 pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
@@ -110,6 +121,16 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
         TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
         TrainCommand::Proposals(of) => show(&a.json, &of.out, &proposals::train_proposals(of)?, || ()),
         TrainCommand::Refiner(of) => show(&a.json, &of.out, &refiner::train_refiner(of)?, || ()),
+        #[cfg(feature = "physics")]
+        TrainCommand::Planner(of) => {
+            let summary = planner::train_planner(of)?;
+            show(&a.json, &of.out, &summary, || {
+                println!("on grasps of objects that were not learned from:");
+                for (name, score) in summary.more.quality.scores() {
+                    println!("  {name}: {score:.3}");
+                }
+            })
+        }
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {
             let summary = mttm::train_mttm(of)?;

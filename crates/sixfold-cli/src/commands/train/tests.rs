@@ -11,6 +11,8 @@ use sixfold_dgcm::recipe::DgcmRecipe;
 use sixfold_mttm::recipe::MttmRecipe;
 use sixfold_nol::recipe::NolRecipe;
 use sixfold_pix2pose::recipe::{NetworkKind, Pix2PoseRecipe};
+#[cfg(feature = "physics")]
+use sixfold_planners::recipe::PlannerOptions;
 use sixfold_views::recipe::ViewsRecipe;
 use sixfold_views::refiner::recipe::RefinerRecipe;
 
@@ -56,6 +58,11 @@ fn without_options_the_command_line_asks_for_the_recipes_defaults() {
     same(recipe!(Views, "views"), default!(ViewsRecipe));
     same(recipe!(Refiner, "refiner"), default!(RefinerRecipe));
     same(recipe!(Proposals, "proposals"), default!(ProposalsRecipe));
+    #[cfg(feature = "physics")]
+    match parsed("planner --planner gpd") {
+        TrainCommand::Planner(a) => assert_eq!(a.options(), default!(PlannerOptions)),
+        _ => panic!("another training"),
+    }
 }
 
 #[test]

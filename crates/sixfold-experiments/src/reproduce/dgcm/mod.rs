@@ -16,7 +16,8 @@ use sixfold_io::write_rgb;
 use self::handles::Handles;
 use self::offline::{Answer, COUNTS, Instance, Offline, Question, Size};
 use self::pictures::Line;
-use crate::grasp::compare::{self, CompareArguments, METHODS};
+use crate::grasp::compare::{self, CompareArguments};
+use crate::grasp::ways::METHODS;
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, OutboxArguments, memory, model};
 use sixfold_shell::grasp::learn::{self, Curve, LearnArguments};
@@ -139,6 +140,8 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         hard: true,
         physics: physics(),
         network: NetworkArguments { weights: a.network.weights.clone() },
+        gpd: None,
+        haf: None,
         out: a.out.join("compare"),
         seed: a.seed,
         json: JsonArguments::default(),

@@ -1,0 +1,100 @@
+//! `sixfold train planner`: grasps on synthetic objects are tried in a physics engine, and a planner learns which of them hold.
+//! Nothing but a seed goes in.
+
+use std::path::PathBuf;
+
+use anyhow::{Result, bail};
+use clap::{Args, ValueEnum};
+use sixfold_planners::quality::PlannerQuality;
+use sixfold_planners::recipe::{GpdRecipe, HafRecipe, PlannerOptions};
+use sixfold_planners::trials::TrialSetOptions;
+
+use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
+
+/// Which planner learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Learned {
+    /// GPD (Ten Pas et al. 2017): a network on images of what the hand closes on
+    Gpd,
+    /// HAF (Fischinger et al. 2015): a linear classifier of height accumulated features
+    Haf,
+}
+
+fn steps_help() -> String {
+    let (gpd, haf) = (GpdRecipe::default().options().steps, HafRecipe::PASSES);
+    format!("Training steps; of haf passes over all grasps (default: gpd {gpd}, haf {haf})")
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TrainPlannerArguments {
+    /// Which planner learns
+    #[arg(long, value_name = "NAME", value_enum)]
+    pub planner: Learned,
+    /// File of the grasps that are tried; it is made, or completed, and both planners can learn from the same (default:
+    /// trials.jsonl in --out)
+    #[arg(long, value_name = "FILE")]
+    pub trials: Option<PathBuf>,
+    /// Scenes in which grasps are tried, four of each object and up to 16 grasps in each; two objects of ten are kept for
+    /// the measurement at the end
+    #[arg(long, value_name = "N", default_value_t = TrialSetOptions::default().scenes)]
+    pub scenes: u64,
+    #[arg(long, value_name = "N", help = steps_help())]
+    pub steps: Option<u64>,
+    #[arg(long, value_name = "RATE", help = format!("Highest learning rate, of gpd alone (default: {})", GpdRecipe::default().options().learning_rate))]
+    pub learning_rate: Option<f64>,
+    /// Seed of objects, scenes, trials and training
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Do not train: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Folder for the model and the training's checkpoints, log and curves
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+impl TrainPlannerArguments {
+    pub(super) fn options(&self) -> PlannerOptions {
+        PlannerOptions {
+            trials: TrialSetOptions { scenes: self.scenes, seed: self.seed },
+            file: self.trials.clone(),
+            steps: self.steps,
+            seed: self.seed,
+            command: command_line(),
+        }
+    }
+}
+
+/// Trains, or resumes a training, and writes and measures the model.
+pub(super) fn train_planner(a: &TrainPlannerArguments) -> Result<Summary<Measured<PlannerQuality>>> {
+    let common = a.options();
+    let shown = |message| Shown { preparing: "scenes", measuring: "grasps", message };
+    let trained = match a.planner {
+        Learned::Gpd => {
+            let recipe = checked(GpdRecipe { common, learning_rate: a.learning_rate })?;
+            let shown = shown(|record| {
+                format!(
+                    "cross entropy {:.3}, {:.2} classified correctly",
+                    loss(record, "cross entropy"),
+                    loss(record, "classified correctly")
+                )
+            });
+            train_in(&recipe, (), &a.out, a.export, shown)?
+        }
+        Learned::Haf if a.learning_rate.is_some() => {
+            bail!("--learning-rate: the training of haf has none; leave it out")
+        }
+        Learned::Haf => {
+            let recipe = checked(HafRecipe { common })?;
+            let shown = shown(|record| {
+                format!(
+                    "hinge loss {:.3}, {:.2} classified correctly",
+                    loss(record, "hinge"),
+                    loss(record, "classified correctly")
+                )
+            });
+            train_in(&recipe, (), &a.out, a.export, shown)?
+        }
+    };
+    Ok(summary(trained, |quality| Measured { quality }))
+}

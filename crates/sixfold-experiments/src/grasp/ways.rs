@@ -1,0 +1,116 @@
+//! Eleven ways to choose the grasp: the planner alone; experience alone (equation 6.6); the network alone and joined with the planner,
+//! both as published (section 6.3.2); the planner's grasps by quality and by the fraction of experience that agrees; the planner's
+//! grasps by what came of earlier attempts; the grasps of both kinds by that; and the planners GPD and HAF, each alone and joined with
+//! the network as published.
+
+use std::time::Instant;
+
+use anyhow::Result;
+use sixfold_dgcm::model::DgcmModel;
+use sixfold_dgcm::transfer::{
+    Kind, Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_agreement,
+    rank_by_outcome, rank_experience_as_published,
+};
+use sixfold_grasp::learned::ScoredGrasp;
+use sixfold_grasp::{
+    AntipodalOptions, ClusterOptions, Grasp, GraspCluster, GraspFitter, GraspView, Gripper, antipodal_grasps,
+};
+use sixfold_shell::grasp::planner::Planner;
+
+/// The methods, in the order of the table.
+pub(crate) const METHODS: [&str; 11] = [
+    "geometry",
+    "experience",
+    "network",
+    "published",
+    "agreement",
+    "outcomes",
+    "both",
+    "gpd",
+    "haf",
+    "gpd published",
+    "haf published",
+];
+
+/// What the methods stand on.
+pub(super) struct Ways<'a> {
+    /// The gripper as it is known.
+    pub gripper: &'a Gripper,
+    pub network: &'a DgcmModel,
+    /// GPD and HAF.
+    pub planners: &'a [Planner; 2],
+}
+
+/// What all methods say of one view.
+pub(super) struct Answers {
+    /// Each method's grasps, the best first, and the seconds that it took.
+    pub ranked: [(Vec<Ranked>, f64); METHODS.len()],
+    /// Distance of the nearest experience's feature.
+    pub nearest: Option<f64>,
+    /// Candidates of geometry and of experience.
+    pub candidates: (usize, usize),
+}
+
+/// What was made, and in how many seconds.
+fn timed<T, E>(make: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {
+    let began = Instant::now();
+    Ok((make()?, began.elapsed().as_secs_f64()))
+}
+
+impl Ways<'_> {
+    pub(super) fn answers(
+        &self,
+        view: &GraspView,
+        options: &AntipodalOptions,
+        memory: &mut Memory,
+    ) -> Result<Answers> {
+        let gripper = self.gripper;
+        let (geometry, of_geometry) = timed(|| antipodal_grasps(view, gripper, options))?;
+        let (fitter, of_fitter) = timed(|| GraspFitter::new(view, gripper, options))?;
+        let (found, seconds) = timed(|| propose(&fitter, self.network, memory, &ProposeOptions::default()))?;
+        let of_experience = of_fitter + seconds;
+        let (alone, seconds) =
+            timed(|| propose(&fitter, self.network, memory, &ProposeOptions::published()))?;
+        let of_network = of_fitter + seconds;
+        let clusters = ClusterOptions::default();
+        let began = Instant::now();
+        let outcomes = memory.outcomes(&gripper.name);
+        let by_outcome = |proposals| rank_by_outcome(&geometry, proposals, &clusters, &fitter, &outcomes);
+        let both = by_outcome(&found.proposals);
+        let of_outcomes = began.elapsed().as_secs_f64();
+        let planned = |planner: &Planner| timed(|| planner.grasps(view, gripper, options));
+        let ((gpd, of_gpd), (haf, of_haf)) = (planned(&self.planners[0])?, planned(&self.planners[1])?);
+        let quality = |&grasp: &Grasp| ScoredGrasp { grasp, score: grasp.quality.total() };
+        let scored: Vec<ScoredGrasp> = geometry.iter().map(quality).collect();
+        let published = |planned: &[ScoredGrasp]| rank_as_published(planned, &alone.proposals, &clusters);
+        let ranked = [
+            (rank(&geometry, &[], &clusters), of_geometry),
+            (rank(&[], &found.proposals, &clusters), of_experience),
+            (rank_experience_as_published(&alone.proposals, &clusters), of_network),
+            (published(&scored), of_geometry + of_network),
+            (rank_by_agreement(&geometry, &found.proposals, &clusters), of_geometry + of_experience),
+            (by_outcome(&[]), of_geometry + of_fitter + of_outcomes),
+            (both, of_geometry + of_experience + of_outcomes),
+            (in_own_order(&self.planners[0], &gpd), of_gpd),
+            (in_own_order(&self.planners[1], &haf), of_haf),
+            (published(&gpd), of_gpd + of_network),
+            (published(&haf), of_haf + of_network),
+        ];
+        let nearest = found.nearest.first().map(|m| m.distance);
+        Ok(Answers { ranked, nearest, candidates: (geometry.len(), found.proposals.len()) })
+    }
+}
+
+/// The grasps of a planner that learned, alone.
+fn in_own_order(planner: &Planner, grasps: &[ScoredGrasp]) -> Vec<Ranked> {
+    let ranked = |c: GraspCluster| Ranked {
+        grasp: c.best,
+        kind: Kind::Geometry,
+        score: c.score,
+        geometry: c.best_score,
+        experience: 0.0,
+        proposal: None,
+        members: c.members,
+    };
+    planner.ranked(grasps).into_iter().map(ranked).collect()
+}

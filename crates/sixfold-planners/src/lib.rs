@@ -1,0 +1,31 @@
+//! Grasp planners that learn: GPD's network, and the trainings of GPD and HAF.
+//!
+//! Candidates and what describes them are in `sixfold_grasp::learned`, HAF's classifier as well: it needs no network. Here a
+//! network judges GPD's candidates ([`GpdModel`], [`gpd_grasps`]). With the feature `recipe` both are trained (`recipe`) on the same
+//! trials: grasps on synthetic objects, tried in a physics engine (`trials`).
+
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+#![warn(unreachable_pub, unnameable_types)]
+
+mod gpd;
+#[cfg(feature = "recipe")]
+pub mod gpd_training;
+#[cfg(feature = "recipe")]
+mod haf_features;
+#[cfg(feature = "recipe")]
+pub mod haf_training;
+mod model;
+mod network;
+#[cfg(feature = "recipe")]
+pub mod quality;
+#[cfg(feature = "recipe")]
+pub mod recipe;
+#[cfg(feature = "recipe")]
+pub mod samples;
+#[cfg(feature = "recipe")]
+mod trial_file;
+#[cfg(feature = "recipe")]
+pub mod trials;
+
+pub use gpd::gpd_grasps;
+pub use model::GpdModel;
