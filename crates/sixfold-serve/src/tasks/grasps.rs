@@ -6,7 +6,8 @@ use axum::extract::{Request as HttpRequest, State};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sixfold_grasp::{AntipodalOptions, GraspView, Gripper, ViewOptions, find_objects, parse_gripper};
-use sixfold_shell::grasp::proposals::{Table, by_geometry, picture};
+use sixfold_shell::grasp::planner::Planner;
+use sixfold_shell::grasp::proposals::{Table, of_planner, picture};
 
 use super::Request;
 use super::find::camera_numbers;
@@ -182,7 +183,8 @@ pub(super) fn run(request: &GraspRequest, work: &mut Work<'_>) -> Result<Value, 
         let default = AntipodalOptions::default();
         let completion = default.completion.filter(|_| !request.seen_only);
         let planner = AntipodalOptions { completion, ..default };
-        proposed = by_geometry(view, &gripper, &planner).map_err(|e| wrong("depth", &e))?;
+        let grasps = Planner::Antipodal.grasps(view, &gripper, &planner).map_err(|e| wrong("depth", &e))?;
+        proposed = of_planner(&Planner::Antipodal, &grasps);
         proposed.truncate(request.number);
     }
     let overlay = picture(images.rgb.clone(), depth, &images.camera, &gripper, &proposed);
