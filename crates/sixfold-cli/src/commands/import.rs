@@ -28,10 +28,17 @@ pub(crate) struct ImportArguments {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Format {
     /// HO-3D (Hampali et al. 2020), version 2 or 3: hands that hold YCB objects
+    #[command(
+        after_help = "Example:\n  sixfold import ho3d HO3D --models YCB_Video_Models/models --every 30 --out out/ho3d"
+    )]
     Ho3d(Ho3dArguments),
     /// SMOT, the dataset of the dissertation's chapter 4
+    #[command(after_help = "Example:\n  sixfold import smot SMOT --split train --out out/smot")]
     Smot(SmotArguments),
     /// Source images of NOL in an HDF5 file of the author's code
+    #[command(
+        after_help = "Example:\n  sixfold import nol obj_01.hdf5 --camera camera_SMOT.json --out out/nol-source"
+    )]
     Nol(NolArguments),
 }
 
