@@ -276,7 +276,7 @@ fn bad_boxes_weights_and_objects() {
     );
     fails(tiny.path(), &boxed.replace("--unit mm", "--unit cm"), &["obj_000001.ply", "mm"]);
     fails(tiny.path(), &boxed.replace("--rgb tiny/test/000007/rgb/000004.png", ""), &["--rgb"]);
-    fails(tiny.path(), &boxed.replace("--method pix2pose", "--method ppf"), &["--method pix2pose"]);
+    fails(tiny.path(), &boxed.replace("--method pix2pose", "--method ppf"), &["--method ppf", "pix2pose"]);
     fails(tiny.path(), &format!("{boxed} --icp"), &["--icp", "--depth"]);
 
     // An image of another size than the camera file says.
