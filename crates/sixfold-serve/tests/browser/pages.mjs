@@ -115,7 +115,7 @@ async function find(page, address) {
   assert(await page.locator('input[value="duck"]').isChecked());
   await page.locator(".choice", { hasText: "driller" }).click();
   await page.getByRole("button", { name: "Find", exact: true }).click();
-  await page.locator("#table tbody tr").nth(1).waitFor({ timeout: 120000 });
+  await page.locator("#table tbody tr").nth(1).waitFor({ timeout: 300000 });
   await page.locator("#overlay").evaluate((image) => image.decode());
   assert.equal(await page.locator("#overlay").evaluate((image) => image.naturalWidth), 640);
   const rows = await page.locator("#table tbody tr").allInnerTexts();
