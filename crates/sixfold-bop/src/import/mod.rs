@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, RgbImage};
 use sixfold_io::write_atomically;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
@@ -239,6 +239,14 @@ fn images_in(dir: &Path, every: usize) -> Result<Vec<(u32, PathBuf)>, DatasetErr
         }
     }
     Ok(images.into_iter().step_by(every.max(1)).collect())
+}
+
+/// Width and height of a camera file.
+fn image_size(at: &At<'_>, camera: &Map<String, Value>) -> Result<(usize, usize), DatasetError> {
+    let side = |field: &str| -> Result<usize, DatasetError> {
+        Ok(at.id(field, at.get(camera, field, "pixels")?)? as usize)
+    };
+    Ok((side("width")?, side("height")?))
 }
 
 /// An error for focal lengths that are none in pixels, or that a BOP dataset could not hold.

@@ -11,7 +11,7 @@ use sixfold_geometry::{Camera, Image, Mask, Pose, Progress, Rect, RgbImage, Vec3
 use sixfold_mesh::{Mesh, check_size};
 
 use super::hdf5::{Dataset, Hdf5Error, Hdf5File};
-use super::{ImportSummary, Importer, NewFrame, of_pixels, read_bytes};
+use super::{ImportSummary, Importer, NewFrame, image_size, of_pixels, read_bytes};
 use crate::dataset_error::DatasetError;
 use crate::json::{At, parse};
 use crate::scene_files::GroundTruth;
@@ -72,10 +72,7 @@ fn read_camera(path: &Path) -> Result<Camera, DatasetError> {
     let at = At::file(path);
     let json = parse(&read_bytes(path, sixfold_io::limits::SMALL_TEXT)?, path)?;
     let map = at.object(&json)?;
-    let side = |field: &str| -> Result<usize, DatasetError> {
-        Ok(at.id(field, at.get(map, field, "pixels")?)? as usize)
-    };
-    let (width, height) = (side("width")?, side("height")?);
+    let (width, height) = image_size(&at, map)?;
     let k: [f64; 9] = at.numbers("cam_K", at.get(map, "cam_K", "9 numbers, row by row")?)?;
     of_pixels(&at, "cam_K", (k[0], k[4]))?;
     let camera = Camera { fx: k[0], fy: k[4], cx: k[2], cy: k[5], width, height, distortion: None };

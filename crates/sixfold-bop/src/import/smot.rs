@@ -13,7 +13,7 @@ use sixfold_geometry::{Camera, Mat3, Pose, Progress, Vec3};
 use sixfold_io::ImageFile;
 use sixfold_mesh::{Unit, read_mesh};
 
-use super::{ImportSummary, Importer, NewFrame, folders_in, images_in, of_pixels, read_bytes};
+use super::{ImportSummary, Importer, NewFrame, folders_in, image_size, images_in, of_pixels, read_bytes};
 use crate::dataset_error::DatasetError;
 use crate::json::{At, by_image, describe, parse};
 use crate::scene_files::GroundTruth;
@@ -114,10 +114,7 @@ fn read_camera(path: &Path) -> Result<Camera, DatasetError> {
     let at = At::file(path);
     let json = parse(&read_bytes(path, sixfold_io::limits::SMALL_TEXT)?, path)?;
     let map = at.object(&json)?;
-    let side = |field: &str| -> Result<usize, DatasetError> {
-        Ok(at.id(field, at.get(map, field, "pixels")?)? as usize)
-    };
-    let (width, height) = (side("width")?, side("height")?);
+    let (width, height) = image_size(&at, map)?;
     let expected = "9 numbers, column by column";
     let k: [f64; 9] = at.numbers("intrinsic_matrix", at.get(map, "intrinsic_matrix", expected)?)?;
     of_pixels(&at, "intrinsic_matrix", (k[0], k[4]))?;

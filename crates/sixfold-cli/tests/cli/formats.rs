@@ -202,9 +202,9 @@ fn write_ho3d(tiny: &Tiny, source: &Path, models: &Path) {
         // OpenGL's camera: y up, z back.
         let pose: Pose = here[0].camera_from_object;
         let (axis, t) = (pose.rotation_matrix(), pose.translation());
-        let turned =
+        let rotated =
             sixfold_geometry::Mat3::from_fn(|i, j| if i == 0 { axis[(i, j)] } else { -axis[(i, j)] });
-        let vector = Pose::from_parts(&turned, t).unwrap().rotation().scaled_axis();
+        let vector = Pose::from_parts(&rotated, t).unwrap().rotation().scaled_axis();
         let arrays: [(&str, &[usize], Vec<f64>); 3] = [
             ("objRot", &[3, 1], vector.as_slice().to_vec()),
             ("objTrans", &[3], vec![t.x, -t.y, -t.z]),

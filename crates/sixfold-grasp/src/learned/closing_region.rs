@@ -74,9 +74,9 @@ impl ClosingRegion {
                 let from_x = if flip[column] { SIDE - 1 - x } else { x };
                 let from_y = if flip[row] { SIDE - 1 - y } else { y };
                 let value = self.pixels[(channel * SIDE + from_y) * SIDE + from_x];
-                let turned = is_height && flip[axis] && value > 0;
+                let flipped = is_height && flip[axis] && value > 0;
                 pixels[(channel * SIDE + y) * SIDE + x] =
-                    if turned { (256 - u16::from(value)) as u8 } else { value };
+                    if flipped { (256 - u16::from(value)) as u8 } else { value };
             }
         }
         ClosingRegion { pixels }
