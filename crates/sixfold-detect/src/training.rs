@@ -6,12 +6,13 @@ use crate::network::{Detector, DetectorConfig, DetectorOutput, MASK_STRIDE};
 use crate::samples::{TrainingImageOptions, TrainingImageSource};
 use crate::targets::Targets;
 use burn::module::Module;
-use burn::optim::{GradientsAccumulator, GradientsParams};
+use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
+use sixfold_nn::parameters::{GradientSum, gradients_of};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
@@ -142,8 +143,8 @@ impl DetectorTraining {
         });
         let Some(sum) = products.reduce(|a, b| a + b) else { unreachable!("a detector has levels") };
         let mut gradients = sum.backward();
-        let encoder = GradientsParams::from_module(&mut gradients, &network.encoder);
-        let heads = GradientsParams::from_module(&mut gradients, network);
+        let encoder = gradients_of(&mut gradients, &network.encoder);
+        let heads = gradients_of(&mut gradients, network);
         ImageGradients { terms, encoder, heads }
     }
 }
@@ -200,19 +201,19 @@ impl Training for DetectorTraining {
             workers.into_iter().map(join).collect()
         });
         // Summed in the order of the images, whichever thread had them.
-        let mut of_encoder = GradientsAccumulator::new();
-        let mut of_heads = GradientsAccumulator::new();
+        let mut of_encoder = GradientSum::new();
+        let mut of_heads = GradientSum::new();
         let mut sums = [0.0; 3];
         let mut parts: Vec<_> = parts.into_iter().map(Vec::into_iter).collect();
         for image in 0..batch.len() {
             let Some(part) = parts[image % threads].next() else { continue };
             sums.iter_mut().zip(part.terms).for_each(|(sum, term)| *sum += term);
-            of_encoder.accumulate(&network.encoder, part.encoder);
-            of_heads.accumulate(network, part.heads);
+            of_encoder.add(&network.encoder, part.encoder);
+            of_heads.add(network, part.heads);
         }
         let encoder_rate = rate * self.options.encoder_share;
-        self.learner.step_part(encoder_rate, of_encoder.grads(), |network| &mut network.encoder);
-        self.learner.step(rate, of_heads.grads());
+        self.learner.step_part(encoder_rate, of_encoder.into_gradients(), |network| &mut network.encoder);
+        self.learner.step(rate, of_heads.into_gradients());
         [("scores", sums[0]), ("boxes", sums[1]), ("masks", sums[2])]
             .map(|(name, value)| (name.to_string(), value))
             .into()

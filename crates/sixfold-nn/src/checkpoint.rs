@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::optim::{ModuleOptimizer, OptimizerRecord};
-use burn::store::ModuleRecord;
+use burn::store::{ModuleRecord, RecordError};
 use burn::tensor::Bytes;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -22,6 +22,7 @@ use sixfold_io::write_atomically_with;
 
 use crate::files::explain;
 use crate::fingerprint::Fingerprint;
+use crate::parameters::{Changeable, Network, Parameters, Visitable};
 
 const MAGIC: &[u8; 8] = b"sixfckp1";
 const ENDING: &str = ".checkpoint";
@@ -113,7 +114,7 @@ impl CheckpointWriter {
     /// [`CheckpointError::Record`].
     pub fn module<M: Module>(mut self, name: &str, module: &M) -> Result<Self, CheckpointError> {
         // `valid` settles running statistics that still wait for their threads.
-        let bytes = module.valid().into_record().into_bytes().map_err(|e| self.error(name, e))?;
+        let bytes = record_of(&module.valid()).map_err(|e| self.error(name, e))?;
         self.sections.insert(module_section(name), bytes.to_vec());
         Ok(self)
     }
@@ -184,6 +185,15 @@ impl CheckpointWriter {
         }
         Ok(path)
     }
+}
+
+fn record_of(module: &dyn Visitable) -> Result<Bytes, RecordError> {
+    Parameters::of(module).into_record().into_bytes()
+}
+
+fn load_record(module: &mut dyn Changeable, record: ModuleRecord) -> Result<(), RecordError> {
+    Parameters::of(module.shown()).try_load_record(record)?.put_into(module);
+    Ok(())
 }
 
 /// A whole checkpoint that was read.
@@ -261,11 +271,13 @@ impl Checkpoint {
     pub fn module<M: Module>(&self, name: &str, module: M) -> Result<M, CheckpointError> {
         let section = module_section(name);
         let bytes = Bytes::from_bytes_vec(self.section(&section)?.to_vec());
-        let unfit = |e: burn::store::RecordError| self.error(&section, "the parameters of this network", e);
+        let unfit = |e: RecordError| self.error(&section, "the parameters of this network", e);
         let record = ModuleRecord::from_bytes(bytes).map_err(unfit)?;
         // Running statistics that still wait for their threads would replace the loaded ones later.
         drop(module.valid());
-        module.try_load_record(record).map_err(unfit)
+        let mut module = Network::new(module);
+        load_record(&mut module, record).map_err(unfit)?;
+        Ok(module.into_inner())
     }
 
     /// Fills an optimiser, configured as before, with the recorded state.
@@ -279,7 +291,7 @@ impl Checkpoint {
     ) -> Result<ModuleOptimizer, CheckpointError> {
         let section = optimiser_section(name);
         let bytes = Bytes::from_bytes_vec(self.section(&section)?.to_vec());
-        let unfit = |e: burn::store::RecordError| self.error(&section, "an optimiser's state", e);
+        let unfit = |e: RecordError| self.error(&section, "an optimiser's state", e);
         let record = OptimizerRecord::from_bytes(bytes).map_err(unfit)?;
         let expected = record.len();
         let optimiser = optimiser.load_record(record);

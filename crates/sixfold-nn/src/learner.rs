@@ -7,6 +7,7 @@ use burn::tensor::Tensor;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use crate::options::TrainingOptions;
+use crate::parameters::{Changeable, Network, Parameters, gradients_of};
 
 /// What a checkpoint holds and gives back.
 pub trait Checkpointed {
@@ -60,7 +61,7 @@ impl<N: Module> Learner<N> {
 
     /// One step down the gradients of `loss` (one number) at a learning rate.
     pub fn descend(&mut self, rate: f64, loss: Tensor<1>) {
-        let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
+        let gradients = gradients_of(&mut loss.backward(), &self.network);
         self.step(rate, gradients);
     }
 
@@ -77,8 +78,14 @@ impl<N: Module> Learner<N> {
         part: impl FnOnce(&mut N) -> &mut P,
     ) {
         let part = part(&mut self.network);
-        *part = self.optimiser.step(rate, part.clone(), gradients);
+        let mut changed = Network::new(part.clone());
+        step(&mut self.optimiser, rate, &mut changed, gradients);
+        *part = changed.into_inner();
     }
+}
+
+fn step(optimiser: &mut ModuleOptimizer, rate: f64, part: &mut dyn Changeable, gradients: GradientsParams) {
+    optimiser.step(rate, Parameters::of(part.shown()), gradients).put_into(part);
 }
 
 impl<N: Module> Checkpointed for Learner<N> {

@@ -24,6 +24,7 @@ pub mod fingerprint;
 pub mod keypoints;
 pub mod learner;
 pub mod options;
+pub mod parameters;
 pub mod pretrained;
 pub mod recipe;
 pub mod resnet;

@@ -15,6 +15,7 @@ use pytorch_reader::{DType, PytorchReader};
 use safetensors::tensor::{Dtype, SafeTensors};
 
 use crate::files::explain;
+use crate::parameters::{Changeable, Network};
 
 /// What training scripts put around the names: data-parallel wrappers and dictionaries around the state.
 const PREFIXES: [&str; 7] =
@@ -263,6 +264,16 @@ pub struct Naming<'a> {
 pub fn fill<M: Module>(module: M, file: &PretrainedFile, naming: &Naming<'_>) -> Result<M, PretrainedError> {
     // Running statistics that still wait for their threads would replace the loaded ones later.
     drop(module.valid());
+    let mut module = Network::new(module);
+    fill_parameters(&mut module, file, naming)?;
+    Ok(module.into_inner())
+}
+
+fn fill_parameters(
+    module: &mut dyn Changeable,
+    file: &PretrainedFile,
+    naming: &Naming<'_>,
+) -> Result<(), PretrainedError> {
     let mut filler = Filler {
         file,
         naming,
@@ -272,7 +283,7 @@ pub fn fill<M: Module>(module: M, file: &PretrainedFile, naming: &Naming<'_>) ->
         used: BTreeSet::new(),
         error: None,
     };
-    let module = module.map(&mut filler);
+    module.change(&mut filler);
     if let Some(error) = filler.error {
         return Err(error);
     }
@@ -288,7 +299,7 @@ pub fn fill<M: Module>(module: M, file: &PretrainedFile, naming: &Naming<'_>) ->
             });
         }
     }
-    Ok(module)
+    Ok(())
 }
 
 struct Filler<'a> {

@@ -18,6 +18,7 @@ use sixfold_geometry::FrameId;
 use sixfold_io::write_atomically_with;
 
 use crate::files::explain;
+use crate::parameters::{Changeable, Network, Visitable};
 
 /// Version of the weight file's layout that this version of Sixfold writes and reads.
 pub(crate) const FORMAT_VERSION: u32 = 1;
@@ -224,9 +225,12 @@ pub enum WeightsError {
 /// [`WeightsError::Write`], and [`WeightsError::NotFinite`] for weights that nobody can use.
 pub fn save_weights<M: Module>(module: &M, card: &ModelCard, path: &Path) -> Result<(), WeightsError> {
     // `valid` settles running statistics that still wait for their threads.
-    let module = module.valid();
+    save_parameters(&module.valid(), card, path)
+}
+
+fn save_parameters(module: &dyn Visitable, card: &ModelCard, path: &Path) -> Result<(), WeightsError> {
     let mut collector = Collector { file: path, path: Vec::new(), tensors: Vec::new(), error: None };
-    module.visit(&mut collector);
+    module.show(&mut collector);
     if let Some(error) = collector.error {
         return Err(error);
     }
@@ -272,6 +276,19 @@ pub fn load_weights_from_bytes<M: Module>(
     bytes: &[u8],
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
+    // Running statistics that still wait for their threads would replace the loaded ones later.
+    drop(module.valid());
+    let mut module = Network::new(module);
+    let card = load_parameters(&mut module, path, bytes, expected_architecture)?;
+    Ok((module.into_inner(), card))
+}
+
+fn load_parameters(
+    module: &mut dyn Changeable,
+    path: &Path,
+    bytes: &[u8],
+    expected_architecture: &str,
+) -> Result<ModelCard, WeightsError> {
     let broken = |reason: String| WeightsError::Broken { file: path.to_owned(), reason };
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| broken(e.to_string()))?;
     let card = header.metadata().as_ref().and_then(|m| m.get(CARD_KEY));
@@ -291,17 +308,15 @@ pub fn load_weights_from_bytes<M: Module>(
     }
     let file = SafeTensors::deserialize(bytes).map_err(|e| broken(e.to_string()))?;
     let tensors = file.tensors().into_iter().collect();
-    // Running statistics that still wait for their threads would replace the loaded ones later.
-    drop(module.valid());
     let mut filler = Filler { file: path, path: Vec::new(), tensors, error: None };
-    let module = module.map(&mut filler);
+    module.change(&mut filler);
     if let Some(error) = filler.error {
         return Err(error);
     }
     if let Some((tensor, view)) = filler.tensors.into_iter().next() {
         return Err(WeightsError::Unknown { file: path.to_owned(), tensor, found: view.shape().to_vec() });
     }
-    Ok((module, card))
+    Ok(card)
 }
 
 /// Reads the card of a weight file and nothing else of it.

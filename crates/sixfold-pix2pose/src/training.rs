@@ -5,12 +5,12 @@ use crate::model::network_input;
 use crate::networks::Compact;
 use crate::object::SymmetryMap;
 use crate::samples::SampleSource;
-use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_nn::critic::Critic;
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace, TrainingOptions};
+use sixfold_nn::parameters::{GradientSum, gradients_of};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
@@ -173,8 +173,8 @@ impl Training for CompactTraining {
         let mut adversarial = [0.0; 2];
         // One object after another: their images together would not fit the processor's caches, and memory is what this
         // network waits for.
-        let mut encoder_gradients = GradientsAccumulator::new();
-        let mut decoder_gradients = GradientsAccumulator::new();
+        let mut encoder_gradients = GradientSum::new();
+        let mut decoder_gradients = GradientSum::new();
         let mut rgb = batch.rgb.as_slice();
         for (object, pool) in pools.iter().enumerate() {
             let (images_of_object, rest) = rgb.split_at(count * 3 * side * side);
@@ -213,14 +213,14 @@ impl Training for CompactTraining {
                 total = total + loss.mul_scalar(options.adversarial * count as f32 / images as f32);
             }
             let mut gradients = total.backward();
-            let of_encoder = GradientsParams::from_module(&mut gradients, &network.encoder);
-            let of_decoders = GradientsParams::from_module(&mut gradients, &network.decoders);
-            encoder_gradients.accumulate(&network.encoder, of_encoder);
-            decoder_gradients.accumulate(&network.decoders, of_decoders);
+            let of_encoder = gradients_of(&mut gradients, &network.encoder);
+            let of_decoders = gradients_of(&mut gradients, &network.decoders);
+            encoder_gradients.add(&network.encoder, of_encoder);
+            decoder_gradients.add(&network.decoders, of_decoders);
         }
         let encoder_rate = rate * options.encoder_share;
-        learner.step_part(encoder_rate, encoder_gradients.grads(), |network| &mut network.encoder);
-        learner.step_part(rate, decoder_gradients.grads(), |network| &mut network.decoders);
+        learner.step_part(encoder_rate, encoder_gradients.into_gradients(), |network| &mut network.encoder);
+        learner.step_part(rate, decoder_gradients.into_gradients(), |network| &mut network.decoders);
         let mut losses = Losses::from(
             [("coordinates", sums[0]), ("error", sums[1]), ("visibility", sums[2])]
                 .map(|(name, value)| (name.to_string(), value)),

@@ -4,13 +4,14 @@
 use std::sync::Arc;
 
 use burn::module::Module;
-use burn::optim::{GradientsAccumulator, GradientsParams};
+use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
 use sixfold_geometry::random::{Random, stream};
 use sixfold_nn::kernels::{Regions, roi_align_forward};
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace};
+use sixfold_nn::parameters::{GradientSum, gradients_of};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
@@ -266,8 +267,8 @@ impl AnchoredTraining {
         }
         let Some(product) = sum.product else { unreachable!("a detector has levels") };
         let mut gradients = product.div_scalar(images as f64).backward();
-        let body = GradientsParams::from_module(&mut gradients, network.body());
-        let rest = GradientsParams::from_module(&mut gradients, network);
+        let body = gradients_of(&mut gradients, network.body());
+        let rest = gradients_of(&mut gradients, network);
         ImageGradients { terms: sum.terms.map(|term| term / images as f64), body, rest }
     }
 }
@@ -337,18 +338,18 @@ impl Training for AnchoredTraining {
             workers.into_iter().map(join).collect()
         });
         // Summed in the order of the images, whichever thread had them.
-        let (mut of_body, mut of_rest) = (GradientsAccumulator::new(), GradientsAccumulator::new());
+        let (mut of_body, mut of_rest) = (GradientSum::new(), GradientSum::new());
         let mut sums = [0.0; 5];
         let mut parts: Vec<_> = parts.into_iter().map(Vec::into_iter).collect();
         for image in 0..images.len() {
             let Some(part) = parts[image % threads].next() else { continue };
             sums.iter_mut().zip(part.terms).for_each(|(sum, term)| *sum += term);
-            of_body.accumulate(network.body(), part.body);
-            of_rest.accumulate(network, part.rest);
+            of_body.add(network.body(), part.body);
+            of_rest.add(network, part.rest);
         }
         let body_rate = rate * self.options.encoder_share;
-        self.learner.step_part(body_rate, of_body.grads(), Layers::body_mut);
-        self.learner.step(rate, of_rest.grads());
+        self.learner.step_part(body_rate, of_body.into_gradients(), Layers::body_mut);
+        self.learner.step(rate, of_rest.into_gradients());
         NAMES.iter().zip(sums).map(|(name, value)| ((*name).to_string(), value)).collect()
     }
 

@@ -1,0 +1,377 @@
+//! A network's parameters without the network's type.
+//!
+//! Burn compiles what visits or changes parameters (an optimiser, a record, a file of weights) once for each kind of network, and
+//! there once for each number of dimensions and each kind of number: 27 times. Here it is compiled once for all networks, in this
+//! crate; a crate with a network of its own compiles a way in and out only. That takes a tenth off the build (docs/build.md).
+
+use std::any::Any;
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::optim::{GradientsAccumulator, GradientsParams};
+use burn::tensor::{Bool, Device, Gradients, Int, Tensor};
+
+/// The numbers of a tensor.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Kind {
+    Float,
+    Int,
+    Bool,
+}
+
+/// `body` with the constant `D` for the number of dimensions; Burn has tensors of up to 8.
+macro_rules! with_rank {
+    ($rank:expr, $d:ident => $body:expr) => {
+        with_rank!(@ $rank, $d, $body, 0, 1, 2, 3, 4, 5, 6, 7, 8)
+    };
+    (@ $rank:expr, $d:ident, $body:expr, $($number:literal),*) => {
+        match $rank {
+            $($number => { const $d: usize = $number; $body })*
+            other => unreachable!("a tensor of {other} dimensions"),
+        }
+    };
+}
+
+/// A [`ModuleVisitor`] whose methods have no type parameters. `parameter` is the `Param<Tensor<D, K>>` that `kind` and `rank` say.
+pub(crate) trait AnyVisitor {
+    fn enter(&mut self, name: &str, container: &str);
+    fn exit(&mut self, name: &str, container: &str);
+    fn visit(&mut self, kind: Kind, rank: usize, parameter: &dyn Any);
+}
+
+impl<V: ModuleVisitor> AnyVisitor for V {
+    fn enter(&mut self, name: &str, container: &str) {
+        self.enter_module(name, container);
+    }
+
+    fn exit(&mut self, name: &str, container: &str) {
+        self.exit_module(name, container);
+    }
+
+    fn visit(&mut self, kind: Kind, rank: usize, parameter: &dyn Any) {
+        with_rank!(rank, D => match kind {
+            Kind::Float => self.visit_float::<D>(typed(parameter)),
+            Kind::Int => self.visit_int::<D>(typed(parameter)),
+            Kind::Bool => self.visit_bool::<D>(typed(parameter)),
+        });
+    }
+}
+
+fn typed<T: Any>(parameter: &dyn Any) -> &T {
+    parameter
+        .downcast_ref()
+        .unwrap_or_else(|| unreachable!("a parameter of the kind and rank that go with it"))
+}
+
+/// A [`ModuleMapper`] whose methods have no type parameters; it gives back a parameter of the same type.
+pub(crate) trait AnyMapper {
+    fn enter(&mut self, name: &str, container: &str);
+    fn exit(&mut self, name: &str, container: &str);
+    fn map(&mut self, kind: Kind, rank: usize, parameter: Box<dyn Any>) -> Box<dyn Any>;
+}
+
+impl<M: ModuleMapper> AnyMapper for M {
+    fn enter(&mut self, name: &str, container: &str) {
+        self.enter_module(name, container);
+    }
+
+    fn exit(&mut self, name: &str, container: &str) {
+        self.exit_module(name, container);
+    }
+
+    fn map(&mut self, kind: Kind, rank: usize, parameter: Box<dyn Any>) -> Box<dyn Any> {
+        with_rank!(rank, D => match kind {
+            Kind::Float => Box::new(self.map_float::<D>(owned(parameter))),
+            Kind::Int => Box::new(self.map_int::<D>(owned(parameter))),
+            Kind::Bool => Box::new(self.map_bool::<D>(owned(parameter))),
+        })
+    }
+}
+
+fn owned<T: Any>(parameter: Box<dyn Any>) -> T {
+    let parameter = parameter.downcast();
+    *parameter.unwrap_or_else(|_| unreachable!("a parameter of the kind and rank that go with it"))
+}
+
+/// A module whose parameters can be visited. This and [`Changeable`] are what each crate compiles for each of its networks.
+pub(crate) trait Visitable {
+    fn show(&self, visitor: &mut dyn AnyVisitor);
+}
+
+impl<N: Module> Visitable for N {
+    fn show(&self, visitor: &mut dyn AnyVisitor) {
+        self.visit(&mut WithoutTypes(visitor));
+    }
+}
+
+/// A module whose parameters can be changed.
+pub(crate) trait Changeable {
+    fn shown(&self) -> &dyn Visitable;
+    fn change(&mut self, mapper: &mut dyn AnyMapper);
+}
+
+/// A module that is [`Changeable`].
+pub(crate) struct Network<N>(Option<N>);
+
+impl<N> Network<N> {
+    pub(crate) fn new(module: N) -> Self {
+        Network(Some(module))
+    }
+
+    pub(crate) fn into_inner(self) -> N {
+        self.0.unwrap_or_else(|| unreachable!("{AWAY}"))
+    }
+}
+
+/// Burn's `map` takes the module and gives it back.
+const AWAY: &str = "a module is away only while it is changed";
+
+impl<N: Module> Changeable for Network<N> {
+    fn shown(&self) -> &dyn Visitable {
+        self.0.as_ref().unwrap_or_else(|| unreachable!("{AWAY}"))
+    }
+
+    fn change(&mut self, mapper: &mut dyn AnyMapper) {
+        self.0 = self.0.take().map(|module| module.map(&mut WithoutTypes(mapper)));
+    }
+}
+
+/// Burn's visitor or mapper that forwards to one without type parameters.
+struct WithoutTypes<'a, T: ?Sized>(&'a mut T);
+
+impl ModuleVisitor for WithoutTypes<'_, dyn AnyVisitor + '_> {
+    fn enter_module(&mut self, name: &str, container: &str) {
+        self.0.enter(name, container);
+    }
+
+    fn exit_module(&mut self, name: &str, container: &str) {
+        self.0.exit(name, container);
+    }
+
+    fn visit_float<const D: usize>(&mut self, parameter: &Param<Tensor<D>>) {
+        self.0.visit(Kind::Float, D, parameter);
+    }
+
+    fn visit_int<const D: usize>(&mut self, parameter: &Param<Tensor<D, Int>>) {
+        self.0.visit(Kind::Int, D, parameter);
+    }
+
+    fn visit_bool<const D: usize>(&mut self, parameter: &Param<Tensor<D, Bool>>) {
+        self.0.visit(Kind::Bool, D, parameter);
+    }
+}
+
+impl ModuleMapper for WithoutTypes<'_, dyn AnyMapper + '_> {
+    fn enter_module(&mut self, name: &str, container: &str) {
+        self.0.enter(name, container);
+    }
+
+    fn exit_module(&mut self, name: &str, container: &str) {
+        self.0.exit(name, container);
+    }
+
+    fn map_float<const D: usize>(&mut self, parameter: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        owned(self.0.map(Kind::Float, D, Box::new(parameter)))
+    }
+
+    fn map_int<const D: usize>(&mut self, parameter: Param<Tensor<D, Int>>) -> Param<Tensor<D, Int>> {
+        owned(self.0.map(Kind::Int, D, Box::new(parameter)))
+    }
+
+    fn map_bool<const D: usize>(&mut self, parameter: Param<Tensor<D, Bool>>) -> Param<Tensor<D, Bool>> {
+        owned(self.0.map(Kind::Bool, D, Box::new(parameter)))
+    }
+}
+
+/// All parameters of a network in their order, as a module of their own: for what Burn offers for modules only. They are the
+/// network's, with its tensors, ids and names.
+#[derive(Debug, Clone)]
+pub(crate) struct Parameters(Vec<Parameter>);
+
+#[derive(Debug, Clone)]
+struct Parameter {
+    /// Name and kind of container of each module above it, and of itself.
+    path: Vec<[String; 2]>,
+    kind: Kind,
+    rank: usize,
+    value: Box<dyn Value>,
+}
+
+/// A `Param<Tensor<D, K>>`.
+trait Value: Any + Send + std::fmt::Debug {
+    fn duplicate(&self) -> Box<dyn Value>;
+    fn devices(&self, devices: Vec<Device>) -> Vec<Device>;
+    fn changed(self: Box<Self>, change: Change<'_>) -> Box<dyn Value>;
+}
+
+/// What a module can be asked to do with its parameters.
+#[derive(Clone, Copy)]
+enum Change<'a> {
+    Fork(&'a Device),
+    ToDevice(&'a Device),
+    Train,
+    Valid,
+    Materialize,
+}
+
+impl<T: Module + 'static> Value for T {
+    fn duplicate(&self) -> Box<dyn Value> {
+        Box::new(self.clone())
+    }
+
+    fn devices(&self, devices: Vec<Device>) -> Vec<Device> {
+        self.collect_devices(devices)
+    }
+
+    fn changed(self: Box<Self>, change: Change<'_>) -> Box<dyn Value> {
+        Box::new(match change {
+            Change::Fork(device) => self.fork(device),
+            Change::ToDevice(device) => self.to_device(device),
+            Change::Train => self.train(),
+            Change::Valid => self.valid(),
+            Change::Materialize => self.materialize(),
+        })
+    }
+}
+
+impl Clone for Box<dyn Value> {
+    fn clone(&self) -> Self {
+        self.as_ref().duplicate()
+    }
+}
+
+impl Parameters {
+    pub(crate) fn of(module: &dyn Visitable) -> Self {
+        let mut gathered = Gathered { path: Vec::new(), parameters: Vec::new() };
+        module.show(&mut gathered);
+        Parameters(gathered.parameters)
+    }
+
+    /// Puts them into the module that they come from.
+    pub(crate) fn put_into(self, module: &mut dyn Changeable) {
+        module.change(&mut Replaced(self.0.into_iter()));
+    }
+
+    fn change(self, change: Change<'_>) -> Self {
+        let changed = |p: Parameter| Parameter { value: p.value.changed(change), ..p };
+        Parameters(self.0.into_iter().map(changed).collect())
+    }
+}
+
+struct Gathered {
+    path: Vec<[String; 2]>,
+    parameters: Vec<Parameter>,
+}
+
+impl AnyVisitor for Gathered {
+    fn enter(&mut self, name: &str, container: &str) {
+        self.path.push([name.to_owned(), container.to_owned()]);
+    }
+
+    fn exit(&mut self, _name: &str, _container: &str) {
+        self.path.pop();
+    }
+
+    fn visit(&mut self, kind: Kind, rank: usize, parameter: &dyn Any) {
+        let value: Box<dyn Value> = with_rank!(rank, D => match kind {
+            Kind::Float => Box::new(typed::<Param<Tensor<D>>>(parameter).clone()),
+            Kind::Int => Box::new(typed::<Param<Tensor<D, Int>>>(parameter).clone()),
+            Kind::Bool => Box::new(typed::<Param<Tensor<D, Bool>>>(parameter).clone()),
+        });
+        self.parameters.push(Parameter { path: self.path.clone(), kind, rank, value });
+    }
+}
+
+struct Replaced(std::vec::IntoIter<Parameter>);
+
+impl AnyMapper for Replaced {
+    fn enter(&mut self, _name: &str, _container: &str) {}
+
+    fn exit(&mut self, _name: &str, _container: &str) {}
+
+    fn map(&mut self, _kind: Kind, _rank: usize, _old: Box<dyn Any>) -> Box<dyn Any> {
+        let new = self.0.next();
+        new.unwrap_or_else(|| unreachable!("parameters go back into the network that they come from")).value
+    }
+}
+
+impl Module for Parameters {
+    fn collect_devices(&self, devices: Vec<Device>) -> Vec<Device> {
+        self.0.iter().fold(devices, |devices, p| p.value.devices(devices))
+    }
+
+    fn fork(self, device: &Device) -> Self {
+        self.change(Change::Fork(device))
+    }
+
+    fn to_device(self, device: &Device) -> Self {
+        self.change(Change::ToDevice(device))
+    }
+
+    fn train(self) -> Self {
+        self.change(Change::Train)
+    }
+
+    fn valid(&self) -> Self {
+        self.clone().change(Change::Valid)
+    }
+
+    fn materialize(self) -> Self {
+        self.change(Change::Materialize)
+    }
+
+    fn visit<V: ModuleVisitor>(&self, visitor: &mut V) {
+        for Parameter { path, kind, rank, value } in &self.0 {
+            path.iter().for_each(|[name, container]| visitor.enter_module(name, container));
+            AnyVisitor::visit(visitor, *kind, *rank, value.as_ref());
+            path.iter().rev().for_each(|[name, container]| visitor.exit_module(name, container));
+        }
+    }
+
+    fn map<M: ModuleMapper>(self, mapper: &mut M) -> Self {
+        let mapped = |Parameter { path, kind, rank, value }: Parameter| {
+            path.iter().for_each(|[name, container]| mapper.enter_module(name, container));
+            let value = with_rank!(rank, D => match kind {
+                Kind::Float => Box::new(mapper.map_float::<D>(owned(value))) as Box<dyn Value>,
+                Kind::Int => Box::new(mapper.map_int::<D>(owned(value))),
+                Kind::Bool => Box::new(mapper.map_bool::<D>(owned(value))),
+            });
+            path.iter().rev().for_each(|[name, container]| mapper.exit_module(name, container));
+            Parameter { path, kind, rank, value }
+        };
+        Parameters(self.0.into_iter().map(mapped).collect())
+    }
+}
+
+/// Takes the gradients of a module's parameters out of `gradients`.
+pub fn gradients_of<M: Module>(gradients: &mut Gradients, module: &M) -> GradientsParams {
+    taken_out(gradients, module)
+}
+
+fn taken_out(gradients: &mut Gradients, module: &dyn Visitable) -> GradientsParams {
+    GradientsParams::from_module(gradients, &Parameters::of(module))
+}
+
+/// A sum of gradients of one module.
+#[derive(Default)]
+pub struct GradientSum(GradientsAccumulator<Parameters>);
+
+impl GradientSum {
+    /// Nothing yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds gradients of `module`'s parameters.
+    pub fn add<M: Module>(&mut self, module: &M, gradients: GradientsParams) {
+        self.add_of(module, gradients);
+    }
+
+    fn add_of(&mut self, module: &dyn Visitable, gradients: GradientsParams) {
+        self.0.accumulate(&Parameters::of(module), gradients);
+    }
+
+    /// The sum.
+    pub fn into_gradients(mut self) -> GradientsParams {
+        self.0.grads()
+    }
+}
