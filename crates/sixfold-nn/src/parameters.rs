@@ -199,7 +199,7 @@ struct Parameter {
 /// A `Param<Tensor<D, K>>`.
 trait Value: Any + Send + std::fmt::Debug {
     fn duplicate(&self) -> Box<dyn Value>;
-    fn devices(&self, devices: Vec<Device>) -> Vec<Device>;
+    fn add_devices(&self, devices: Vec<Device>) -> Vec<Device>;
     fn changed(self: Box<Self>, change: Change<'_>) -> Box<dyn Value>;
 }
 
@@ -218,7 +218,7 @@ impl<T: Module + 'static> Value for T {
         Box::new(self.clone())
     }
 
-    fn devices(&self, devices: Vec<Device>) -> Vec<Device> {
+    fn add_devices(&self, devices: Vec<Device>) -> Vec<Device> {
         self.collect_devices(devices)
     }
 
@@ -296,7 +296,7 @@ impl AnyMapper for Replaced {
 
 impl Module for Parameters {
     fn collect_devices(&self, devices: Vec<Device>) -> Vec<Device> {
-        self.0.iter().fold(devices, |devices, p| p.value.devices(devices))
+        self.0.iter().fold(devices, |devices, p| p.value.add_devices(devices))
     }
 
     fn fork(self, device: &Device) -> Self {
@@ -373,5 +373,132 @@ impl GradientSum {
     /// The sum.
     pub fn into_gradients(mut self) -> GradientsParams {
         self.0.grads()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::nn::conv::{Conv2d, Conv2dConfig};
+    use burn::nn::{Linear, LinearConfig};
+    use burn::optim::AdamWConfig;
+    use burn::tensor::Distribution;
+
+    use super::*;
+    use crate::batch_norm::{BatchNorm, BatchNormConfig};
+    use crate::learner::Learner;
+    use crate::options::TrainingOptions;
+
+    /// Parameters of one to four dimensions, running statistics, whole numbers and truth values.
+    #[derive(Module, Debug)]
+    struct Net {
+        conv: Conv2d,
+        norm: BatchNorm,
+        heads: Vec<Linear>,
+        depth: Param<Tensor<3>>,
+        counts: Param<Tensor<1, Int>>,
+        mask: Param<Tensor<2, Bool>>,
+    }
+
+    fn net(device: &Device) -> Net {
+        device.seed(3);
+        Net {
+            conv: Conv2dConfig::new([3, 4], [3, 3]).init(device),
+            norm: BatchNormConfig::new(4).init(device),
+            heads: vec![LinearConfig::new(4, 2).init(device), LinearConfig::new(4, 5).init(device)],
+            depth: Param::from_tensor(Tensor::random([1, 4, 1], Distribution::Default, device)),
+            counts: Param::initialized(burn::module::ParamId::new(), Tensor::from_data([3, -7], device)),
+            mask: Param::initialized(
+                burn::module::ParamId::new(),
+                Tensor::from_data([[true, false]], device),
+            ),
+        }
+    }
+
+    fn loss(net: &Net, x: &Tensor<4>) -> Tensor<1> {
+        let [n, ..] = x.dims();
+        let x = net.norm.forward(net.conv.forward(x.clone())).mean_dim(3).mean_dim(2).reshape([n, 4]);
+        let x = x * net.depth.val().reshape([1, 4]);
+        net.heads[0].forward(x.clone()).square().mean() + net.heads[1].forward(x).square().mean()
+    }
+
+    /// All tensors of a module with their names and ids, as Burn writes them.
+    fn record(net: &Net) -> Vec<u8> {
+        net.valid().into_record().into_bytes().unwrap().to_vec()
+    }
+
+    fn images(device: &Device, seed: u64) -> Tensor<4> {
+        device.seed(seed);
+        Tensor::random([2, 3, 8, 8], Distribution::Default, device)
+    }
+
+    #[test]
+    fn the_parameters_are_the_networks_with_names_ids_and_kinds() {
+        let device = Device::flex();
+        let original = net(&device);
+        let parameters = Parameters::of(&original);
+        assert_eq!(parameters.num_params(), original.num_params());
+        assert_eq!(parameters.devices(), original.devices());
+        assert_eq!(parameters.into_record().into_bytes().unwrap().to_vec(), record(&original));
+        // Into another network of the same kind, which then is the first one to Burn.
+        device.seed(4);
+        let mut other = Network::new(net(&device.clone()).map(&mut Doubled));
+        assert_ne!(numbers(&original), numbers(other.0.as_ref().unwrap()));
+        Parameters::of(&original).put_into(&mut other);
+        assert_eq!(numbers(&original), numbers(&other.into_inner()));
+    }
+
+    /// What a file of weights holds: all but the ids, which running statistics keep.
+    fn numbers(net: &Net) -> Vec<u8> {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("weights.safetensors");
+        crate::weights::save_weights(net, &crate::weights::ModelCard::new("net", "A network"), &file)
+            .unwrap();
+        std::fs::read(file).unwrap()
+    }
+
+    struct Doubled;
+
+    impl ModuleMapper for Doubled {
+        fn map_float<const D: usize>(&mut self, parameter: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            parameter.map(|tensor| tensor.mul_scalar(2.0))
+        }
+
+        fn map_int<const D: usize>(&mut self, parameter: Param<Tensor<D, Int>>) -> Param<Tensor<D, Int>> {
+            parameter.map(|tensor| tensor.mul_scalar(2))
+        }
+    }
+
+    #[test]
+    fn steps_are_burns_own_bit_for_bit() {
+        let device = Device::flex().autodiff();
+        let options = TrainingOptions {
+            steps: 3,
+            learning_rate: 1e-2,
+            warm_up: 0,
+            weight_decay: 0.01,
+            max_grad_norm: Some(0.1),
+            seed: 0,
+        };
+        let mut burns = net(&device).train();
+        let mut ours = Learner::adam_w("network", burns.clone(), &options);
+        let config = AdamWConfig::new()
+            .with_weight_decay(options.weight_decay)
+            .with_grad_clipping(options.max_grad_norm.map(burn::grad_clipping::GradientClippingConfig::Norm));
+        let mut optimiser = config.init();
+        let start = record(&burns);
+        for step in 0..3 {
+            let (mut sum, mut accumulator) = (GradientSum::new(), GradientsAccumulator::new());
+            for image in 0..2 {
+                let x = images(&device, 10 * step + image);
+                let mut gradients = loss(ours.network(), &x).backward();
+                sum.add(ours.network(), gradients_of(&mut gradients, ours.network()));
+                let gradients = GradientsParams::from_grads(loss(&burns, &x).backward(), &burns);
+                accumulator.accumulate(&burns, gradients);
+            }
+            ours.step(1e-2, sum.into_gradients());
+            burns = optimiser.step(1e-2, burns, accumulator.grads());
+            assert_eq!(record(ours.network()), record(&burns), "step {step}");
+        }
+        assert_ne!(start, record(&burns));
     }
 }
