@@ -237,6 +237,9 @@ fn image(bytes: &[u8]) {
     if let Ok(image) = file.rgb() {
         assert_eq!(Some(image.size()), size, "the header says the size");
     }
+    if let Ok(Some(focal_length)) = file.focal_length() {
+        assert!(focal_length.is_finite() && focal_length > 0.0, "{focal_length}");
+    }
     let mask = file.mask();
     if let Ok(mask) = &mask {
         assert_eq!(mask.as_slice().len(), mask.width() * mask.height());

@@ -24,6 +24,9 @@ const BESIDE_PIXELS: u64 = 32 << 20;
 /// Most bytes that a pixel takes, decoded: four channels of 16 bits. An image file of more bytes than that is no image.
 const BYTES_A_PIXEL: u64 = 8;
 
+/// Diagonal of 35 mm film (36 x 24 mm), millimetres.
+const FILM_DIAGONAL: f64 = 43.266_615_305_567_87;
+
 /// An image (PNG or JPEG) that is still to be read: a file, or the bytes of one.
 #[derive(Debug, Clone)]
 pub struct ImageFile<'a> {
@@ -190,6 +193,25 @@ impl<'a> ImageFile<'a> {
         self.image(pixels.width(), pixels.height(), pixels.as_raw().as_chunks::<3>().0.to_vec())
     }
 
+    /// The focal length that the file names in its EXIF data (`FocalLengthIn35mmFilm`, related to the diagonal of 43.27 mm of that film:
+    /// CIPA DC-008), in pixels; `None` where it names none, or none that a camera can have. Of an image that was cut or enlarged
+    /// afterwards it is wrong.
+    ///
+    /// # Errors
+    /// [`ImageFileError`] naming the file, for what is no image. Broken EXIF data are as none.
+    pub fn focal_length(&self) -> Result<Option<f64>, ImageFileError> {
+        let bytes = self.bytes()?;
+        let mut decoder = self.decoder(&bytes)?.0;
+        let (width, height) = decoder.dimensions();
+        let Ok(Some(raw)) = decoder.exif_metadata() else { return Ok(None) };
+        let Ok(exif) = exif::Reader::new().read_raw(raw) else { return Ok(None) };
+        let field = exif.get_field(exif::Tag::FocalLengthIn35mmFilm, exif::In::PRIMARY);
+        let millimetres = field.and_then(|field| field.value.get_uint(0)).map(f64::from);
+        // From a fisheye to a telescope; 0 stands for "not known".
+        let possible = millimetres.filter(|f| (5.0..=2000.0).contains(f));
+        Ok(possible.map(|f| f / FILM_DIAGONAL * f64::from(width).hypot(f64::from(height))))
+    }
+
     /// Width and height from the header alone.
     ///
     /// # Errors
@@ -272,6 +294,45 @@ mod tests {
         assert_eq!(depth.size(), (20, 10));
         assert!((depth[(3, 2)] - 0.0203).abs() < 1e-7);
         assert_eq!(file(&path).size().unwrap(), (20, 10));
+    }
+
+    /// A JPEG of 40 x 30 pixels whose EXIF data name a focal length of that many millimetres on 35 mm film.
+    fn jpeg_with_exif(millimetres: u16) -> Vec<u8> {
+        let mut jpeg = Cursor::new(Vec::new());
+        DynamicImage::new_rgb8(40, 30).write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
+        let jpeg = jpeg.into_inner();
+        let entry = |tag: u16, kind: u16, value: u32| {
+            [&tag.to_le_bytes()[..], &kind.to_le_bytes(), &1u32.to_le_bytes(), &value.to_le_bytes()].concat()
+        };
+        let directory = |entry: Vec<u8>| [&1u16.to_le_bytes()[..], &entry, &0u32.to_le_bytes()].concat();
+        let tiff = [
+            b"II*\0\x08\0\0\0".to_vec(),
+            // The EXIF directory follows this one.
+            directory(entry(0x8769, 4, 26)),
+            directory(entry(0xa405, 3, u32::from(millimetres))),
+        ];
+        let exif = [b"Exif\0\0".to_vec(), tiff.concat()].concat();
+        let length = u16::try_from(exif.len() + 2).unwrap().to_be_bytes();
+        [&jpeg[..2], b"\xff\xe1", &length, &exif, &jpeg[2..]].concat()
+    }
+
+    #[test]
+    fn the_focal_length_of_exif_data_is_read_in_pixels() {
+        let of =
+            |bytes: &[u8]| ImageFile::of_bytes(Path::new("photograph.jpg"), bytes).focal_length().unwrap();
+        // 26 mm on film of 43.27 mm are .601 of the image's diagonal of 50 pixels.
+        let f = of(&jpeg_with_exif(26)).unwrap();
+        assert!((f - 50.0 * 26.0 / 43.2666).abs() < 1e-3, "{f}");
+        // Not known, or none that a camera has.
+        assert_eq!([0, 4, 2001].map(|f| of(&jpeg_with_exif(f))), [None; 3]);
+        assert_eq!(of(&depth_png()), None);
+        // Data that end early are as none.
+        let whole = jpeg_with_exif(26);
+        let mut broken = whole.clone();
+        broken[40..50].fill(0xff);
+        assert_eq!(of(&broken), None);
+        let error = ImageFile::of_bytes(Path::new("notes.jpg"), b"no image").focal_length().unwrap_err();
+        assert!(error.to_string().contains("notes.jpg"), "{error}");
     }
 
     #[test]

@@ -19,6 +19,8 @@ pub struct SfmOptions {
     pub min_angle: f64,
     /// The camera is a guess: its focal length is searched, then refined with principal point and two radial coefficients.
     pub refine_camera: bool,
+    /// The guess's focal length is what the camera says of itself (EXIF): it is tried as it is, before others.
+    pub focal_length_from_camera: bool,
     /// Seed of all samples.
     pub seed: u64,
 }
@@ -33,6 +35,7 @@ impl Default for SfmOptions {
             min_photographs: 3,
             min_angle: 2.0,
             refine_camera: false,
+            focal_length_from_camera: false,
             seed: 0,
         }
     }

@@ -166,10 +166,12 @@ fn with_best_focal_length(
         let of = |m: &&PairMatches| of_pair(&lens, pixels, m, &tight).map_or(0, |v| v.inliers.len());
         chosen.par_iter().map(of).sum::<usize>()
     };
-    let counts: Vec<usize> = FOCAL_LENGTHS.iter().map(agreeing).collect();
+    let as_it_is = options.focal_length_from_camera.then_some(1.0);
+    let factors: Vec<f64> = as_it_is.into_iter().chain(FOCAL_LENGTHS).collect();
+    let counts: Vec<usize> = factors.iter().map(agreeing).collect();
     let most = counts.iter().copied().max().unwrap_or(0);
     // The nearest to the guess among those that are as good as the best.
-    let best = FOCAL_LENGTHS
+    let best = factors
         .iter()
         .zip(&counts)
         .filter(|(_, count)| **count as f64 >= 0.98 * most as f64)

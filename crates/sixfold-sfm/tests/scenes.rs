@@ -142,6 +142,23 @@ fn a_camera_that_is_a_guess_is_found_too() {
 }
 
 #[test]
+fn a_focal_length_that_the_camera_names_helps_with_a_lens_that_nobody_guesses() {
+    // The telephoto lens of a telephone: 77 mm on 35 mm film.
+    let truth = Camera::new(2278.0, 2278.0, 511.5, 383.5, 1024, 768).unwrap();
+    let scene = Scene::new(around(12), truth, false, 0.5, 0.1);
+    let error = |f: f64, focal_length_from_camera: bool| {
+        let guess = Camera::new(f, f, 511.5, 383.5, 1024, 768).unwrap();
+        let options = SfmOptions { refine_camera: true, focal_length_from_camera, ..SfmOptions::default() };
+        let found = scene.found(&guess, &options).ok()?;
+        Some((found.camera.fx / truth.fx - 1.0).abs())
+    };
+    // What the file says is rounded, and lenses breathe: three per cent off.
+    let (named, guessed) = (error(1.03 * truth.fx, true), error(0.9 * 1024.0, false));
+    assert!(named.is_some_and(|named| named < 0.01), "{named:?}");
+    assert!(guessed.is_none_or(|guessed| guessed > 0.05), "{guessed:?}");
+}
+
+#[test]
 fn the_same_bytes_at_one_and_two_threads() {
     let scene = Scene::new(around(8), camera(), false, 0.5, 0.3);
     let options = SfmOptions { refine_camera: true, ..SfmOptions::default() };

@@ -97,7 +97,7 @@ fn located(
     let start = std::time::Instant::now();
     let of = |(i, image): (usize, &RgbImage)| {
         let (name, size) = (i.to_string(), image.size());
-        Ok(SeenFeatures { name, size, features: features_of(&finder, image)? })
+        Ok(SeenFeatures { name, size, features: features_of(&finder, image)?, focal_length: None })
     };
     let seen: Vec<SeenFeatures> = images.iter().enumerate().map(of).collect::<Result<_, TeachError>>()?;
     let counts: Vec<usize> = seen.iter().map(|s| s.features.points.len()).collect();

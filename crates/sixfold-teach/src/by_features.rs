@@ -2,7 +2,7 @@
 //! everything is.
 
 use sixfold_geometry::Progress;
-use sixfold_io::{read_depth, read_rgb};
+use sixfold_io::{ImageFile, read_depth, read_rgb};
 use sixfold_nn::keypoints::KeypointFinder;
 
 use crate::error::TeachError;
@@ -57,9 +57,12 @@ impl Teaching {
         for (done, number) in used.iter().enumerate() {
             step(progress, done, 2 * count)?;
             let photograph = &self.photographs()[*number];
-            let image = read_rgb(&self.path("photographs", &photograph.file))?;
+            let file = self.path("photographs", &photograph.file);
+            let image = read_rgb(&file)?;
             let features = features_of(&finder, &image)?;
-            seen.push(SeenFeatures { name: photograph.name.clone(), size: image.size(), features });
+            let focal_length = ImageFile::new(&file).focal_length()?;
+            let (name, size) = (photograph.name.clone(), image.size());
+            seen.push(SeenFeatures { name, size, features, focal_length });
         }
         let rest =
             |done: usize, total: usize| progress.report(count + done * count / total.max(1), 2 * count);

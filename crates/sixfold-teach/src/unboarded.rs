@@ -3,7 +3,10 @@
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::{Camera, DepthImage, Image, Pose, Progress, RgbImage, Vec2, Vec3, stats::median};
+use sixfold_geometry::{
+    Camera, DepthImage, Image, Pose, Progress, RgbImage, Vec2, Vec3,
+    stats::{median, upper_median},
+};
 use sixfold_nn::keypoints::{KeypointFinder, KeypointOptions, Keypoints};
 use sixfold_sfm::{Features, Reconstruction, SfmError, SfmOptions, matched, reconstruct, triangulated};
 
@@ -92,6 +95,8 @@ pub struct SeenFeatures {
     pub size: (usize, usize),
     /// Its features.
     pub features: Features,
+    /// The focal length that its file names, pixels.
+    pub focal_length: Option<f64>,
 }
 
 /// A known length: that between two points which somebody marked.
@@ -194,13 +199,17 @@ fn scene_of(
     let matches = matched(&features, LEAST_PRODUCT, &|done: usize, _: usize| progress.report(done, total))
         .ok_or(TeachError::Stopped)?;
     let longest = size.0.max(size.1) as f64;
+    let mut focal_lengths: Vec<f64> =
+        seen.iter().filter(|s| s.size == size).filter_map(|s| s.focal_length).collect();
+    let focal_length = upper_median(&mut focal_lengths);
     let options = SfmOptions {
         // Features are as exact as the pixels in which they were searched.
         threshold_px: SfmOptions::default().threshold_px * (longest / SIDE as f64).max(1.0),
         refine_camera: camera.is_none(),
+        focal_length_from_camera: focal_length.is_some(),
         ..SfmOptions::default()
     };
-    let guess = camera.copied().unwrap_or_else(|| guessed(size));
+    let guess = camera.copied().unwrap_or_else(|| guessed(size, focal_length));
     let pixels: Vec<Vec<Vec2>> = features.into_iter().map(|f| f.points).collect();
     reconstruct(&pixels, &matches, &guess, &options, &|done: usize, _: usize| {
         progress.report(pairs + done, total)
@@ -208,9 +217,9 @@ fn scene_of(
     .map_err(|error| named(error, seen, size))
 }
 
-/// A camera of which the size alone is known.
-fn guessed((width, height): (usize, usize)) -> Camera {
-    let f = FOCAL_LENGTH * width.max(height) as f64;
+/// A camera of which the size is known, and perhaps the focal length (pixels).
+fn guessed((width, height): (usize, usize), focal_length: Option<f64>) -> Camera {
+    let f = focal_length.unwrap_or(FOCAL_LENGTH * width.max(height) as f64);
     let (cx, cy) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
     Camera { fx: f, fy: f, cx, cy, width, height, distortion: None }
 }
@@ -405,6 +414,7 @@ mod tests {
             name: "a.jpg".to_owned(),
             size: (640, 480),
             features: Features { points: pixels(pose), ..Features::default() },
+            focal_length: None,
         });
         let shown = |i: usize| (0..SIDES).map(|k| (k, i as u32)).collect();
         let seen = seen.collect();

@@ -72,7 +72,7 @@ fn taken() -> Taken {
     let seen = (0..PHOTOGRAPHS).map(|i| {
         let image = capture.photograph(i).unwrap();
         let features = features_of(&finder, &image).unwrap();
-        SeenFeatures { name: format!("{i:02}.jpg"), size: image.size(), features }
+        SeenFeatures { name: format!("{i:02}.jpg"), size: image.size(), features, focal_length: None }
     });
     Taken { truth: capture.camera_from_board.clone(), seen: seen.collect() }
 }
@@ -139,7 +139,12 @@ fn assert_refused(taken: Taken, length: &KnownLength) {
     let two = KnownLength { ends: vec![length.ends[0], (3, length.ends[1].1)], ..length.clone() };
     refused(&one, Some(&two), &["one place", "walk around"]);
     // Nothing to recognise.
-    let bare = SeenFeatures { name: "bare.jpg".to_owned(), size: (640, 480), features: Default::default() };
+    let bare = SeenFeatures {
+        name: "bare.jpg".to_owned(),
+        size: (640, 480),
+        features: Default::default(),
+        focal_length: None,
+    };
     let bare = Taken { seen: vec![bare; 5], ..one };
     refused(&bare, Some(&two), &["0 photographs", "texture", "bare.jpg: 0 features"]);
 }
