@@ -13,6 +13,7 @@ mod hypotheses;
 mod lookalikes;
 mod members;
 mod numbers;
+mod prepared;
 mod regression;
 
 pub use calibration::{Calibration, CalibrationError};
@@ -20,4 +21,5 @@ pub use estimator::{AutoEstimator, AutoObject};
 pub use hypotheses::Hypothesis;
 pub use members::AutoMembers;
 pub use numbers::{NAMES, Numbers};
+pub use prepared::prepare_all;
 pub use regression::{Fit, LogisticModel, fit};

@@ -11,7 +11,7 @@ use crate::commands::NETWORKS;
 use crate::commands::board::BoardArguments;
 use crate::commands::calibrate::CalibrateArguments;
 use crate::commands::completions::CompletionsArguments;
-use crate::commands::demo::arguments::DemoArguments;
+use crate::commands::demo::DemoArguments;
 use crate::commands::detect_arguments::DetectArguments;
 use crate::commands::estimate::arguments::{AFTER_HELP as ESTIMATE_HELP, EstimateArguments};
 use crate::commands::eval::EvalArguments;

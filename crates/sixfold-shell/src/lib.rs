@@ -9,6 +9,7 @@ pub mod screen;
 
 pub mod board;
 pub mod datasets;
+pub mod demo;
 pub mod depth_views;
 pub mod folder;
 pub mod found;
@@ -29,10 +30,16 @@ pub mod sheets;
 pub mod shipped;
 pub mod symmetries;
 #[cfg(feature = "networks")]
+pub mod teachings;
+#[cfg(feature = "networks")]
 pub mod training;
 
 use std::num::NonZeroUsize;
 use std::process::ExitCode;
+
+/// Why a program built without the feature `networks` does not do what was asked for.
+pub const WITHOUT_NETWORKS: &str =
+    "this program was built without the feature networks: cargo install --path crates/sixfold-cli";
 
 /// What a command that went through tells the shell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

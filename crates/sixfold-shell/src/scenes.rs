@@ -13,6 +13,7 @@ use sixfold_bop::{
 };
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
+use sixfold_io::CameraFile;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, Unit, read_mesh};
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{ConvexParts, PartsOptions, Tabletop, TabletopOptions};
@@ -139,6 +140,26 @@ struct Listed<'a> {
     id: u32,
     name: &'a str,
     diameter: f64,
+}
+
+/// The camera that sees scenes, without its place: that of a file, or one with 640x480 pixels and the focal length of a Kinect.
+///
+/// # Errors
+/// For a file that cannot be read, or with lens distortion, which rendered images do not have.
+pub fn pinhole(file: Option<&Path>) -> Result<Camera> {
+    let Some(file) = file else {
+        return Ok(Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480)?);
+    };
+    let read = CameraFile::read(file)?;
+    let (width, height) = if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
+    let camera = read.for_image(width, height, file)?;
+    if camera.distortion.is_some() {
+        bail!(
+            "{}: field distortion: rendered images have none; give a camera file without it",
+            file.display()
+        );
+    }
+    Ok(camera)
 }
 
 /// Writes the models, and a list of their names.

@@ -2,22 +2,21 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
-use sixfold_estimator::{Object, ObjectRecord, ObjectStore, PoseEstimator, StoreError};
-use sixfold_io::{CameraFile, limits, read_regular, write_rgb};
-use sixfold_mesh::{Unit, Verdict, read_mesh};
-use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
-use sixfold_ppf::PpfEstimator;
+use sixfold_auto::prepare_all;
+use sixfold_estimator::{ObjectRecord, ObjectStore, StoreError};
+use sixfold_io::write_rgb;
+use sixfold_mesh::{Unit, Verdict};
 use sixfold_shell::Outcome;
-use sixfold_shell::board::{Ends, photograph_files, ruler_in_metres};
+use sixfold_shell::board::Ends;
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Bar;
 use sixfold_shell::ranges;
 use sixfold_shell::symmetries::described;
-use sixfold_teach::{By, KnownLength, SalientSegmenter, ShapeOptions, TeachOptions, Teaching, World};
-use sixfold_views::estimator::ViewsEstimator;
+use sixfold_shell::teachings::{LeftOut, TeachingFiles};
+use sixfold_teach::{SalientSegmenter, ShapeOptions};
 
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold board --out board.pdf                         # print it, stand the object on it, photograph it from all sides\n  \
@@ -96,12 +95,6 @@ struct Taught<'a> {
     folder: &'a Path,
 }
 
-#[derive(Serialize)]
-struct LeftOut {
-    photograph: String,
-    reason: String,
-}
-
 pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     let store = ObjectStore::new(&a.store);
     if let Err(error @ StoreError::Name(_)) = store.record(&a.name) {
@@ -115,7 +108,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
         );
     }
     let out = a.out.clone().unwrap_or_else(|| Path::new("out/teach").join(&a.name));
-    let mut teaching = opened(a, &out)?;
+    let mut teaching = files(a).open(&out)?;
     let options = ShapeOptions { stereo: !a.hull_only, ..ShapeOptions::default() };
     let bar = Bar::stopped_by_interrupts("finding poses");
     teaching.locate(&bar)?;
@@ -127,14 +120,14 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     teaching.reconstruct(&options, &bar)?;
     bar.finish();
     write_rgb(&out.join("photographs.png"), &teaching.picture()?)?;
-    let stored = teaching.store(&store, &a.name, a.replace, prepare)?;
+    let stored = teaching.store(&store, &a.name, a.replace, prepare_all)?;
     let facts = teaching.shape().ok_or_else(|| anyhow!("{}: no mesh was made", out.display()))?;
     let proposed = stored.symmetries.iter().filter(|s| s.verdict(true) != Verdict::Sure);
     let taught = Taught {
         name: &a.name,
         record: &stored.record,
         photographs: stored.photographs,
-        left_out: left_out(&teaching),
+        left_out: LeftOut::all(&teaching),
         unseen: facts.unseen,
         with_depth: facts.with_depth,
         symmetries_proposed: proposed.map(described).collect(),
@@ -144,90 +137,19 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     Ok(Outcome::Found)
 }
 
-/// The folder with all that was given.
-fn opened(a: &TeachArguments, out: &Path) -> Result<Teaching> {
-    match a.photographs.as_slice() {
-        [file] if file.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => {
-            with_poses(a, file, out)
-        }
-        _ => without_poses(a, out),
+/// What was given, as files.
+fn files(a: &TeachArguments) -> TeachingFiles<'_> {
+    TeachingFiles {
+        photographs: &a.photographs,
+        depth: &a.depth,
+        depth_scale: a.depth_scale,
+        camera: a.camera.as_deref(),
+        ruler: a.ruler,
+        without_board: a.no_board,
+        length: a.length,
+        ends: &a.ends,
+        mesh: a.mesh.as_deref().zip(a.unit),
     }
-}
-
-/// Photographs with poses, from a file.
-fn with_poses(a: &TeachArguments, file: &Path, out: &Path) -> Result<Teaching> {
-    if a.ruler.is_some() || a.camera.is_some() || !a.depth.is_empty() || a.no_board {
-        bail!(
-            "--ruler, --camera, --depth and --no-board belong to photographs without poses: {} names what it has",
-            file.display()
-        );
-    }
-    let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
-    Ok(Teaching::open_file(out, file, mesh.as_ref())?)
-}
-
-/// Photographs of the object, on the board or without one.
-fn without_poses(a: &TeachArguments, out: &Path) -> Result<Teaching> {
-    let ruler = ruler_in_metres(a.ruler)?;
-    let files = photograph_files(&a.photographs)?;
-    let depth = if a.depth.is_empty() { vec![] } else { photograph_files(&a.depth)? };
-    if !depth.is_empty() && depth.len() != files.len() {
-        bail!("--depth: found {} images, expected one for each of {} photographs", depth.len(), files.len());
-    }
-    let camera = match (&a.camera, files.first()) {
-        (Some(file), Some(first)) => {
-            let (width, height) = sixfold_io::ImageFile::new(first).size()?;
-            Some(CameraFile::read(file)?.for_image(width, height, file)?)
-        }
-        _ => None,
-    };
-    let mesh = a.mesh.as_ref().zip(a.unit).map(|(file, unit)| read_mesh(file, unit)).transpose()?;
-    let world = if a.no_board { World::Features } else { World::Board };
-    let length = a
-        .length
-        .map(|metres| anyhow::Ok(KnownLength { metres, ends: Ends::numbered(&a.ends, &files)? }))
-        .transpose()?;
-    let mut teaching = Teaching::open(out, &TeachOptions { ruler, camera, world })?;
-    teaching.set_mesh(mesh.as_ref())?;
-    for (i, file) in files.iter().enumerate() {
-        let bytes = read_regular(file, limits::IMAGE).with_context(|| file.display().to_string())?;
-        let number = teaching.add_photograph(&file.display().to_string(), &bytes)?;
-        if let (Some(depth), Some(scale)) = (depth.get(i), a.depth_scale) {
-            let bytes = read_regular(depth, limits::IMAGE).with_context(|| depth.display().to_string())?;
-            teaching.add_depth(number, &bytes, scale / 1000.0)?;
-        }
-    }
-    let given: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
-    teaching.leave_out_others(&given)?;
-    if a.no_board {
-        let in_folder = |i: usize| teaching.photographs().iter().position(|p| p.name == given[i]);
-        let length = length.map(|length| KnownLength {
-            ends: length.ends.iter().filter_map(|(i, ends)| Some((in_folder(*i)?, *ends))).collect(),
-            ..length
-        });
-        teaching.set_length(length)?;
-    }
-    Ok(teaching)
-}
-
-/// What methods derive from an object: now, not at the first estimate.
-fn prepare(object: &Object) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
-    PpfEstimator::default().prepare(object)?;
-    if let (Some(mesh), Some(file)) = (&object.mesh, object.file(TEMPLATES_FILE)) {
-        ObjectTemplates::from_mesh(mesh, &TemplateOptions::default())?.write(&file)?;
-        MttmEstimator::default().prepare(object)?;
-    }
-    ViewsEstimator::shipped()?.prepare(object)?;
-    Ok(())
-}
-
-fn left_out(teaching: &Teaching) -> Vec<LeftOut> {
-    let of = |p: &sixfold_teach::Photograph| {
-        let by_person = p.left_out_by_person.then(|| "not given this time".to_owned());
-        let reason = by_person.or_else(|| p.left_out.clone().filter(|_| p.pose_by != Some(By::Person)))?;
-        Some(LeftOut { photograph: p.name.clone(), reason })
-    };
-    teaching.photographs().iter().filter_map(of).collect()
 }
 
 fn print(t: &Taught<'_>) {

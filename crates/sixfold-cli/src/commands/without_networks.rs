@@ -4,11 +4,7 @@ use std::ffi::OsString;
 
 use anyhow::{Result, anyhow};
 use clap::Args;
-use sixfold_shell::Outcome;
-
-/// Why the program does not do what was asked for.
-pub(crate) const MESSAGE: &str =
-    "this program was built without the feature networks: cargo install --path crates/sixfold-cli";
+use sixfold_shell::{Outcome, WITHOUT_NETWORKS};
 
 /// Whatever is asked, the answer is the same.
 #[derive(Debug, Args)]
@@ -27,5 +23,5 @@ pub(crate) type TrainArguments = Unanswered;
 pub(crate) const AFTER_HELP: &str = "";
 
 pub(crate) fn run(_: &Unanswered) -> Result<Outcome> {
-    Err(anyhow!(MESSAGE))
+    Err(anyhow!(WITHOUT_NETWORKS))
 }

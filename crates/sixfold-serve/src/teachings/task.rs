@@ -4,13 +4,10 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use sixfold_estimator::{Object, PoseEstimator};
-use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
-use sixfold_ppf::PpfEstimator;
+use sixfold_auto::prepare_all;
 use sixfold_teach::{
     FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, ShapeOptions, TeachError, TeachOptions, Teaching,
 };
-use sixfold_views::estimator::ViewsEstimator;
 
 use super::views::MeshFacts;
 use super::{Entry, locked, of_teach};
@@ -137,7 +134,7 @@ fn accept(app: &App, entry: &Entry, accepted: &AcceptedAs, work: &mut Work<'_>) 
     let name = &accepted.name;
     let before = entry.record().object;
     entry.note(|record| record.object = Some(name.clone()))?;
-    let stored = match known.store(&app.store, name, replace, prepare) {
+    let stored = match known.store(&app.store, name, replace, prepare_all) {
         Ok(stored) => stored,
         Err(error) => {
             entry.note(|record| record.object = before)?;
@@ -151,15 +148,4 @@ fn accept(app: &App, entry: &Entry, accepted: &AcceptedAs, work: &mut Work<'_>) 
         "record": stored.record,
         "photographs": stored.photographs,
     }))
-}
-
-/// What methods derive from an object: now, not at the first search.
-fn prepare(object: &Object) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
-    PpfEstimator::default().prepare(object)?;
-    if let (Some(mesh), Some(file)) = (&object.mesh, object.file(TEMPLATES_FILE)) {
-        ObjectTemplates::from_mesh(mesh, &TemplateOptions::default())?.write(&file)?;
-        MttmEstimator::default().prepare(object)?;
-    }
-    ViewsEstimator::shipped()?.prepare(object)?;
-    Ok(())
 }

@@ -8,8 +8,7 @@ use sixfold_estimator::Region;
 use sixfold_geometry::RgbImage;
 use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_runner::RegionSource;
-
-use crate::commands::without_networks::MESSAGE;
+use sixfold_shell::WITHOUT_NETWORKS;
 
 /// Who matches with `--method mttm`, unless `--matcher` says so.
 pub(super) const DEFAULT_MATCHER: &str = "points";
@@ -19,19 +18,19 @@ pub(super) fn objects_file(_weights: &Path) -> Option<PathBuf> {
 }
 
 pub(super) fn detected(_weights: &Path, _image: &RgbImage, _id: u32) -> Result<Option<Region>> {
-    bail!("--detector: {MESSAGE}")
+    bail!("--detector: {WITHOUT_NETWORKS}")
 }
 
 pub(super) fn regions(_weights: &Path, _ids: BTreeSet<u32>) -> Result<RegionSource> {
-    bail!("--detector: {MESSAGE}")
+    bail!("--detector: {WITHOUT_NETWORKS}")
 }
 
 /// The same, when points match alone.
 pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
     match (estimator.options.matched_by, weights) {
-        (_, Some(_)) => bail!("--weights: {MESSAGE}"),
-        (MatchedBy::Network, None) => bail!("--matcher network: {MESSAGE}"),
-        (MatchedBy::Both, None) => bail!("--matcher both: {MESSAGE}"),
+        (_, Some(_)) => bail!("--weights: {WITHOUT_NETWORKS}"),
+        (MatchedBy::Network, None) => bail!("--matcher network: {WITHOUT_NETWORKS}"),
+        (MatchedBy::Both, None) => bail!("--matcher both: {WITHOUT_NETWORKS}"),
         (MatchedBy::Points, None) => Ok(estimator),
     }
 }

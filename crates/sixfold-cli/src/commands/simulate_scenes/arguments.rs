@@ -5,8 +5,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
-use sixfold_geometry::Camera;
-use sixfold_io::CameraFile;
 use sixfold_mesh::Unit;
 use sixfold_simulation::{PileOptions, TabletopOptions};
 use sixfold_synth::shapes::Family;
@@ -219,23 +217,6 @@ impl SimulateScenesArguments {
                 None => bail!("--families: found {name:?}, expected all, or some of {}", known()),
             })
             .collect()
-    }
-
-    /// The camera without its place.
-    pub fn pinhole(&self) -> Result<Camera> {
-        let Some(file) = &self.camera else {
-            return Ok(Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480)?);
-        };
-        let read = CameraFile::read(file)?;
-        let (width, height) = if read.sized { (read.camera.width, read.camera.height) } else { (640, 480) };
-        let camera = read.for_image(width, height, file)?;
-        if camera.distortion.is_some() {
-            bail!(
-                "{}: field distortion: rendered images have none; give a camera file without it",
-                file.display()
-            );
-        }
-        Ok(camera)
     }
 
     /// The options that decide about the result.

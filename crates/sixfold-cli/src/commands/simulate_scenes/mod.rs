@@ -15,7 +15,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::output::report;
 use sixfold_shell::pictures::Pictures;
-use sixfold_shell::scenes::{Counts, DEPTH_SCALE, SceneMaker, write_objects};
+use sixfold_shell::scenes::{Counts, DEPTH_SCALE, SceneMaker, pinhole, write_objects};
 use sixfold_shell::sheets::first_scenes;
 
 #[derive(Serialize)]
@@ -40,7 +40,7 @@ struct Summary {
 
 pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     a.check()?;
-    let camera = a.pinhole()?;
+    let camera = pinhole(a.camera.as_deref())?;
     // Other options are refused before the objects take their time.
     let inputs: Vec<&Path> = [&a.dataset, &a.camera].into_iter().flatten().map(|p| p.as_path()).collect();
     let folder = DatasetFolder::take(&a.out, "simulate-scenes", a.deciding(), &inputs)?;

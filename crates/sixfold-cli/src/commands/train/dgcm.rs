@@ -8,7 +8,7 @@ use serde::Serialize;
 use sixfold_dgcm::recipe::{DgcmKind, DgcmRecipe};
 use sixfold_nn::choice::Choice;
 
-use super::options::{Preset, by_network, choices, presets};
+use super::options::{Preset, ResultArguments, by_network, choices, presets};
 use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> DgcmRecipe {
@@ -63,12 +63,8 @@ pub(crate) struct TrainDgcmArguments {
     /// Seed of weights, objects, views and pairs
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
-    /// Do not train: write the model of the last checkpoint in --out
-    #[arg(long)]
-    pub export: bool,
-    /// Folder for the model and the training's checkpoints, log and curves
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[command(flatten)]
+    pub result: ResultArguments,
 }
 
 impl TrainDgcmArguments {
@@ -111,6 +107,6 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<Views>> {
             )
         },
     };
-    let trained = train_in(&recipe, (), &a.out, a.export, shown)?;
+    let trained = train_in(&recipe, (), &a.result.out, a.result.export, shown)?;
     Ok(summary(trained, |()| Views { views: recipe.views }))
 }

@@ -118,13 +118,13 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
                 }
             })
         }
-        TrainCommand::Views(of) => show(&a.json, &of.out, &views::train_views(of)?, || ()),
-        TrainCommand::Proposals(of) => show(&a.json, &of.out, &proposals::train_proposals(of)?, || ()),
-        TrainCommand::Refiner(of) => show(&a.json, &of.out, &refiner::train_refiner(of)?, || ()),
+        TrainCommand::Views(of) => show(&a.json, &of.result.out, &views::train_views(of)?, || ()),
+        TrainCommand::Proposals(of) => show(&a.json, &of.result.out, &proposals::train_proposals(of)?, || ()),
+        TrainCommand::Refiner(of) => show(&a.json, &of.result.out, &refiner::train_refiner(of)?, || ()),
         #[cfg(feature = "physics")]
         TrainCommand::Planner(of) => {
             let summary = planner::train_planner(of)?;
-            show(&a.json, &of.out, &summary, || {
+            show(&a.json, &of.result.out, &summary, || {
                 println!("on grasps of objects that were not learned from:");
                 for (name, score) in summary.more.quality.scores() {
                     println!("  {name}: {score:.3}");
@@ -134,7 +134,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
         #[cfg(feature = "physics")]
         TrainCommand::Mttm(of) => {
             let summary = mttm::train_mttm(of)?;
-            show(&a.json, &of.out, &summary, || {
+            show(&a.json, &of.result.out, &summary, || {
                 let quality = &summary.more.quality;
                 println!("on {} regions of synthetic objects it was not trained on:", quality.regions);
                 for (name, score) in quality.scores() {
@@ -143,7 +143,7 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })
         }
         #[cfg(feature = "experience")]
-        TrainCommand::Dgcm(of) => show(&a.json, &of.out, &dgcm::train_dgcm(of)?, || ()),
+        TrainCommand::Dgcm(of) => show(&a.json, &of.result.out, &dgcm::train_dgcm(of)?, || ()),
     }
 }
 

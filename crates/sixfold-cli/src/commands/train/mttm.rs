@@ -9,7 +9,7 @@ use sixfold_mttm::quality::Quality;
 use sixfold_mttm::recipe::{MttmKind, MttmRecipe};
 use sixfold_nn::choice::Choice;
 
-use super::options::{Preset, by_network, choices, presets};
+use super::options::{Preset, ResultArguments, by_network, choices, presets};
 use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> MttmRecipe {
@@ -55,12 +55,8 @@ pub(crate) struct TrainMttmArguments {
     /// Seed of weights, objects, scenes and samples
     #[arg(long, default_value_t = default().seed)]
     pub seed: u64,
-    /// Do not train: write the model of the last checkpoint in --out
-    #[arg(long)]
-    pub export: bool,
-    /// Folder for the model and the training's checkpoints, log and curves
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[command(flatten)]
+    pub result: ResultArguments,
 }
 
 impl TrainMttmArguments {
@@ -100,6 +96,6 @@ pub(super) fn train_mttm(a: &TrainMttmArguments) -> Result<Summary<Measured<Qual
             )
         },
     };
-    let trained = train_in(&recipe, (), &a.out, a.export, shown)?;
+    let trained = train_in(&recipe, (), &a.result.out, a.result.export, shown)?;
     Ok(summary(trained, |quality| Measured { quality }))
 }

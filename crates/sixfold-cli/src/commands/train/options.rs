@@ -1,8 +1,10 @@
 //! Options of trainings on the command line, from the recipes' own types and defaults.
 
 use std::fmt;
+use std::path::PathBuf;
 use std::str::FromStr;
 
+use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use sixfold_nn::choice::Choice;
 
@@ -50,6 +52,17 @@ pub(super) fn by_network(what: &str, default: impl fmt::Display, paper: impl fmt
 /// Help for an option whose default depends on the preset.
 pub(super) fn presets(what: &str, default: impl fmt::Display, published: impl fmt::Display) -> String {
     format!("{what} (default: {default}; with --preset published: {published})")
+}
+
+/// What a training that learns from procedural objects writes.
+#[derive(Debug, Args)]
+pub(crate) struct ResultArguments {
+    /// Do not train: write the model of the last checkpoint in --out
+    #[arg(long)]
+    pub export: bool,
+    /// Folder for the model and the training's checkpoints, log and curves
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
 }
 
 /// An angle in the image plane: degrees from 0 to 180 on the command line, radians inside.

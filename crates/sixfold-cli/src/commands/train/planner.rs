@@ -9,6 +9,7 @@ use sixfold_planners::quality::PlannerQuality;
 use sixfold_planners::recipe::{GpdRecipe, HafRecipe, PlannerOptions};
 use sixfold_planners::trials::TrialSetOptions;
 
+use super::options::ResultArguments;
 use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
 
 /// Which planner learns.
@@ -45,12 +46,8 @@ pub(crate) struct TrainPlannerArguments {
     /// Seed of objects, scenes, trials and training
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// Do not train: write the model of the last checkpoint in --out
-    #[arg(long)]
-    pub export: bool,
-    /// Folder for the model and the training's checkpoints, log and curves
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[command(flatten)]
+    pub result: ResultArguments,
 }
 
 impl TrainPlannerArguments {
@@ -79,7 +76,7 @@ pub(super) fn train_planner(a: &TrainPlannerArguments) -> Result<Summary<Measure
                     loss(record, "classified correctly")
                 )
             });
-            train_in(&recipe, (), &a.out, a.export, shown)?
+            train_in(&recipe, (), &a.result.out, a.result.export, shown)?
         }
         Learned::Haf if a.learning_rate.is_some() => {
             bail!("--learning-rate: the training of haf has none; leave it out")
@@ -93,7 +90,7 @@ pub(super) fn train_planner(a: &TrainPlannerArguments) -> Result<Summary<Measure
                     loss(record, "classified correctly")
                 )
             });
-            train_in(&recipe, (), &a.out, a.export, shown)?
+            train_in(&recipe, (), &a.result.out, a.result.export, shown)?
         }
     };
     Ok(summary(trained, |quality| Measured { quality }))

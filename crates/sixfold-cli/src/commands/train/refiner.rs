@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use sixfold_views::refiner::recipe::RefinerRecipe;
 
+use super::options::ResultArguments;
 use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> RefinerRecipe {
@@ -29,12 +30,8 @@ pub(crate) struct TrainRefinerArguments {
     /// Seed of the samples
     #[arg(long, default_value_t = default().options.common.seed)]
     pub seed: u64,
-    /// Do not train: write the model of the last checkpoint in --out
-    #[arg(long)]
-    pub export: bool,
-    /// Folder for the model and the training's checkpoints, log and curves
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[command(flatten)]
+    pub result: ResultArguments,
 }
 
 impl TrainRefinerArguments {
@@ -65,5 +62,5 @@ pub(super) fn train_refiner(a: &TrainRefinerArguments) -> Result<Summary<()>> {
             )
         },
     };
-    Ok(summary(train_in(&recipe, (), &a.out, a.export, shown)?, |()| ()))
+    Ok(summary(train_in(&recipe, (), &a.result.out, a.result.export, shown)?, |()| ()))
 }

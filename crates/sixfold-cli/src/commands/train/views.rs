@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use sixfold_views::recipe::ViewsRecipe;
 
+use super::options::ResultArguments;
 use super::{Shown, Summary, checked, command_line, loss, summary, train_in};
 
 fn default() -> ViewsRecipe {
@@ -29,12 +30,8 @@ pub(crate) struct TrainViewsArguments {
     /// Seed of the samples
     #[arg(long, default_value_t = default().options.common.seed)]
     pub seed: u64,
-    /// Do not train: write the model of the last checkpoint in --out
-    #[arg(long)]
-    pub export: bool,
-    /// Folder for the model and the training's checkpoints, log and curves
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[command(flatten)]
+    pub result: ResultArguments,
 }
 
 impl TrainViewsArguments {
@@ -64,5 +61,5 @@ pub(super) fn train_views(a: &TrainViewsArguments) -> Result<Summary<()>> {
             )
         },
     };
-    Ok(summary(train_in(&recipe, (), &a.out, a.export, shown)?, |()| ()))
+    Ok(summary(train_in(&recipe, (), &a.result.out, a.result.export, shown)?, |()| ()))
 }

@@ -11,33 +11,33 @@ use sixfold_detect::detector::TrainedDetector;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
 
-use super::arguments::DemoArguments;
-use super::colour::{Colour, Row};
+use super::colour::{Colour, ColourPose};
 use super::samples::{Known, add_s};
-use sixfold_shell::overlay::{self, Drawn};
-use sixfold_shell::pictures::Pictures;
-use sixfold_shell::progress::Progress;
-use sixfold_shell::shipped::{DETECTOR, PIX2POSE};
-use sixfold_shell::training::was_trained_on;
+use super::{DemoFiles, RIGHT};
+use crate::overlay::{self, Drawn};
+use crate::pictures::Pictures;
+use crate::progress::Progress;
+use crate::shipped::{DETECTOR, PIX2POSE};
+use crate::training::was_trained_on;
 
 pub(super) fn run(
-    a: &DemoArguments,
+    files: &DemoFiles<'_>,
     out: &mut Pictures,
     dataset: &BopDataset,
     targets: &[Target],
     known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
-    let weights = match a.weights.clone().map_or_else(|| PIX2POSE.find(), Ok) {
+    let weights = match files.weights.map_or_else(|| PIX2POSE.find(), |file| Ok(file.to_owned())) {
         Ok(weights) => weights,
         Err(error) => return Ok(Colour::none(None, error.to_string())),
     };
     // What was asked for has to be right.
-    let detector = match a.detector.clone().or_else(|| DETECTOR.find().ok()) {
+    let detector = match files.detector.map(Path::to_owned).or_else(|| DETECTOR.find().ok()) {
         None => None,
         Some(file) => match TrainedDetector::load(&file) {
             Ok(detector) => Some((detector, file)),
-            Err(error) if a.detector.is_some() => return Err(error.into()),
-            Err(error) => return Ok(Colour::none(Some(weights), sixfold_shell::describe(&error.into()))),
+            Err(error) if files.detector.is_some() => return Err(error.into()),
+            Err(error) => return Ok(Colour::none(Some(weights), crate::describe(&error.into()))),
         },
     };
     let result = Pix2PoseEstimator::load(&weights)
@@ -45,8 +45,8 @@ pub(super) fn run(
         .and_then(|pix2pose| with_model(out, &pix2pose, &weights, detector, dataset, targets, known));
     match result {
         Ok(colour) => Ok(colour),
-        Err(error) if a.weights.is_some() => Err(error),
-        Err(error) => Ok(Colour::none(Some(weights), sixfold_shell::describe(&error))),
+        Err(error) if files.weights.is_some() => Err(error),
+        Err(error) => Ok(Colour::none(Some(weights), crate::describe(&error))),
     }
 }
 
@@ -111,7 +111,7 @@ fn with_model(
                     continue;
                 };
                 let error = add_s(k, posed.camera_from_object, truth);
-                colour.poses.push(Row {
+                colour.poses.push(ColourPose {
                     image: format!("{scene_id}/{im_id}"),
                     object: o.obj_id,
                     add_s_mm: 1000.0 * error,
@@ -127,7 +127,7 @@ fn with_model(
         }
     }
     progress.finish();
-    colour.correct = colour.poses.iter().filter(|r| r.add_s_of_diameter < 0.1).count();
+    colour.correct = colour.poses.iter().filter(|r| r.add_s_of_diameter < RIGHT).count();
     if colour.targets == 0 {
         colour.reason = Some("the samples have no colour images".into());
     }

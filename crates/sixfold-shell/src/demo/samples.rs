@@ -20,7 +20,7 @@ pub(super) struct Known {
 
 impl Known {
     /// Object `id`; its description is kept in `folder`.
-    pub fn new(dataset: &BopDataset, infos: &ModelsInfo, id: u32, folder: &Path) -> Result<Known> {
+    pub(super) fn new(dataset: &BopDataset, infos: &ModelsInfo, id: u32, folder: &Path) -> Result<Known> {
         let mesh = dataset.model(id, Models::Rendering)?;
         let points = ModelPoints::new(mesh.vertices())
             .ok_or_else(|| anyhow!("object {id}: the model has no vertices"))?;
@@ -36,7 +36,7 @@ impl Known {
     }
 
     /// Its surface.
-    pub fn mesh(&self) -> Option<&Mesh> {
+    pub(super) fn mesh(&self) -> Option<&Mesh> {
         self.object.mesh.as_deref()
     }
 }

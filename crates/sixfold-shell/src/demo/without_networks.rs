@@ -2,25 +2,25 @@
 
 use std::collections::BTreeMap;
 
+use crate::pictures::Pictures;
 use anyhow::{Result, bail};
 use sixfold_bop::{BopDataset, Target};
-use sixfold_shell::pictures::Pictures;
 
-use super::arguments::DemoArguments;
+use super::DemoFiles;
 use super::colour::Colour;
 use super::samples::Known;
-use crate::commands::without_networks::MESSAGE;
+use crate::WITHOUT_NETWORKS;
 
 /// No poses, and why; an error where weights were given.
 pub(super) fn run(
-    a: &DemoArguments,
+    files: &DemoFiles<'_>,
     _out: &mut Pictures,
     _dataset: &BopDataset,
     _targets: &[Target],
     _known: &BTreeMap<u32, Known>,
 ) -> Result<Colour> {
-    if a.weights.is_some() || a.detector.is_some() {
-        bail!("--weights and --detector: {MESSAGE}");
+    if files.weights.is_some() || files.detector.is_some() {
+        bail!("--weights and --detector: {WITHOUT_NETWORKS}");
     }
-    Ok(Colour::none(None, MESSAGE.into()))
+    Ok(Colour::none(None, WITHOUT_NETWORKS.into()))
 }

@@ -1,0 +1,22 @@
+//! What methods derive from an object, for all of them at once.
+
+use std::error::Error;
+
+use sixfold_estimator::{Object, PoseEstimator};
+use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptions};
+use sixfold_ppf::PpfEstimator;
+use sixfold_views::estimator::ViewsEstimator;
+
+/// Derives from an object what the methods that need no training for it keep in its folder: now, not at the first estimate.
+///
+/// # Errors
+/// As the methods: for a mesh that one of them cannot use, or a file that cannot be written.
+pub fn prepare_all(object: &Object) -> Result<(), Box<dyn Error + Send + Sync>> {
+    PpfEstimator::default().prepare(object)?;
+    if let (Some(mesh), Some(file)) = (&object.mesh, object.file(TEMPLATES_FILE)) {
+        ObjectTemplates::from_mesh(mesh, &TemplateOptions::default())?.write(&file)?;
+        MttmEstimator::default().prepare(object)?;
+    }
+    ViewsEstimator::shipped()?.prepare(object)?;
+    Ok(())
+}
