@@ -14,7 +14,7 @@ use sixfold_io::ImageFile;
 use sixfold_mesh::{Mesh, Unit, read_mesh};
 
 use super::pickle::{Item, PickledDict};
-use super::{ImportSummary, Importer, NewFrame, folders_in, images_in, of_pixels, read_bytes};
+use super::{ImportSummary, Importer, NewFrame, Sequence, folders_in, images_in, of_pixels, read_bytes};
 use crate::dataset_error::DatasetError;
 use crate::json::At;
 use crate::scene_files::GroundTruth;
@@ -71,26 +71,22 @@ pub fn import_ho3d(
     }
     let mut chosen = vec![];
     // Numbers are those among all sequences: one alone keeps its own.
-    for (scene_id, (name, dir)) in (1..).zip(sequences) {
+    for (scene_id, (name, folder)) in (1..).zip(sequences) {
         if options.sequences.is_empty() || options.sequences.contains(&name) {
-            let images = images_in(&dir.join("rgb"), options.every)?;
-            chosen.push((scene_id, name, dir, images));
+            let images = images_in(&folder.join("rgb"), options.every)?;
+            chosen.push(Sequence { scene_id, name, folder, images });
         }
     }
     let mut importer = Importer::new(out, &options.split, DEPTH_SCALE);
     let mut models = BTreeMap::new();
-    let (mut done, total) = (0, chosen.iter().map(|c| c.3.len()).sum());
-    for (scene_id, name, dir, images) in chosen {
-        importer.begin_scene(scene_id, &name);
-        for (im_id, rgb) in images {
-            add_frame(&mut importer, &dir, (im_id, &rgb), &options.models, &mut models)?;
-            done += 1;
-            if !progress.report(done, total) {
-                return Err(DatasetError::Stopped);
-            }
-        }
-        importer.finish_scene()?;
-    }
+    importer.add_sequences(
+        &chosen,
+        progress,
+        |_| Ok(()),
+        |importer, sequence, (), image| {
+            add_frame(importer, &sequence.folder, image, &options.models, &mut models)
+        },
+    )?;
     importer.finish()
 }
 

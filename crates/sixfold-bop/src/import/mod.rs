@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use serde_json::{Map, Value, json};
-use sixfold_geometry::{Camera, DepthImage, Mask, Pose, RgbImage};
+use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Progress, RgbImage};
 use sixfold_io::write_atomically;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, write_ply};
 
@@ -52,6 +52,15 @@ struct NewFrame<'a> {
     /// The visible part of the only object; otherwise computed from depth and models.
     mask: Option<&'a Mask>,
     ground_truth: &'a [GroundTruth],
+}
+
+/// A sequence of the source, which becomes a scene.
+struct Sequence {
+    scene_id: u32,
+    name: String,
+    folder: PathBuf,
+    /// Ids and colour files of its images.
+    images: Vec<(u32, PathBuf)>,
 }
 
 /// Writes the new dataset.
@@ -93,6 +102,30 @@ impl Importer {
     fn finish_scene(&mut self) -> Result<(), DatasetError> {
         self.summary.scenes += 1;
         self.writer.finish()
+    }
+
+    /// Writes a scene for each sequence: `common` reads what its images have in common, `add_image` adds one of them.
+    fn add_sequences<C>(
+        &mut self,
+        sequences: &[Sequence],
+        progress: &dyn Progress,
+        common: impl Fn(&Sequence) -> Result<C, DatasetError>,
+        mut add_image: impl FnMut(&mut Importer, &Sequence, &C, (u32, &Path)) -> Result<(), DatasetError>,
+    ) -> Result<(), DatasetError> {
+        let (mut done, total) = (0, sequences.iter().map(|s| s.images.len()).sum());
+        for sequence in sequences {
+            self.begin_scene(sequence.scene_id, &sequence.name);
+            let common = common(sequence)?;
+            for (im_id, rgb) in &sequence.images {
+                add_image(self, sequence, &common, (*im_id, rgb))?;
+                done += 1;
+                if !progress.report(done, total) {
+                    return Err(DatasetError::Stopped);
+                }
+            }
+            self.finish_scene()?;
+        }
+        Ok(())
     }
 
     fn leave_out(&mut self) {

@@ -13,7 +13,9 @@ use sixfold_geometry::{Camera, Mat3, Pose, Progress, Vec3};
 use sixfold_io::ImageFile;
 use sixfold_mesh::{Unit, read_mesh};
 
-use super::{ImportSummary, Importer, NewFrame, folders_in, image_size, images_in, of_pixels, read_bytes};
+use super::{
+    ImportSummary, Importer, NewFrame, Sequence, folders_in, image_size, images_in, of_pixels, read_bytes,
+};
 use crate::dataset_error::DatasetError;
 use crate::json::{At, by_image, describe, parse};
 use crate::scene_files::GroundTruth;
@@ -46,32 +48,26 @@ pub fn import_smot(
     let root = source.join(&options.split);
     let sequences = folders_in(&root, "a folder of sequences, such as train/seq1")?;
     let mut chosen = vec![];
-    for (name, dir) in sequences {
+    for (name, folder) in sequences {
         let number = name.strip_prefix("seq").and_then(|number| number.parse().ok());
         let Some(scene_id) = number else {
             return Err(At::file(&root).error("(folder)", name, "seq and a number, such as seq1"));
         };
-        let images = images_in(&dir.join("color"), options.every)?;
-        chosen.push((scene_id, name, dir, images));
+        let images = images_in(&folder.join("color"), options.every)?;
+        chosen.push(Sequence { scene_id, name, folder, images });
     }
     let mut importer = Importer::new(out, &options.split, DEPTH_SCALE);
-    let (mut done, total) = (0, chosen.iter().map(|c| c.3.len()).sum());
-    for (scene_id, name, dir, images) in chosen {
-        importer.begin_scene(scene_id, &name);
-        let path = dir.join("scene_gt.json");
-        let truth = parse_truth(&read_bytes(&path, sixfold_io::limits::LARGE_TEXT)?, &path)?;
-        for (im_id, rgb) in images {
-            match truth.get(&im_id) {
-                Some(truth) => add_frame(&mut importer, source, &dir, (im_id, &rgb), &camera, truth)?,
-                None => importer.leave_out(),
-            }
-            done += 1;
-            if !progress.report(done, total) {
-                return Err(DatasetError::Stopped);
-            }
+    let truth_of = |sequence: &Sequence| {
+        let path = sequence.folder.join("scene_gt.json");
+        parse_truth(&read_bytes(&path, sixfold_io::limits::LARGE_TEXT)?, &path)
+    };
+    importer.add_sequences(&chosen, progress, truth_of, |importer, sequence, truth, (im_id, rgb)| {
+        match truth.get(&im_id) {
+            Some(truth) => add_frame(importer, source, &sequence.folder, (im_id, rgb), &camera, truth)?,
+            None => importer.leave_out(),
         }
-        importer.finish_scene()?;
-    }
+        Ok(())
+    })?;
     importer.finish()
 }
 
