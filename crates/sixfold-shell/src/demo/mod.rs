@@ -159,7 +159,7 @@ struct FromDepth {
 }
 
 impl FromDepth {
-    /// Looks for the targets of one image; draws what was found.
+    /// Searches for the targets of one image and draws the poses.
     fn add_image(
         &mut self,
         scene: &Scene,
