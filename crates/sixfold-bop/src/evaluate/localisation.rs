@@ -1,4 +1,4 @@
-//! BOP'19: the poses that are to be found, by VSD, MSSD, MSPD and ADD(-S).
+//! BOP'19: the poses that are to be found, by VSD, MSSD and MSPD (Hodaň et al. 2020) and ADD(-S) (Hinterstoisser et al. 2012).
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};

@@ -4,22 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-/// A pose from colour, beside the ground truth.
-#[derive(Serialize)]
-pub struct ColourPose {
-    /// Scene and image.
-    pub image: String,
-    /// Object id.
-    pub object: u32,
-    /// Mean distance of the model's points (nearest points for symmetric objects), millimetres.
-    pub add_s_mm: f64,
-    /// The same as a fraction of the diameter.
-    pub add_s_of_diameter: f64,
-    /// The method's confidence.
-    pub confidence: f64,
-    /// Time it took.
-    pub seconds: f64,
-}
+use super::SamplePose;
 
 /// Poses from colour, or why there are none.
 #[derive(Serialize)]
@@ -29,7 +14,7 @@ pub struct Colour {
     /// Weights of the detector; without them boxes are the ground truth's.
     pub detector: Option<PathBuf>,
     /// What was found.
-    pub poses: Vec<ColourPose>,
+    pub poses: Vec<SamplePose>,
     /// How many of the poses are within 10 % of the diameter.
     pub correct: usize,
     /// Targets in colour images that were looked for.

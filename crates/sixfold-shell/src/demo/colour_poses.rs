@@ -11,7 +11,8 @@ use sixfold_detect::detector::TrainedDetector;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
 
-use super::colour::{Colour, ColourPose};
+use super::SamplePose;
+use super::colour::Colour;
 use super::samples::{Known, add_s};
 use super::{DemoFiles, RIGHT};
 use crate::overlay::{self, Drawn};
@@ -111,7 +112,8 @@ fn with_model(
                     continue;
                 };
                 let error = add_s(k, posed.camera_from_object, truth);
-                colour.poses.push(ColourPose {
+                colour.poses.push(SamplePose {
+                    depth: None,
                     image: format!("{scene_id}/{im_id}"),
                     object: o.obj_id,
                     add_s_mm: 1000.0 * error,

@@ -22,7 +22,7 @@ use sixfold_bop::{
 };
 use sixfold_ppf::{PpfOptions, estimate};
 
-pub use self::colour::{Colour, ColourPose};
+pub use self::colour::Colour;
 use self::samples::{Known, add_s};
 use crate::overlay::{self, Drawn};
 use crate::pictures::Pictures;
@@ -46,13 +46,14 @@ pub struct DemoFiles<'a> {
     pub detector: Option<&'a Path>,
 }
 
-/// A pose from depth, beside the ground truth.
+/// A pose, beside the ground truth.
 #[derive(Serialize)]
-pub struct DepthPose {
+pub struct SamplePose {
     /// Scene and image.
     pub image: String,
-    /// Whether the depth is real or simulated.
-    pub depth: &'static str,
+    /// Whether the depth that it was found from is real or simulated; none for a pose from colour.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<&'static str>,
     /// Object id.
     pub object: u32,
     /// Mean distance of the model's points (nearest points for symmetric objects), millimetres.
@@ -69,7 +70,7 @@ pub struct DepthPose {
 #[derive(Serialize)]
 pub struct Demo {
     /// Poses from depth.
-    pub poses: Vec<DepthPose>,
+    pub poses: Vec<SamplePose>,
     /// How many of them are within 10 % of the diameter.
     pub correct: usize,
     /// Poses to be found.
@@ -153,7 +154,7 @@ impl<'a> Samples<'a> {
 /// Poses from depth: as they are shown, and as they are scored.
 #[derive(Default)]
 struct FromDepth {
-    poses: Vec<DepthPose>,
+    poses: Vec<SamplePose>,
     results: Vec<Estimate>,
     pictures: Vec<PathBuf>,
 }
@@ -188,9 +189,9 @@ impl FromDepth {
                 found.push((id, pose, e.confidence));
                 let Some(truth) = truth else { continue };
                 let error = add_s(known, pose, truth);
-                self.poses.push(DepthPose {
+                self.poses.push(SamplePose {
                     image: format!("{scene_id}/{im_id}"),
-                    depth: if scene_id >= SIMULATED { "simulated" } else { "real" },
+                    depth: Some(if scene_id >= SIMULATED { "simulated" } else { "real" }),
                     object: id,
                     add_s_mm: 1000.0 * error,
                     add_s_of_diameter: error / known.model.diameter(),

@@ -47,7 +47,7 @@ fn print_tables(demo: &Demo) {
         println!(
             "{:>10} {:>10} {:>7} {:>12.1} {:>9.1}% {:>11.3} {:>8.2}",
             r.image,
-            r.depth,
+            r.depth.unwrap_or("none"),
             r.object,
             r.add_s_mm,
             100.0 * r.add_s_of_diameter,
