@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use sixfold_geometry::{OptionError, PointCloud, Pose};
 
 use crate::V3;
-use crate::model::{FeatureTable, ObjectModel, fast_acos, local_frame, turn_about_normal};
+use crate::model::{BLOCK, FeatureTable, ObjectModel, fast_acos, local_frame, turn_about_normal};
 
 /// A pose with the votes it got.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -179,22 +179,22 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
     references
         .par_chunks(CHUNK)
         .map(|chunk| {
-            let mut counter = Counter::new(model.samples.len(), &model.table);
+            let mut counter = Counter::new(&model.table);
             let mut found = Vec::new();
             for &r in chunk {
-                counter.vote(&grid, r, model.diameter as f32, &model.table, options.bin_margin);
-                counter.peaks(options, |reference, turn, votes| {
+                counter.collect(&grid, r, model.diameter as f32, &model.table, options.bin_margin);
+                for peak in counter.peaks(model.samples.len(), &model.table, options) {
                     found.push(Hypothesis {
                         camera_from_object: pose_of(
                             &grid.points[r],
                             &local_frame(&grid.normals[r]),
-                            &model_points[reference],
-                            &model_frames[reference],
-                            turn,
+                            &model_points[peak.reference],
+                            &model_frames[peak.reference],
+                            peak.angle,
                         ),
-                        votes,
+                        votes: peak.votes as f32,
                     });
-                });
+                }
             }
             found
         })
@@ -202,22 +202,46 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
         .concat()
 }
 
-/// The accumulator of one reference point.
+/// A row of the feature table that votes at one rotation.
+struct RowVote {
+    /// Index of the row's first block in [`FeatureTable::starts`].
+    first: u32,
+    /// Rotation of the scene pair about the normal, in 256ths.
+    turn: u8,
+}
+
+/// A maximum of the votes of one reference point.
+struct Peak {
+    votes: u32,
+    /// The model point.
+    reference: usize,
+    /// Rotation about the normal, radians.
+    angle: f32,
+}
+
+/// The votes of one reference point.
 struct Counter {
-    /// Votes per model point and rotation.
-    votes: Vec<u16>,
-    /// Per feature row, the turns that have voted, one bit each.
+    /// Votes per model point of a block and rotation.
+    votes: Box<[u16; BLOCK * TURNS]>,
+    /// Per feature row, the rotations that have voted, one bit each.
     voted: Vec<u32>,
     touched: Vec<u32>,
+    row_votes: Vec<RowVote>,
 }
 
 impl Counter {
-    fn new(samples: usize, table: &FeatureTable) -> Counter {
-        Counter { votes: vec![0; samples * TURNS], voted: vec![0; table.starts.len()], touched: vec![] }
+    fn new(table: &FeatureTable) -> Counter {
+        Counter {
+            votes: Box::new([0; BLOCK * TURNS]),
+            voted: vec![0; table.rows()],
+            touched: vec![],
+            row_votes: vec![],
+        }
     }
 
-    fn vote(&mut self, grid: &Grid, r: usize, diameter: f32, table: &FeatureTable, margin: f32) {
-        self.votes.fill(0);
+    /// Collects the rows that vote for scene point `r`, with their rotations.
+    fn collect(&mut self, grid: &Grid, r: usize, diameter: f32, table: &FeatureTable, margin: f32) {
+        self.row_votes.clear();
         for row in self.touched.drain(..) {
             self.voted[row as usize] = 0;
         }
@@ -225,7 +249,7 @@ impl Counter {
         let frame = local_frame(&n);
         let per_angle = table.angle_steps as f32 / PI;
         let per_metre = 1.0 / table.distance_step;
-        let Counter { votes, voted, touched } = self;
+        let Counter { voted, touched, row_votes, .. } = self;
         grid.for_neighbours(&p, |i| {
             let d = grid.points[i] - p;
             let squared = d.norm_squared();
@@ -264,20 +288,17 @@ impl Counter {
                     for c in 0..counts[2] {
                         for e in 0..counts[3] {
                             let row = table.row(bins[0][a], [bins[1][b], bins[2][c], bins[3][e]]);
-                            let (start, end) = (table.starts[row] as usize, table.starts[row + 1] as usize);
-                            if start == end || voted[row] & bit != 0 {
+                            let first = row * table.blocks;
+                            if table.starts[first] == table.starts[first + table.blocks]
+                                || voted[row] & bit != 0
+                            {
                                 continue;
                             }
                             if voted[row] == 0 {
                                 touched.push(row as u32);
                             }
                             voted[row] |= bit;
-                            for &entry in &table.entries[start..end] {
-                                // Scene rotation minus model rotation, in 256ths, to one of 32 bins.
-                                let difference = turn.wrapping_sub(entry as u8);
-                                let slot = (entry >> 8) as usize * TURNS + (difference >> 3) as usize;
-                                votes[slot] = votes[slot].saturating_add(1);
-                            }
+                            row_votes.push(RowVote { first: first as u32, turn });
                         }
                     }
                 }
@@ -285,41 +306,55 @@ impl Counter {
         });
     }
 
-    /// The best model points and turns; votes of a turn are smoothed with its two neighbours.
-    fn peaks(&self, options: &VotingOptions, mut f: impl FnMut(usize, f32, f32)) {
-        let mut best: Vec<(u32, usize, usize)> = Vec::with_capacity(options.peaks_per_reference + 1);
+    /// Counts the votes for the model points of one block. They fit 16 bits: an entry votes at most twice for a slot, and a model point
+    /// has fewer entries than [`MAX_SAMPLES`](crate::model::MAX_SAMPLES).
+    fn count(&mut self, block: usize, table: &FeatureTable) {
+        self.votes.fill(0);
+        for vote in &self.row_votes {
+            let at = vote.first as usize + block;
+            for &entry in &table.entries[table.starts[at] as usize..table.starts[at + 1] as usize] {
+                let [angle, reference] = entry.to_le_bytes();
+                // Scene rotation minus model rotation, in 256ths, to one of 32 bins.
+                let difference = vote.turn.wrapping_sub(angle);
+                self.votes[usize::from(reference) * TURNS + usize::from(difference >> 3)] += 1;
+            }
+        }
+    }
+
+    /// The best model points and rotations, by decreasing votes. The votes of a rotation are smoothed with its two neighbours.
+    fn peaks(&mut self, samples: usize, table: &FeatureTable, options: &VotingOptions) -> Vec<Peak> {
+        let mut best: Vec<Peak> = Vec::with_capacity(options.peaks_per_reference + 1);
         let mut most = 0u32;
-        for (reference, turns) in self.votes.chunks_exact(TURNS).enumerate() {
-            // The best rotation of each model point.
-            let (turn, sum) = (0..TURNS)
-                .map(|t| {
-                    let sum = 2 * u32::from(turns[t])
-                        + u32::from(turns[(t + 1) % TURNS])
-                        + u32::from(turns[(t + TURNS - 1) % TURNS]);
-                    (t, sum)
-                })
-                .max_by_key(|&(t, sum)| (sum, std::cmp::Reverse(t)))
-                .unwrap_or((0, 0));
-            if sum == 0 || (sum as f32) < options.peak_fraction * most as f32 {
-                continue;
-            }
-            most = most.max(sum);
-            let at = best.partition_point(|b| b.0 >= sum);
-            if at < options.peaks_per_reference {
-                best.insert(at, (sum, reference, turn));
-                best.truncate(options.peaks_per_reference);
-            }
-        }
-        for (sum, reference, turn) in best {
-            if sum as f32 >= options.peak_fraction * most as f32 {
-                let turns = &self.votes[reference * TURNS..(reference + 1) * TURNS];
-                let left = f32::from(turns[(turn + TURNS - 1) % TURNS]);
-                let right = f32::from(turns[(turn + 1) % TURNS]);
-                let shift = (right - left) / sum as f32;
-                let angle = (turn as f32 + 0.5 + shift) / TURNS as f32 * 2.0 * PI;
-                f(reference, angle, sum as f32);
+        for block in 0..samples.div_ceil(BLOCK) {
+            self.count(block, table);
+            for (k, turns) in self.votes.chunks_exact(TURNS).enumerate() {
+                // The best rotation of each model point.
+                let (turn, votes) = (0..TURNS)
+                    .map(|t| {
+                        let votes = 2 * u32::from(turns[t])
+                            + u32::from(turns[(t + 1) % TURNS])
+                            + u32::from(turns[(t + TURNS - 1) % TURNS]);
+                        (t, votes)
+                    })
+                    .max_by_key(|&(t, votes)| (votes, std::cmp::Reverse(t)))
+                    .unwrap_or((0, 0));
+                if votes == 0 || (votes as f32) < options.peak_fraction * most as f32 {
+                    continue;
+                }
+                most = most.max(votes);
+                let at = best.partition_point(|b| b.votes >= votes);
+                if at < options.peaks_per_reference {
+                    let left = f32::from(turns[(turn + TURNS - 1) % TURNS]);
+                    let right = f32::from(turns[(turn + 1) % TURNS]);
+                    let shift = (right - left) / votes as f32;
+                    let angle = (turn as f32 + 0.5 + shift) / TURNS as f32 * 2.0 * PI;
+                    best.insert(at, Peak { votes, reference: block * BLOCK + k, angle });
+                    best.truncate(options.peaks_per_reference);
+                }
             }
         }
+        best.retain(|peak| peak.votes as f32 >= options.peak_fraction * most as f32);
+        best
     }
 }
 
