@@ -170,6 +170,7 @@ impl DetectorConfig {
 
 /// The part that is pretrained.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Encoder {
     /// EfficientNet-Lite0, five stages.
@@ -193,6 +194,7 @@ impl Encoder {
 
 /// From the finest level and the encoder's map at 1/4 to prototypes of masks.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Prototypes {
     coarse: Conv,
     fine: Conv,
@@ -202,6 +204,7 @@ struct Prototypes {
 
 /// A detector, made by [`DetectorConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Detector {
     /// The pretrained part.
     pub encoder: Encoder,
@@ -215,6 +218,8 @@ pub struct Detector {
     boxes: Conv,
     masks: Prototypes,
 }
+
+sixfold_nn::displayed_by_name!(Encoder, Prototypes, Detector);
 
 /// What a detector predicts for a batch, raw.
 #[derive(Debug, Clone)]

@@ -58,12 +58,15 @@ impl BareConvConfig {
 
 /// A convolution without bias, made by [`BareConvConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct BareConv {
     /// `outputs x inputs x kernel x kernel`.
     pub weight: Param<Tensor<4>>,
     stride: usize,
     padding: [usize; 2],
 }
+
+crate::displayed_by_name!(BareConv);
 
 impl BareConv {
     fn apply(&self, x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, activation: Activation) -> Tensor<4> {

@@ -226,6 +226,7 @@ impl ConvTransposeConfig {
 
 /// Transposed convolution with TensorFlow's `SAME` border, made by [`ConvTransposeConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct ConvTranspose {
     /// `inputs x outputs x kernel x kernel`.
     pub weight: Param<Tensor<4>>,
@@ -233,6 +234,8 @@ pub struct ConvTranspose {
     pub bias: Option<Param<Tensor<1>>>,
     stride: usize,
 }
+
+crate::displayed_by_name!(ConvTranspose);
 
 impl ConvTranspose {
     /// `batch x inputs x height x width` to `batch x outputs x height * stride x width * stride`.

@@ -129,12 +129,14 @@ fn names(field: &str) -> Vec<String> {
 /// DenseNet-121, made by [`DenseNet121Config`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456,
 /// 0.406) over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct DenseNet121 {
     features: Features,
     classifier: Option<Linear>,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Features {
     conv0: BareConv,
     norm0: BatchNorm,
@@ -145,12 +147,14 @@ struct Features {
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct DenseBlock {
     denselayer: Vec<DenseLayer>,
 }
 
 /// Normalise, rectify, 1x1, normalise, rectify, 3x3: 32 more channels from all that are there.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct DenseLayer {
     norm1: BatchNorm,
     conv1: BareConv,
@@ -160,10 +164,13 @@ struct DenseLayer {
 
 /// Half the channels at half the resolution.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Transition {
     norm: BatchNorm,
     conv: BareConv,
 }
+
+crate::displayed_by_name!(DenseNet121, Features, DenseBlock, DenseLayer, Transition);
 
 impl DenseLayer {
     fn init(inputs: usize, rng: &mut ChaCha8Rng, device: &Device) -> Self {

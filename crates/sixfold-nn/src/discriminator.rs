@@ -41,16 +41,20 @@ impl DiscriminatorConfig {
 
 /// The discriminator, made by `DiscriminatorConfig`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Discriminator {
     stages: Vec<Stage>,
     judge: Linear,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Stage {
     conv: BareConv,
     norm: BatchNorm,
 }
+
+crate::displayed_by_name!(Discriminator, Stage);
 
 impl Discriminator {
     /// Images in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones. Smaller images, of at least 16

@@ -88,6 +88,7 @@ pub use sixfold_geometry::random::normal;
 
 /// `activation(conv(x) + bias)`, made by [`ConvConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Conv {
     /// `outputs x inputs / groups x kernel x kernel`.
     pub weight: Param<Tensor<4>>,
@@ -100,6 +101,8 @@ pub struct Conv {
     #[module(skip)]
     activation: Activation,
 }
+
+crate::displayed_by_name!(Conv);
 
 impl Conv {
     /// `batch x inputs x height x width` to `batch x outputs x height / stride x width / stride`.

@@ -18,6 +18,7 @@ pub mod critic;
 pub mod dense;
 pub mod densenet;
 mod discriminator;
+mod display;
 mod enlarge;
 mod files;
 pub mod fingerprint;

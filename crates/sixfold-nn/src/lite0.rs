@@ -64,6 +64,7 @@ pub enum Lite0Error {
 
 /// An inverted residual block (Sandler et al. 2018): expand, depthwise, project, and add where the shapes allow it.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Block {
     expand: Option<Conv>,
     depthwise: Conv,
@@ -97,10 +98,13 @@ impl Default for Lite0Config {
 
 /// The convolutional part of EfficientNet-Lite0. Input: RGB as `(value - 127) / 128` of 8-bit values.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Lite0 {
     stem: Conv,
     blocks: Vec<Block>,
 }
+
+crate::displayed_by_name!(Block, Lite0);
 
 /// Where a convolution's numbers come from.
 trait Source {

@@ -143,6 +143,7 @@ impl ResNet50Config {
 /// ResNet-50, made by [`ResNet50Config`], or one of other sizes, made by [`Bottlenecks`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456, 0.406)
 /// over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct ResNet50 {
     conv1: BareConv,
     bn1: BatchNorm,
@@ -155,6 +156,7 @@ pub struct ResNet50 {
 
 /// 1x1 to fewer channels, 3x3, 1x1 to more, and the input added.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Bottleneck {
     conv1: BareConv,
     bn1: BatchNorm,
@@ -165,6 +167,8 @@ struct Bottleneck {
     /// Where stride or channels change: PyTorch's `downsample.0` and `downsample.1`.
     downsample: Option<(BareConv, BatchNorm)>,
 }
+
+crate::displayed_by_name!(ResNet50, Bottleneck);
 
 impl Bottleneck {
     fn freeze_norms(self) -> Bottleneck {

@@ -42,6 +42,7 @@ pub struct XFeatOutput {
 
 /// The part that makes features; other networks begin with it.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Backbone {
     shortcut: Conv,
     block1: Vec<Conv>,
@@ -72,12 +73,15 @@ impl Backbone {
 
 /// The network. Made by [`XFeat::shipped`] or [`XFeat::from_pytorch`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct XFeat {
     backbone: Backbone,
     reliability: Vec<Conv>,
     keypoints: Vec<Conv>,
     fine_matcher: Vec<Conv>,
 }
+
+crate::displayed_by_name!(Backbone, XFeat);
 
 /// A convolution of the network: kernel, stride, channels in and out, normalised and rectified or plain with bias.
 struct Layer(usize, usize, [usize; 2], bool);

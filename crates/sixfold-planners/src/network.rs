@@ -43,12 +43,15 @@ impl GpdConfig {
 
 /// The network, made by `GpdConfig`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(crate) struct Gpd {
     first: Conv,
     second: Conv,
     hidden: Linear,
     out: Linear,
 }
+
+sixfold_nn::displayed_by_name!(Gpd);
 
 impl Gpd {
     /// Images `batch x 15 x 32 x 32`, 0 to 1, to logits of the success probability, `batch`.

@@ -28,10 +28,13 @@ pub(crate) fn shipped_hash() -> u64 {
 
 /// Features of crops, 64 numbers for every 8x8 pixels.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct ViewNetwork {
     backbone: Backbone,
     colour: Conv,
 }
+
+sixfold_nn::displayed_by_name!(ViewNetwork);
 
 impl ViewNetwork {
     /// XFeat with its authors' weights; colour makes no difference yet.

@@ -16,11 +16,14 @@ use super::transform::Input;
 
 /// The network, with torchvision's names.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct FasterRcnn {
     pub backbone: Backbone,
     pub rpn: ProposalNetwork,
     pub roi_heads: RoiHeads,
 }
+
+sixfold_nn::displayed_by_name!(FasterRcnn);
 
 impl FasterRcnn {
     pub(super) fn init(config: &AnchoredConfig, seed: u64, device: &Device) -> FasterRcnn {

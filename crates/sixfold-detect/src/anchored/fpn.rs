@@ -20,12 +20,14 @@ pub(super) fn rectified(channels: usize, random: &mut Random, device: &Device) -
 
 /// The ResNet and the pyramid on it: torchvision's `backbone`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct Backbone {
     pub body: ResNet50,
     fpn: Pyramid,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Pyramid {
     /// Of every map of the ResNet, 1x1.
     inner_blocks: Vec<Conv>,
@@ -38,10 +40,13 @@ struct Pyramid {
 /// 3x3 convolutions with stride 2 (Lin et al. 2017, "Focal loss", section 4; from the finest level that they follow, as torchvision's
 /// v1 models do).
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Further {
     p6: Conv,
     p7: Conv,
 }
+
+sixfold_nn::displayed_by_name!(Backbone, Pyramid, Further);
 
 impl Backbone {
     pub(super) fn init(config: &AnchoredConfig, seed: u64, random: &mut Random, device: &Device) -> Backbone {

@@ -36,6 +36,7 @@ const MASK_LAYERS: usize = 4;
 
 /// torchvision's `roi_heads`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct RoiHeads {
     box_head: BoxHead,
     box_predictor: BoxPredictor,
@@ -44,27 +45,33 @@ pub(super) struct RoiHeads {
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct BoxHead {
     fc6: Linear,
     fc7: Linear,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct BoxPredictor {
     cls_score: Linear,
     bbox_pred: Linear,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct MaskHead {
     layers: Vec<Conv>,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct MaskPredictor {
     conv5_mask: ConvTranspose,
     mask_fcn_logits: Conv,
 }
+
+sixfold_nn::displayed_by_name!(RoiHeads, BoxHead, BoxPredictor, MaskHead, MaskPredictor);
 
 /// The levels of an image's pyramid for pooling.
 pub(super) struct Levels<'a> {

@@ -27,6 +27,7 @@ pub struct AnchoredDetection {
 
 /// The layers of one of the networks.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub(super) enum Layers {
     /// Faster R-CNN and Mask R-CNN.
@@ -34,6 +35,8 @@ pub(super) enum Layers {
     /// RetinaNet.
     OneStage(RetinaNet),
 }
+
+sixfold_nn::displayed_by_name!(Layers);
 
 impl Layers {
     /// The ResNet, which is pretrained.

@@ -23,28 +23,34 @@ const MAX_CANDIDATES: usize = 1000;
 
 /// The network, with torchvision's names.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct RetinaNet {
     pub backbone: Backbone,
     head: Heads,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Heads {
     classification_head: ClassificationHead,
     regression_head: RegressionHead,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct ClassificationHead {
     conv: Vec<Conv>,
     cls_logits: Conv,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct RegressionHead {
     conv: Vec<Conv>,
     bbox_reg: Conv,
 }
+
+sixfold_nn::displayed_by_name!(RetinaNet, Heads, ClassificationHead, RegressionHead);
 
 /// The layer of the labels, which begin with the prior score.
 fn label_logits(config: &AnchoredConfig, random: &mut Random, device: &Device) -> Conv {

@@ -35,16 +35,20 @@ impl Most {
 
 /// torchvision's `rpn`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct ProposalNetwork {
     head: ProposalHead,
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct ProposalHead {
     conv: Conv,
     cls_logits: Conv,
     bbox_pred: Conv,
 }
+
+sixfold_nn::displayed_by_name!(ProposalNetwork, ProposalHead);
 
 /// Raw output for the levels of one image: `1 x anchors x rows x columns` and `1 x (4 anchors) x rows x columns`.
 pub(super) struct Proposed {

@@ -74,6 +74,7 @@ impl CompactConfig {
 
 /// The compact network, made by `CompactConfig`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Compact {
     geometry: Vec<Conv>,
     refine: Vec<Conv>,
@@ -85,6 +86,8 @@ pub struct Compact {
     decoder: Vec<Conv>,
     head: Conv,
 }
+
+sixfold_nn::displayed_by_name!(Compact);
 
 /// `batch x channels x height x width` to `batch x numbers`.
 fn flat(x: Tensor<4>) -> Tensor<2> {

@@ -49,6 +49,7 @@ fn half(map: &Tensor<4>) -> Tensor<4> {
 
 /// One of the networks.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
     /// For two processor cores.
@@ -56,6 +57,8 @@ pub enum Network {
     /// The dissertation's.
     Paper(Paper),
 }
+
+sixfold_nn::displayed_by_name!(Network);
 
 impl Network {
     /// Side of the input in pixels.

@@ -105,6 +105,7 @@ impl PaperConfig {
 
 /// The dissertation's network, made by `PaperConfig`.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Paper {
     backbone: ResNet50,
     geometry: Vec<Conv>,
@@ -117,6 +118,8 @@ pub struct Paper {
     mix: Vec<Conv>,
     head: Conv,
 }
+
+sixfold_nn::displayed_by_name!(Paper);
 
 fn flat(x: Tensor<4>) -> Tensor<2> {
     let [batch, channels, height, width] = x.dims();

@@ -72,6 +72,7 @@ impl CompactConfig {
 
 /// The compact network, made by [`CompactConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Compact {
     stem: Conv,
     widen: Conv,
@@ -88,6 +89,8 @@ pub struct Compact {
     numbers: Linear,
     numbers_out: Linear,
 }
+
+sixfold_nn::displayed_by_name!(Compact);
 
 impl Compact {
     /// See [`super::Network::maps`].

@@ -35,6 +35,7 @@ pub struct Compared {
 
 /// One of the networks.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
     /// For two processor cores.
@@ -42,6 +43,8 @@ pub enum Network {
     /// The dissertation's sizes.
     Paper(Paper),
 }
+
+sixfold_nn::displayed_by_name!(Network);
 
 impl Network {
     /// Side of the patches that go in, pixels.

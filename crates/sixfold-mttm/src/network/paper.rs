@@ -75,6 +75,7 @@ impl PaperConfig {
 
 /// The dissertation's network, made by [`PaperConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Paper {
     backbone: ResNet50,
     reduce: Conv,
@@ -85,6 +86,8 @@ pub struct Paper {
     mask_out: Conv,
     numbers: Vec<Linear>,
 }
+
+sixfold_nn::displayed_by_name!(Paper);
 
 fn dense_layers(layers: &[Linear], x: Tensor<2>) -> Tensor<2> {
     let last = layers.len().saturating_sub(1);

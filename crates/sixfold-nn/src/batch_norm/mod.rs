@@ -57,6 +57,7 @@ impl BatchNormConfig {
 /// On a device with gradients, mean and variance are the batch's, unless the layer is frozen; else they are the running
 /// ones.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct BatchNorm {
     /// Factor of every channel.
     pub weight: Param<Tensor<1>>,
@@ -71,6 +72,8 @@ pub struct BatchNorm {
     momentum: f64,
     epsilon: f64,
 }
+
+crate::displayed_by_name!(BatchNorm);
 
 impl BatchNorm {
     /// `batch x channels x height x width` in and out.

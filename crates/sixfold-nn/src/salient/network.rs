@@ -23,6 +23,7 @@ const HALVING: usize = 4;
 
 /// One stage: down over its levels, up again, and added to where it began ("residual U-block").
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Stage {
     input: Conv,
     down: Vec<Conv>,
@@ -78,6 +79,7 @@ impl Stage {
 
 /// The layers, made by `Layers::empty` and filled from a weight file.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Layers {
     encoder: Vec<Stage>,
     /// The coarsest first.
@@ -86,6 +88,8 @@ pub struct Layers {
     sides: Vec<Conv>,
     fusion: Conv,
 }
+
+crate::displayed_by_name!(Stage, Layers);
 
 impl Layers {
     /// The layers with zeros as weights.

@@ -73,6 +73,7 @@ fn unit_norm(channels: usize, device: &Device) -> BatchNorm {
 
 /// The compact network, made by [`CompactConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Compact {
     /// Frozen, on a device without gradients, and in no file: the program carries it.
     #[module(skip)]
@@ -81,6 +82,8 @@ pub struct Compact {
     norm: Vec<BatchNorm>,
     pub(super) head: Head,
 }
+
+sixfold_nn::displayed_by_name!(Compact);
 
 impl Compact {
     /// See [`super::Network::encode`].

@@ -59,6 +59,7 @@ impl DecoderConfig {
 }
 
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct Block {
     wide: Conv,
     narrow: Conv,
@@ -67,6 +68,7 @@ struct Block {
 
 /// WDSR-B, made by [`DecoderConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct Decoder {
     head: Conv,
     blocks: Vec<Block>,
@@ -74,6 +76,8 @@ pub(super) struct Decoder {
     skip: Conv,
     half: bool,
 }
+
+sixfold_nn::displayed_by_name!(Block, Decoder);
 
 impl Decoder {
     /// X^S (`B x 17 x height x width`, sides even) to X^phi (`B x 3 x height x width`).

@@ -52,11 +52,14 @@ fn lstm_gates(inputs: usize, channels: usize, rng: &mut ChaCha8Rng, device: &Dev
 
 /// Integrates looked-up sources, made by [`IntegratorConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct Integrator {
     /// Gates of the LSTM's layers.
     layers: Vec<Conv>,
     average: Option<Conv>,
 }
+
+sixfold_nn::displayed_by_name!(Integrator);
 
 impl Integrator {
     /// `K B x 17 x height x width` to `B x 16 x height x width`.

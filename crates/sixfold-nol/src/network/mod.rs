@@ -81,6 +81,7 @@ impl Default for Parts {
 
 /// Integrator, weight prediction and decoder.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Head {
     integrator: Integrator,
     weighting: Weighting,
@@ -114,6 +115,7 @@ pub struct Blend {
 
 /// One of the networks.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
     /// For two processor cores.
@@ -121,6 +123,8 @@ pub enum Network {
     /// The dissertation's.
     Paper(Paper),
 }
+
+sixfold_nn::displayed_by_name!(Head, Network);
 
 impl Network {
     /// Its name in weight files.

@@ -73,6 +73,7 @@ impl PaperConfig {
 
 /// The dissertation's network, made by [`PaperConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Paper {
     encoder: DenseNet121,
     before: Vec<BatchNorm>,
@@ -80,6 +81,8 @@ pub struct Paper {
     after: Vec<BatchNorm>,
     pub(super) head: Head,
 }
+
+sixfold_nn::displayed_by_name!(Paper);
 
 impl Paper {
     /// See [`super::Network::encode`].

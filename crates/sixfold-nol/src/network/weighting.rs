@@ -35,9 +35,12 @@ impl WeightingConfig {
 
 /// Predicts weights, made by [`WeightingConfig`].
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct Weighting {
     layers: Vec<Conv>,
 }
+
+sixfold_nn::displayed_by_name!(Weighting);
 
 impl Weighting {
     /// `K B x 17`, `K B x 1` and `B x 16` channels of `height x width`.

@@ -29,6 +29,7 @@ pub struct CompactConfig {
 
 /// Shared encoder, a decoder for every object.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Compact {
     /// EfficientNet-Lite0 to 1/16 of the resolution.
     pub encoder: Lite0,
@@ -38,6 +39,7 @@ pub struct Compact {
 
 /// From the encoder's maps to one object's coordinates.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct Decoder {
     code: Conv,
     context: Conv,
@@ -48,6 +50,8 @@ pub struct Decoder {
     refine: Conv,
     head: Conv,
 }
+
+sixfold_nn::displayed_by_name!(Compact, Decoder);
 
 impl CompactConfig {
     /// The network with random decoders and the given encoder.

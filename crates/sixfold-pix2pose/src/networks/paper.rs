@@ -60,6 +60,7 @@ impl PaperGeneratorConfig {
 
 /// The dissertation's generator, made by [`PaperGeneratorConfig`]. Input: RGB as `(value - 128) / 128` of 8-bit values.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct PaperGenerator {
     e1: ConvStage,
     e2: ConvStage,
@@ -86,6 +87,7 @@ impl PaperGenerator {
 
 /// 5x5 convolution, batch normalisation, leaky rectifier.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct ConvStage {
     conv: BareConv,
     norm: BatchNorm,
@@ -105,6 +107,7 @@ impl ConvStage {
 
 /// Twice the resolution by a transposed convolution, the encoder's map beside it, and a convolution over both.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 struct UpStage {
     up: ConvTranspose,
     norm: BatchNorm,
@@ -129,6 +132,7 @@ impl UpStage {
 
 /// From the map of 8 x 8 pixels through the code to the output; shared by the generators.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub(super) struct Decoder {
     code: Linear,
     uncode: Linear,
@@ -138,6 +142,8 @@ pub(super) struct Decoder {
     coordinates: ConvTranspose,
     error: ConvTranspose,
 }
+
+sixfold_nn::displayed_by_name!(PaperGenerator, ConvStage, UpStage, Decoder);
 
 impl Decoder {
     /// `skips`: channels of the encoder's maps at 64, 32 and 16 pixels.

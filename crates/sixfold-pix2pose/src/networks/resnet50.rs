@@ -44,11 +44,14 @@ impl ResNet50GeneratorConfig {
 /// The generator with a ResNet-50 encoder, made by [`ResNet50GeneratorConfig`]. Input: RGB, for torchvision's weights in 0..1
 /// minus mean (0.485, 0.456, 0.406) over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct ResNet50Generator {
     encoder: ResNet50,
     last: ConvStage,
     decoder: Decoder,
 }
+
+sixfold_nn::displayed_by_name!(ResNet50Generator);
 
 impl ResNet50Generator {
     /// `batch x 3 x 128 x 128` to coordinates and error.

@@ -40,6 +40,7 @@ const DEPTH: usize = 5;
 
 /// Compares a render with a crop.
 #[derive(Module, Debug)]
+#[module(custom_display)]
 pub struct RefinerNetwork {
     detail: Vec<Conv>,
     cells: Conv,
@@ -48,6 +49,8 @@ pub struct RefinerNetwork {
     trunk: Vec<Conv>,
     head: Conv,
 }
+
+sixfold_nn::displayed_by_name!(RefinerNetwork);
 
 impl RefinerNetwork {
     /// With random weights.
