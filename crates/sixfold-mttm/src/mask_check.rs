@@ -20,7 +20,7 @@ pub(crate) const MAX_LEFT_OUT: f64 = 1.0 / 3.0;
 /// are left out of correct masks too. Chosen by hand; not swept.
 pub const WORTH_A_WARNING: f64 = 0.03;
 
-/// A jump between neighbours of more than both this many metres and this fraction of the nearer depth is a depth edge, as in the
+/// A jump between neighbours of more than this many metres plus this fraction of the nearer depth is a depth edge, as in the
 /// preparation of scenes.
 const EDGE: (f64, f64) = (0.005, 0.015);
 /// Width of the ring around the mask in which the plane is searched, as a fraction of the mask's longer side, and its minimum in
