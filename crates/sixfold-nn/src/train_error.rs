@@ -52,7 +52,7 @@ pub enum TrainError {
         /// Which option or input differs, and how.
         difference: String,
     },
-    /// The loss became NaN.
+    /// The loss is not finite.
     #[error(
         "step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})"
     )]
