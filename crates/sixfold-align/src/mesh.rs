@@ -1,4 +1,4 @@
-//! The mesh that verification renders: without colours, and simplified where it is very fine.
+//! The mesh that verification renders: without colours, and simplified if it is very fine.
 
 use std::io;
 use std::path::{Path, PathBuf};
