@@ -239,7 +239,7 @@ impl DetectorModel {
         Ok((network, config))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].

@@ -68,8 +68,8 @@ impl DetectorConfig {
         }
     }
 
-    /// RetinaNet's pyramid and heads on ResNet-50 (Lin et al. 2017): five levels of 256 channels, four convolutions each
-    /// for scores and boxes. Unlike there, locations have no anchors, and there are masks.
+    /// RetinaNet's pyramid and heads on ResNet-50 (Lin et al. 2017): five levels of 256 channels, four convolutions each for scores
+    /// and boxes. In contrast to RetinaNet, locations have no anchors, and there are masks.
     pub fn retinanet(classes: usize) -> Self {
         DetectorConfig {
             classes,
