@@ -59,7 +59,7 @@ pub enum TemplateError {
         /// Largest fraction that may be left out.
         most: f64,
     },
-    /// What the mask shows has a size that no tabletop object has.
+    /// The object in the mask has a size that no tabletop object has.
     #[error(
         "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"
     )]
@@ -71,7 +71,7 @@ pub enum TemplateError {
         /// Largest extent accepted.
         high: f64,
     },
-    /// More views than templates that a file may hold.
+    /// There are more views than a file can contain templates.
     #[error("found {found} views, expected at most {most}: leave out views that look nearly the same")]
     TooManyViews {
         /// Views found.

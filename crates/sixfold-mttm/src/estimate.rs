@@ -50,7 +50,7 @@ pub struct MttmOptions {
     pub hypotheses: usize,
     /// Pose hypotheses that the network adds to those of a region; not used in the published form.
     pub network_hypotheses: usize,
-    /// Hypotheses that are refined and verified with the mesh, where there is one.
+    /// Hypotheses that are refined and verified with the mesh, if there is one.
     pub verified: usize,
     /// Regions, masks and hypotheses as published, if there is a network; see [`MttmOptions::published`].
     pub published: bool,
@@ -138,7 +138,7 @@ const AROUND_NETWORK_HYPOTHESES: usize = 12;
 const PUBLISHED_VERIFIED: usize = 15;
 
 impl MttmOptions {
-    /// The dissertation's form (sections 5.2.4, 5.2.5, 5.3.3): the network alone, masks before any alignment, five hypotheses a
+    /// The dissertation's form (sections 5.2.4, 5.2.5, 5.3.3): the network alone, masks before any alignment, five hypotheses per
     /// region, regions rejected after three iterations of ICP, at most 50 of them, 15 hypotheses verified by the published score.
     pub fn published() -> MttmOptions {
         let default = MttmOptions::default();

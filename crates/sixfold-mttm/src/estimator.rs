@@ -32,12 +32,12 @@ pub struct MttmEstimator {
     /// Which templates are rendered from a mesh if the object's folder has none yet.
     pub templates: TemplateOptions,
     /// From which sides an object with a mesh is searched, whatever templates its folder has; these templates are kept in files of
-    /// their own. `None`: the templates in its folder, or those rendered with [`MttmEstimator::templates`].
+    /// their own. `None`: the templates in its folder, or those rendered with the field `templates`.
     pub coverage: Option<ViewCoverage>,
     /// The network (feature `network`); without one, matching is by points alone.
     #[cfg(feature = "network")]
     pub network: Option<Arc<crate::model::MttmModel>>,
-    /// Judge poses by the matched templates alone, as if there were no mesh.
+    /// Verify poses with the matched templates only, as if there were no mesh.
     pub templates_only: bool,
 }
 

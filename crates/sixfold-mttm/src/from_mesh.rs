@@ -85,7 +85,7 @@ impl ObjectTemplates {
     /// Checks that the contents of a file fit the mesh from which it claims to be made.
     fn fits(&self, mesh: &Mesh, options: &TemplateOptions) -> Result<(), &'static str> {
         let (low, high) = mesh.bounding_box();
-        // A view's reference point lies on the mesh, so it is no further from the frame's origin than the furthest corner of the
+        // A view's reference point is on the mesh, so it is no further from the frame's origin than the furthest corner of the
         // bounding box.
         let reach = low.abs().sup(&high.abs()).norm() + self.diameter;
         if self.source != Source::Mesh || self.options != *options {
@@ -182,7 +182,7 @@ mod tests {
                 let surface = off(p.x, 0.06).min(off(p.y, 0.08)).min(off(p.z, 0.10));
                 assert!(surface < 2e-4, "{p:?}");
             }
-            // The reference point is seen and lies in the centre of the patch.
+            // The reference point is visible and at the centre of the patch.
             assert!(t.relative_depth(SIDE / 2, SIDE / 2).is_some_and(|z| z.abs() < 0.01));
         }
     }

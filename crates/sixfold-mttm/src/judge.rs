@@ -21,7 +21,7 @@ pub struct Surface {
     pub sparse: PointCloud,
     /// All points with normals.
     pub dense: PointCloud,
-    /// Which of them lie on the outline.
+    /// Which of them are on the outline.
     pub outline: Vec<bool>,
     /// Their pixels in the template, row by row.
     pub pixels: Vec<u16>,

@@ -63,7 +63,8 @@ impl CheckedMask {
 /// Removes the pixels of a mask that, by their depth, do not show the object. Depth in metres, without lens distortion.
 ///
 /// # Errors
-/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than `MAX_LEFT_OUT` would be left out.
+/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] if more than `MAX_LEFT_OUT` would be
+/// left out.
 pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<CheckedMask, TemplateError> {
     camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;
@@ -103,7 +104,7 @@ pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<Ch
     Ok(checked)
 }
 
-/// The four neighbours of a pixel that lie in the image.
+/// The four neighbours of a pixel that are in the image.
 fn neighbours([x, y]: [usize; 2], (width, height): (usize, usize)) -> impl Iterator<Item = [usize; 2]> {
     let beside = [
         (x > 0).then(|| [x - 1, y]),
@@ -114,7 +115,7 @@ fn neighbours([x, y]: [usize; 2], (width, height): (usize, usize)) -> impl Itera
     beside.into_iter().flatten()
 }
 
-/// Whether two measured depths lie on one surface.
+/// Whether two measured depths belong to one surface.
 fn joined(a: f32, b: f32) -> bool {
     let (a, b) = (f64::from(a), f64::from(b));
     a > 0.0 && b > 0.0 && (a - b).abs() <= EDGE.0 + EDGE.1 * a.min(b)

@@ -74,7 +74,7 @@ pub struct Entry {
     pub turn: f64,
 }
 
-/// A match: how well (0 to 1) and with what.
+/// A match: its score (0 to 1) and its entry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Match {
     /// Agreement.

@@ -19,7 +19,7 @@ use crate::patch::{PLANES, Patch};
 /// Patches per forward pass.
 const AT_A_TIME: usize = 64;
 
-/// Compact weights for all objects; see the card beside the file.
+/// Compact weights for all objects; see the card next to the file.
 static SHIPPED: &[u8] = include_bytes!("../weights/mttm-compact.safetensors");
 
 /// Why a model could not be read.
@@ -45,7 +45,7 @@ pub enum ModelError {
 /// A descriptor: regions and templates of the same object in about the same pose have close descriptors (Euclidean distance).
 pub type Descriptor = [f32; DESCRIPTOR];
 
-/// What the network predicts for a region and a template.
+/// Predictions of the network for a region and a template.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairSays {
     /// Probability that each of 14 x 14 cells of the region belongs to the object, row by row.
@@ -134,7 +134,7 @@ impl MttmModel {
         Self::from_bytes(Path::new("mttm-compact.safetensors"), SHIPPED)
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
@@ -161,12 +161,12 @@ impl MttmModel {
     /// Maps of patches, the input of all other queries.
     ///
     /// # Panics
-    /// For patches of another side than the network's.
+    /// If the patches have another side than the network's input.
     pub fn encode(&self, patches: &[&Patch]) -> Encoded {
         Encoded { maps: self.network.maps(self.tensor(patches)) }
     }
 
-    /// Maps of templates: zeros where the object is not.
+    /// Maps of templates: zeros outside the object.
     ///
     /// # Panics
     /// As [`MttmModel::encode`].

@@ -18,8 +18,7 @@ pub struct Roi {
     pub centre: Vec3,
 }
 
-/// What one cell of a region shows: depth along the region's axis relative to its centre (metres) and the normal in the
-/// region's frame.
+/// One cell of a region: depth along the region's axis relative to its centre (metres) and the normal in the region's frame.
 pub type Cell = [f32; 4];
 
 /// A cell in which nothing was measured, or which is left out: like an occluder, it neither agrees nor contradicts. A thousand
@@ -231,7 +230,7 @@ mod tests {
         let at = |column: usize, row: usize| cells[row * GRID + column];
         let middle = at(GRID / 2, GRID / 2);
         assert!(middle[0].abs() < 0.003, "{middle:?}");
-        // The box faces the camera's axis; the region looks along a ray 20 degrees off it.
+        // The box faces the camera's axis; the region's axis is a ray 20 degrees from it.
         let axis = centre.normalize();
         assert!((f64::from(middle[3]) + axis.z).abs() < 0.01, "{middle:?}");
         let nothing = Roi { centre }.cells(&scene, 0.06, |_| false);

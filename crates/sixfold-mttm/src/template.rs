@@ -26,7 +26,7 @@ const NORMAL_REACH: f64 = 0.008;
 pub struct TemplateOptions {
     /// Directions from which a mesh is rendered.
     pub coverage: ViewCoverage,
-    /// Side of a patch as a fraction of the object's diameter (largest extent, where the object is known from depth images).
+    /// Side of a patch as a fraction of the object's diameter (the largest extent for objects from depth images).
     pub margin: f64,
     /// Distance from which a mesh is rendered, metres.
     pub distance: f64,

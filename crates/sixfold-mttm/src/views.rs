@@ -47,7 +47,7 @@ pub fn view_directions(coverage: ViewCoverage) -> Vec<Vec3> {
         corners.push(Vec3::new(a, b, 0.0).normalize());
         corners.push(Vec3::new(b, 0.0, a).normalize());
     }
-    // Faces: triples of corners that are neighbours (an edge is 63.4 degrees long).
+    // Faces: triples of neighbouring vertices (an edge is 63.4 degrees long).
     let near = |a: &Vec3, b: &Vec3| a.dot(b) > 0.4;
     let mut faces = vec![];
     for i in 0..12 {

@@ -80,8 +80,8 @@ pub struct Batch {
     pub rotations: Vec<f32>,
     /// Positions of the positive templates' reference points.
     pub offsets: Vec<f32>,
-    /// Margins of the negative templates (equation 5.4): twice the pose distance for one of the same object, gamma for one of another;
-    /// 0 where there is none.
+    /// Margins of the negative templates (equation 5.4): twice the pose distance for one of the same object, gamma for one of
+    /// another; 0 if there is none.
     pub margins: Vec<f32>,
     /// Numbers of the objects.
     pub objects: Vec<usize>,
@@ -318,7 +318,7 @@ mod tests {
         for mirrored in [false, true] {
             for turns in 0..4 {
                 let quarter = Quarter { mirrored, turns };
-                // A rotated direction, changed, is the changed direction, rotated by the changed rotation.
+                // Transforming a rotated direction equals rotating the transformed direction by the transformed rotation.
                 let d = Vector3::new(0.3f32, -0.8, 0.5);
                 let changed = quarter.quaternion([q.w, q.i, q.j, q.k]);
                 let p = UnitQuaternion::new_unchecked(Quaternion::new(

@@ -29,7 +29,7 @@ pub struct DepthPoolOptions {
     pub elevation: (f64, f64),
     /// Largest rotation of the image, radians.
     pub roll: f64,
-    /// Objects of which less is visible are left out (dissertation: half).
+    /// Smallest visible fraction of an object; others are left out (dissertation: half).
     pub visible: f64,
     /// Regions without an object from each view.
     pub without_object: usize,
@@ -190,7 +190,7 @@ fn table(size: f64) -> Option<Mesh> {
     Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok()
 }
 
-/// Camera from world of a camera that looks at `target`, its image rotated by `roll`.
+/// Camera from world of a camera aimed at `target`, its image rotated by `roll`.
 fn look_at(azimuth: f64, elevation: f64, distance: f64, roll: f64, target: &Vec3) -> Pose {
     let back = Vec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
     let right = Vec3::new(-azimuth.sin(), azimuth.cos(), 0.0);
