@@ -445,7 +445,7 @@ mod tests {
         }
     }
 
-    /// A training whose data follow from the step, as a real one's do.
+    /// A training whose data depend on the step, as in a real one.
     fn train(net: Net, optimiser: &mut ModuleOptimizer, steps: std::ops::Range<u64>, device: &Device) -> Net {
         steps.fold(net, |net, step| {
             let values: Vec<f32> =

@@ -89,7 +89,7 @@ mod tests {
         let step = 0.02;
         let slope = (loss(moved(step)) - loss(moved(-step))) / f64::from(2.0 * step);
         assert!((slope / f64::from(length) - 1.0).abs() < 0.1, "{slope} {length}");
-        // The loss is the cross entropy with the label of true images, so images classified as true have a smaller loss.
+        // A step against the gradient lowers the loss: the images are then classified as true with a higher probability.
         assert!(loss(moved(-0.5)) < loss(pixels.clone()));
     }
 

@@ -1,5 +1,5 @@
-//! ResNet-50 (He et al. 2016, table 1) in torchvision's layout: names of the tensors, and the stride in the 3x3
-//! convolution of a bottleneck. [`Bottlenecks`] gives networks of the same kind other sizes.
+//! ResNet-50 (He et al. 2016, table 1) in torchvision's layout: names of the tensors, and the stride in the 3x3 convolution of a
+//! bottleneck. [`Bottlenecks`] configures networks of the same kind with other sizes.
 
 use std::path::Path;
 

@@ -219,8 +219,8 @@ impl XFeat {
         self.backbone
     }
 
-    /// Grey images with mean 0 and variance 1 each (instance normalisation), `batch x 1 x height x width`, from images of any number
-    /// of channels, whose mean is the grey value.
+    /// Grey images with mean 0 and variance 1 each (instance normalisation), `batch x 1 x height x width`, from images with any
+    /// number of channels, whose mean is the grey value.
     pub fn normalised(images: Tensor<4>) -> Tensor<4> {
         let grey = images.mean_dim(1);
         let [batch, _, height, width] = grey.dims();

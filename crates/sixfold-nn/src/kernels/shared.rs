@@ -1,5 +1,5 @@
-//! What all convolution kernels share: their options, the activation, vector code for several processors, and
-//! writing to disjoint parts of one output from several threads.
+//! Code shared by all convolution kernels: their options, the activation, vector code for several processors, and writing to
+//! disjoint parts of one output from several threads.
 
 use std::marker::PhantomData;
 use std::mem::{ManuallyDrop, MaybeUninit};
