@@ -19,7 +19,7 @@ use crate::source::SourceView;
 /// Border around the visible pixels that is processed too, so that they are surrounded by zeros as in the training.
 const BORDER: usize = 8;
 
-/// Compact weights for all objects; see the card beside the file.
+/// Compact weights for all objects; see the card next to the file.
 static SHIPPED: &[u8] = include_bytes!("../weights/nol-compact.safetensors");
 
 /// Why a model could not be read.
@@ -115,7 +115,7 @@ impl NolModel {
             .ok_or_else(|| wrong("architecture", "nol-compact or nol-paper", card.architecture.clone()))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].

@@ -13,7 +13,7 @@ use sixfold_geometry::{Pose, Vec3};
 use crate::error::NolError;
 use crate::source::SourceView;
 
-/// An image is left out where its mask covers less of the object's outline.
+/// An image is left out if its mask covers a smaller fraction of the object's outline.
 const MIN_MASK: f64 = 0.1;
 /// Number of its [`POINTS`] that a further image of an object must add.
 const MIN_GAIN: f64 = 15.0;

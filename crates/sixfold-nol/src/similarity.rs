@@ -46,8 +46,9 @@ pub(crate) fn psnr_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f
     (count > 0).then(|| psnr(sum / count as f64))
 }
 
-/// Structural similarity: the mean over the pixels of a mask and over red, green and blue. The window (Gaussian of 1.5 pixels, 11 x
-/// 11) includes only pixels in the mask, so that pixels outside the object have no influence. `None` for an empty mask.
+/// Structural similarity: the mean over the pixels of a mask and over red, green and blue. The Gaussian
+/// window (sigma 1.5 pixels, 11 x 11 pixels) includes only pixels in the mask, so that pixels outside the object have no influence.
+/// `None` for an empty mask.
 pub(crate) fn ssim_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
     let (width, height) = mask.size();
     let area = width * height;

@@ -226,7 +226,8 @@ impl<'a> ViewMaker<'a> {
 /// Iterations in which filled pixels are replaced by the mean of themselves and their neighbours.
 const SMOOTHINGS: usize = 40;
 
-/// Gives unseen pixels of the object the colours of seen ones nearby: means over ever larger neighbourhoods, from halved images.
+/// Fills unseen pixels of the object with the colours of visible ones nearby: means over increasingly large neighbourhoods, from
+/// repeatedly halved images.
 fn fill(view: &mut NewView, mean: [f32; 3]) {
     let (width, height) = view.mask.size();
     if !view.unseen.as_slice().contains(&true) {

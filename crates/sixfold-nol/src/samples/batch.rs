@@ -79,12 +79,12 @@ pub struct ViewBatchOptions {
     /// Fewest sources of a sample.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub min_sources: usize,
-    /// Most sources of a sample; a step has from `min_sources` to this many, uniformly distributed.
+    /// Maximum number of sources of a sample; a step has from `min_sources` to this many, uniformly distributed.
     #[serde(rename = "most_sources")]
     pub max_sources: usize,
     /// Sources in a step at the smallest side; fewer at a larger one.
     pub sources: usize,
-    /// Most samples in a step.
+    /// Maximum number of samples in a step.
     #[serde(rename = "most_samples")]
     pub max_samples: usize,
 }

@@ -130,7 +130,7 @@ fn photographs_camera(random: &mut Random) -> Camera {
     Camera { fx: f, fy: f, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None }
 }
 
-/// The pose of an object seen from a direction (object frame), somewhere in the image.
+/// The pose of an object seen from a direction (object frame), at a random position in the image.
 fn seen_from(direction: &Vec3, options: &ViewSampleOptions, random: &mut Random) -> Pose {
     let z = -direction;
     let helper = if z.z.abs() < 0.95 { Vec3::z() } else { Vec3::x() };
