@@ -183,7 +183,7 @@ impl Pix2PoseModel {
         Ok(Compact { decoders, ..network })
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
         match &self.network {
             Network::Compact(network) => save_weights(network.as_ref(), &self.card, path)?,

@@ -592,7 +592,7 @@ fn outlines(objects: &[TrainingObject], photographs: &[PosedImage]) -> BTreeMap<
     objects.iter().map(|o| (o.id, (outline_mesh(&o.mesh), o.info.clone()))).collect()
 }
 
-/// Gives an object the symmetries of a preset, which must have the object.
+/// Sets the symmetries of an object to those of a preset, which must include the object.
 fn apply(preset: Preset, object: &mut TrainingObject, session: &mut Session<'_>) -> Result<(), OptionError> {
     if preset.thresholds(object.id).is_none() {
         let found = format!("{} with object {}", preset.name(), object.id);

@@ -218,7 +218,7 @@ mod tests {
         Mesh::new(vertices, faces).unwrap()
     }
 
-    /// Errors in metres before and after alignment of a part at 0.8 m, a fraction of whose columns is covered.
+    /// Errors in metres before and after alignment of a part at 0.8 m, with a fraction of its columns covered.
     fn errors(covered: f64) -> [f64; 2] {
         let mesh = part();
         let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
