@@ -20,7 +20,7 @@ pub struct CompletionOptions {
     pub step: f64,
     /// Largest shift of planes from the centre of the visible points, in steps to each side.
     pub shifts: i32,
-    /// A mirrored point this far in front of what was measured contradicts it, metres.
+    /// A mirrored point this far in front of the measured surface contradicts the image, metres.
     pub tolerance: f64,
     /// Largest fraction of mirrored points that may contradict the image.
     pub max_contradiction: f64,

@@ -1,4 +1,4 @@
-//! Files of grasps: `grasps.json` of `sixfold grasp propose`, one grasp as a person writes it, a trial of `sixfold grasp measure`.
+//! Files of grasps: `grasps.json` of `sixfold grasp propose`, one grasp written by a person, or a trial of `sixfold grasp measure`.
 
 use std::path::Path;
 

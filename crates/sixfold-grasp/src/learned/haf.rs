@@ -1,7 +1,7 @@
 //! HAF as a planner: a linear classifier of height accumulated features, and the candidates that it ranks.
 //!
-//! The original trains a support vector machine (Fischinger, Weiss and Vincze 2015); ours is linear, and its margin becomes a success
-//! probability by a logistic curve (Platt 1999).
+//! The original trains a support vector machine (Fischinger, Weiss and Vincze 2015); ours is linear, and its margin is converted to
+//! a success probability with a logistic curve (Platt 1999).
 
 use rayon::prelude::*;
 
