@@ -25,7 +25,7 @@ pub enum ViewsError {
         /// The framework's error.
         reason: String,
     },
-    /// The object cannot be seen from any side.
+    /// The object is not visible from any side.
     #[error("object {object}: expected a mesh with faces that a camera sees, found none; give another mesh")]
     Invisible {
         /// Name of the object.

@@ -1,7 +1,7 @@
 //! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
 //! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models).
 //!
-//! Proposals and their features belong to the image: they are computed once, however many objects are searched in it.
+//! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

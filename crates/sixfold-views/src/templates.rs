@@ -251,7 +251,7 @@ pub(crate) fn make_templates(
     Ok(templates)
 }
 
-/// Templates that are rendered before their features are computed.
+/// Number of templates rendered at a time, before their features are computed.
 const CHUNK: usize = 64;
 
 /// A template without features, and the network's input for these; `None` for a side from which nothing is visible.
