@@ -10,7 +10,7 @@ use crate::{AttemptOptions, TrialOptions};
 
 /// Mass of an object in the hard setting, kg.
 const HARD_MASS: f64 = 0.5;
-/// Friction coefficient of the pads in the hard setting, which the planner does not know.
+/// Friction coefficient of the pads in the hard setting, unknown to the planner.
 const HARD_FRICTION: f64 = 0.25;
 
 /// Settings of simulated scenes and trials.
@@ -34,8 +34,8 @@ impl Hardness {
         Hardness { real: gripper.clone(), gripper, options, error: None }
     }
 
-    /// The hard setting: twice the sensor noise and lost edges, errors of the gripper's pose of 5 mm and 3 degrees (standard deviation
-    /// per axis), friction of 0.25, which the planner does not know, objects of 0.5 kg.
+    /// The hard setting: twice the sensor noise and lost edges, errors of the gripper's pose of 5 mm and 3 degrees (standard
+    /// deviation per axis), friction of 0.25, unknown to the planner, and objects of 0.5 kg.
     pub fn hard(gripper: Gripper, trial: TrialOptions) -> Hardness {
         let mut setting = Hardness::usual(gripper, TrialOptions { mass: HARD_MASS, ..trial });
         setting.real.friction = HARD_FRICTION;

@@ -16,7 +16,7 @@ use crate::error::check_ranges;
 pub struct PartsOptions {
     /// Size of a voxel, metres; walls thinner than this are thickened to it.
     pub voxel: f64,
-    /// Most parts.
+    /// Maximum number of parts.
     pub max_parts: usize,
     /// A part is split further when the volume of its hull exceeds its own by more than this fraction of the volume of the whole
     /// object's hull.
@@ -57,7 +57,7 @@ impl ConvexParts {
     /// The object as one convex part: its hull.
     ///
     /// # Errors
-    /// [`SimulationError::NoSolid`] when all vertices lie in a plane.
+    /// [`SimulationError::NoSolid`] when all vertices are in a plane.
     pub fn of_convex(mesh: &Mesh) -> Result<ConvexParts, SimulationError> {
         Self::from_points(vec![mesh.vertices().to_vec()], mesh)
     }

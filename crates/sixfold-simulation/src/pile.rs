@@ -12,7 +12,7 @@ use crate::error::check_ranges;
 use crate::world::{body_pose, insert_object, world};
 use crate::{ConvexParts, SimulationError};
 
-/// Time step, seconds; twice that of grasps, as nothing is held here.
+/// Time step, seconds; longer than that of grasps, because nothing is held here.
 const STEP: f64 = 0.004;
 /// Steps between two checks of which objects still move: 0.1 s.
 const STEPS: usize = 25;

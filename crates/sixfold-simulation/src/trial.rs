@@ -376,7 +376,7 @@ impl Run {
         }
     }
 
-    /// Moves the palm by `way`, speeding up and slowing down over the first and last third.
+    /// Moves the palm by `way`, speeding up and slowing down smoothly.
     fn travel(&mut self, way: Vec3, speed: f64) {
         let length = way.norm();
         if length < 1e-9 {
