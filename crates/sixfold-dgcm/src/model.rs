@@ -110,7 +110,7 @@ impl DgcmModel {
         Ok((network, crop))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
