@@ -53,7 +53,7 @@ impl GpdModel {
         Ok(GpdModel { network: network.valid(), card })
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`WeightsError`].
