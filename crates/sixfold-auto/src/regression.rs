@@ -8,7 +8,7 @@ use crate::numbers::{Numbers, SPEAKS_FOR};
 
 /// Inverse variance of the prior on the weights of standardised numbers, per row of the fit; chosen by hand, not swept.
 const PRECISION: f64 = 2.0;
-/// Most steps of Newton's method.
+/// Maximum number of steps of Newton's method.
 const STEPS: usize = 50;
 
 /// A model that computes a probability from numbers.
