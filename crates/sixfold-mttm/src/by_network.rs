@@ -48,7 +48,7 @@ impl KnownObject {
     }
 
     /// The same, with the network's descriptors kept in a file. The second value says why an existing file could not be used or the
-    /// new one not be written.
+    /// new one could not be written.
     pub fn with_network_cached(
         mut self,
         model: Arc<MttmModel>,

@@ -52,7 +52,7 @@ impl ObjectTemplates {
     }
 
     /// The templates of `mesh`: read from `path` if the file belongs to this mesh and these options, otherwise rendered and written
-    /// there. The second value says why an existing file was not used or the new one not be written.
+    /// there. The second value says why an existing file was not used or the new one could not be written.
     ///
     /// # Errors
     /// [`TemplateError`] as [`ObjectTemplates::from_mesh`].
