@@ -56,7 +56,7 @@ pub enum ModelFileError {
 
 impl ObjectModel {
     /// The model of `mesh`: its description is read from `path` if the file belongs to this mesh and these options, otherwise
-    /// computed and written there. The second value says why an existing file was not used or the new one not be written.
+    /// computed and written there. The second value says why an existing file was not used or the new one could not be written.
     ///
     /// # Errors
     /// [`ModelError`] as [`ObjectModel::new`].
