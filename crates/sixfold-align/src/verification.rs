@@ -21,9 +21,9 @@ pub struct VerificationOptions {
     /// Depth inlier threshold in metres (dissertation: 10 mm, 5 mm for small objects); `None`: 5 % of the diameter, between 5 and
     /// 10 mm.
     pub depth_threshold: Option<f64>,
-    /// Largest angle between the normals of an inlier that agree, radians.
+    /// Largest angle between the rendered and the measured normal of an inlier whose normals agree, radians.
     pub normal_angle: f64,
-    /// Largest distance of a silhouette pixel from a scene edge that it is on, pixels.
+    /// Largest distance from a silhouette pixel to a scene edge at which the pixel counts as being on the edge, pixels.
     pub boundary_distance: u8,
     /// Count hidden pixels as occluded only if the scene has an edge between them and the visible part; `false` as published.
     pub occluders_have_edges: bool,
@@ -33,9 +33,10 @@ pub struct VerificationOptions {
 const DEPTH_THRESHOLD: f64 = 0.05;
 /// Its bounds, metres: the values of the dissertation, section 5.2.5, for small objects and for all others.
 const DEPTH_THRESHOLDS: (f64, f64) = (0.005, 0.010);
-/// Largest angle between the normals of an inlier that agree, degrees; chosen by hand, not swept.
+/// Largest angle between the rendered and the measured normal of an inlier whose normals agree, degrees; chosen by hand, not swept.
 const NORMAL_ANGLE: f64 = 30.0;
-/// Largest distance of a silhouette pixel from a scene edge that it is on, pixels; chosen by hand, not swept.
+/// Largest distance from a silhouette pixel to a scene edge at which the pixel counts as being on the edge, pixels; chosen by hand,
+/// not swept.
 const BOUNDARY_DISTANCE: u8 = 3;
 /// Visibility at which [`VerificationScore::ranking`] is half the total; chosen by hand, not swept.
 const HALF_RANKING: f64 = 0.1;
