@@ -3,7 +3,8 @@
 //! The copy is an ordinary store file. All reads use it, and additions are written to it, on disk, before anything else happens;
 //! its numbers never change. Every contact with the server has three steps, each of which may be interrupted and repeated:
 //! experiences for which the file has no server number are delivered, in order; experiences removed here are removed there; and
-//! additions and removals by others are copied. The server's unique key makes a repeated delivery harmless.
+//! additions and removals by others are copied. Attempts are exchanged as well. The server's unique key makes a repeated delivery
+//! harmless.
 
 use std::cell::{Cell, RefCell};
 use std::fmt;
