@@ -1,9 +1,9 @@
-//! A pose that is good across the image and poor along the view axis brought to a depth image: the distance first, then
+//! Aligns a pose that is accurate across the image but inaccurate along the view axis with a depth image: first its distance, then
 //! point-to-plane ICP (Chen and Medioni 1992).
 //!
-//! Coordinates from colour place an object well across the image and badly along the view axis, too far off for ICP to start
-//! from. The median difference of measured and rendered depth over the object's pixels corrects that (as the author's BOP
-//! entry with ICP does); then the visible surface is rendered and aligned with the image, three times.
+//! Poses from coordinates in colour images are accurate across the image, but their error along the view axis is too large for ICP.
+//! The median difference of measured and rendered depth over the object's pixels corrects that (as the author's BOP entry with ICP
+//! does); then the visible surface is rendered and aligned with the image, three times.
 
 use sixfold_geometry::{DepthTarget, IcpError, IcpLevel, IcpOptions, PointCloud, Pose, icp};
 use sixfold_mesh::Mesh;
@@ -16,31 +16,32 @@ use crate::prepared::PreparedDepth;
 pub struct AlignedToDepth {
     /// The pose, metres.
     pub camera_from_object: Pose,
-    /// Rendered points that found a measured partner at the end.
+    /// Rendered points with a measured correspondence in the last iteration.
     pub inliers: usize,
     /// Root mean square of their distances to the surface, metres.
     pub rms: f64,
 }
 
-/// Fewer pixels with depth say nothing of the distance; chosen by hand, not swept.
+/// Fewest pixels with depth to correct the distance; chosen by hand, not swept.
 const MIN_PIXELS: usize = 20;
 /// Rejection distances of the three levels, as fractions of the diameter; chosen by hand, not swept.
 const REJECTION: [f64; 3] = [0.15, 0.08, 0.04];
 /// Iterations of a level; chosen by hand, not swept.
 const ITERATIONS: usize = 8;
-/// About so many points of the rendered surface are used; chosen by hand, not swept.
+/// Approximate number of points of the rendered surface that are used; chosen by hand, not swept.
 const POINTS: usize = 1000;
-/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+/// Largest angle between the normals of a correspondence, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 45.0;
-/// A level ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
+/// A level stops when a step is smaller than this, metres and radians; chosen by hand, well below the depth noise.
 const CONVERGENCE: f64 = 1e-5;
-/// Factors of the distance outside of which something else than the object was measured; chosen by hand, not swept.
+/// Plausible range of the ratio of measured and rendered distance: outside it, something other than the object was measured; chosen
+/// by hand, not swept.
 const PLAUSIBLE: std::ops::Range<f64> = 0.5..2.0;
 
-/// Aligns a pose; `diameter` in metres. `visible` says which pixels (column, row) show the object.
+/// Aligns a pose; `diameter` in metres. `visible` returns whether a pixel (column, row) shows the object.
 ///
 /// # Errors
-/// [`IcpError`] where too little depth is measured on the object or its surface can slide.
+/// [`IcpError`] if too little depth is measured on the object, or its surface does not constrain the pose.
 pub fn align_to_depth(
     image: &PreparedDepth,
     mesh: &Mesh,

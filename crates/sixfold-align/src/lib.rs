@@ -1,8 +1,9 @@
-//! Does a pose agree with an image? A depth image prepared once for every method, verification by rendering, ICP of a rendered
-//! mesh against measured depth, and the outline of a mesh aligned with a colour image. How hypotheses arise is not known here.
+//! Agreement of poses with images: a depth image prepared once for all methods, verification by rendering, ICP of a rendered mesh
+//! against measured depth, and alignment of a mesh's outline with a colour image. This crate does not depend on how hypotheses are
+//! found.
 
 #![warn(unreachable_pub, unnameable_types)]
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+// `!(x > 0.0)` refuses NaN and `x <= 0.0` does not: the checks here rely on this.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 mod depth_icp;

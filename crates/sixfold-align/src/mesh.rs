@@ -1,4 +1,4 @@
-//! The mesh that verification renders: without colours, and simplified where it is very fine.
+//! The mesh that verification renders: without colours, and simplified if it is very fine.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -12,21 +12,21 @@ use thiserror::Error;
 /// thousandth of the diameter, and rendering costs a fifth.
 const RENDERED_FACES: usize = 4000;
 
-/// The mesh as verification renders it.
+/// The mesh for rendering in the verification.
 ///
 /// # Errors
-/// [`MeshError`] where it has no surface.
+/// [`MeshError`] if it has no surface.
 pub fn verification_mesh(mesh: &Mesh) -> Result<Mesh, MeshError> {
     let bare = Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())?;
     Ok(if bare.faces().len() > RENDERED_FACES { simplify(&bare, RENDERED_FACES) } else { bare })
 }
 
-/// How far outside of the mesh's box its simplified form may reach, as a fraction of the box's diagonal: collapsed edges move a
-/// little.
+/// Largest extent of the simplified mesh beyond the bounding box of the original, as a fraction of the box's diagonal: collapsing
+/// edges moves vertices slightly.
 const OVERHANG: f64 = 0.5;
 
-/// Whether `simple` can be what is kept of `mesh` after simplification: it has a surface, no more faces, and lies where the mesh
-/// lies. What a file says is held against this before it is used.
+/// Whether `simple` can be a simplified form of `mesh`: it has a surface, not more faces, and is in the same place. The content of
+/// a file is tested with this before it is used.
 pub fn could_be_simplified(simple: &Mesh, mesh: &Mesh) -> bool {
     let (low, high) = mesh.bounding_box();
     let margin = Vec3::repeat(OVERHANG * (high - low).norm());
@@ -51,10 +51,10 @@ pub enum VerificationMeshError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file is something else, another version, of another mesh, or damaged.
+    /// The file is of another kind, version or mesh, or damaged.
     #[error("{}: damaged, of another version or made from another mesh", path.display())]
     Unusable {
         /// The file.
@@ -62,17 +62,17 @@ pub enum VerificationMeshError {
     },
 }
 
-/// A verification mesh with what could not be kept of it.
+/// A verification mesh, and why it could not be read or stored.
 #[derive(Debug)]
 pub struct VerificationMesh {
     /// The mesh.
     pub mesh: Mesh,
-    /// Why the file that was there was not used, or the new one could not be written.
+    /// Why an existing file was not used, or the new one could not be written.
     pub note: Option<VerificationMeshError>,
 }
 
 impl VerificationMesh {
-    /// [`verification_mesh`], kept in `file` (little-endian, with a checksum) where simplifying takes time.
+    /// [`verification_mesh`], kept in `file` (little-endian, with a checksum) if the simplification takes time.
     ///
     /// # Errors
     /// As [`verification_mesh`].
@@ -123,7 +123,7 @@ fn decode(bytes: &[u8], key: u64) -> Option<Mesh> {
         return None;
     }
     let (vertices, faces) = (word(20)? as usize, word(24)? as usize);
-    // The sizes must be exactly what is there before anything is allocated.
+    // The sizes must match the file exactly; checked before anything is allocated.
     if body.len() != vertices.checked_mul(24)?.checked_add(faces.checked_mul(12)?)?.checked_add(HEAD)? {
         return None;
     }
@@ -176,7 +176,7 @@ mod tests {
             assert!(same(&again) && again.note.is_some());
             assert_eq!(std::fs::read(&file).unwrap(), kept);
         }
-        // Whole and of this mesh, as it says, but with a vertex far away, or with nothing to see.
+        // A file that claims to be intact and of this mesh, but has a vertex far away, or no faces.
         for (shift, faces) in [(9.0, expected.faces()), (0.0, &[])] {
             let mut vertices = expected.vertices().to_vec();
             vertices[0].x += shift;
@@ -185,7 +185,7 @@ mod tests {
             let again = VerificationMesh::cached(Some(&file), &mesh).unwrap();
             assert!(same(&again) && again.note.is_some());
         }
-        // Of another mesh.
+        // A file of another mesh.
         let moved: Vec<Vec3> = mesh.vertices().iter().map(|v| v * 1.01).collect();
         let other = Mesh::new(moved, mesh.faces().to_vec()).unwrap();
         let found = VerificationMesh::cached(Some(&file), &other).unwrap();

@@ -1,5 +1,5 @@
-//! A depth image prepared once for every method: in-painting, normals, table plane, depth edges. A [`DepthRegion`] is a view on
-//! it: the points in which an object is searched.
+//! A depth image prepared once for every method: in-painting, normals, table plane, depth edges. A [`DepthRegion`] is a view of it
+//! with the points in which an object is searched.
 
 use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
@@ -16,10 +16,10 @@ use thiserror::Error;
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum PreparedDepthError {
-    /// The image does not belong to the camera.
+    /// The image does not have the camera's size.
     #[error(transparent)]
     Camera(#[from] CameraError),
-    /// The mask does not belong to the image.
+    /// The mask does not have the image's size.
     #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}")]
     MaskSize {
         /// Width of the mask.
@@ -31,7 +31,7 @@ pub enum PreparedDepthError {
         /// Height of the depth image.
         height: usize,
     },
-    /// The depth image holds nothing that could be an object.
+    /// The depth image has no usable depth.
     #[error(transparent)]
     Depth(#[from] DepthImageError),
     /// An option is out of range.
@@ -39,7 +39,7 @@ pub enum PreparedDepthError {
     Option(#[from] OptionError),
 }
 
-/// How a depth image is prepared.
+/// Options of the preparation of depth images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthOptions {
     /// How normals are computed.
@@ -60,7 +60,8 @@ pub struct DepthOptions {
 /// hand; not swept.
 const MATCHING_NORMAL_RADIUS: usize = 4;
 
-/// Rounds of in-painting, each a pixel into the holes. The dissertation, section 5.3.1, in-paints; how far was chosen by hand.
+/// Rounds of in-painting, each of which fills one pixel into the holes. The dissertation, section 5.3.1, in-paints; the number was
+/// chosen by hand.
 const INPAINT_ROUNDS: usize = 2;
 /// Depth beyond which points are left out, metres; chosen by hand, not swept.
 const MAX_DEPTH: f64 = 5.0;
@@ -92,11 +93,11 @@ impl DepthOptions {
     }
 }
 
-/// A depth image with what methods derive from it, computed once. Plane and edges are computed when first asked for.
+/// A depth image with data that methods derive from it, computed once. Plane and edges are computed on first use.
 #[derive(Debug)]
 pub struct PreparedDepth {
     camera: Camera,
-    /// As measured, invalid pixels 0.
+    /// Depth as measured, invalid pixels 0.
     depth: DepthImage,
     filled: DepthImage,
     normals: NormalImage,
@@ -105,16 +106,17 @@ pub struct PreparedDepth {
     edge_distance: OnceLock<Image<u8>>,
 }
 
-/// Points of a region are thinned to this first, metres: about the noise of depth cameras at a metre. Chosen by hand; not swept.
+/// Spacing to which the points of a region are downsampled first, metres: about the noise of depth cameras at one metre. Chosen by
+/// hand; not swept.
 const BASE_STEP: f64 = 0.002;
-/// Normals further apart than this stay apart when points are thinned, radians. Chosen by hand; not swept.
+/// Points whose normals differ by more than this angle are not merged when downsampling, radians. Chosen by hand; not swept.
 const BASE_ANGLE: f64 = 1.0;
 
 impl PreparedDepth {
     /// Prepares a depth image (metres, 0 where nothing was measured) of a pinhole camera.
     ///
     /// # Errors
-    /// [`PreparedDepthError`] where the image does not belong to the camera or cannot be depth in metres.
+    /// [`PreparedDepthError`] if the image does not have the camera's size or cannot be depth in metres.
     pub fn new(
         depth: &DepthImage,
         camera: &Camera,
@@ -152,12 +154,12 @@ impl PreparedDepth {
         &self.depth
     }
 
-    /// Normals per pixel, zero where there is none.
+    /// Normals per pixel, zero where there is no normal.
     pub fn normals(&self) -> &NormalImage {
         &self.normals
     }
 
-    /// The table plane, if one was looked for and found; its normal points to the camera.
+    /// The table plane, if it was searched and found; its normal points to the camera.
     pub fn plane(&self) -> Option<&Plane> {
         let find = || {
             let near = |z: &f32| if f64::from(*z) < self.options.max_depth { *z } else { 0.0 };
@@ -170,7 +172,7 @@ impl PreparedDepth {
         self.plane.get_or_init(find).as_ref()
     }
 
-    /// Points nearer to the plane than this are its own, metres.
+    /// Points closer to the plane than this belong to it, metres.
     pub(crate) fn plane_margin(&self) -> f64 {
         self.options.plane.threshold
     }
@@ -180,8 +182,8 @@ impl PreparedDepth {
         self.edge_distance.get_or_init(|| edge_distances(&self.filled, &self.normals))
     }
 
-    /// The points off the plane, row by row, of the pixels that `inside` accepts within columns and rows of `bounds`
-    /// (`[x0, y0, x1, y1]`, the ends excluded).
+    /// The points off the plane, row by row, of the pixels for which `inside` is true, within the columns and rows `bounds` (`[x0,
+    /// y0, x1, y1]`, ends excluded).
     fn points(&self, [x0, y0, x1, y1]: [usize; 4], inside: impl Fn(usize, usize) -> bool) -> PointCloud {
         let plane = self.plane();
         let margin = self.options.plane.threshold;
@@ -204,12 +206,12 @@ impl PreparedDepth {
     }
 }
 
-/// A view on a prepared depth image: an object is searched in its points alone, and the rest of the image still hides and
-/// supports.
+/// A view of a prepared depth image: an object is searched only in its points, but occluders and support are taken from the whole
+/// image.
 #[derive(Debug)]
 pub struct DepthRegion {
     image: Arc<PreparedDepth>,
-    /// Points off the plane, thinned.
+    /// Points off the plane, downsampled.
     cloud: PointCloud,
     indexed: OnceLock<Option<IndexedCloud>>,
 }
@@ -269,7 +271,7 @@ impl DepthRegion {
         DepthRegion { image: image.clone(), cloud, indexed: OnceLock::new() }
     }
 
-    /// The image that it is a view on.
+    /// The image of which it is a view.
     pub fn image(&self) -> &Arc<PreparedDepth> {
         &self.image
     }
@@ -279,12 +281,12 @@ impl DepthRegion {
         &self.cloud
     }
 
-    /// These points with a search tree, made when first asked for; `None` where there is no point.
+    /// These points with a search tree, built on first use; `None` if there are no points.
     pub fn indexed_cloud(&self) -> Option<&IndexedCloud> {
         self.indexed.get_or_init(|| IndexedCloud::new(self.cloud.clone()).ok()).as_ref()
     }
 
-    /// The points further than `distance` metres from all of the given ones: what was explained is not matched again.
+    /// The points further than `distance` metres from all given ones, so that explained points are not matched again.
     pub fn cloud_without(&self, explained: &[Vec3], distance: f64) -> PointCloud {
         let tree = sixfold_geometry::KdTree::new(explained);
         let keep: Vec<bool> = self
@@ -304,18 +306,19 @@ impl DepthRegion {
     }
 }
 
-/// A depth edge is a jump between neighbours of more than this many metres ([`EDGE_JUMP`]) and this fraction of the nearer depth
+/// A depth edge is a jump between neighbours of more than this many metres ([`EDGE_JUMP`]) plus this fraction of the nearer depth
 /// ([`EDGE_SLOPE`]): the fraction allows for slanted surfaces. Both chosen by hand; not swept.
 const EDGE_JUMP: f32 = 0.005;
 /// See [`EDGE_JUMP`].
 const EDGE_SLOPE: f32 = 0.015;
-/// A crease: normals on both sides enclose an angle with less than this cosine, about 35 degrees. Chosen by hand; not swept.
+/// A crease: the cosine of the angle between the normals on both sides is less than this, about 35 degrees. Chosen by hand; not
+/// swept.
 const CREASE_COSINE: f32 = 0.82;
-/// Pixels from a crease to where its normals are taken, to both sides; chosen by hand, not swept.
+/// Distance from a crease, to both sides, at which its normals are compared, pixels; chosen by hand, not swept.
 const CREASE_REACH: usize = 4;
 
-/// Distance in pixels (8-neighbour steps) to the nearest depth edge, at most 255: a jump between neighbours, or a crease (an
-/// object on a table has no jump where it stands).
+/// Distance in pixels (8-neighbour steps) to the nearest depth edge, at most 255: a jump between neighbours, or a crease (there is
+/// no jump in depth where an object touches the table).
 fn edge_distances(depth: &DepthImage, normals: &NormalImage) -> Image<u8> {
     let crease = |a: [f32; 3], b: [f32; 3]| {
         a != [0.0; 3] && b != [0.0; 3] && a[0] * b[0] + a[1] * b[1] + a[2] * b[2] < CREASE_COSINE

@@ -1,12 +1,11 @@
-//! Judging a pose by rendering it: does the depth image agree with what would be seen?
+//! Verification of a pose by rendering: compares the depth image with the rendered depth.
 //!
-//! The scores of the dissertation, section 5.2.5: depth fitness `S_D = P_O N_i / (N_m - N_occ)` with
-//! `P_O = 1 - N_out / N_m`, the fraction `S_N` of matched normals, the fraction `S_B` of the silhouette that lies on an edge
-//! of the scene, and their product. `N_m` are the rendered pixels; a pixel is an inlier within the threshold,
-//! occluded when the scene is nearer, an outlier when the scene is further away (one would see through the object).
-//! Pixels without measured depth count in `N_m` only, as published. Beyond the dissertation: what hides an object has an
-//! outline. Hidden pixels behind a surface that continues smoothly from what is seen of the object ([`pierced`]
-//! (VerificationScore::pierced)) are no excuse and stay in `N_m - N_occ`.
+//! The scores of the dissertation, section 5.2.5: depth fitness `S_D = P_O N_i / (N_m - N_occ)` with `P_O = 1 - N_out / N_m`, the
+//! fraction `S_N` of matched normals, the fraction `S_B` of the silhouette that is on an edge of the scene, and their product.
+//! `N_m` are the rendered pixels; a pixel is an inlier within the threshold, occluded when the scene is nearer, an outlier when the
+//! scene is further away (one would see through the object). Pixels without measured depth count in `N_m` only, as published.
+//! Beyond the dissertation: an occluder must have an outline. Hidden pixels behind a surface that continues smoothly from the
+//! visible part of the object ([`pierced`](VerificationScore::pierced)) do not count as occluded and stay in `N_m - N_occ`.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -19,33 +18,33 @@ use crate::prepared::PreparedDepth;
 /// Thresholds of the verification.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VerificationOptions {
-    /// Depth inlier threshold in metres (dissertation: 10 mm, 5 mm for small objects); `None` takes 5 % of the diameter,
-    /// between 5 and 10 mm.
+    /// Depth inlier threshold in metres (dissertation: 10 mm, 5 mm for small objects); `None`: 5 % of the diameter, between 5 and
+    /// 10 mm.
     pub depth_threshold: Option<f64>,
-    /// Normals of an inlier agree within this angle, radians.
+    /// Largest angle between the rendered and the measured normal of an inlier whose normals agree, radians.
     pub normal_angle: f64,
-    /// A silhouette pixel lies on a scene edge within this distance, pixels.
+    /// Largest distance from a silhouette pixel to a scene edge at which the pixel counts as being on the edge, pixels.
     pub boundary_distance: u8,
-    /// Hidden pixels count as hidden only as far as the scene has an edge between them and what is seen; `false` as
-    /// published.
+    /// Count hidden pixels as occluded only if the scene has an edge between them and the visible part; `false` as published.
     pub occluders_have_edges: bool,
 }
 
-/// Depth inlier threshold as a fraction of the diameter, where none is given; chosen by hand, not swept.
+/// Depth inlier threshold as a fraction of the diameter, if none is given; chosen by hand, not swept.
 const DEPTH_THRESHOLD: f64 = 0.05;
-/// Its bounds, metres: what the dissertation, section 5.2.5, takes for small objects and for all others.
+/// Its bounds, metres: the values of the dissertation, section 5.2.5, for small objects and for all others.
 const DEPTH_THRESHOLDS: (f64, f64) = (0.005, 0.010);
-/// Normals of an inlier agree within this angle, degrees; chosen by hand, not swept.
+/// Largest angle between the rendered and the measured normal of an inlier whose normals agree, degrees; chosen by hand, not swept.
 const NORMAL_ANGLE: f64 = 30.0;
-/// A silhouette pixel lies on a scene edge within this distance, pixels; chosen by hand, not swept.
+/// Largest distance from a silhouette pixel to a scene edge at which the pixel counts as being on the edge, pixels; chosen by hand,
+/// not swept.
 const BOUNDARY_DISTANCE: u8 = 3;
 /// Visibility at which [`VerificationScore::ranking`] is half the total; chosen by hand, not swept.
 const HALF_RANKING: f64 = 0.1;
 /// A rendered point whose normal has a z (camera frame, towards the camera negative) above this is seen at a grazing angle, less
-/// than 9 degrees, and slides out of its pixel. Chosen by hand; not swept.
+/// than 9 degrees, and may move out of its pixel. Chosen by hand; not swept.
 const GRAZING: f32 = -0.15;
-/// Pixels by which the crop that is rendered exceeds the projected box to the upper left, and to the lower right: silhouettes need
-/// an empty pixel beside them.
+/// Pixels by which the rendered crop exceeds the projected bounding box to the upper left and to the lower right: silhouettes need
+/// an empty pixel next to them.
 const CROP_MARGINS: (f64, f64) = (1.0, 2.0);
 
 impl Default for VerificationOptions {
@@ -88,13 +87,13 @@ pub struct VerificationScore {
     pub inliers: usize,
     /// Pixels where the scene is nearer, `N_occ`.
     pub occluded: usize,
-    /// Those of them that nothing excuses: the pose reaches into a surface.
+    /// Those of them without an occluder's edge: the pose penetrates a surface.
     pub pierced: usize,
     /// Pixels where the scene is further away, `N_out`.
     pub outliers: usize,
     /// Depth fitness `S_D`.
     pub depth: f64,
-    /// Fraction of the visible silhouette on a scene edge, `S_B`.
+    /// Fraction of the visible silhouette that is on a scene edge, `S_B`.
     pub boundary: f64,
     /// Fraction of the inliers whose normals agree, `S_N`.
     pub normals: f64,
@@ -103,36 +102,35 @@ pub struct VerificationScore {
 }
 
 impl VerificationScore {
-    /// Inliers as a fraction of the rendered pixels: how much of the object is really seen.
+    /// Inliers as a fraction of the rendered pixels: the visible fraction of the object.
     pub fn visible_fraction(&self) -> f64 {
         if self.rendered == 0 { 0.0 } else { self.inliers as f64 / self.rendered as f64 }
     }
 
-    /// The total, lowered where little of the object is seen: `total * v / (v + 0.1)` with `v` the
-    /// [`visible_fraction`](Self::visible_fraction). The dissertation removes every penalty for occlusion, so a pose hidden
-    /// behind something scores like one in full view; between hypotheses of one object the seen one is the better
-    /// bet.
+    /// The total, reduced if little of the object is visible: `total * v / (v + 0.1)` with `v` the
+    /// [`visible_fraction`](Self::visible_fraction). The dissertation removes every penalty for occlusion, so a hidden pose may
+    /// score like a fully visible one; of two hypotheses for one object the visible one is more likely to be right.
     pub fn ranking(&self) -> f64 {
         let v = self.visible_fraction();
         self.total * v / (v + HALF_RANKING)
     }
 }
 
-/// Renders poses into crops of a scene and compares; keeps its buffers.
+/// Renders poses into crops of a scene and compares them; reuses its buffers.
 #[derive(Debug)]
 pub struct Verifier {
     frame: VisibilityBuffer,
     agreement: Vec<Agreement>,
 }
 
-/// What the scene says at a pixel of a rendering or template.
+/// Comparison with the scene at a pixel of a rendering or template.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Agreement {
-    /// Nothing there, nothing measured, or the scene is further away.
+    /// Nothing was rendered, nothing was measured, or the scene is further away.
     Nothing,
     /// The depth agrees.
     Inlier {
-        /// Near an edge of the scene.
+        /// Whether the pixel is near an edge of the scene.
         on_edge: bool,
     },
     /// The scene is nearer.
@@ -146,7 +144,7 @@ impl Default for Verifier {
     }
 }
 
-/// A point seen at a pixel of a rendered pose.
+/// The point visible at a pixel of a rendered pose.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderedPoint {
     /// In the object's frame, metres.
@@ -158,8 +156,8 @@ pub struct RenderedPoint {
 }
 
 impl Verifier {
-    /// Renders the mesh into the part of the image it projects to; the corner of that part, or `None` when nothing
-    /// of it is in the image.
+    /// Renders the mesh into the part of the image that it covers; returns the corner of that part, or `None` if the mesh is
+    /// outside the image.
     fn render(&mut self, image: &PreparedDepth, mesh: &Mesh, pose: &Pose) -> Option<(usize, usize)> {
         let camera = image.camera();
         let (mut x0, mut y0, mut x1, mut y1) =
@@ -167,7 +165,7 @@ impl Verifier {
         let (low, high) = mesh.bounding_box();
         for k in 0..8 {
             let corner = Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] });
-            // An object that reaches behind the camera is drawn into the whole image.
+            // An object that extends behind the camera is rendered into the whole image.
             let Some(p) = camera.project(&pose.transform_point(&corner)) else {
                 (x0, y0, x1, y1) = (0.0, 0.0, camera.width as f64, camera.height as f64);
                 break;
@@ -261,7 +259,7 @@ impl Verifier {
         score
     }
 
-    /// About `count` of the points that would be seen at a pose, evenly over the image.
+    /// About `count` of the points visible at a pose, evenly spread over the image.
     pub(crate) fn visible_points(
         &mut self,
         image: &PreparedDepth,
@@ -286,7 +284,7 @@ impl Verifier {
                     continue;
                 }
                 let normal = normals[(x, y)];
-                // Grazing surface slides out of its pixel.
+                // A surface seen at a grazing angle may move out of its pixel.
                 if normal[2] > GRAZING {
                     continue;
                 }
@@ -327,8 +325,8 @@ impl Verifier {
     }
 }
 
-/// How many hidden pixels no occluder excuses: of each connected part of them, the fraction of its border with inliers that
-/// lies on no edge of the scene. `agreement` holds rows of `width` pixels; its hidden ones are taken out.
+/// Number of hidden pixels that are not explained by an occluder: of each connected part of them, the fraction of its border with
+/// inliers that is not on an edge of the scene. `agreement` has rows of `width` pixels; its hidden pixels are removed.
 pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
     let mut total = 0;
     let mut open = vec![];
@@ -365,7 +363,7 @@ pub fn pierced(agreement: &mut [Agreement], width: usize) -> usize {
             touch(x + 1, y);
             touch(x, y + 1);
         }
-        // Hidden all over, it says nothing about what hides it.
+        // A part without a border with inliers gives no information about its occluder.
         total += (pixels * without_edge).checked_div(border).unwrap_or(0);
     }
     total

@@ -1,4 +1,4 @@
-//! The last sieve of every method on depth: ICP of the rendered mesh against the depth image, then the scores of
+//! The final verification of every method on depth: ICP of the rendered mesh against the depth image, then the scores of
 //! [`crate::verification`].
 
 use rayon::prelude::*;
@@ -13,26 +13,27 @@ use crate::verification::{VerificationOptions, VerificationScore, Verifier};
 pub struct VerifiedPose {
     /// The pose after ICP.
     pub camera_from_object: Pose,
-    /// What the verification says.
+    /// The scores of the verification.
     pub score: VerificationScore,
 }
 
-/// Levels of the ICP: rejection distance as a multiple of the depth inlier threshold, and iterations. The dissertation takes 30
-/// iterations (chapter 5); the mesh is rendered again between these levels, so fewer do. The multiples were chosen by hand; not swept.
+/// Levels of the ICP: rejection distance as a multiple of the depth inlier threshold, and iterations. The dissertation uses 30
+/// iterations (chapter 5); here the mesh is rendered again between the levels, so fewer suffice. The multiples were chosen by hand;
+/// not swept.
 const LEVELS: [(f64, usize); 3] = [(2.0, 5), (1.2, 5), (0.8, 8)];
-/// Points rendered for a level, about; chosen by hand, not swept.
+/// Approximate number of points rendered for a level; chosen by hand, not swept.
 const POINTS: usize = 600;
-/// Rendered points this many rejection distances off the measured surface are not the object's; chosen by hand, not swept.
+/// Rendered points more than this many rejection distances from the measured surface are not used; chosen by hand, not swept.
 const NEAR: f64 = 2.0;
-/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+/// Largest angle between the normals of a correspondence, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 45.0;
-/// A level ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
+/// A level stops when a step is smaller than this, metres and radians; chosen by hand, well below the depth noise.
 const CONVERGENCE: f64 = 1e-5;
-/// Fewer correspondences do not hold six degrees of freedom twice over.
+/// Fewest correspondences: twice the six degrees of freedom.
 const MIN_CORRESPONDENCES: usize = 12;
 
-/// Refines and scores poses of a mesh; in the order of `poses`. `threshold` is the depth inlier threshold in metres
-/// ([`VerificationOptions::threshold_for`]); `mesh` is best one of [`crate::verification_mesh`].
+/// Refines and scores poses of a mesh; the results are in the order of `poses`. `threshold` is the depth inlier threshold in metres
+/// ([`VerificationOptions::threshold_for`]); `mesh` should come from [`crate::verification_mesh`].
 pub fn verify(
     image: &PreparedDepth,
     mesh: &Mesh,

@@ -1,4 +1,4 @@
-//! The fitted models, one for each kind of image, and their file.
+//! The fitted models, one for each combination of images (depth, colour, both), and their file.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use thiserror::Error;
 use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS};
 use crate::regression::{Fit, LogisticModel, fit};
 
-/// The version of the file's form.
+/// Version of the file format.
 const VERSION: u32 = 1;
 
 /// Why a calibration cannot be used.
@@ -20,10 +20,10 @@ pub enum CalibrationError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// It is no calibration.
+    /// The file is not a calibration.
     #[error("{file}: {reason}; expected a file that `sixfold reproduce auto --fit FILE` wrote")]
     Content {
         /// The file.
@@ -33,12 +33,12 @@ pub enum CalibrationError {
     },
 }
 
-/// How numbers become probabilities.
+/// Models that turn the numbers of a pose into a probability.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
     version: u32,
-    /// The names of the numbers, as this version knows them.
+    /// The names of the numbers, equal to [`NAMES`].
     names: Vec<String>,
     /// With depth alone.
     depth: LogisticModel,
@@ -49,10 +49,10 @@ pub struct Calibration {
 }
 
 impl Calibration {
-    /// That within the program.
+    /// The shipped calibration.
     ///
     /// # Errors
-    /// [`CalibrationError::Content`]; never for a program that passed its tests.
+    /// [`CalibrationError::Content`]; never if the tests pass.
     pub fn shipped() -> Result<Calibration, CalibrationError> {
         Calibration::parse(include_str!("../calibration.json"), "calibration.json within the program")
     }
@@ -83,8 +83,8 @@ impl Calibration {
         Ok(read)
     }
 
-    /// Fits the three models: `rows` and those of them that would be reported, for depth alone, colour alone and both. A list without
-    /// rows keeps the model that is within the program.
+    /// Fits the three models, for depth alone, colour alone and both; each from its rows and from those of them that would be
+    /// reported. For an empty list the shipped model is kept.
     ///
     /// # Errors
     /// As [`Calibration::shipped`].
@@ -109,7 +109,7 @@ impl Calibration {
         Ok(Calibration { version: VERSION, names: NAMES.map(str::to_owned).to_vec(), depth, color, both })
     }
 
-    /// The probability that a pose is right; 0 where nothing is known of it.
+    /// The probability that a pose is right; 0 if no number of it is known.
     pub fn probability(&self, numbers: &Numbers) -> f64 {
         let known = |mut range: std::ops::Range<usize>| range.any(|k| numbers[k].is_some());
         match (known(OF_DEPTH), known(OF_COLOR)) {
@@ -120,9 +120,9 @@ impl Calibration {
         }
     }
 
-    /// As a file has it.
+    /// The content of the calibration file.
     pub fn to_text(&self) -> String {
-        // Numbers, lists and strings are always JSON.
+        // Numbers, lists and strings can always be serialised.
         serde_json::to_string_pretty(self).unwrap_or_default() + "\n"
     }
 }

@@ -1,4 +1,4 @@
-//! The method that asks the others.
+//! The method `auto`, which runs the other methods and compares their poses.
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
@@ -19,39 +19,40 @@ use crate::lookalikes::LookAlikes;
 use crate::numbers::NAMES;
 
 const METHOD: &str = "auto";
-/// Where the mesh that is rendered is kept; the file of template matching, which keeps the same.
+/// File of the mesh that is rendered; shared with template matching.
 const MESH_FILE: &str = "verification-mesh.bin";
 /// Step at which a continuous symmetry is sampled, as a fraction of the diameter.
 const SYMMETRY_STEP: f64 = 0.05;
-/// Poses that a method is asked for beside the instances: what is second best says how sure the best is. Chosen by hand; not swept.
+/// Poses requested from a method in addition to the number of instances: the second best pose shows how certain the best is. Chosen
+/// by hand; not swept.
 const MORE: usize = 2;
-/// With a pose this probable for every instance no further method is asked; chosen by hand, not swept.
+/// When every instance has a pose this probable, no further method runs; chosen by hand, not swept.
 const SURE: f64 = 0.9;
-/// A colour image whose brightest and darkest values differ by no more than this, in each channel, shows nothing: a covered lens, a filled image.
-/// Chosen by hand; not swept.
+/// A colour image whose brightest and darkest values differ by no more than this, in each channel, has no content: a covered lens,
+/// or an image of one colour. Chosen by hand; not swept.
 const FLAT: u8 = 8;
 /// Below this probability a pose is not reported by default.
 const REPORTED: f64 = 0.5;
 
-/// One method that asks others in turn, judges their poses together, and says how probable each is.
+/// A method that runs other methods in order, compares their poses, and estimates the probability of each.
 #[derive(Clone)]
 pub struct AutoEstimator {
     members: Vec<Arc<dyn PoseEstimator>>,
     calibration: Arc<Calibration>,
-    /// How depth images are prepared, for all methods alike.
+    /// How depth images are prepared, the same for all methods.
     pub depth: DepthOptions,
-    /// Once this has passed for an object, no further method is asked; the first always is. With it results depend on how fast the
-    /// machine is.
+    /// Once this time has passed for an object, no further method runs; the first always does. With a budget, results depend on the
+    /// speed of the machine.
     pub budget: Option<Duration>,
-    /// Ask all methods, however sure the first are.
+    /// Run all methods, even if the first ones are certain.
     pub ask_all: bool,
 }
 
 impl AutoEstimator {
-    /// Asks `members` in this order, and judges by the calibration within the program.
+    /// Runs `members` in this order, with the shipped calibration.
     ///
     /// # Errors
-    /// [`CalibrationError`], never for a program that passed its tests.
+    /// [`CalibrationError`], never if the tests pass.
     pub fn new(members: Vec<Arc<dyn PoseEstimator>>) -> Result<AutoEstimator, CalibrationError> {
         let calibration = Arc::new(Calibration::shipped()?);
         Ok(AutoEstimator {
@@ -63,16 +64,16 @@ impl AutoEstimator {
         })
     }
 
-    /// Judges by another calibration.
+    /// Uses another calibration.
     #[must_use]
     pub fn with_calibration(self, calibration: Calibration) -> AutoEstimator {
         AutoEstimator { calibration: Arc::new(calibration), ..self }
     }
 
-    /// Everything that is known of an object in an image: all poses of all methods that were asked, the most probable first.
+    /// All hypotheses for an object in an image: the poses of all methods that ran, the most probable first.
     ///
     /// # Errors
-    /// [`EstimatorError`], as that of the method that it comes from; [`EstimatorError::Lacks`] for an object without a mesh.
+    /// [`EstimatorError`], passed on from the method that fails; [`EstimatorError::Lacks`] for an object without a mesh.
     pub fn hypotheses(
         &self,
         object: &AutoObject,
@@ -84,7 +85,7 @@ impl AutoEstimator {
         self.pool((object, surface), query, |pool, _| Ok(pool.hypotheses))
     }
 
-    /// The first method that knows an object without a mesh, with what it knows.
+    /// The first method that can find an object without a mesh, with the object prepared for it.
     fn without_mesh(&self, object: &AutoObject) -> Result<Option<Knowing<'_>>, EstimatorError> {
         for (number, member) in self.members.iter().enumerate() {
             if let (Ok(prepared), _) = object.prepared(number, member.as_ref())? {
@@ -94,7 +95,7 @@ impl AutoEstimator {
         Ok(None)
     }
 
-    /// Poses of an object without a mesh: nothing can be rendered, so that one method answers and its confidence is no probability.
+    /// Poses of an object without a mesh: nothing can be rendered, so only one method runs and its confidence is not a probability.
     fn answer_of_one(
         &self,
         object: &AutoObject,
@@ -123,7 +124,7 @@ impl AutoEstimator {
         Ok(found)
     }
 
-    /// Fills a pool and hands it on, with what was left out.
+    /// Fills a pool and passes it to `done`, with notes about what was left out.
     fn pool<T>(
         &self,
         (object, surface): (&AutoObject, &Surface),
@@ -214,7 +215,7 @@ impl AutoEstimator {
     }
 }
 
-/// Why nothing can be read from a colour image, if so.
+/// Why a colour image cannot be used; `None` if it can.
 fn unusable(image: &RgbImage, camera: (usize, usize)) -> Option<&'static str> {
     if image.size() != camera {
         return Some("has another size than the camera");
@@ -227,7 +228,7 @@ fn unusable(image: &RgbImage, camera: (usize, usize)) -> Option<&'static str> {
     (0..3).all(flat).then_some("has one colour everywhere")
 }
 
-/// The error for an object that no method can look for.
+/// The error for an object that no method can search.
 fn lacks_mesh(object: &AutoObject) -> EstimatorError {
     EstimatorError::Lacks {
         object: object.object.name.clone(),
@@ -237,7 +238,7 @@ fn lacks_mesh(object: &AutoObject) -> EstimatorError {
     }
 }
 
-/// Whether a query has what a method needs.
+/// Whether a query has the inputs that a method needs.
 fn can_answer(method: &dyn PoseEstimator, query: &Query<'_>) -> bool {
     let needs = method.needs();
     let has = |need: Need, there: bool| need != Need::Required || there;
@@ -246,35 +247,35 @@ fn can_answer(method: &dyn PoseEstimator, query: &Query<'_>) -> bool {
         && has(needs.region, query.region.is_some())
 }
 
-/// An object as all methods know it.
+/// An object prepared for all methods.
 pub struct AutoObject {
     object: Object,
-    /// `None` for an object that is known by depth images alone.
+    /// `None` for an object known only from depth images.
     surface: Option<Surface>,
     members: Vec<Prepared>,
     notes: Vec<String>,
 }
 
-/// What poses are judged by.
+/// The surface with which poses are verified.
 struct Surface {
     mesh: Arc<Mesh>,
     rendered: Mesh,
     diameter: f64,
     threshold: f64,
     symmetries: Vec<Pose>,
-    /// Found when they are first needed.
+    /// Computed on first use.
     look_alikes: OnceLock<LookAlikes>,
 }
 
-/// An object as one method knows it; `Err` says why it cannot be asked.
+/// An object prepared for one method; `Err` says why the method cannot be used.
 type Known = Result<Arc<Box<dyn PreparedObject>>, String>;
-/// A method with an object as it knows it.
+/// A method with an object prepared for it.
 type Knowing<'a> = (&'a dyn PoseEstimator, Arc<Box<dyn PreparedObject>>);
-/// The same as [`Known`], prepared when the method is first asked.
+/// The same as [`Known`], prepared when the method first runs.
 type Prepared = Mutex<Option<Known>>;
 
 impl Surface {
-    /// The surface of an object with this mesh, and a note where something could not be kept.
+    /// The surface of an object with this mesh, and a note if a file could not be written.
     fn of(object: &Object, mesh: &Arc<Mesh>) -> Result<(Surface, Option<String>), EstimatorError> {
         let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
         let kept =
@@ -298,7 +299,7 @@ impl Surface {
 }
 
 impl AutoObject {
-    /// The object as method number `number` knows it, or why it cannot be asked; and whether it was prepared just now.
+    /// The object prepared for method number `number`, or why this method cannot be used; and whether it was prepared in this call.
     fn prepared(&self, number: usize, method: &dyn PoseEstimator) -> Result<(Known, bool), EstimatorError> {
         let Some(place) = self.members.get(number) else {
             return Err(EstimatorError::Foreign { method: METHOD });
@@ -335,7 +336,7 @@ impl PoseEstimator for AutoEstimator {
         METHOD
     }
 
-    /// An object, with a mesh if its poses are to be judged, and one image at least.
+    /// An object (with a mesh, for probabilities) and at least one image.
     fn needs(&self) -> Needs {
         Needs { depth: Need::Optional, rgb: Need::Optional, region: Need::Optional, object: Need::Required }
     }
@@ -344,7 +345,8 @@ impl PoseEstimator for AutoEstimator {
         self.depth
     }
 
-    /// Probabilities need no other threshold for other images. In a dataset all that may be there is reported, and scores sort it.
+    /// Probabilities have the same threshold for all images. In a dataset all hypotheses are reported, because its scores rank them
+    /// by confidence.
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: REPORTED, dataset: 0.0 }
     }

@@ -1,4 +1,4 @@
-//! Poses of all methods in one pool: held against the image, joined where they are the same, compared with each other.
+//! Poses of all methods in one pool: compared with the image, merged if they are the same, and compared with each other.
 
 use rayon::prelude::*;
 use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
@@ -11,39 +11,39 @@ use crate::calibration::Calibration;
 use crate::lookalikes::LookAlikes;
 use crate::numbers::{Numbers, add_others, of_evidence, strength};
 
-/// Poses whose points lie apart by less than this fraction of the diameter are the same; of methods on colour alone, which err along
-/// the view axis. Chosen by hand; not swept.
+/// Poses whose points are less than this fraction of the diameter apart are the same; [`SAME_BY_COLOR`] for methods on colour
+/// alone, which have larger errors along the view axis. Chosen by hand; not swept.
 const SAME: f64 = 0.1;
 /// See [`SAME`].
 const SAME_BY_COLOR: f64 = 0.2;
-/// Poses that share more than this fraction of the smaller one's pixels are of one place; chosen by hand, not swept.
+/// Poses that share more than this fraction of the smaller one's pixels are at the same place; chosen by hand, not swept.
 const ONE_PLACE: f64 = 0.5;
 
-/// A pose with what is known of it.
+/// A pose with its evidence and probability.
 #[derive(Debug, Clone)]
 pub struct Hypothesis {
     /// The method that found it.
     pub method: &'static str,
     /// All methods that found it.
     pub found_by: Vec<&'static str>,
-    /// What that method said, and the pose as it stands now.
+    /// The method's estimate, with the pose after any refinement here.
     pub estimate: PoseEstimate,
-    /// What the image says.
+    /// Agreement with the image.
     pub evidence: Evidence,
-    /// The same and the other poses, as numbers.
+    /// The evidence and the comparison with other poses, as numbers.
     pub numbers: Numbers,
-    /// That it is right.
+    /// Probability that the pose is right.
     pub probability: f64,
     strength: f64,
 }
 
-/// What a pool of hypotheses knows of object and image.
+/// A pool of hypotheses for one object in one image.
 pub(crate) struct Pool<'a> {
     pub scene: Scene<'a>,
     pub shape: Shape<'a>,
     pub diameter: f64,
     pub symmetries: &'a [Pose],
-    /// What depth alone takes for the same.
+    /// Rotations that depth alone cannot distinguish.
     pub look_alikes: &'a LookAlikes,
     pub calibration: &'a Calibration,
     pub one_instance: bool,
@@ -52,7 +52,7 @@ pub(crate) struct Pool<'a> {
 }
 
 impl Pool<'_> {
-    /// Takes in what a method found, and judges all anew.
+    /// Adds the poses that a method found, and recomputes all probabilities.
     pub(crate) fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
         self.asked += 1;
         let by_depth = method.needs().depth != Need::Unused;
@@ -99,7 +99,7 @@ impl Pool<'_> {
         self.compare();
     }
 
-    /// Adds a hypothesis, or joins it with the same one.
+    /// Adds a hypothesis, or merges it with an equal one.
     fn join(&mut self, new: Hypothesis) {
         let same = |h: &&mut Hypothesis| {
             let limit = if h.evidence.depth.is_some() { SAME } else { SAME_BY_COLOR };
@@ -124,7 +124,7 @@ impl Pool<'_> {
         place.found_by = found_by;
     }
 
-    /// Compares every hypothesis with the others, and computes probabilities; the most probable first.
+    /// Compares every hypothesis with the others, and computes probabilities; sorts the most probable first.
     fn compare(&mut self) {
         let others: Vec<(f64, f64)> = self
             .hypotheses
@@ -147,7 +147,8 @@ impl Pool<'_> {
         self.hypotheses.sort_by(|a, b| b.probability.total_cmp(&a.probability));
     }
 
-    /// The most probable hypotheses, one at a place, at most `most`, each with the others at its place that are not much less probable.
+    /// The most probable hypotheses, one per place, at most `most`, each with the others at its place that are not much less
+    /// probable.
     pub(crate) fn chosen(&self, most: usize) -> Vec<(&Hypothesis, Vec<&Hypothesis>)> {
         let mut chosen: Vec<(&Hypothesis, Vec<&Hypothesis>)> = vec![];
         for hypothesis in &self.hypotheses {
@@ -163,13 +164,14 @@ impl Pool<'_> {
     }
 }
 
-/// Another pose at the same place is said if it is at least this probable beside the best; chosen by hand, not swept.
+/// Another pose at the same place is reported if its probability exceeds this fraction of the best one's; chosen by hand, not
+/// swept.
 const ALTERNATIVE: f64 = 0.25;
 
-/// An object whose centre is nearer than this many diameters lies against the lens; chosen by hand, not swept.
+/// An object whose centre is nearer than this many diameters is too close to the lens; chosen by hand, not swept.
 const AGAINST_LENS: f64 = 0.5;
 
-/// The object's frame may lie anywhere: what counts is the centre of its box.
+/// Tests the centre of the bounding box, because the object's frame may be anywhere.
 fn is_before_camera(pose: &Pose, mesh: &Mesh, diameter: f64) -> bool {
     let (low, high) = mesh.bounding_box();
     let centre = pose.transform_point(&(0.5 * (low + high)));
@@ -180,7 +182,7 @@ pub(crate) fn ranking(evidence: &Evidence) -> f64 {
     evidence.depth.map_or(0.0, |d| d.score.ranking())
 }
 
-/// A pose from colour where the measured surface has it.
+/// A pose from colour, aligned with the measured surface.
 pub(crate) fn moved_to_depth(
     scene: &Scene<'_>,
     shape: &Shape<'_>,
@@ -192,7 +194,7 @@ pub(crate) fn moved_to_depth(
     Some(refine(&mut Verifier::default(), image, shape.mesh, &aligned.camera_from_object, shape.threshold))
 }
 
-/// The largest distance between a corner of the object's box at both poses, under the symmetry for which it is smallest, metres.
+/// The largest distance between a corner of the object's box at both poses, minimised over the symmetries, metres.
 fn distance(a: &Pose, b: &Pose, symmetries: &[Pose], shape: &Shape<'_>) -> f64 {
     let (low, high) = shape.mesh.bounding_box();
     let corners: [Vec3; 8] =
@@ -205,13 +207,13 @@ fn distance(a: &Pose, b: &Pose, symmetries: &[Pose], shape: &Shape<'_>) -> f64 {
     symmetries.iter().map(at).fold(none, f64::min)
 }
 
-/// Whether two poses are of one place in the image.
+/// Whether two poses are at the same place in the image.
 fn one_place(a: &Hypothesis, b: &Hypothesis) -> bool {
     let (a, b) = (&a.evidence.pixels, &b.evidence.pixels);
     shared(a, b) as f64 > ONE_PLACE * a.len().min(b.len()) as f64
 }
 
-/// How many numbers two ascending lists share.
+/// Number of values that two ascending lists share.
 fn shared(a: &[u32], b: &[u32]) -> usize {
     let (mut i, mut k, mut count) = (0, 0, 0);
     while i < a.len() && k < b.len() {
@@ -242,7 +244,7 @@ mod tests {
         };
         let at = |z| is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, z)), &mesh(0.0), 0.2);
         assert_eq!([at(-1.0), at(0.05), at(0.5), at(f64::NAN)], [false, false, true, false]);
-        // A scan whose frame lies a metre behind it.
+        // A scan whose frame is a metre behind it.
         assert!(is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, -0.5)), &mesh(1.0), 0.2));
     }
 }

@@ -1,9 +1,9 @@
-//! One method that asks the others, holds their poses against the image together, and says how probable each is.
+//! A method that runs the others, compares all their poses with the image, and estimates the probability of each.
 //!
-//! [`AutoEstimator`] is given other methods behind [`PoseEstimator`](sixfold_estimator::PoseEstimator). Their poses compete in one
-//! pool: each is rendered and held against depth, normals, outline, edges and colours ([`sixfold_align::evidence`]), and a
-//! [`Calibration`] turns these numbers into a probability. What is asked, and in which order, is the caller's choice; [`AutoMembers`] puts together
-//! all that there is.
+//! [`AutoEstimator`] runs other methods through [`PoseEstimator`](sixfold_estimator::PoseEstimator). Their poses compete in one
+//! pool: each is rendered and compared with depth, normals, outline, edges and colours ([`sixfold_align::evidence`]), and a
+//! [`Calibration`] turns these numbers into a probability. The caller chooses the methods and their order; [`AutoMembers`] collects
+//! all available ones.
 
 #![warn(unreachable_pub, unnameable_types)]
 

@@ -1,5 +1,5 @@
-//! Rotations that an object's shape hardly shows and its colours do: a box with print, a can with a label. A method on depth takes
-//! one of them by chance; with a colour image the pool takes the one whose colours agree.
+//! Rotations that are hardly visible in an object's shape but visible in its colours: a printed box, a can with a label. A method
+//! on depth finds one of them at random; with a colour image the pool chooses the one whose colours agree.
 
 use std::f64::consts::TAU;
 
@@ -11,22 +11,23 @@ use sixfold_mesh::{ContinuousSymmetry, Mesh, SymmetryOptions, find_symmetries};
 
 use crate::hypotheses::{moved_to_depth, ranking};
 
-/// Noise of the mesh's surface as a fraction of its diameter: what is alike for depth need not be a symmetry, and a mesh made from
-/// photographs is rough. 0.005 left rotations of such meshes out (two of eight objects of `sixfold reproduce teach`); the most that
-/// [`find_symmetries`] takes is 0.02.
+/// Noise of the mesh's surface as a fraction of its diameter: rotations that depth cannot distinguish need not be exact symmetries,
+/// and a mesh made from photographs is rough. 0.005 missed rotations of such meshes (two of eight objects of `sixfold reproduce
+/// teach`); the maximum of [`find_symmetries`] is 0.02.
 const NOISE: f64 = 0.018;
-/// A rotation that is off a known symmetry by less is that symmetry, radians; chosen by hand, not swept.
+/// A rotation that differs from a known symmetry by less than this is that symmetry, radians; chosen by hand, not swept.
 const KNOWN: f64 = 0.1;
-/// Most discrete rotations that are tried.
+/// Largest number of discrete rotations tried.
 const MOST: usize = 24;
 /// Steps of a full turn about a continuous axis; chosen by hand, not swept.
 const STEPS: usize = 16;
-/// Halvings of that step around the best one.
+/// Times that the step is halved around the best rotation.
 const HALVINGS: usize = 4;
-/// By how much colours have to agree better; chosen by hand, not swept.
+/// Smallest improvement of the agreement of colours; chosen by hand, not swept.
 const BETTER: f64 = 0.03;
-/// Depth may agree less well by this fraction, if colours agree better by [`WORSE_DEPTH`] of it: a mesh made from photographs is closed where
-/// none shows it, and fits upside down as well. Chosen by hand on two of the twelve objects of `sixfold reproduce teach`; not swept.
+/// The agreement with depth may decrease by up to this fraction, if that of colours improves by [`WORSE_DEPTH`] times the decrease:
+/// a mesh made from photographs is closed where no photograph shows it, and fits upside down as well. Chosen by hand on two of the
+/// twelve objects of `sixfold reproduce teach`; not swept.
 const DEPTH_LOSS: f64 = 0.5;
 /// See [`DEPTH_LOSS`].
 const WORSE_DEPTH: f64 = 0.5;
@@ -40,13 +41,13 @@ pub(crate) struct LookAlikes {
 }
 
 impl LookAlikes {
-    /// Those of a mesh that are not among its known symmetries. None for a mesh without colours.
+    /// The look-alikes of a mesh that are not among its known symmetries. None for a mesh without colours.
     pub(crate) fn of(mesh: &Mesh, diameter: f64, symmetries: &[Pose]) -> LookAlikes {
         if mesh.colors().is_none() && mesh.texture().is_none() {
             return LookAlikes::default();
         }
         let options = SymmetryOptions { noise: NOISE * diameter, ..SymmetryOptions::default() };
-        // An object of no size, or of several metres, has none.
+        // An object of zero size, or of several metres, has none.
         let found = find_symmetries(mesh, &options).unwrap_or_default();
         let is_new = |pose: &Pose| symmetries.iter().all(|known| known.rotation_angle_to(pose) > KNOWN);
         let mut discrete = vec![Pose::identity()];
@@ -59,13 +60,13 @@ impl LookAlikes {
         let axes: Vec<ContinuousSymmetry> = found
             .iter()
             .filter_map(|s| s.continuous())
-            // A quarter turn and one more: a known symmetry of order 4 is not all rotations.
+            // Tests a quarter turn and another angle: a known symmetry of order 4 does not include all rotations.
             .filter(|axis| is_new(&axis.rotation(0.25 * TAU)) || is_new(&axis.rotation(0.15 * TAU)))
             .collect();
         LookAlikes { discrete, axes }
     }
 
-    /// The pose among its look-alikes whose colours agree best with the image, if another than this one.
+    /// The pose among its look-alikes whose colours agree best with the image, if it is not `pose` itself.
     pub(crate) fn best(
         &self,
         scene: &Scene<'_>,
@@ -116,7 +117,7 @@ impl LookAlikes {
         if best.0 < needed {
             return None;
         }
-        // A look-alike differs a little: depth moves it to its place.
+        // A look-alike is only approximately symmetric: its pose is aligned with depth.
         if let Some(moved) = moved_to_depth(scene, shape, diameter, &best.1) {
             let (agreement, moved, after) = judge(moved);
             if agreement.is_some_and(|agreement| agreement >= needed) && ranking(&after) > ranking(&best.2) {
@@ -128,7 +129,7 @@ impl LookAlikes {
         is_worth_it.then_some((best.1, best.2))
     }
 
-    /// A discrete rotation, and with it all steps about every axis.
+    /// A discrete rotation, alone and combined with all steps about every axis.
     fn around(&self, discrete: &Pose) -> Vec<Pose> {
         let steps = (1..STEPS).map(|k| TAU * k as f64 / STEPS as f64);
         let rotations = self.axes.iter().flat_map(|axis| steps.clone().map(|angle| axis.rotation(angle)));

@@ -1,4 +1,4 @@
-//! The methods that are asked, put together: all that the program has.
+//! Collects all methods of the program for `auto`.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -14,10 +14,10 @@ use sixfold_views::estimator::ViewsEstimator;
 
 use crate::estimator::AutoEstimator;
 
-/// What may be left out, or comes in, when all methods are put together.
+/// Which methods are included.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AutoMembers<'a> {
-    /// A trained model of Pix2Pose, and which of its objects is meant where an object does not say.
+    /// A trained model of Pix2Pose, and the number of its object, for objects that do not give one.
     pub pix2pose: Option<(&'a Path, Option<u32>)>,
     /// Leave out the views in colour.
     pub without_views: bool,
@@ -28,11 +28,11 @@ pub struct AutoMembers<'a> {
 }
 
 impl AutoMembers<'_> {
-    /// The method that asks them: point pair features, templates, Pix2Pose where there is a model, views.
+    /// The method `auto` over point pair features, templates, Pix2Pose if there is a model, and views.
     ///
     /// # Errors
-    /// [`EstimatorError::Method`] where the file of Pix2Pose is no such model, or a network within the program cannot be read, which a
-    /// program that passed its tests never says.
+    /// [`EstimatorError::Method`] if the file of Pix2Pose is not such a model, or a shipped network cannot be read (never if the
+    /// tests pass).
     pub fn estimator(&self) -> Result<AutoEstimator, EstimatorError> {
         let network = MttmModel::shipped().map_err(EstimatorError::method)?;
         let ppf = PpfEstimator { depth: self.depth, ..PpfEstimator::default() };

@@ -1,8 +1,8 @@
-//! What is known of a pose, as the numbers that its probability is computed from.
+//! The numbers from which the probability of a pose is computed.
 
 use sixfold_align::Evidence;
 
-/// How many numbers there are.
+/// Number of values.
 const COUNT: usize = 17;
 
 /// Their names, in order.
@@ -26,26 +26,27 @@ pub const NAMES: [&str; COUNT] = [
     "gap_elsewhere",
 ];
 
-/// Whether more of each speaks for a pose: a fit that says otherwise has learned how its scenes were made.
+/// Whether a larger value makes a pose more probable: a fit with the opposite sign has learned artefacts of its scenes.
 pub(crate) const SPEAKS_FOR: [bool; COUNT] = [
     true, true, true, true, true, true, false, true, false, true, false, true, false, true, true, true, true,
 ];
-/// Those that come of the depth image.
+/// Numbers from the depth image.
 pub(crate) const OF_DEPTH: std::ops::Range<usize> = 0..9;
-/// Those that come of the colour image.
+/// Numbers from the colour image.
 pub(crate) const OF_COLOR: std::ops::Range<usize> = 9..14;
-/// Those that come of the other poses.
+/// Numbers from the comparison with other poses.
 pub(crate) const OF_OTHERS: std::ops::Range<usize> = 14..17;
 
 /// The numbers of a pose, in the order of [`NAMES`]; `None` where one is not known.
 pub type Numbers = [Option<f64>; COUNT];
 
-/// A gap to other poses above this says no more; chosen by hand, not swept.
+/// Larger gaps to other poses are clipped to this; chosen by hand, not swept.
 const MAX_GAP: f64 = 0.4;
-/// A tint further off than this says no more: lamps and cameras colour images too. Chosen by hand; not swept.
+/// Larger differences in tint are clipped to this: lamps and cameras colour images too. Chosen by hand; not swept.
 const MAX_TINT: f64 = 0.15;
 
-/// What the image says, without the other poses. `similarity` is what a method on colour says of its pose.
+/// The numbers from the image, without the other poses. `similarity` is the similarity that a method on colour reports for its
+/// pose.
 pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>) -> Numbers {
     let mut numbers = [None; COUNT];
     if let Some(depth) = &evidence.depth {
@@ -79,7 +80,8 @@ pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>) -> Numbe
     numbers
 }
 
-/// What one number says of a pose before the others are known: the ranking of verification, else edges and similarity.
+/// A single score of a pose before the comparison with others: the ranking of the verification if there is depth, otherwise edges
+/// and similarity.
 pub(crate) fn strength(evidence: &Evidence, similarity: Option<f64>) -> f64 {
     match (&evidence.depth, &evidence.color) {
         (Some(depth), _) => depth.score.ranking(),
@@ -88,8 +90,8 @@ pub(crate) fn strength(evidence: &Evidence, similarity: Option<f64>) -> f64 {
     }
 }
 
-/// Adds what the other poses say: how many other methods agree, and by how much this one is stronger than the strongest other at the
-/// same place and elsewhere.
+/// Adds the numbers from the other poses: how many other methods agree, and by how much this one is stronger than the strongest
+/// other at the same place and elsewhere.
 pub(crate) fn add_others(numbers: &mut Numbers, agreement: Option<f64>, here: f64, elsewhere: Option<f64>) {
     let gap = |value: f64| value.clamp(-MAX_GAP, MAX_GAP);
     numbers[OF_OTHERS].copy_from_slice(&[agreement, Some(gap(here)), elsewhere.map(gap)]);

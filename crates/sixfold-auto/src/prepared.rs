@@ -1,4 +1,4 @@
-//! What methods derive from an object, for all of them at once.
+//! Prepares an object for all methods at once.
 
 use std::error::Error;
 
@@ -7,10 +7,11 @@ use sixfold_mttm::{MttmEstimator, ObjectTemplates, TEMPLATES_FILE, TemplateOptio
 use sixfold_ppf::PpfEstimator;
 use sixfold_views::estimator::ViewsEstimator;
 
-/// Derives from an object what the methods that need no training for it keep in its folder: now, not at the first estimate.
+/// Computes in advance the files that methods without per-object training keep in an object's folder, instead of at the first
+/// estimate.
 ///
 /// # Errors
-/// As the methods: for a mesh that one of them cannot use, or a file that cannot be written.
+/// Those of the methods: for a mesh that one of them cannot use, or a file that cannot be written.
 pub fn prepare_all(object: &Object) -> Result<(), Box<dyn Error + Send + Sync>> {
     PpfEstimator::default().prepare(object)?;
     if let (Some(mesh), Some(file)) = (&object.mesh, object.file(TEMPLATES_FILE)) {

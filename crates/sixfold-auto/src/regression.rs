@@ -1,23 +1,23 @@
-//! Logistic regression with a normal prior about zero (Cox 1958; the most probable weights by Newton's method), and how well its
-//! probabilities hold.
+//! Logistic regression with a normal prior about zero (Cox 1958; the most probable weights by Newton's method), and its
+//! calibration.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{DMatrix, DVector};
 
 use crate::numbers::{Numbers, SPEAKS_FOR};
 
-/// One over the variance of the weights of standardised numbers, per row of the fit; chosen by hand, not swept.
+/// Inverse variance of the prior on the weights of standardised numbers, per row of the fit; chosen by hand, not swept.
 const PRECISION: f64 = 2.0;
-/// Most steps of Newton's method.
+/// Maximum number of steps of Newton's method.
 const STEPS: usize = 50;
 
-/// Probabilities from numbers.
+/// A model that computes a probability from numbers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogisticModel {
-    /// Which numbers it takes, by their place in [`crate::NAMES`].
+    /// Which numbers it uses, by their index in [`crate::NAMES`].
     pub takes: Vec<usize>,
-    /// Their means, which stand for those that are not known.
+    /// Their means, which replace unknown values.
     pub means: Vec<f64>,
     /// Their standard deviations.
     pub deviations: Vec<f64>,
@@ -25,11 +25,11 @@ pub struct LogisticModel {
     pub weights: Vec<f64>,
     /// The constant.
     pub constant: f64,
-    /// What the sum is multiplied with, and what is added, so that the probabilities of the poses that are reported hold (Platt 1999).
+    /// Factor and offset applied to the sum, so that the probabilities of reported poses are calibrated (Platt 1999).
     pub scaling: [f64; 2],
 }
 
-/// What a fit is made of.
+/// One row of a fit.
 #[derive(Debug, Clone, Copy)]
 pub struct Fit<'a> {
     /// The numbers of a pose.
@@ -55,7 +55,7 @@ impl LogisticModel {
         sigmoid(self.scaling[0] * self.raw(numbers) + self.scaling[1])
     }
 
-    /// Whether the lengths belong together and all numbers are finite.
+    /// Whether the lengths are consistent and all numbers are finite.
     pub(crate) fn is_whole(&self) -> bool {
         let n = self.takes.len();
         let all = [&self.means, &self.deviations, &self.weights];
@@ -66,23 +66,22 @@ impl LogisticModel {
             && self.scaling.iter().all(|s| s.is_finite())
     }
 
-    /// The same with the scaling under which the probabilities of `rows` hold best.
+    /// The same model with the scaling that calibrates the probabilities of `rows` best.
     #[must_use]
     pub(crate) fn scaled_to(self, rows: &[Fit<'_>]) -> LogisticModel {
         let z: Vec<[f64; 2]> = rows.iter().map(|r| [self.raw(r.numbers), 1.0]).collect();
         let right: Vec<bool> = rows.iter().map(|r| r.right).collect();
-        // About a scaling of one: few rows change little.
+        // The prior is centred on a scaling of one, so that few rows change little.
         let weights = newton(&z, &right, &[1.0, 0.0], &[1.0, 0.01]);
         let scaling = if weights[0] > 0.0 { [weights[0], weights[1]] } else { [1.0, 0.0] };
         LogisticModel { scaling, ..self }
     }
 }
 
-/// The most probable model of some rows; `takes` says which numbers it may use. Those whose weight would have the wrong sign, by how much
-/// they speak for a pose, are left out one by one, the worst first. Rows weigh alike; the same rows in the same order give the same
-/// model.
+/// The most probable model of some rows; `takes` lists the numbers it may use. Numbers whose weight would have the wrong sign are
+/// removed one by one, the worst first. All rows have the same weight; the same rows in the same order give the same model.
 pub fn fit(rows: &[Fit<'_>], takes: &[usize]) -> LogisticModel {
-    // What is the same for all says nothing.
+    // Numbers that are equal in all rows carry no information.
     let varies = |k: &usize| {
         let mut known = rows.iter().filter_map(|r| r.numbers[*k]);
         let first = known.next();
@@ -100,7 +99,7 @@ pub fn fit(rows: &[Fit<'_>], takes: &[usize]) -> LogisticModel {
     }
 }
 
-/// The same with all of `takes`.
+/// The same, using all of `takes`.
 fn fit_all(rows: &[Fit<'_>], takes: &[usize]) -> LogisticModel {
     let known = |k: usize| rows.iter().filter_map(move |r| r.numbers[k]);
     let mean = |k: usize| known(k).sum::<f64>() / known(k).count().max(1) as f64;
@@ -123,7 +122,7 @@ fn fit_all(rows: &[Fit<'_>], takes: &[usize]) -> LogisticModel {
     LogisticModel { takes: takes.to_vec(), means, deviations, weights, constant, scaling: [1.0, 0.0] }
 }
 
-/// The weights that make `right` most probable, under a normal prior about `prior`.
+/// The weights that make `right` most probable, under a normal prior with mean `prior`.
 fn newton<R: AsRef<[f64]>>(inputs: &[R], right: &[bool], prior: &[f64], precision: &[f64]) -> Vec<f64> {
     let rows: Vec<DVector<f64>> = inputs.iter().map(|r| DVector::from_row_slice(r.as_ref())).collect();
     let prior = DVector::from_row_slice(prior);
@@ -147,7 +146,7 @@ fn newton<R: AsRef<[f64]>>(inputs: &[R], right: &[bool], prior: &[f64], precisio
             curvature.ger(p * (1.0 - p), x, x, 1.0);
         }
         let Some(step) = curvature.cholesky().map(|c| c.solve(&gradient)) else { break };
-        // Newton's step may go too far where the sigmoid is flat.
+        // Newton's step may be too long where the sigmoid is flat.
         let mut length = 1.0;
         let mut next = &weights - &step;
         while loss(&next) > value && length > 1e-6 {
@@ -174,7 +173,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows whose truth is drawn with log odds of `2 x - 1`, where x is number 3.
+    /// Rows whose outcome is sampled with log odds of `2 x - 1`, where x is number 3.
     fn drawn(count: usize, seed: u64) -> Vec<(Numbers, bool)> {
         let mut random = stream(seed, 0);
         (0..count)
@@ -202,7 +201,7 @@ mod tests {
             let (found, drawn) = (model.probability(numbers), sigmoid(2.0 * x - 1.0));
             assert!((found - drawn).abs() < 0.05, "{x}: {found} instead of {drawn}");
         }
-        // What is not known counts as the mean.
+        // Unknown values count as the mean.
         let unknown = model.probability(&[None; crate::NAMES.len()]);
         let mut mean: Numbers = [None; crate::NAMES.len()];
         for (k, value) in model.takes.iter().zip(&model.means) {
@@ -213,7 +212,7 @@ mod tests {
 
     #[test]
     fn what_speaks_the_wrong_way_is_left_out() {
-        // Number 3 speaks for a pose; where it seems to speak against, it is not taken.
+        // A larger number 3 makes a pose more probable; if the rows show the opposite, it is not used.
         let turned: Vec<(Numbers, bool)> = drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
         let model = fit(&rows(&turned), &[3, 5]);
         assert!(!model.takes.contains(&3), "{model:?}");
@@ -222,7 +221,7 @@ mod tests {
 
     #[test]
     fn scaling_makes_up_for_rows_that_were_chosen() {
-        // Of what is reported half as much is right as of all: the probabilities follow.
+        // If half as many of the reported poses are right as of all, the probabilities decrease accordingly.
         let known = drawn(4000, 3);
         let model = fit(&rows(&known), &[3, 5]);
         let mut random = stream(4, 0);

@@ -1,4 +1,4 @@
-//! What the card of a detector's weight file says, checked before a network is made.
+//! Reads and checks the card of a detector's weight file before a network is created.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use sixfold_nn::weights::{ModelCard, WeightsError, read_card};
 use crate::anchored::{AnchoredConfig, AnchoredKind, AnchoredNetwork, Wrong};
 use crate::model::{ClassEntry, DetectorUse, ModelError};
 
-/// Which network with anchors a card describes, if it is one.
+/// Which network with anchors a card describes, if it describes one.
 pub(crate) fn anchored_kind(card: &ModelCard) -> Option<AnchoredKind> {
     AnchoredKind::ALL.iter().copied().find(|kind| kind.architecture() == card.architecture)
 }

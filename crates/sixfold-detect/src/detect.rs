@@ -6,33 +6,33 @@ use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
 use sixfold_synth::augment::{AffineMap, Patch};
 
-/// Most detections of an image, of one object or of all.
+/// Upper bound of the number of detections per image, of one object or of all.
 const MOST_DETECTIONS: usize = 10_000;
 
-/// Which detections are given.
+/// Which detections are returned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DetectOptions {
     /// Detections with a lower score are left out.
     pub threshold: f32,
-    /// Of two boxes of a class that overlap more (intersection over union) the worse one is left out.
+    /// Of two boxes of a class with a larger intersection over union, the one with the lower score is left out.
     pub overlap: f32,
-    /// Most detections of a class, the best ones.
+    /// Maximum number of detections of a class, the best ones.
     pub per_class: usize,
     /// Maximum number of detections of an image, the best ones.
     pub most: usize,
-    /// Make masks too.
+    /// Also compute masks.
     pub masks: bool,
 }
 
 impl Default for DetectOptions {
-    /// For people and for poses: what the detector is sure of.
+    /// For display and for poses: only confident detections.
     fn default() -> Self {
         DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, most: 100, masks: true }
     }
 }
 
 impl DetectOptions {
-    /// For average precision, which wants unsure detections too.
+    /// For average precision, which also needs uncertain detections.
     pub fn for_scores() -> Self {
         DetectOptions { threshold: 0.02, ..DetectOptions::default() }
     }
@@ -40,7 +40,7 @@ impl DetectOptions {
     /// Tests every field.
     ///
     /// # Errors
-    /// The field, what it is and what it must be, in words.
+    /// A text with the field, its value and the values allowed.
     pub fn check(&self) -> Result<(), String> {
         for (field, value) in [("threshold", self.threshold), ("overlap", self.overlap)] {
             if !(0.0..=1.0).contains(&value) {
@@ -61,20 +61,20 @@ impl DetectOptions {
 /// A detected object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detected {
-    /// Place of its class in the network.
+    /// Index of its class in the network.
     pub class: usize,
-    /// Expected overlap of the box with the truth where there is one: the confidence, 0..1.
+    /// Confidence, 0..1: the expected overlap of the box with the true one.
     pub score: f32,
     /// Box of the visible part in the image's pixels: first pixel, last minus first, as BOP's `bbox_visib`.
     pub bbox: Rect,
-    /// Visible part, of the image's size, if asked for.
+    /// Mask of the visible part, of the image's size, if requested.
     pub mask: Option<Mask>,
 }
 
 /// An image at the network's scale.
 #[derive(Debug, Clone)]
 pub struct NetworkImage {
-    /// 3 x height x width, as the encoder wants it.
+    /// 3 x height x width, scaled for the encoder.
     pub values: Vec<f32>,
     /// Columns, multiple of the alignment.
     pub width: usize,
@@ -123,7 +123,7 @@ impl NetworkImage {
     }
 }
 
-/// Network output of one image as numbers.
+/// Network output of one image as plain numbers.
 #[derive(Debug, Clone)]
 pub struct Numbers {
     /// Logits of every level.
@@ -155,9 +155,9 @@ fn overlap(a: &[f32; 4], b: &[f32; 4]) -> f32 {
     w * h / (area(a) + area(b) - w * h)
 }
 
-/// Non-maximum suppression of each class by itself: goes from the best to the worst and leaves out what overlaps a kept
-/// box of its class by more than `most_overlap`; at most `per_class` of a class and `most` in all are kept. Equal scores
-/// keep their order.
+/// Non-maximum suppression for each class separately: in order of decreasing score, boxes that overlap a kept box of their class by
+/// more than `most_overlap` are left out; at most `per_class` of a class and `most` in total are kept. Equal scores keep their
+/// order.
 fn suppress(
     mut candidates: Vec<Candidate>,
     most_overlap: f32,
@@ -186,7 +186,7 @@ pub fn decode(
     config: &DetectorConfig,
     options: &DetectOptions,
 ) -> Vec<Detected> {
-    /// Maximum number of candidates that suppression looks at.
+    /// Maximum number of candidates in the suppression.
     const MAX_CANDIDATES: usize = 2000;
     let threshold = options.threshold.clamp(1e-4, 1.0 - 1e-6);
     let least_logit = (threshold / (1.0 - threshold)).ln();
@@ -269,7 +269,7 @@ fn mask_of(
     };
     let per_mask = MASK_STRIDE as f32;
     for y in span(c.corners[1], c.corners[3], size.1) {
-        // Where the pixel lies between the midpoints of the prototypes' pixels.
+        // Position of the pixel between the centres of the prototypes' pixels.
         let v = (((y as f32 + 0.5) / image.step) / per_mask - 0.5 - y0 as f32).max(0.0);
         for x in span(c.corners[0], c.corners[2], size.0) {
             let u = (((x as f32 + 0.5) / image.step) / per_mask - 0.5 - x0 as f32).max(0.0);
@@ -320,7 +320,7 @@ mod tests {
             boxes: sizes.iter().map(|n| vec![0.0; 6 * n]).collect(),
             prototypes: vec![0.0; 24 * 16],
         };
-        // Location (4, 3) of level 0, middle (35.5, 27.5): class 1, 8 pixels up, 16 to the other sides.
+        // Location (4, 3) of level 0, centre (35.5, 27.5): class 1, 8 pixels up, 16 to the other sides.
         let location = 3 * 12 + 4;
         raw.scores[0][96 + location] = 2.0;
         for i in [0, 2, 3] {
@@ -328,7 +328,7 @@ mod tests {
         }
         raw.boxes[0][4 * 96 + location] = 1.0;
         raw.boxes[0][5 * 96 + location] = -0.5;
-        // The prototype is on in its left half, up to network pixel 35.
+        // The prototype is positive in its left half, up to network pixel 35.
         for row in raw.prototypes.chunks_exact_mut(24) {
             row[..9].fill(1.0);
         }

@@ -8,12 +8,13 @@ use sixfold_geometry::RgbImage;
 use crate::detect::DetectOptions;
 use crate::model::{DetectorModel, ModelError};
 
-/// Least score of an object that was asked for: it is more likely there than any of the detector's objects.
+/// Threshold for a requested object, if the detector's own is higher: it is more likely to be present than an arbitrary one of the
+/// detector's objects.
 const MIN_SCORE: f32 = 0.4;
-/// In datasets, detections this sure are passed on: a pose's own confidence sorts them further.
+/// Minimum score of detections in datasets: the poses' own confidences rank them further.
 const MIN_DETECTION: f32 = 0.1;
 
-/// A trained detector with what is asked of it.
+/// A trained detector with its options.
 pub struct TrainedDetector {
     model: DetectorModel,
     options: DetectOptions,
@@ -23,24 +24,24 @@ impl TrainedDetector {
     /// The detector of a weight file with its own threshold.
     ///
     /// # Errors
-    /// [`ModelError`] where the file is not that of a detector.
+    /// [`ModelError`] if the file is not a detector.
     pub fn load(weights: &Path) -> Result<TrainedDetector, ModelError> {
         let model = DetectorModel::load(weights)?;
         let options = model.options();
         Ok(TrainedDetector { model, options })
     }
 
-    /// The detector of any object that is within the program: proposals for objects that no detector was trained on.
+    /// The shipped detector of any object: proposals for objects that no detector was trained on.
     ///
     /// # Errors
-    /// [`ModelError`] if the program carries weights of another version than its own.
+    /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn proposals() -> Result<TrainedDetector, ModelError> {
         let model = DetectorModel::proposals()?;
         let options = DetectOptions { masks: false, ..model.options() };
         Ok(TrainedDetector { model, options })
     }
 
-    /// A detector with options of one's own.
+    /// A detector with other options.
     pub fn new(model: DetectorModel, options: DetectOptions) -> TrainedDetector {
         TrainedDetector { model, options }
     }
@@ -50,20 +51,20 @@ impl TrainedDetector {
         &self.model
     }
 
-    /// What is asked of it.
+    /// The options.
     pub fn options(&self) -> &DetectOptions {
         &self.options
     }
 
-    /// A detector that says where a method looks in the images of a dataset.
+    /// The detector with the options for a method's regions in the images of a dataset.
     pub fn for_dataset(self) -> TrainedDetector {
         self.with_threshold(MIN_DETECTION)
     }
 
-    /// Where it sees the object that was asked for best, if at all.
+    /// The region of the best detection of the requested object, if there is one.
     ///
     /// # Errors
-    /// When the network fails on the image.
+    /// If the network fails on the image.
     pub fn best(self, image: &RgbImage, object_id: u32) -> Result<Option<Region>, EstimatorError> {
         let threshold = self.options.threshold.min(MIN_SCORE);
         let found = self.with_threshold(threshold).detect(image)?;
@@ -72,7 +73,7 @@ impl TrainedDetector {
         Ok(best.map(|d| d.region))
     }
 
-    /// Detections of a score below `threshold` are left out.
+    /// Detections with a score below `threshold` are left out.
     pub(crate) fn with_threshold(self, threshold: f32) -> TrainedDetector {
         TrainedDetector { options: DetectOptions { threshold, ..self.options }, ..self }
     }

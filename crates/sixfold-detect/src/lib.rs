@@ -1,6 +1,6 @@
 //! 2D detection of known objects in colour images: boxes, confidences and masks.
 //!
-//! The short way: [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
+//! Start with [`model::DetectorModel::load`], [`model::DetectorModel::detect`].
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

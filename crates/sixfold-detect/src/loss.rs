@@ -1,9 +1,9 @@
 //! Losses on the network's raw output, with their gradients.
 //!
-//! Scores: the quality focal loss (Li et al. 2020, "Generalized focal loss", equation 2): a location is to say how well
-//! its own box fits, so that the best of several boxes of an object also has the best score. Boxes: one minus the
-//! generalised overlap (Rezatofighi et al. 2019). Masks: cross entropy within the box (Bolya et al. 2019, section 3.1).
-//! A training step hands the gradient on to the network as the sum of output times gradient, whose derivative it is.
+//! Scores: the quality focal loss (Li et al. 2020, "Generalized focal loss", equation 2): a location learns to predict how well its
+//! own box fits, so that the best of several boxes of an object also has the highest score. Boxes: one minus the generalised
+//! overlap (Rezatofighi et al. 2019). Masks: cross entropy within the box (Bolya et al. 2019, section 3.1). A training step passes
+//! the gradient to the network through the sum of output times gradient, whose derivative it is.
 
 use crate::network::DetectorConfig;
 use crate::targets::Targets;
@@ -12,11 +12,11 @@ use sixfold_geometry::stats::sigmoid;
 /// Weights of the terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct LossWeights {
-    /// Of scores.
+    /// Weight of the score term.
     pub scores: f32,
-    /// Of boxes.
+    /// Weight of the box term.
     pub boxes: f32,
-    /// Of masks.
+    /// Weight of the mask term.
     pub masks: f32,
 }
 
@@ -39,24 +39,24 @@ pub(crate) struct RawOutput<'a> {
     pub mask_width: usize,
 }
 
-/// What an image adds to the loss, and the gradients in the shapes of the output.
+/// Loss terms of one image, and the gradients in the shapes of the output.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct LossValue {
-    /// Before its weight.
+    /// Score term, before its weight.
     pub scores: f64,
-    /// Before its weight.
+    /// Box term, before its weight.
     pub boxes: f64,
-    /// Before its weight.
+    /// Mask term, before its weight.
     pub masks: f64,
     /// Gradient of the weighted sum with respect to the logits.
     pub of_scores: Vec<Vec<f32>>,
-    /// With respect to sides, coefficients and bias.
+    /// Gradient with respect to sides, coefficients and bias.
     pub of_boxes: Vec<Vec<f32>>,
-    /// With respect to the prototypes.
+    /// Gradient with respect to the prototypes.
     pub of_prototypes: Vec<f32>,
 }
 
-/// Logarithms of distances are cut to this on both sides.
+/// Logarithms of distances are clipped to this absolute value.
 const LONGEST: f32 = 6.0;
 
 /// Cross entropy of a logit and a target in 0..1, without overflow.
@@ -64,17 +64,17 @@ fn entropy(logit: f32, target: f32) -> f32 {
     logit.max(0.0) - logit * target + (-logit.abs()).exp().ln_1p()
 }
 
-/// Distance of a side from its location, in pixels, from the network's number.
+/// Distance of a side from its location, in pixels, computed from the network's output.
 pub(crate) fn distance(raw: f32, stride: f32) -> f32 {
     stride * raw.clamp(-LONGEST, LONGEST).exp()
 }
 
-/// Middle of a location in pixels, whose centres are at whole numbers.
+/// Centre of a location in pixels; pixel centres are at whole numbers.
 pub(crate) fn middle(location: usize, width: usize, stride: f32) -> [f32; 2] {
     [location % width, location / width].map(|at| (at as f32 + 0.5) * stride - 0.5)
 }
 
-/// Overlap, generalised overlap, and the latter's slopes with respect to left, top, right and bottom of `found`.
+/// Overlap, generalised overlap, and the latter's derivatives with respect to left, top, right and bottom of `found`.
 fn generalised_overlap(found: [f32; 4], truth: [f32; 4]) -> (f32, f32, [f32; 4]) {
     let [x0, y0, x1, y1] = found;
     let [tx0, ty0, tx1, ty1] = truth;
@@ -86,7 +86,7 @@ fn generalised_overlap(found: [f32; 4], truth: [f32; 4]) -> (f32, f32, [f32; 4])
     let hull = (hull_w * hull_h).max(1e-6);
     let overlap = common / union;
     let touching = common > 0.0;
-    // Of the common area, the found box's area, and the hull's, by side; left and top shrink them.
+    // Derivatives of the common area, the found box's area and the hull's area by each side; those by left and top are negative.
     let common_slopes = [
         if touching && x0 > tx0 { -h } else { 0.0 },
         if touching && y0 > ty0 { -w } else { 0.0 },
@@ -108,11 +108,11 @@ fn generalised_overlap(found: [f32; 4], truth: [f32; 4]) -> (f32, f32, [f32; 4])
     (overlap, overlap - 1.0 + union / hull, slopes)
 }
 
-/// Loss of one image. Score and box terms are divided by `positives`, the number of locations of objects in the whole
-/// batch, mask terms by `masks`, that of learnt masks.
+/// Loss of one image. Score and box terms are divided by `positives`, the number of locations of objects in the whole batch, mask
+/// terms by `masks`, the number of masks that are learned.
 ///
 /// # Panics
-/// If the output does not fit the targets.
+/// If the shapes of output and targets differ.
 pub(crate) fn loss(
     raw: &RawOutput<'_>,
     targets: &Targets,
@@ -130,7 +130,7 @@ pub(crate) fn loss(
         of_boxes: raw.boxes.iter().map(|v| vec![0.0; v.len()]).collect(),
         of_prototypes: vec![0.0; raw.prototypes.len()],
     };
-    // Boxes, and what overlap every location has reached.
+    // Boxes, and the overlap that every location has reached.
     let mut reached: Vec<Vec<(usize, usize, f32)>> = vec![vec![]; config.levels];
     for p in &targets.positives {
         let [width, height] = targets.grids[p.level];
@@ -283,7 +283,7 @@ mod tests {
         }
     }
 
-    /// The slope of the terms that `which` names, by shifting one number.
+    /// The derivative of the terms in `which` by finite differences in one number.
     fn slope(
         case: &mut Case,
         place: impl Fn(&mut Case) -> &mut f32,
@@ -304,7 +304,7 @@ mod tests {
     fn gradients_are_the_slopes_of_the_losses() {
         let mut case = case();
         let value = case.value();
-        // The overlap that a score aims at moves with the box, but no gradient is to flow through it.
+        // The target of a score is the overlap of the box, but no gradient flows through it.
         for level in 0..3 {
             for i in 0..case.scores[level].len() {
                 let expected = slope(&mut case, |c| &mut c.scores[level][i], |v| v.scores);
@@ -326,7 +326,7 @@ mod tests {
             assert!((expected - f64::from(value.of_prototypes[i])).abs() < 1e-5);
         }
         assert!(value.of_boxes[0].iter().any(|g| *g != 0.0) && value.of_prototypes.iter().any(|g| *g != 0.0));
-        // What is ignored counts for nothing: the last row of the finest level.
+        // Ignored locations do not contribute: the last row of the finest level.
         assert!(case.targets.ignored[0][56..].iter().all(|i| *i == (value.of_scores[0][56] == 0.0)));
     }
 
@@ -338,7 +338,7 @@ mod tests {
         let (overlap, generalised, slopes) = generalised_overlap([0.0, 0.0, 1.0, 1.0], [2.0, 0.0, 3.0, 1.0]);
         assert_eq!(overlap, 0.0);
         assert!((generalised + 1.0 / 3.0).abs() < 1e-6);
-        // Apart, it still pulls the right side towards the truth.
+        // For disjoint boxes there is still a gradient that moves the right side towards the truth.
         assert!(slopes[2] > 0.0);
     }
 

@@ -1,4 +1,4 @@
-//! A trained detector: the network with the objects it knows, as one file; or weights of torchvision.
+//! A trained detector: the network and the ids of its objects in one file; or weights of torchvision.
 
 use crate::anchored::{AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
 use crate::card::{anchored_kind, classes_of, read_anchored};
@@ -16,7 +16,7 @@ use sixfold_nn::weights::{
 };
 use std::path::{Path, PathBuf};
 
-/// The weights of the detector of any object; their card lies beside them.
+/// The weights of the detector of any object; their card is next to them.
 const PROPOSALS: &[u8] = include_bytes!("../weights/proposals.safetensors");
 
 /// Name of the compact detector in weight files.
@@ -24,14 +24,14 @@ pub const COMPACT: &str = "detect-compact";
 /// Name of the detector on ResNet-50 in weight files.
 pub(crate) const RETINANET: &str = "detect-retinanet";
 
-/// What a detector knows of a class.
+/// One class of a detector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClassEntry {
     /// The object's id in its dataset.
     pub id: u32,
 }
 
-/// How a detector is used unless something else is asked for; part of its file.
+/// Default options of a detector; part of its file.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DetectorUse {
     /// Larger images are reduced to this along their longer side, pixels.
@@ -69,15 +69,15 @@ pub enum ModelError {
         "the detector knows the objects {known}, not object {id}; train it (`sixfold train detector`), give other weights or a file of detections"
     )]
     UnknownObject {
-        /// The object that was asked for.
+        /// The requested object.
         id: u32,
-        /// Those it knows.
+        /// The objects of the detector.
         known: String,
     },
     /// An option is out of range.
     #[error("{0}")]
     Option(String),
-    /// The file is neither of Sixfold nor one of torchvision's networks.
+    /// The file is neither a detector of Sixfold nor a network of torchvision.
     #[error(
         "{}: expected a detector that `sixfold train detector` wrote, or torchvision's weights of fasterrcnn_resnet50_fpn, \
          maskrcnn_resnet50_fpn or retinanet_resnet50_fpn, found no tensor of their last layers; give another file", file.display()
@@ -89,7 +89,7 @@ pub enum ModelError {
     /// Weights of torchvision that do not fit its network.
     #[error(transparent)]
     Torchvision(PretrainedError),
-    /// The file beside weights of torchvision.
+    /// Error in the file next to weights of torchvision.
     #[error(
         "{}: expected what the labels of the weights beside it mean, such as {{\"objects\": {{\"1\": 5, \"2\": 8}}}} with an object's id \
          for each label, found {found}; correct or remove it", file.display()
@@ -100,12 +100,12 @@ pub enum ModelError {
         /// What is wrong with it.
         found: String,
     },
-    /// There is nothing to look at.
+    /// The image is empty.
     #[error("the image is empty (0x0 pixels); give one with at least one pixel")]
     EmptyImage,
 }
 
-/// A network and what it was trained on.
+/// A network and its card.
 #[derive(Debug, Clone)]
 pub struct DetectorModel {
     network: Network,
@@ -118,13 +118,13 @@ pub struct DetectorModel {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)]
 enum Network {
-    /// Those that Sixfold trains.
+    /// Networks that Sixfold trains.
     Anchorless(AnchorlessNetwork),
-    /// Those of torchvision, with the label of every class.
+    /// Networks of torchvision, with the label of every class.
     Anchored(AnchoredNetwork, Vec<usize>),
 }
 
-/// A network without anchors, which Sixfold trained.
+/// A network without anchors, trained by Sixfold.
 #[derive(Debug, Clone)]
 pub struct AnchorlessNetwork {
     network: Detector,
@@ -140,10 +140,10 @@ fn architecture(config: &DetectorConfig) -> &'static str {
 }
 
 impl DetectorModel {
-    /// A model of a trained network. `card` gets architecture, classes and sizes filled in.
+    /// A model of a trained network. Its architecture, classes and sizes are written into `card`.
     ///
     /// # Panics
-    /// If there is not one entry a class.
+    /// If there is not one entry per class.
     pub fn new(
         network: Detector,
         config: DetectorConfig,
@@ -163,11 +163,11 @@ impl DetectorModel {
         DetectorModel { network: anchorless(network, config, Device::flex()), classes, usage, card }
     }
 
-    /// Reads a weight file: one that a training wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet (`.pth`, `.pt`
-    /// or `.safetensors`; [`crate::torchvision::objects_file`] beside it says which objects its labels are).
+    /// Reads a weight file: one written by a training, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet (`.pth`,
+    /// `.pt` or `.safetensors`; [`crate::torchvision::objects_file`] next to it maps its labels to objects).
     ///
     /// # Errors
-    /// [`ModelError`] for a file that cannot be read or is no detector.
+    /// [`ModelError`] for a file that cannot be read or is not a detector.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let pickled =
             path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pth") || e.eq_ignore_ascii_case("pt"));
@@ -184,8 +184,8 @@ impl DetectorModel {
         Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
     }
 
-    /// A model of a trained network with anchors, whose labels are the classes in their order. `card` gets architecture, classes and
-    /// sizes filled in.
+    /// A model of a trained network with anchors, whose labels are the classes in their order. Its architecture, classes and sizes
+    /// are written into `card`.
     pub fn of_anchored(
         network: AnchoredNetwork,
         classes: Vec<ClassEntry>,
@@ -207,10 +207,10 @@ impl DetectorModel {
         Ok(DetectorModel { network: Network::Anchored(network, labels), classes, usage, card })
     }
 
-    /// The detector of any object that is within the program: one class, [`crate::proposals::ANY_OBJECT`].
+    /// The shipped detector of any object, with one class, [`crate::proposals::ANY_OBJECT`].
     ///
     /// # Errors
-    /// [`ModelError`] if the program carries weights of another version than its own.
+    /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn proposals() -> Result<Self, ModelError> {
         let device = Device::flex();
         let config = DetectorConfig::compact(1);
@@ -222,7 +222,7 @@ impl DetectorModel {
         Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
     }
 
-    /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
+    /// The network of a weight file, for further training on `device` with the objects `ids` in this order.
     ///
     /// # Errors
     /// As [`DetectorModel::load`]; [`ModelError::Card`] also for a detector of other objects or in another order.
@@ -239,7 +239,7 @@ impl DetectorModel {
         Ok((network, config))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
@@ -289,7 +289,7 @@ impl DetectorModel {
         Ok(network)
     }
 
-    /// The classes, in the network's order.
+    /// The classes, in the order of the network's outputs.
     pub fn classes(&self) -> &[ClassEntry] {
         &self.classes
     }
@@ -299,7 +299,7 @@ impl DetectorModel {
         self.classes.get(class).map_or(0, |c| c.id)
     }
 
-    /// An error unless the detector knows the object.
+    /// Returns an error if the detector was not trained on the object.
     ///
     /// # Errors
     /// [`ModelError::UnknownObject`].
@@ -311,12 +311,12 @@ impl DetectorModel {
         Err(ModelError::UnknownObject { id, known })
     }
 
-    /// How it is used unless something else is asked for.
+    /// Its default options.
     pub fn usage(&self) -> DetectorUse {
         self.usage
     }
 
-    /// The network where it is one without anchors.
+    /// The network, if it is one without anchors.
     pub fn anchorless(&self) -> Option<&AnchorlessNetwork> {
         match &self.network {
             Network::Anchorless(network) => Some(network),
@@ -355,7 +355,8 @@ impl DetectorModel {
     }
 }
 
-/// Detections of a network of torchvision. Its boxes stay as they are: what their numbers mean is up to those who trained it.
+/// Detections of a network of torchvision. Its boxes are not converted: the convention of their coordinates depends on its
+/// training.
 fn anchored(
     network: &AnchoredNetwork,
     labels: &[usize],
@@ -442,8 +443,8 @@ fn read(path: &Path, device: &Device) -> Result<Content, ModelError> {
     Ok((network, config, classes, usage, card))
 }
 
-/// Whether numbers of a card can be those of a detector in a file of so many `bytes`; otherwise which field cannot, what it should hold,
-/// and what it holds. Nothing of their size is made before.
+/// Tests that the numbers of a card are valid for a detector in a file of `bytes` bytes; otherwise returns the invalid field, the
+/// expected values and the value found. Called before anything of these sizes is allocated.
 fn check_sizes(
     config: &DetectorConfig,
     usage: &DetectorUse,
@@ -475,7 +476,7 @@ fn check_sizes(
     if !(0.0..=1.0).contains(&usage.threshold) {
         return Err(("extra.use.threshold", "0 to 1", usage.threshold.to_string()));
     }
-    // Two bytes or more for each number of the 3x3 convolutions of the heads and of the scores.
+    // At least two bytes for each weight of the heads' 3x3 convolutions and of the scores.
     let numbers = 9 * width * width * (shared + 2 * own) + width * classes;
     if bytes < 2 * numbers as u64 {
         let found = format!("{bytes} bytes for {numbers} numbers or more");

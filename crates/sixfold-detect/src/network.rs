@@ -2,8 +2,8 @@
 //! share (Lin et al. 2017, "Focal loss"; without anchors as Tian et al. 2019, "FCOS"), and prototypes of masks (Bolya
 //! et al. 2019, "YOLACT").
 //!
-//! Every pixel of a level, a *location*, says for each class how well it would box an object of that class, where that
-//! box's four sides lie, and how the object's mask is put together from the image's prototypes.
+//! Every pixel of a level, a *location*, predicts for each class how well its box would fit an object of that class, the four sides
+//! of that box, and the coefficients with which the object's mask is combined from the image's prototypes.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -15,14 +15,14 @@ use sixfold_nn::lite0::{Lite0, Lite0Config};
 use sixfold_nn::ops::upsample;
 use sixfold_nn::resnet::{ResNet50, ResNet50Config};
 
-/// Pixels between the locations of the finest level.
+/// Distance of the locations of the finest level, pixels.
 pub(crate) const FINEST_STRIDE: usize = 8;
 /// Pixels per pixel of the mask prototypes along a side.
 pub(crate) const MASK_STRIDE: usize = 4;
-/// Score of every class everywhere before training (Lin et al. 2017, section 3.3).
+/// Initial score of every class at every location (Lin et al. 2017, section 3.3).
 const PRIOR: f32 = 0.01;
 
-/// Which encoder a detector stands on.
+/// Which encoder a detector uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EncoderKind {
@@ -35,21 +35,21 @@ pub enum EncoderKind {
 /// Sizes of a detector; part of its weight file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DetectorConfig {
-    /// Classes, one an object.
+    /// Number of classes, one per object.
     pub classes: usize,
     /// The encoder.
     pub encoder: EncoderKind,
     /// Channels of pyramid and heads.
     pub width: usize,
-    /// Levels of the pyramid from 1/8 of the resolution on.
+    /// Number of levels of the pyramid, the finest at 1/8 of the resolution.
     pub levels: usize,
-    /// 3x3 convolutions that scores and boxes have in common.
+    /// 3x3 convolutions shared by scores and boxes.
     pub shared: usize,
-    /// 3x3 convolutions that scores, and boxes with masks, have for themselves.
+    /// 3x3 convolutions separate for scores and for boxes with masks.
     pub own: usize,
-    /// 3x3 convolutions on each level of the pyramid after it is put together.
+    /// Whether each level of the pyramid has a final 3x3 convolution.
     pub smooth: bool,
-    /// Mask prototypes.
+    /// Number of mask prototypes.
     pub prototypes: usize,
 }
 
@@ -68,8 +68,8 @@ impl DetectorConfig {
         }
     }
 
-    /// RetinaNet's pyramid and heads on ResNet-50 (Lin et al. 2017): five levels of 256 channels, four convolutions each
-    /// for scores and boxes. Unlike there, locations have no anchors, and there are masks.
+    /// RetinaNet's pyramid and heads on ResNet-50 (Lin et al. 2017): five levels of 256 channels, four convolutions each for scores
+    /// and boxes. In contrast to RetinaNet, locations have no anchors, and there are masks.
     pub fn retinanet(classes: usize) -> Self {
         DetectorConfig {
             classes,
@@ -83,7 +83,7 @@ impl DetectorConfig {
         }
     }
 
-    /// Channels beside the scores: four sides, the mask's coefficients, and its bias.
+    /// Channels in addition to the scores: four sides, the mask's coefficients, and its bias.
     pub(crate) fn regression_channels(&self) -> usize {
         4 + self.prototypes + 1
     }
@@ -93,7 +93,7 @@ impl DetectorConfig {
         FINEST_STRIDE << (self.levels - 1)
     }
 
-    /// Pixels between the locations of a level.
+    /// Distance of the locations of a level, pixels.
     pub fn stride(&self, level: usize) -> usize {
         FINEST_STRIDE << level
     }
@@ -107,7 +107,7 @@ impl DetectorConfig {
         self.init_with(encoder, seed, device)
     }
 
-    /// The network on a given encoder, the rest random.
+    /// The network with a given encoder; the other weights are random.
     ///
     /// # Panics
     /// If the encoder is not of the configured kind.
@@ -133,7 +133,7 @@ impl DetectorConfig {
         let shared = tower(self.shared, &mut layer);
         let score_tower = tower(self.own, &mut layer);
         let box_tower = tower(self.own, &mut layer);
-        // Small, as the encoder's numbers are large: scores begin at their prior everywhere.
+        // Small, because the encoder's outputs are large: initial scores are equal to their prior everywhere.
         let mut scores = conv(w, self.classes, 1, Activation::Linear, 0.003);
         scores.bias = burn::module::Param::from_tensor(Tensor::full(
             [self.classes],
@@ -141,7 +141,7 @@ impl DetectorConfig {
             device,
         ));
         let mut boxes = conv(w, self.regression_channels(), 1, Activation::Linear, 0.003);
-        // Sides begin three strides away: e is 2.7.
+        // Sides are initially e (2.7) strides away.
         let bias: Vec<f32> = (0..self.regression_channels()).map(|i| f32::from(i < 4)).collect();
         boxes.bias = burn::module::Param::from_tensor(Tensor::from_data(
             burn::tensor::TensorData::new(bias, [self.regression_channels()]),
@@ -168,7 +168,7 @@ impl DetectorConfig {
     }
 }
 
-/// The part that is pretrained.
+/// The pretrained part.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
@@ -192,7 +192,7 @@ impl Encoder {
     }
 }
 
-/// From the finest level and the encoder's map at 1/4 to prototypes of masks.
+/// Computes prototypes of masks from the finest level and the encoder's map at 1/4.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct Prototypes {
@@ -202,7 +202,7 @@ struct Prototypes {
     out: Conv,
 }
 
-/// A detector, made by [`DetectorConfig`].
+/// A detector, created by [`DetectorConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Detector {
@@ -221,21 +221,21 @@ pub struct Detector {
 
 sixfold_nn::displayed_by_name!(Encoder, Prototypes, Detector);
 
-/// What a detector predicts for a batch, raw.
+/// Raw output of a detector for a batch.
 #[derive(Debug, Clone)]
 pub struct DetectorOutput {
-    /// Of every level, finest first: logits, `batch x classes x height x width`.
+    /// Logits of every level, finest first: `batch x classes x height x width`.
     pub scores: Vec<Tensor<4>>,
-    /// Of every level: logarithms of the distances in strides from the location to the left, top, right and bottom
-    /// side, then the coefficients of the prototypes, then the mask's bias; `batch x channels x height x width`.
+    /// For every level: logarithms of the distances in strides from the location to the left, top, right and bottom side, then the
+    /// coefficients of the prototypes, then the mask's bias; `batch x channels x height x width`.
     pub boxes: Vec<Tensor<4>>,
     /// `batch x prototypes x height / 4 x width / 4`.
     pub prototypes: Tensor<4>,
 }
 
 impl Detector {
-    /// `x` is `batch x 3 x height x width`, rows and columns multiples of [`DetectorConfig::alignment`], values as the
-    /// encoder wants them ([`DetectorConfig::input`]).
+    /// `x` is `batch x 3 x height x width`, rows and columns multiples of [`DetectorConfig::alignment`], values scaled for the
+    /// encoder ([`DetectorConfig::input`]).
     pub fn forward(&self, x: Tensor<4>) -> DetectorOutput {
         let maps = self.encoder.maps(x);
         let mut levels: Vec<Tensor<4>> =
@@ -245,7 +245,7 @@ impl Detector {
             let coarser = conv.forward(levels[levels.len() - 1].clone());
             levels.push(coarser);
         }
-        // Coarser levels tell finer ones what they see; RetinaNet's further levels take no part.
+        // Coarser levels are added to finer ones; RetinaNet's further levels are not included.
         let top = if self.smooth.is_empty() { levels.len() } else { of_encoder };
         for level in (1..top).rev() {
             levels[level - 1] = levels[level - 1].clone() + upsample(levels[level].clone());
@@ -266,7 +266,7 @@ impl Detector {
         DetectorOutput { scores, boxes, prototypes }
     }
 
-    /// The costly first stages of the encoder stay as they are in a training (EfficientNet-Lite0 only).
+    /// Freezes the costly first stages of the encoder during training (EfficientNet-Lite0 only).
     pub fn freeze(mut self, stages: usize) -> Self {
         self.encoder = match self.encoder {
             Encoder::Lite0(network) => Encoder::Lite0(network.freeze(stages)),
@@ -277,8 +277,8 @@ impl Detector {
 }
 
 impl DetectorConfig {
-    /// An image of three planes with values in 0..1, `pixels` each, as the encoder wants it: `(255 v - 127) / 128` for
-    /// EfficientNet-Lite0, torchvision's mean and deviation for ResNet-50.
+    /// Scales an image of three planes with values in 0..1, `pixels` each, for the encoder: `(255 v - 127) / 128` for
+    /// EfficientNet-Lite0, torchvision's mean and standard deviation for ResNet-50.
     pub fn input(&self, rgb: &mut [f32], pixels: usize) {
         const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
         const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];

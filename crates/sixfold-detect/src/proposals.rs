@@ -1,8 +1,8 @@
-//! A detector of anything that could be an object, for objects nobody trained on: one class, learnt from synthetic toys,
-//! household shapes and solids that lie in heaps before photographs.
+//! A detector of any object, for objects without a trained detector: one class, trained on synthetic toys, household shapes and
+//! solids in piles in front of photographs.
 //!
-//! What it finds are *proposals*: boxes and masks without a name. CNOS (Nguyen et al. 2023) takes them from a foundation
-//! model; this one is EfficientNet-Lite0 with a pyramid, as the detector of known objects.
+//! Its detections are *proposals*: boxes and masks without a class. CNOS (Nguyen et al. 2023) uses a foundation model for them;
+//! here it is EfficientNet-Lite0 with a pyramid, as in the detector of known objects.
 
 use std::path::PathBuf;
 
@@ -30,27 +30,27 @@ use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Id of the one class.
 pub const ANY_OBJECT: u32 = 0;
-/// Proposals with a lower score are left out unless something else is asked for.
+/// Proposals with a lower score are left out by default.
 const THRESHOLD: f32 = 0.1;
 /// Fraction of toys and household shapes; the others are solids in the textures of photographs.
 const TOYS: f32 = 0.6;
-/// Fraction of toys in one colour; the others are in several that change slowly.
+/// Fraction of toys in one colour; the others have several colours with smooth transitions.
 const PLAIN: f32 = 0.7;
-/// Sizes of the objects, metres: a toy's are its own.
+/// Range of sizes of the solids, metres; toys have their own sizes.
 const SOLID: [f64; 2] = [0.08, 0.25];
 
-/// How a detector of any object is trained.
+/// Options of the training of a detector of any object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProposalsRecipe {
     /// Steps, learning rate, seed, images in a step.
     pub options: DetectorTrainingOptions,
-    /// Synthetic objects to learn from.
+    /// Number of synthetic objects.
     pub objects: usize,
     /// Side of the training images in pixels, a multiple of 32.
     pub size: usize,
-    /// Folder of photographs for textures and backgrounds; procedural textures without.
+    /// Folder of photographs for textures and backgrounds; procedural textures if `None`.
     pub backgrounds: Option<PathBuf>,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -73,7 +73,7 @@ impl ProposalsRecipe {
             rotation: std::f32::consts::PI,
             render_share: 1.0,
             max_distractors: 2,
-            // Solids are objects.
+            // Solids are objects here, not distractors.
             solid_fraction: 0.0,
             min_visibility: 0.2,
             random_color_probability: 0.0,
@@ -83,7 +83,7 @@ impl ProposalsRecipe {
         }
     }
 
-    /// What a training draws its images from.
+    /// The source of the training images.
     ///
     /// # Errors
     /// [`TrainError`] for backgrounds that cannot be read and options out of range.
@@ -103,7 +103,7 @@ impl ProposalsRecipe {
     }
 }
 
-/// An object about the origin.
+/// An object centred on the origin.
 fn object(textures: &Backgrounds, random: &mut Random) -> Option<Mesh> {
     let mesh = if random.random::<f32>() < TOYS {
         let toy = toy(random).ok()?;
@@ -158,7 +158,7 @@ impl Recipe for ProposalsRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; the size is in the options of the samples.
+        // Every field by its name, so that the compiler reports a new one; the size is in the options of the samples.
         let ProposalsRecipe { options, objects, size: _, backgrounds, command: _ } = self;
         let backgrounds =
             background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
@@ -282,7 +282,7 @@ mod tests {
         use sixfold_geometry::Rect;
 
         let mut recipe = ProposalsRecipe { objects: 40, ..ProposalsRecipe::default() };
-        // Objects and images of another seed than the training's.
+        // Objects and images with another seed than the training's.
         recipe.options.common.seed = 77;
         let source = recipe.source().unwrap();
         let detector = TrainedDetector::proposals().unwrap();

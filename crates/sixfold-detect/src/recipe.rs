@@ -1,5 +1,5 @@
-//! A whole training: photographs with their ground truth, and models, in; a detector's file out. Interrupted at any time, it
-//! is resumed.
+//! A complete training: from photographs with ground truth and models to a detector's file. It can be interrupted at any time and
+//! resumed.
 
 use std::f32::consts::PI;
 use std::path::PathBuf;
@@ -21,15 +21,15 @@ use crate::network::{Detector, DetectorConfig, Encoder};
 use crate::samples::{TrainingImageError, TrainingImageOptions, TrainingImageSource};
 use crate::training::{AnyTraining, DetectorTraining, DetectorTrainingOptions};
 
-/// Which network learns.
+/// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum DetectorKind {
     /// EfficientNet-Lite0 with a pyramid of three levels; trains on two cores.
     #[default]
     Compact,
-    /// ResNet-50 with RetinaNet's pyramid and towers. Boxes come without anchors, unlike the dissertation's.
+    /// ResNet-50 with RetinaNet's pyramid and towers. There are no anchors, unlike in the dissertation.
     Retinanet,
-    /// The dissertation's detectors, from pretrained weights of torchvision.
+    /// The dissertation's detectors, trained from torchvision's pretrained weights.
     Anchored(AnchoredKind),
 }
 
@@ -61,23 +61,23 @@ impl Choice for DetectorKind {
     }
 }
 
-/// How a detector is trained.
+/// Options of the training of a detector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DetectorRecipe {
-    /// Which network learns.
+    /// Which network is trained.
     pub network: DetectorKind,
-    /// Steps in all.
+    /// Number of steps.
     pub steps: u64,
     /// Images in a step.
     pub batch: usize,
     /// Highest learning rate.
     pub learning_rate: f64,
-    /// The pretrained encoder's fraction of the learning rate, 0 to 1.
+    /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
     pub encoder_share: f64,
-    /// Stages of the ImageNet encoder that stay as they are, of five.
+    /// Number of frozen stages of the ImageNet encoder, of five.
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones without. For [`DetectorKind::Anchored`], which needs
-    /// it, these or torchvision's weights of the same network.
+    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones if `None`. For [`DetectorKind::Anchored`] it is
+    /// required: these, or torchvision's weights of the same network.
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (RetinaNet: 128).
     pub size: usize,
@@ -87,19 +87,19 @@ pub struct DetectorRecipe {
     pub render_share: f32,
     /// Largest rotation in the image plane, radians.
     pub rotation: f32,
-    /// Draw the meshes in their own colours; otherwise in random ones.
+    /// Render the meshes in their own colours; otherwise in random ones.
     pub mesh_colors: bool,
-    /// Larger images will be reduced to so many pixels along their longer side before detection.
+    /// Larger images are reduced to this many pixels along their longer side before detection.
     pub longest_side: usize,
-    /// Score below which detections will be left out unless something else is asked for, 0 to 1.
+    /// Default score below which detections are left out, 0 to 1.
     pub threshold: f32,
     /// Continue from the weights of another training of the same objects instead of ImageNet's.
     pub init: Option<PathBuf>,
-    /// Folder of photographs for backgrounds; procedural textures without.
+    /// Folder of photographs for backgrounds; procedural textures if `None`.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -131,20 +131,20 @@ impl Default for DetectorRecipe {
     }
 }
 
-/// Less complete instances are not cut out to be pasted elsewhere.
+/// Instances with a smaller visible fraction are not cut out for pasting.
 const CUT_VISIBLE: f64 = 0.6;
-/// Instances in photographs count however little of them is visible.
+/// Instances in photographs count even if little of them is visible.
 pub const MIN_VISIBILITY: f64 = 0.0;
 
-/// What is known beside the network before the first step.
+/// Data prepared before the first step, in addition to the network.
 pub struct Context {
     material: TrainingSet,
     classes: Vec<ClassEntry>,
 }
 
 impl DetectorRecipe {
-    /// The dissertation's training (section 3.4.1) as far as it is here: the ResNet-50 network on objects cut out of photographs and
-    /// pasted on other backgrounds.
+    /// The dissertation's training (section 3.4.1) as far as it is implemented here: the ResNet-50 network on objects cut out of
+    /// photographs and pasted on other backgrounds.
     pub fn published() -> Self {
         DetectorRecipe {
             network: DetectorKind::Retinanet,
@@ -211,7 +211,7 @@ impl DetectorRecipe {
         let expected = "torchvision's weights of ResNet-50 or of the same network";
         let wrong = |found: String| OptionError { field: "encoder", found, expected };
         let file = self.encoder.as_deref().ok_or_else(|| wrong("none".to_owned()))?;
-        // The R-CNNs know a background beside the objects.
+        // The R-CNNs have a background class in addition to the objects.
         let labels = ids.len() + AnchoredConfig::new(kind, 1).first_label();
         let network = AnchoredNetwork::pretrained(file, kind, labels, self.seed, device);
         let network = network.map_err(TrainError::method)?;
@@ -258,16 +258,16 @@ impl Recipe for DetectorRecipe {
         self.options().check()
     }
 
-    /// How the detector is used later (`longest_side`, `threshold`) does not count: it may be exported again with others.
+    /// The default options of the detector (`longest_side`, `threshold`) do not count: it may be exported again with others.
     fn inputs(&self, material: &TrainingSet) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place.
+        // Every field by name, so that the compiler reports a new one.
         #[rustfmt::skip]
         let DetectorRecipe {
             network, encoder, init, backgrounds,
-            // In the options of training and samples.
+            // These are in the options of training and samples.
             steps: _, batch: _, learning_rate: _, encoder_share: _, frozen_stages: _, size: _, photograph_share: _,
             render_share: _, rotation: _, mesh_colors: _, seed: _,
-            // Change nothing.
+            // These do not affect the training.
             longest_side: _, threshold: _, command: _,
         } = self;
         let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::method)?;

@@ -1,9 +1,9 @@
-//! Training images: the few photographs with all that is annotated in them, objects cut out of them or rendered and
-//! pasted on other backgrounds (dissertation, section 3.4.1: "Cropped patches of objects in real images are pasted to
-//! random background images"), and images without any object.
+//! Training images: the few photographs with all their annotations, objects cut out of them or rendered and pasted on other
+//! backgrounds (dissertation, section 3.4.1: "Cropped patches of objects in real images are pasted to random background images"),
+//! and images without any object.
 //!
-//! A photograph shows objects wherever it shows them: it is never a mere background, its annotations stay. Each sample is
-//! a function of seed and number alone.
+//! A photograph is never used as a mere background: the objects in it keep their annotations. Each sample is a function of seed and
+//! number alone.
 
 use crate::tabletop::{Tabletop, tabletop};
 use crate::targets::{Annotation, IGNORED, Instance};
@@ -25,16 +25,16 @@ use sixfold_synth::randomly_colored;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Objects with fewer visible pixels in a training image are not learnt.
+/// Objects with fewer visible pixels in a training image are ignored in the training.
 const MIN_PIXELS: usize = 64;
-/// Photographs whose colours are kept of each object, and how many colours of each.
+/// Photographs per object from which colours are taken, and the number of colours from each.
 const PALETTE_PICTURES: usize = 6;
 const PALETTE_COLORS: usize = 40;
-/// Meshes with more faces are simplified, but for those with a texture.
+/// Meshes with more faces are simplified, except for those with a texture.
 const FACES: usize = 5000;
-/// Different objects on a table, at most.
+/// Maximum number of different objects on a table.
 const TABLETOP_CHOICE: usize = 40;
-/// Directions in which a mesh's farthest vertices decide about its box.
+/// Directions whose extreme vertices determine a mesh's bounding box.
 const EXTREMES: usize = 200;
 
 /// Fractions and ranges. The defaults are for few real images of objects on a table.
@@ -51,21 +51,21 @@ pub struct TrainingImageOptions {
     pub scale: [f32; 2],
     /// Largest rotation in the image plane to either side, radians.
     pub rotation: f32,
-    /// Most objects pasted on a background.
+    /// Maximum number of objects pasted on a background.
     #[serde(rename = "most_pasted")]
     pub max_pasted: u32,
-    /// Most objects pasted on a part of a photograph.
+    /// Maximum number of objects pasted on a part of a photograph.
     #[serde(rename = "most_added")]
     pub max_added: u32,
     /// Fraction of renders among pasted objects that have photographs, 0..1.
     pub render_share: f32,
-    /// Most distractors: solids, shapes, and outlines of objects filled with something else.
+    /// Maximum number of distractors: solids, shapes, and outlines of objects filled with something else.
     #[serde(rename = "most_distractors")]
     pub max_distractors: u32,
     /// Fraction of solids among them, 0..1.
     #[serde(rename = "solid_share")]
     pub solid_fraction: f32,
-    /// Objects of which a smaller part is visible than this fraction are not learnt.
+    /// Objects with a smaller visible fraction are ignored in the training.
     #[serde(rename = "least_visible")]
     pub min_visibility: f32,
     /// Probability that a rendered object has random colours.
@@ -77,7 +77,7 @@ pub struct TrainingImageOptions {
     /// Fraction of images that are rendered as a whole: the objects in their own colours on a table, 0..1.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub tabletop_fraction: f32,
-    /// All objects are of one class: the detector learns what an object is, not which.
+    /// All objects are of one class: the detector learns what an object is, not which object it is.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub one_class: bool,
 }
@@ -109,7 +109,7 @@ impl Default for TrainingImageOptions {
     }
 }
 
-/// Why no training images can be made.
+/// Why training images cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingImageError {
     /// An option is out of its range.
@@ -117,15 +117,15 @@ pub enum TrainingImageError {
     Option {
         /// Its name.
         field: &'static str,
-        /// What it is.
+        /// Its value.
         found: String,
-        /// What it must be.
+        /// The values allowed.
         expected: &'static str,
     },
-    /// There is nothing to learn.
+    /// No object was given.
     #[error("no object to learn was given; give at least one mesh")]
     NoObjects,
-    /// No image can be had of an object.
+    /// There is no image of an object.
     #[error(
         "object {id}: no photograph shows it and its mesh has neither colours nor texture; give photographs or a coloured mesh, or set random_color_probability above 0"
     )]
@@ -136,21 +136,21 @@ pub enum TrainingImageError {
     /// An image does not show enough of its object.
     #[error(transparent)]
     Image(#[from] PosedImageError),
-    /// Colours or backgrounds.
+    /// Error in colours or backgrounds.
     #[error(transparent)]
     Augment(#[from] AugmentError),
 }
 
-/// An object made ready.
+/// An object prepared for the samples.
 struct Prepared {
     drawn: PreparedMesh,
     poses: Vec<Pose>,
     distance: [f64; 2],
-    /// Visible parts in photographs, with the length of the longer side there.
+    /// Visible parts in photographs, with the length of the longer side in the photograph.
     cutouts: Vec<(Cutout, f32)>,
 }
 
-/// An image with a label for each of the objects visible in it.
+/// An image with a label for each visible object.
 struct LabelledImage {
     image: Arc<RgbImage>,
     /// For every pixel 0 or the object's number in the photograph, from 1.
@@ -164,11 +164,11 @@ struct LabelledImage {
 pub struct TrainingImage {
     /// 3 x side x side, in 0..1.
     pub rgb: Vec<f32>,
-    /// What is in it.
+    /// Its annotation.
     pub annotation: Annotation,
 }
 
-/// Draws training images; shared between threads by reference.
+/// Generates training images; shared between threads by reference.
 pub struct TrainingImageSource {
     objects: Vec<Prepared>,
     photographs: Vec<LabelledImage>,
@@ -184,18 +184,18 @@ pub struct TrainingImageSource {
     palette: Vec<[u8; 3]>,
 }
 
-/// An image in the making.
+/// An image under construction.
 struct Canvas {
     image: Patch,
     labels: Vec<u8>,
-    /// Class and pixels if nothing hid it; number 1 is the first.
+    /// Class and number of unoccluded pixels of each object; number 1 is the first.
     instances: Vec<(usize, f32)>,
     side: usize,
 }
 
 impl Canvas {
-    /// Draws a small image whose top left pixel comes to lie at `corner`; returns how many pixels it covers in all,
-    /// also outside the canvas. `label` 0 hides what is there.
+    /// Pastes a small image with its top left pixel at `corner`; returns the number of pixels it covers, including those outside
+    /// the canvas. With `label` 0 it is an occluder.
     fn paste(&mut self, patch: &Patch, cover: &Coverage, corner: [i64; 2], feather: f32, label: u8) -> f32 {
         let mut soft = cover.clone();
         soft.blur(feather);
@@ -217,7 +217,7 @@ impl Canvas {
                     continue;
                 }
                 let to = to_y as usize * self.side + to_x as usize;
-                // Soft towards the inside: outside the image has no colours.
+                // The border is soft towards the inside, because the image has no colours outside.
                 let alpha_soft = alpha * (1.6 * soft.data[from]).min(1.0);
                 for c in 0..3 {
                     let value = &mut self.image.data[c * planes + to];
@@ -233,8 +233,8 @@ impl Canvas {
 }
 
 impl TrainingImageSource {
-    /// Makes objects and photographs ready, which takes seconds. `real` holds every visible object of the photographs
-    /// that is to be learnt, `cut` those of them that are complete enough to be pasted elsewhere.
+    /// Prepares objects and photographs, which takes seconds. `real` has every visible object of the photographs that is to be
+    /// learned, `cut` those of them that are complete enough for pasting.
     ///
     /// # Errors
     /// [`TrainingImageError`].
@@ -284,7 +284,7 @@ impl TrainingImageSource {
         &self.options
     }
 
-    /// How many photographs there are.
+    /// Number of photographs.
     pub fn photographs(&self) -> usize {
         self.photographs.len()
     }
@@ -294,7 +294,7 @@ impl TrainingImageSource {
         let mut random = stream(seed ^ 0x5ce9_e000, number);
         let random = &mut random;
         let options = &self.options;
-        // Those who do without them draw the same images as before there were any.
+        // Without tabletops the samples are the same as before this option existed.
         let tabletop = options.tabletop_fraction > 0.0 && random.random::<f32>() < options.tabletop_fraction;
         let kind = random.random::<f32>();
         let mut canvas = if tabletop {
@@ -347,12 +347,12 @@ impl TrainingImageSource {
         Canvas { image, labels: vec![0; side * side], instances: vec![], side }
     }
 
-    /// A factor on sizes, even on the logarithm.
+    /// A factor on sizes, uniform in its logarithm.
     fn scale(&self, random: &mut Random) -> f32 {
         uniform(random, self.options.scale.map(f32::ln)).exp()
     }
 
-    /// A part of a photograph about one of its objects, or anywhere.
+    /// A part of a photograph around one of its objects, or anywhere.
     fn photograph(&self, random: &mut Random) -> Canvas {
         let side = self.options.size;
         let photograph = &self.photographs[random.random_range(0..self.photographs.len())];
@@ -368,7 +368,7 @@ impl TrainingImageSource {
             let (_, _, middle) = photograph.instances[random.random_range(0..photograph.instances.len())];
             middle.map(|m| m + uniform(random, [-reach, reach]))
         };
-        // The image is better filled than not.
+        // The part should lie within the photograph if possible.
         let half = 0.35 * side as f32 * step;
         let clamped = |at: f32, limit: usize| {
             let (low, high) = (half, limit as f32 - half);
@@ -424,7 +424,7 @@ impl TrainingImageSource {
         canvas.instances.push((if self.options.one_class { 0 } else { class }, pixels));
     }
 
-    /// Where an image's corner comes to lie: its middle is in the image.
+    /// A random position of a patch's corner, with the patch's centre inside the canvas.
     fn corner(&self, patch: &Patch, random: &mut Random) -> [i64; 2] {
         let side = self.options.size as f32;
         [patch.width, patch.height].map(|length| {
@@ -476,7 +476,7 @@ impl TrainingImageSource {
         Some((patch, cover))
     }
 
-    /// Something that is no object to be found: a solid, a shape, or the outline of an object filled with something else.
+    /// A distractor: a solid, a shape, or the outline of an object filled with another texture.
     fn distract(&self, canvas: &mut Canvas, random: &mut Random) {
         let side = self.options.size;
         let longest = uniform(random, [0.06, 0.5]) * side as f32;
@@ -509,13 +509,13 @@ impl TrainingImageSource {
         canvas.paste(&patch, &cover, corner, feather, 0);
     }
 
-    /// A solid whose longest side is at most `longest` pixels long, from anywhere.
+    /// A solid whose longest side is at most `longest` pixels long, from a random direction.
     fn solid(&self, longest: f32, random: &mut Random) -> (Patch, Coverage) {
         let mesh = random_solid(&self.backgrounds, &self.palette, random);
         let distance = f64::from(uniform(random, [4.0, 10.0]));
         let turn = random_rotation(random);
         let pose = Pose::new(turn.rotation(), Vec3::new(0.0, 0.0, distance));
-        // A cube of side 1 fits into a ball of diameter 1.74; it is nearer than its middle.
+        // A cube of side 1 fits into a ball of diameter 1.74, and its front is nearer than its centre.
         let size = (1.9 * longest).ceil().max(8.0) as usize;
         let focal = f64::from(longest) * (distance - 0.87);
         let middle = 0.5 * (size as f64 - 1.0);
@@ -533,7 +533,7 @@ impl TrainingImageSource {
         (patch, cover)
     }
 
-    /// What is visible in the end.
+    /// The annotation of the visible objects.
     fn annotation(&self, canvas: &mut Canvas) -> Annotation {
         let side = canvas.side;
         let mut seen = vec![(0usize, [usize::MAX, usize::MAX, 0, 0]); canvas.instances.len()];
@@ -562,7 +562,7 @@ impl TrainingImageSource {
     }
 }
 
-/// A cut-out as a small image about itself.
+/// A cut-out as a small image around it.
 fn draw(cutout: &Cutout, longest: f32, turn: f32) -> (Patch, Coverage) {
     let (width, height) = cutout.size();
     let scale = longest / width.max(height) as f32;
@@ -633,7 +633,7 @@ impl Prepared {
             return Err(TrainingImageError::NoPictures { id });
         }
         let poses: Vec<Pose> = mine().map(|c| *c.camera_from_object()).collect();
-        // Without images of its own: those of the others.
+        // An object without images uses the distances of the others.
         let distance = distances(mine())
             .or_else(|| distances(real))
             .unwrap_or(default_distances(info.diameter))
@@ -641,7 +641,7 @@ impl Prepared {
         Ok(Prepared { drawn, poses, distance, cutouts })
     }
 
-    /// A few of its colours: as photographed, else those of its mesh.
+    /// A few of its colours: from photographs, otherwise from its mesh.
     fn palette(&self) -> Vec<[u8; 3]> {
         let mut colors = vec![];
         for (cutout, longest) in self.cutouts.iter().take(PALETTE_PICTURES) {

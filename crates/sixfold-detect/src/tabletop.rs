@@ -1,5 +1,5 @@
-//! Synthetic photographs of tabletops: objects that stand, lie and hide one another on a table before something, all under one
-//! light. Pasted objects (`samples`) have sharp borders and a light of their own, which a detector of any object would learn
+//! Synthetic photographs of tabletops: objects that stand, lie and occlude one another on a table in front of a background, all
+//! under one light. Pasted objects (`samples`) have sharp borders and their own light, which a detector of any object would learn
 //! instead of what an object is.
 
 use rand::RngExt;
@@ -12,21 +12,21 @@ use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::{Backgrounds, Patch, procedural_texture};
 use sixfold_synth::distractors::random_rotation;
 
-/// Objects on a table.
+/// Range of the number of objects on a table.
 const OBJECTS: [u32; 2] = [2, 16];
-/// Pixels along an object of mean size.
+/// Range of the size of a mean object, pixels.
 const PIXELS: [f32; 2] = [35.0, 130.0];
 /// Mean diameter of the objects, metres.
 const DIAMETER: f64 = 0.17;
 /// Field of view, radians.
 const FIELD: [f32; 2] = [0.5, 1.1];
-/// The camera's elevation over the table, radians.
+/// The camera's elevation above the table, radians.
 const ELEVATION: [f32; 2] = [0.2, 1.4];
-/// Fraction of objects that stand as they were made; the others lie as they fell.
+/// Fraction of objects that stand upright; the others lie in a random orientation.
 const STANDING: f32 = 0.5;
-/// Fraction of objects that may be put upon others.
+/// Fraction of objects that may be placed on others.
 const STACKED: f32 = 0.2;
-/// Sheets of paper on a table, flat and no objects.
+/// Maximum number of sheets of paper on a table; they do not count as objects.
 const SHEETS: u32 = 3;
 /// Side of textures, pixels.
 const TEXTURE: usize = 192;
@@ -35,7 +35,7 @@ const TEXTURE: usize = 192;
 pub(crate) struct Tabletop {
     pub(crate) image: Patch,
     pub(crate) labels: Vec<u8>,
-    /// Of each object its place among the meshes, and its pixels if nothing hid it.
+    /// For each object the index of its mesh, and its number of unoccluded pixels.
     pub(crate) whole: Vec<(usize, f32)>,
 }
 
@@ -43,7 +43,7 @@ fn between(random: &mut Random, low: f64, high: f64) -> f64 {
     low + (high - low) * random.random::<f64>()
 }
 
-/// A flat rectangle about `centre` at the height z, in a texture.
+/// A flat rectangle around `centre` at the height z, with a texture.
 fn sheet(centre: [f64; 2], half: [f64; 2], turn: f64, z: f64, texture: RgbImage) -> Option<Mesh> {
     let (s, c) = turn.sin_cos();
     let corners = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]];
@@ -63,10 +63,10 @@ fn texture(textures: &Backgrounds, random: &mut Random) -> RgbImage {
     }
 }
 
-/// A camera that looks at the table's middle from `distance` metres.
+/// A camera aimed at the table's centre from `distance` metres.
 fn looking_down(distance: f64, random: &mut Random) -> Pose {
     let elevation = f64::from(uniform(random, ELEVATION));
-    // The table's frame has z up; the camera's z looks away from it, its y down.
+    // In the table's frame z is up; in the camera's frame z is forward and y down.
     let forward = Vec3::new(0.0, elevation.cos(), -elevation.sin());
     let down = Vec3::new(0.0, -elevation.sin(), -elevation.cos());
     let right = down.cross(&forward);
@@ -79,9 +79,9 @@ fn looking_down(distance: f64, random: &mut Random) -> Pose {
     Pose::new(roll * UnitQuaternion::from_rotation_matrix(&rotation), Vec3::new(0.0, 0.0, distance))
 }
 
-/// Where an object may lie: on the table, beside the others or upon them.
+/// Places the objects on the table, next to the others or on them.
 fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose)> {
-    // Centre and radius of what stands there, and its height.
+    // Centre, radius and height of the objects placed so far.
     let mut taken: Vec<([f64; 2], f64, f64)> = vec![];
     let mut out = vec![];
     for _ in 0..random.random_range(OBJECTS[0]..=OBJECTS[1]) {
@@ -112,7 +112,7 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
     out
 }
 
-/// Draws a photograph of `side` pixels of a table with some of `meshes`, which stand on z = 0 or lie about the origin.
+/// Renders an image of `side` pixels of a table with some of `meshes`, which stand on z = 0 or are centred on the origin.
 pub(crate) fn tabletop(
     meshes: &[&Mesh],
     textures: &Backgrounds,

@@ -1,15 +1,15 @@
-//! What the network should say of an image: which locations stand for which object.
+//! Training targets of an image: which locations represent which object.
 //!
-//! An object's locations are those on its visible mask that lie nearest to the mask's centre of mass. Masks do not
-//! overlap, so no location ever has to choose between two objects, as it does with boxes (Tian et al. 2019, section 3.2).
+//! An object's locations are those on its visible mask that are nearest to the mask's centre of mass. Masks do not overlap, so no
+//! location is ambiguous between two objects, as with boxes (Tian et al. 2019, section 3.2).
 
 use crate::network::{DetectorConfig, MASK_STRIDE};
 
-/// Locations of an object on a level, at most.
+/// Maximum number of locations of an object on a level.
 const MAX_LOCATIONS: usize = 9;
-/// Locations of an object whose mask is learnt.
+/// Number of locations of an object whose masks are learned.
 const MASK_LOCATIONS: usize = 3;
-/// Pixel label of what is neither background nor to be learnt.
+/// Pixel label of areas that are neither background nor to be learned.
 pub(crate) const IGNORED: u8 = 255;
 
 /// An object in a training image.
@@ -21,7 +21,7 @@ pub struct Instance {
     pub corners: [f32; 4],
 }
 
-/// The objects of an image and where they are visible.
+/// The objects of an image and their visible pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Annotation {
     /// Columns and rows.
@@ -32,7 +32,7 @@ pub struct Annotation {
     pub instances: Vec<Instance>,
 }
 
-/// A location that stands for an object.
+/// A location that represents an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Positive {
     /// Level of the pyramid.
@@ -43,7 +43,7 @@ pub(crate) struct Positive {
     pub instance: usize,
 }
 
-/// An object's mask at the resolution of the prototypes, about its box.
+/// An object's mask at the resolution of the prototypes, around its bounding box.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct MaskTarget {
     /// First column and row.
@@ -59,19 +59,19 @@ pub(crate) struct MaskTarget {
 pub(crate) struct Targets {
     /// Columns and rows of every level.
     pub grids: Vec<[usize; 2]>,
-    /// Locations that stand for objects.
+    /// Locations that represent objects.
     pub positives: Vec<Positive>,
-    /// Of every level: locations that count for nothing.
+    /// For every level: locations that are ignored.
     pub ignored: Vec<Vec<bool>>,
     /// The objects.
     pub instances: Vec<Instance>,
     /// Their masks.
     pub masks: Vec<MaskTarget>,
-    /// Positives (by their numbers) whose masks are learnt.
+    /// Positives (by their numbers) whose masks are learned.
     pub mask_positives: Vec<usize>,
 }
 
-/// Least and greatest size (square root of the box's area, pixels) of objects on a level; neighbours overlap.
+/// Smallest and largest size (square root of the box's area, pixels) of objects on a level; neighbours overlap.
 fn sizes(config: &DetectorConfig, level: usize) -> [f32; 2] {
     let stride = config.stride(level) as f32;
     let least = if level == 0 { 0.0 } else { 3.5 * stride };
@@ -79,7 +79,7 @@ fn sizes(config: &DetectorConfig, level: usize) -> [f32; 2] {
     [least, greatest]
 }
 
-/// The pixel in the middle of a location.
+/// The pixel at the centre of a location.
 fn centre(location: usize, stride: usize) -> usize {
     location * stride + stride / 2
 }
@@ -136,7 +136,7 @@ impl Targets {
                     continue;
                 }
                 if locations.is_empty() {
-                    // So small or thin that it lies between all middles.
+                    // The object is so small or thin that it contains no location's centre.
                     let at = |sum: f64, side: usize| ((sum / sums[index][2]) as usize / stride).min(side - 1);
                     let location = at(sums[index][1], grid[1]) * grid[0] + at(sums[index][0], grid[0]);
                     if !taken[location] {
@@ -163,7 +163,7 @@ impl Targets {
     }
 }
 
-/// Fraction of blocks that show the object, from two blocks outside its box on.
+/// Fraction of each block that shows the object, in its bounding box extended by two blocks.
 fn mask_target(annotation: &Annotation, index: usize) -> MaskTarget {
     let [width, height] = annotation.size;
     let [left, top, right, bottom] = annotation.instances[index].corners;
@@ -194,7 +194,7 @@ fn mask_target(annotation: &Annotation, index: usize) -> MaskTarget {
 mod tests {
     use super::*;
 
-    /// Two objects side by side, a third that hides a part of the first, and something ignored.
+    /// Two objects side by side, a third that hides a part of the first, and an ignored area.
     fn annotation() -> Annotation {
         let size = [128, 96];
         let mut labels = vec![0u8; size[0] * size[1]];
@@ -222,7 +222,7 @@ mod tests {
         let config = DetectorConfig::compact(3);
         let targets = Targets::new(&annotation, &config);
         assert_eq!(targets.grids, [[16, 12], [8, 6], [4, 3]]);
-        // 39 pixels: level 0 alone; 64 pixels: levels 0 and 1; 2 pixels: one location of level 0.
+        // 39 pixels: level 0 only; 64 pixels: levels 0 and 1; 2 pixels: one location of level 0.
         let count = |level: usize, instance: usize| {
             targets.positives.iter().filter(|p| p.level == level && p.instance == instance).count()
         };
@@ -252,7 +252,7 @@ mod tests {
         assert_eq!((mask.corner, mask.size), ([13, 3], [19, 21]));
         let area: f32 = mask.share.iter().sum();
         assert_eq!(area * 16.0, 60.0 * 70.0);
-        // The first object without what the third hides of it.
+        // The first object without the part that the third hides.
         assert_eq!(targets.masks[0].share.iter().sum::<f32>() * 16.0, 1600.0 - 9.0);
     }
 }

@@ -1,5 +1,4 @@
-//! A detector that torchvision trained, as a file of weights and, beside it, what the weights do not state: which object each of
-//! its labels is.
+//! A detector trained with torchvision: a file of weights and, next to it, a file that maps its labels to objects.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,16 +11,16 @@ use sixfold_nn::weights::{ModelCard, WeightsError};
 use crate::anchored::{AnchoredConfig, AnchoredNetwork};
 use crate::model::{ClassEntry, ModelError};
 
-/// Labels that a file beside the weights may name.
+/// Maximum number of labels in the file next to the weights.
 const MAX_LABELS: usize = 10_000;
-/// Sides of images in the network, pixels; as of the networks that Sixfold trains.
+/// Sides of images in the network, pixels; as for the networks that Sixfold trains.
 const SIDES: std::ops::RangeInclusive<usize> = 32..=16_384;
 
-/// What stands in the file beside the weights; every field may be missing.
+/// Content of the file next to the weights; every field is optional.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Beside {
-    /// Object ids by label; other labels are not detected. Without it every label is the id of its object.
+    /// Object ids by label; other labels are not detected. If missing, every label is the id of its object.
     #[serde(default)]
     objects: Option<BTreeMap<usize, u32>>,
     /// See [`crate::anchored::AnchoredConfig::norm_epsilon`].
@@ -30,10 +29,10 @@ pub(crate) struct Beside {
     /// Shorter side of the images in the network, pixels; torchvision's `min_size`.
     #[serde(default)]
     min_side: Option<usize>,
-    /// Longest longer side, pixels; torchvision's `max_size`.
+    /// Maximum length of the longer side, pixels; torchvision's `max_size`.
     #[serde(default)]
     max_side: Option<usize>,
-    /// Detections with a lower score are left out unless something else is asked for.
+    /// Detections with a lower score are left out by default.
     #[serde(default)]
     pub threshold: Option<f32>,
 }
@@ -48,19 +47,19 @@ pub(crate) struct Torchvision {
     pub card: ModelCard,
 }
 
-/// The file beside torchvision's weights that says which objects its labels are: `detector.objects.json` beside `detector.pth`. It
-/// need not exist.
+/// The file next to torchvision's weights that maps its labels to objects: `detector.objects.json` for `detector.pth`. It need not
+/// exist.
 pub fn objects_file(weights: &Path) -> PathBuf {
     weights.with_extension("objects.json")
 }
 
-/// [`objects_file`] where it exists: what a run's options and inputs must name beside the weights.
+/// [`objects_file`] if it exists; the options and inputs of a run must list it in addition to the weights.
 pub fn existing_objects_file(weights: &Path) -> Option<PathBuf> {
     Some(objects_file(weights)).filter(|file| file.is_file())
 }
 
 impl Beside {
-    /// The file beside these weights, or its defaults where there is none.
+    /// Reads the file next to these weights, or returns the defaults if there is none.
     fn read(weights: &Path) -> Result<Beside, ModelError> {
         let file = objects_file(weights);
         let wrong = |found: String| ModelError::Objects { file: file.clone(), found };
@@ -127,7 +126,7 @@ impl Beside {
 /// Reads weights of torchvision.
 ///
 /// # Errors
-/// [`ModelError`] for a file that cannot be read or holds none of the three networks, and for a wrong file beside it.
+/// [`ModelError`] for a file that cannot be read or does not contain one of the three networks, and for an invalid file next to it.
 pub(crate) fn read(path: &Path) -> Result<Torchvision, ModelError> {
     let beside = Beside::read(path)?;
     let network =

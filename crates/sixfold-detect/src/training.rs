@@ -1,4 +1,4 @@
-//! The training of a detector: image after image through the network, gradients summed over a batch, AdamW.
+//! The training of a detector: one image at a time through the network, gradients summed over a batch, AdamW.
 
 use crate::anchored::{AnchoredImage, AnchoredTraining};
 use crate::loss::{LossWeights, RawOutput, loss};
@@ -16,7 +16,7 @@ use sixfold_nn::parameters::{GradientSum, gradients_of};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DetectorTrainingOptions {
     /// Steps, learning rate of pyramid and heads, seed.
@@ -24,9 +24,9 @@ pub struct DetectorTrainingOptions {
     pub common: TrainingOptions,
     /// Images in a step, 1 or more.
     pub batch: usize,
-    /// The encoder's fraction of the learning rate, 0 to 1: it is pretrained.
+    /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
     pub encoder_share: f64,
-    /// Stages of the encoder that stay as they are, 0 to 5.
+    /// Number of frozen stages of the encoder, 0 to 5.
     pub frozen_stages: usize,
 }
 
@@ -61,7 +61,7 @@ impl DetectorTrainingOptions {
     }
 }
 
-/// An image as the network wants it, and the output that is expected.
+/// An image as the network's input, and its targets.
 pub struct TrainingImage {
     input: Vec<f32>,
     targets: Targets,
@@ -72,14 +72,14 @@ pub struct DetectorTraining {
     learner: Learner<Detector>,
     config: DetectorConfig,
     options: DetectorTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     side: usize,
     device: Device,
 }
 
 impl DetectorTraining {
-    /// Of a network that `config` made on the autodiff `device`, on images of `side` pixels.
+    /// Starts the training of a network created by `config` on the autodiff `device`, with images of `side` pixels.
     pub fn new(
         network: Detector,
         config: DetectorConfig,
@@ -92,7 +92,7 @@ impl DetectorTraining {
         DetectorTraining { learner, config, options, pace, side, device }
     }
 
-    /// The trained network, and how it is built.
+    /// The trained network and its configuration.
     pub fn into_network(self) -> (Detector, DetectorConfig) {
         (self.learner.into_network(), self.config)
     }
@@ -103,7 +103,7 @@ fn numbers(tensor: &Tensor<4>) -> Vec<f32> {
     data.try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
 
-/// Losses of one image, gradients of encoder and of the rest.
+/// Losses of one image, and the gradients of the encoder and of the other parameters.
 struct ImageGradients {
     terms: [f64; 3],
     encoder: GradientsParams,
@@ -111,8 +111,8 @@ struct ImageGradients {
 }
 
 impl DetectorTraining {
-    /// One image through the network and back. `network` is this thread's own copy ([`Module::fork`]): graphs that share
-    /// parameters are one to Burn, and two threads that build and walk it lock each other out for good.
+    /// Forward and backward pass of one image. `network` is this thread's own copy ([`Module::fork`]): Burn treats graphs that
+    /// share parameters as one, and two threads that build and traverse it deadlock.
     fn gradients(
         &self,
         network: &Detector,
@@ -179,9 +179,9 @@ impl Training for DetectorTraining {
         let count = |of: fn(&Targets) -> usize| batch.iter().map(|i| of(&i.targets)).sum::<usize>();
         let positives = count(|t| t.positives.len());
         let masks = count(|t| t.mask_positives.len());
-        // An image a thread: together in one tensor they would not fit the processor's caches, and much between the
-        // convolutions runs on one thread. Threads of their own, not of rayon's pool, whose kernels must not wait for a
-        // whole image.
+        // One image per thread: a batch in one tensor would not fit into the processor's caches, and many operations between
+        // convolutions run on one thread. These are separate threads, not rayon's pool, whose kernels must not wait for a whole
+        // image.
         let threads = rayon::current_num_threads().clamp(1, batch.len().max(1));
         let (training, network) = (&*self, self.learner.network());
         let parts: Vec<Vec<ImageGradients>> = std::thread::scope(|scope| {
@@ -200,7 +200,7 @@ impl Training for DetectorTraining {
             };
             workers.into_iter().map(join).collect()
         });
-        // Summed in the order of the images, whichever thread had them.
+        // Summed in the order of the images, independent of the threads.
         let mut of_encoder = GradientSum::new();
         let mut of_heads = GradientSum::new();
         let mut sums = [0.0; 3];
@@ -237,7 +237,7 @@ pub enum AnyTraining {
     Anchored(Box<AnchoredTraining>),
 }
 
-/// What a step of [`AnyTraining`] learns from.
+/// The batch of a step of [`AnyTraining`].
 pub enum AnyBatch {
     /// Without anchors.
     Anchorless(Vec<TrainingImage>),
@@ -311,7 +311,7 @@ fn make_batch(
         .collect()
 }
 
-/// All that decides about the result.
+/// Everything that affects the result.
 #[derive(Serialize)]
 struct Settings<'a> {
     #[serde(flatten)]
@@ -321,7 +321,7 @@ struct Settings<'a> {
     photographs: usize,
 }
 
-/// Milliseconds that one training image takes to be made, over so many, on all threads (for benchmarks).
+/// Milliseconds to generate one training image, averaged over `count`, on all threads (for benchmarks).
 pub fn sample_time(source: &TrainingImageSource, count: u64) -> f64 {
     let start = std::time::Instant::now();
     (0..count).into_par_iter().for_each(|n| drop(source.sample(0, n)));

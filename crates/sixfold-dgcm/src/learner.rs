@@ -1,11 +1,11 @@
-//! What a robot that learns grasps by doing tries next, and what it keeps of it (dissertation, section 6.2.1).
+//! Learning of grasps by trial: which grasps a robot tries next, and what it stores (dissertation, section 6.2.1).
 //!
-//! Experience proposes where some is near enough, else geometry alone; the best grasps are tried until one holds, and a few
-//! others besides. What held becomes an experience, and every try an outcome. How a grasp is tried, in simulation or by a
-//! robot, is the caller's.
+//! Grasps are proposed from experience if some is near enough, otherwise from geometry alone. The best ones are tried until one
+//! holds, and a few others in addition. A grasp that held is stored as an experience, and every trial as an attempt. The caller
+//! executes the trials, in simulation or on a robot.
 //!
-//! What came of a task is stored at its end, all of it at once: a task that was interrupted has left nothing behind that would
-//! change what is tried when it is done again.
+//! All results of a task are stored together at its end: an interrupted task leaves nothing behind that would change the trials
+//! when it is repeated.
 
 use std::error::Error as StdError;
 
@@ -20,63 +20,61 @@ use crate::transfer::{
     Kind, Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
 };
 
-/// How much is tried, and when experience is asked.
+/// Number of trials, and when experience is used.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnerOptions {
     /// Grasps tried until one holds, the best first.
     pub tries: usize,
-    /// Further grasps tried, spread over the ranked ones: what fails teaches how much to trust a grasp.
+    /// Further grasps tried, spread over the ranked ones: failures improve the prediction of outcomes.
     pub explore: usize,
-    /// Feature distance of the nearest experience below which experience proposes; 0 for never (dissertation, section 6.3.2:
-    /// 0.9).
+    /// Feature distance of the nearest experience below which experience is used; 0 for never (dissertation, section 6.3.2: 0.9).
     pub near: f64,
-    /// Only grasps on parts of this name.
+    /// Only grasps on parts with this name.
     pub part: Option<String>,
 }
 
-/// The part that a grasp is on; none in particular, or one by name.
+/// Returns the name of the part on which a grasp is, or `None`.
 pub type PartOf<'a> = dyn Fn(&Grasp) -> Option<&'static str> + 'a;
 
 /// An object in front of the robot.
 pub struct GraspTask<'a> {
-    /// What the camera sees of it.
+    /// The camera's view of it.
     pub view: &'a GraspView,
-    /// How grasps are planned by geometry.
+    /// Options of the geometric planner.
     pub planner: AntipodalOptions,
     /// The object's name, for the store.
     pub object: &'a str,
-    /// Where what is stored comes from.
+    /// Origin to store with the results.
     pub provenance: &'a str,
-    /// The part that a grasp is on, where somebody knows the object's parts.
+    /// The part on which a grasp is, if the object's parts are known.
     pub part_of: Option<&'a PartOf<'a>>,
     /// Seconds since 1970.
     pub now: fn() -> i64,
 }
 
-/// What came of a lesson. `T` is how a try ended.
+/// The result of a task. `T` is the outcome of a trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Learned<T> {
-    /// Distance of the nearest experience's feature, where experience was asked and there is some.
+    /// Distance of the nearest experience's feature, if experience was used and there is some.
     pub nearest: Option<f64>,
-    /// Whether experience proposed; else geometry did.
+    /// Whether the grasps were proposed from experience; otherwise from geometry.
     pub from_experience: bool,
-    /// The last of the grasps that were tried to hold the object: its rank from 0, and how the try ended. None where there
-    /// was no grasp.
+    /// The last grasp tried before exploration: its rank, from 0, and its outcome. `None` if there was no grasp.
     pub last: Option<(usize, T)>,
     /// Whether it held.
     pub held: bool,
-    /// Number of the experience that came of it.
+    /// Number of the stored experience.
     pub stored: Option<i64>,
 }
 
-/// What cannot be learned from.
+/// Errors of learning.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum LearnError {
     /// The planner's options.
     #[error(transparent)]
     Options(#[from] OptionsError),
-    /// Experience cannot be asked.
+    /// The proposals from experience.
     #[error(transparent)]
     Propose(#[from] ProposeError),
     /// The store.
@@ -87,42 +85,42 @@ pub enum LearnError {
     Try(Box<dyn StdError + Send + Sync>),
 }
 
-/// Tries a grasp: whether it held, and how it ended.
+/// Tries a grasp; returns whether it held, and its outcome.
 pub type TryGrasp<'a, T> = dyn FnMut(&Grasp) -> Result<(bool, T), Box<dyn StdError + Send + Sync>> + 'a;
 
-/// The row that a journal gets for a task, with the number of the experience that came of it.
+/// The row of a task in a journal, with the number of the stored experience.
 pub struct JournalOf<'a, T> {
-    /// The journal's name, which no other has.
+    /// The journal's unique name.
     pub journal: &'a str,
     /// The row.
     pub row: &'a dyn Fn(&Learned<T>, Option<i64>) -> String,
 }
 
-/// What a task has led to so far.
+/// Results of a task so far.
 #[derive(Default)]
 struct Record {
     attempts: Vec<Attempt>,
     experience: Option<Experience>,
 }
 
-/// Whoever learns.
+/// A learner.
 pub struct Learner<'a> {
-    /// Encodes what is seen.
+    /// Encodes views.
     pub network: &'a DgcmModel,
-    /// What is known so far.
+    /// The experiences and outcomes so far.
     pub memory: &'a mut Memory,
-    /// The gripper as the learner knows it.
+    /// The gripper that the learner assumes.
     pub gripper: &'a Gripper,
-    /// How much is tried.
+    /// Options.
     pub options: &'a LearnerOptions,
 }
 
 impl Learner<'_> {
-    /// Chooses grasps on what is seen, has them tried, and keeps what came of it. Where somebody keeps a journal of tasks, the
-    /// store keeps its row too, in the same step.
+    /// Chooses grasps for a view, has them tried, and stores the results. If there is a journal of tasks, its row is stored in the
+    /// same transaction.
     ///
     /// # Errors
-    /// [`LearnError`]; where a grasp could not be tried, the outcomes of those before are kept.
+    /// [`LearnError`]; if a grasp could not be tried, the outcomes of those before are kept.
     pub fn learn<T>(
         &mut self,
         task: &GraspTask<'_>,
@@ -181,7 +179,7 @@ impl Learner<'_> {
                 break;
             }
         }
-        // The object is put back after every try: what the others would have done costs nothing but time.
+        // The object is put back after every trial: exploring other grasps costs only time.
         let others = &ranked[left..];
         let count = self.options.explore.min(others.len());
         for k in 0..count {
@@ -191,7 +189,7 @@ impl Learner<'_> {
         Ok(learned)
     }
 
-    /// The distance of the nearest experience, and what experience proposes where that is near enough.
+    /// The distance of the nearest experience, and the proposals from experience if it is near enough.
     fn ask_experience(
         &mut self,
         fitter: &GraspFitter<'_>,
@@ -217,7 +215,7 @@ impl Learner<'_> {
         let outcomes = self.memory.outcomes(&self.gripper.name);
         let clusters = ClusterOptions::default();
         match found {
-            // Where nobody says what a handle is, experience on handles does.
+            // If the object's parts are unknown, experience on this part locates it.
             Some(found) if self.options.part.is_some() && !parts_are_known => {
                 rank_on_part(geometry, found, &clusters, fitter, &outcomes)
             }
@@ -252,7 +250,7 @@ impl Learner<'_> {
         Ok((held, ending))
     }
 
-    /// The experience of a grasp that held; none where the object cannot be cut out.
+    /// The experience of a grasp that held; `None` if the object cannot be cropped.
     fn experience(&self, task: &GraspTask<'_>, grasp: &Grasp) -> Option<Experience> {
         let crop = Crop::of_view(task.view, self.network.crop_options()).ok()?;
         let part = match task.part_of {

@@ -1,8 +1,8 @@
-//! DGCM-Net: a grasp that worked once is transferred to the next object of similar shape.
+//! DGCM-Net: transfers successful grasps to other objects of similar shape.
 //!
-//! An object's depth image is encoded into a feature; the nearest stored experiences are retrieved; for each, a network
-//! predicts where every pixel of the object has its counterpart on the experience; the region around the stored grasp is
-//! found again and aligned, and the grasp goes with it. After Park, *6D Pose Estimation of Objects Using Limited Training
+//! An object's depth image is encoded into a feature; the nearest stored experiences are retrieved; for each, a network predicts
+//! the counterpart of every pixel of the object on the experience; the region around the stored grasp is located on the object and
+//! aligned, and the grasp is transferred with this alignment. After Park, *6D Pose Estimation of Objects Using Limited Training
 //! Data* (2020), chapter 6.
 //!
 //! Metres and radians, in the camera's frame unless a name says otherwise.

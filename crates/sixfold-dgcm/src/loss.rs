@@ -16,7 +16,7 @@ pub(crate) fn metric_loss(
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
     let pairs = input.dims()[0];
     let squared = (input.clone() - experience.clone()).square().sum_dim(1);
-    // The root's slope at zero is infinite.
+    // The derivative of the root at zero is infinite.
     let distance = (squared.clone() + 1e-9).sqrt();
     let near = squared.narrow(0, 0, positives).sum();
     let mut sum = near;
@@ -32,8 +32,8 @@ pub(crate) fn metric_loss(
     (sum / pairs as f64, mean(0, positives), mean(positives, negatives))
 }
 
-/// Equation 6.2 for all pairs of a first and a second view of the batch that show different families: the same images say
-/// that much more. `different` (`pairs x pairs`) holds 1 for such pairs.
+/// Equation 6.2 for all pairs of a first and a second view of the batch that show different families: which uses the same images
+/// for more comparisons. `different` (`pairs x pairs`) holds 1 for such pairs.
 pub(crate) fn cross_loss(input: &Tensor<2>, experience: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
     let of_input = input.clone().square().sum_dim(1);
     let of_experience = experience.clone().square().sum_dim(1).transpose();
@@ -75,7 +75,7 @@ mod tests {
         let rows = |v: Vec<f32>| Tensor::<2>::from_data(TensorData::new(v, [3, 2]), &device);
         let a = rows(vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let b = rows(vec![3.0, 4.0, 0.0, 6.0, 20.0, 0.0]);
-        // Positive at distance 5: 25. Negative at 6: 16. Negative at 20: nothing.
+        // Positive at distance 5: 25. Negative at 6: 16. Negative at 20: 0.
         let (loss, near, far) = metric_loss(&a, &b, 1);
         assert!((number(loss) - 41.0 / 3.0).abs() < 1e-4);
         assert!((number(near) - 5.0).abs() < 1e-4 && (number(far) - 13.0).abs() < 1e-4);
@@ -96,7 +96,7 @@ mod tests {
     fn equation_6_3_by_hand() {
         let device = Device::flex();
         let image = |v: Vec<f32>, c: usize| Tensor::<4>::from_data(TensorData::new(v, [1, c, 1, 2]), &device);
-        // Errors of 0.1, 0.2, 0.3 on the object's pixel and 1.0 once beside it.
+        // Errors of 0.1, 0.2, 0.3 on the object's pixel, and one of 1.0 outside it.
         let output = image(vec![0.1, 1.0, 0.2, 0.0, 0.3, 0.0], 3);
         let target = image(vec![0.0; 6], 3);
         let (loss, error) = coordinate_loss(output, target, image(vec![1.0, 0.0], 1));

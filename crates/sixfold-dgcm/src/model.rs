@@ -1,4 +1,4 @@
-//! A trained DGCM-Net as one file, and what it is asked: features, and coordinates of an object in an experience.
+//! A trained DGCM-Net as one file, and its queries: features, and coordinates of an object in an experience.
 
 use std::path::{Path, PathBuf};
 
@@ -33,7 +33,7 @@ pub enum ModelError {
     },
 }
 
-/// A network and how objects are cut out for it.
+/// A network and the options of its crops.
 #[derive(Debug, Clone)]
 pub struct DgcmModel {
     network: Network,
@@ -42,7 +42,7 @@ pub struct DgcmModel {
     device: Device,
 }
 
-/// What the network predicts for an input, kept for several experiences.
+/// The network's encoding of an input, reused for several experiences.
 #[derive(Debug, Clone)]
 pub struct InputCode {
     encoded: Encoded,
@@ -51,7 +51,7 @@ pub struct InputCode {
 }
 
 impl DgcmModel {
-    /// A model of a trained network. `card` gets architecture and crop filled in.
+    /// A model of a trained network. Its architecture and crop are written into `card`.
     pub fn new(network: Network, crop: CropOptions, card: ModelCard) -> Self {
         let mut extra = card.extra.clone();
         if !extra.is_object() {
@@ -65,7 +65,7 @@ impl DgcmModel {
     /// Reads a weight file.
     ///
     /// # Errors
-    /// [`ModelError`] for a file that cannot be read or is no DGCM-Net.
+    /// [`ModelError`] for a file that cannot be read or is not a DGCM-Net.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let card = read_card(path)?;
         let device = Device::flex();
@@ -74,7 +74,7 @@ impl DgcmModel {
         Ok(DgcmModel { network: network.valid(), crop, card, device })
     }
 
-    /// Reads a model from the bytes of a weight file; `name` stands for it in messages.
+    /// Reads a model from the bytes of a weight file; `name` is used in messages.
     ///
     /// # Errors
     /// [`ModelError`].
@@ -110,7 +110,7 @@ impl DgcmModel {
         Ok((network, crop))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
@@ -119,7 +119,7 @@ impl DgcmModel {
         Ok(write_card_markdown(&self.card, &path.with_extension("md"))?)
     }
 
-    /// How objects are cut out for the network.
+    /// Options of the network's crops.
     pub fn crop_options(&self) -> &CropOptions {
         &self.crop
     }
@@ -129,16 +129,16 @@ impl DgcmModel {
         &self.card
     }
 
-    /// A name that tells this network's features from those of another: its architecture and a hash of its card.
+    /// A name that distinguishes this network's features from those of another: its architecture and a hash of its card.
     pub fn fingerprint(&self) -> String {
         let hash = fnv1a(serde_json::to_string(&self.card).unwrap_or_default().as_bytes());
         format!("{}-{hash:016x}", self.card.architecture)
     }
 
-    /// What the network makes of an object's normals.
+    /// Encodes an object's normals.
     ///
     /// # Panics
-    /// For a crop of another side than the network's.
+    /// If the crop's side differs from the network's.
     pub fn encode(&self, crop: &Crop) -> InputCode {
         assert_eq!(crop.side, self.crop.side, "a crop of another size than the network's");
         let encoded = self.network.geometry(self.tensor(crop.normal_planes(), 1));
@@ -150,7 +150,7 @@ impl DgcmModel {
     /// experience's frame, pixel by pixel.
     ///
     /// # Panics
-    /// For features or VD-NOC of another size than the network's.
+    /// If features or VD-NOC do not have the network's size.
     pub fn coordinates(&self, input: &InputCode, experiences: &[(&[f32], &[f32])]) -> Vec<Vec<[f32; 3]>> {
         let (count, pixels) = (experiences.len(), self.crop.side * self.crop.side);
         if count == 0 {
@@ -173,7 +173,8 @@ impl DgcmModel {
     }
 }
 
-/// Whether numbers of a card can be those of a crop; otherwise which field cannot, what it should hold, and what it holds.
+/// Tests that the numbers of a card are valid for a crop; otherwise returns the invalid field, the expected values and the value
+/// found.
 fn check_crop(crop: &CropOptions) -> Result<(), (&'static str, &'static str, String)> {
     if !(crop.size > 0.01 && crop.size < 5.0) {
         return Err(("extra.crop.size", "0.01 to 5 m", crop.size.to_string()));

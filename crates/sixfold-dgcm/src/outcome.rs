@@ -1,44 +1,45 @@
-//! What has come of the grasps that were tried: the probability that the next one holds.
+//! Outcomes of earlier attempts: predicts the probability that the next grasp holds.
 //!
 //! The dissertation stores successes only ("unsuccessful grasp attempts do not provide any information for replicating past
-//! experience", section 6.2.1), and ranks by how near an experience is. Failures do say something: how much worse than the
-//! planner believes a grasp on the edge of its friction cone is, or one far from the object's centre, with this hand and
-//! these pads. So every attempt is kept with a dozen numbers that were known before, and a logistic regression with a normal
-//! prior (Cox 1958; MAP by Newton's method) predicts the next one. The prior is what simulated attempts taught: without an
-//! attempt of its own, a hand ranks by the quality of the contacts and the agreement with experience, as section 6.3.2 does,
-//! and keeps away from the table.
+//! experience", section 6.2.1), and ranks by the distance of an experience. Failures are informative too: they show how much worse
+//! than the planner assumes a grasp is at the edge of its friction cone, or far from the object's centre, with this gripper and
+//! these pads. So every attempt is stored with a dozen numbers that were known before it, and a logistic regression with a normal
+//! prior (Cox 1958; MAP by Newton's method) predicts the next one. The prior was fitted to simulated attempts: without attempts of
+//! its own, a gripper ranks grasps by the quality of the contacts and the agreement with experience, as in section 6.3.2, and keeps
+//! a distance from the table.
 
 use sixfold_experience::Attempt;
 use sixfold_geometry::nalgebra::{SMatrix, SVector};
 use sixfold_grasp::GraspDescription;
 
-/// How many numbers describe a grasp to the model, the constant included.
+/// Number of inputs that describe a grasp to the model, including the constant.
 const NUMBERS: usize = 17;
 type Numbers = SVector<f64, NUMBERS>;
 
-/// Weights without any attempt, in the order of [`numbers`]: what 1322 simulated attempts at synthetic objects taught a hand
+/// Weights without any attempt, in the order of [`numbers`]: fitted to 1322 simulated attempts at synthetic objects by a gripper
 /// with an error of 5 mm and 3 degrees (`sixfold grasp learn --families all --members 5 --tries 2 --explore 8 --near 0 --hard`,
-/// then [`OutcomeModel::learn`]), rounded. Those attempts had no experience to agree with: its weight is a choice.
+/// then [`OutcomeModel::learn`]), rounded. Those attempts had no experience, so its weight was chosen by us.
 const PRIOR: [f64; NUMBERS] =
     [0.15, 0.1, -0.2, 0.25, 0.25, 0.55, 0.2, -0.1, 0.75, 0.35, 0.4, 1.0, 0.0, 0.0, -0.6, 0.9, 0.65];
-/// One over the variance of the weights around the prior. The constant is nearly free.
+/// Inverse variance of the weights around the prior. The constant is almost unconstrained.
 const PRECISION: f64 = 5.0;
 const PRECISION_OF_CONSTANT: f64 = 0.01;
 
-/// Room over the table counts by its logarithm between these, metres: the first millimetres are worth most.
+/// Clearance from the table enters by its logarithm between these limits, metres: the first millimetres matter most.
 const ROOM: (f64, f64) = (0.003, 0.1);
-/// And once more below this, metres: a hand with an error of millimetres meets the table.
+/// Below this it enters a second time, linearly, metres: a gripper with an error of millimetres may touch the table.
 const SCARCE: f64 = 0.01;
-/// With the object's centre this far off along the closing direction, metres, something at its side is held: from where on, and where surely.
+/// Distance of the object's centre along the closing direction, metres, from which a part at the object's side may be held, and
+/// from which it certainly is.
 const WALL: (f64, f64) = (0.015, 0.035);
 
-/// What is known of a grasp, each number in about -1 to 1.
+/// The inputs for a grasp, each in about -1 to 1.
 fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
     let q = &d.quality;
     let both_sides = |v: f64| 2.0 * v - 1.0;
     let room = d.table_room.unwrap_or(ROOM.1);
     let overlap = both_sides(d.overlap.clamp(0.0, 0.05) / 0.05);
-    // A wall or a handle at the object's side is held otherwise than the object about its centre.
+    // Holding a wall or a handle at the object's side differs from holding the object near its centre.
     let wall = ((d.lever - WALL.0) / (WALL.1 - WALL.0)).clamp(0.0, 1.0);
     Numbers::from([
         1.0,
@@ -57,7 +58,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
         wall,
         wall * both_sides(q.alignment),
         wall * overlap,
-        // The torque of the weight over that which the pads can hold.
+        // The torque of the weight relative to that which the pads can hold.
         1.0 - 0.5 * (d.lever / d.overlap.max(0.002)).min(4.0),
     ])
 }
@@ -66,7 +67,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutcomeModel {
     weights: Numbers,
-    /// Attempts it has seen.
+    /// Number of attempts it was fitted to.
     pub attempts: usize,
     /// How many of them held.
     pub held: usize,
@@ -115,7 +116,7 @@ impl OutcomeModel {
                 curvature += x * x.transpose() * (p * (1.0 - p));
             }
             let Some(step) = curvature.cholesky().map(|c| c.solve(&gradient)) else { break };
-            // Newton's step may go too far where the sigmoid is flat.
+            // Newton's step may be too long where the sigmoid is flat.
             let mut length = 1.0;
             let mut next = model.weights - step;
             while loss(&next) > value && length > 1e-6 {
@@ -174,7 +175,7 @@ mod tests {
         let of = |alignment, share| model.success_probability(&description(alignment, 0.0), share, false);
         assert!(of(0.9, 0.0) > of(0.5, 0.0));
         assert!(of(0.5, 0.9) > of(0.5, 0.1));
-        // What simulated attempts taught beforehand: a lever is worse than none, and so is a table under the fingers.
+        // The prior from simulated attempts: a lever is worse than none, and so is a table close to the fingers.
         assert!(model.success_probability(&description(0.5, 0.05), 0.0, false) < of(0.5, 0.0));
         let above = |room: f64| {
             let d = GraspDescription { table_room: Some(room), ..description(0.5, 0.0) };
@@ -189,7 +190,7 @@ mod tests {
 
     #[test]
     fn it_learns_what_fails_with_this_hand_only() {
-        // A hand that loses what it holds off its middle, whatever the contacts: 3 of 4 times against 1 of 10.
+        // A gripper that loses objects held away from their centre, whatever the contacts: 3 of 4 times against 1 of 10.
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let attempts: Vec<Attempt> = (0..200)
             .map(|_| {
@@ -204,7 +205,7 @@ mod tests {
         assert!(off < 0.45 && near > 0.8, "{off} {near}");
         assert_eq!(model.attempts, 200);
         assert_eq!(OutcomeModel::learn(&attempts, "other"), OutcomeModel::default());
-        // Nothing but successes does not make everything certain.
+        // Successes alone do not make everything certain.
         let good: Vec<Attempt> = (0..50).map(|_| attempt(description(0.7, 0.0), true)).collect();
         let sure = OutcomeModel::learn(&good, "jaws").success_probability(&description(0.7, 0.0), 0.0, false);
         assert!(sure > 0.9 && sure < 0.9999, "{sure}");
@@ -212,7 +213,7 @@ mod tests {
 
     #[test]
     fn walls_and_middles_are_learnt_apart() {
-        // Over a wall the pads have to reach far, over a middle they must not: no sum of both says that.
+        // At a wall the pads must reach far, at the centre they must not: a sum of both inputs cannot express this.
         let of = |wall: bool, deep: bool| GraspDescription {
             lever: if wall { 0.045 } else { 0.0 },
             overlap: if deep { 0.045 } else { 0.01 },
@@ -230,7 +231,7 @@ mod tests {
 
     #[test]
     fn it_is_where_the_loss_is_smallest() {
-        // The gradient of the penalised loss, by hand, is zero there.
+        // The gradient of the penalised loss, computed directly, is zero there.
         let attempts: Vec<Attempt> = (0..60)
             .map(|k| {
                 let d = description(f64::from(k % 10) / 10.0, f64::from(k % 7) / 100.0);

@@ -1,4 +1,4 @@
-//! A whole training: nothing but a seed in, a network for grasps from experience out. Interrupted at any time, it is resumed.
+//! A complete training of the network for grasps from experience, from a seed alone. It can be interrupted at any time and resumed.
 
 use std::path::PathBuf;
 
@@ -16,13 +16,13 @@ use crate::samples::{GraspPoolOptions, Pool};
 use crate::training::{DgcmTraining, DgcmTrainingOptions};
 use sixfold_experience::CropOptions;
 
-/// Which network learns.
+/// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum DgcmKind {
     /// Plain convolutions on 96x96 pixels; trains on two cores.
     #[default]
     Compact,
-    /// The dissertation's: ResNet-50, 128x128 pixels.
+    /// The dissertation's network: ResNet-50, 128x128 pixels.
     Paper,
 }
 
@@ -45,7 +45,7 @@ impl Choice for DgcmKind {
 }
 
 impl DgcmKind {
-    /// How it is trained unless something else is asked for.
+    /// Its default training options.
     pub fn options(self) -> DgcmTrainingOptions {
         match self {
             DgcmKind::Compact => DgcmTrainingOptions::default(),
@@ -68,23 +68,23 @@ impl DgcmKind {
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DgcmRecipe {
-    /// Which network learns.
+    /// Which network is trained.
     pub network: DgcmKind,
-    /// ImageNet weights of ResNet-50 in torchvision's layout for [`DgcmKind::Paper`]; random ones without.
+    /// ImageNet weights of ResNet-50 in torchvision's layout for [`DgcmKind::Paper`]; random ones if `None`.
     pub encoder: Option<PathBuf>,
-    /// Steps in all; `None`: the network's of [`DgcmKind::options`], as for the next three.
+    /// Number of steps; `None`: the value of [`DgcmKind::options`], as for the next three fields.
     pub steps: Option<u64>,
-    /// Positive pairs in a step; the dissertation's network takes as many negative ones.
+    /// Positive pairs in a step; the dissertation's network uses the same number of negative ones.
     pub pairs: Option<usize>,
     /// Highest learning rate.
     pub learning_rate: Option<f64>,
-    /// Weight of the coordinates' loss beside the features'.
+    /// Weight of the loss of coordinates relative to that of features.
     pub lambda: Option<f64>,
-    /// Simulated views to learn from, made at the start (about 35 kB of memory each).
+    /// Simulated views for the training, generated at the start (about 35 kB of memory each).
     pub views: usize,
     /// Seed of weights, objects, views and pairs.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -152,7 +152,7 @@ impl Recipe for DgcmRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         #[rustfmt::skip]
         let DgcmRecipe { network, encoder, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
         Fingerprint::of(&self.options())?

@@ -13,7 +13,7 @@ use crate::networks::Network;
 use crate::samples::{GraspPoolOptions, Pair, PairOptions, Pool};
 use sixfold_synth::shapes::Family;
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DgcmTrainingOptions {
     /// Steps, learning rate, seed.
@@ -25,11 +25,11 @@ pub struct DgcmTrainingOptions {
     pub negatives: usize,
     /// Weight of the coordinates in equation 6.4.
     pub lambda: f64,
-    /// Weight of equation 6.2 for all pairs of views in a batch that show different families, beside the rendered pairs.
+    /// Weight of equation 6.2 for all pairs of views in a batch that show different families, in addition to the rendered pairs.
     pub cross_pairs: f64,
     /// How pairs are sampled.
     pub samples: PairOptions,
-    /// How often the learning rate is divided by ten, at even distances; 0: it follows a cosine.
+    /// How often the learning rate is divided by ten, at equal intervals; 0: it follows a cosine.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub divisions: u64,
 }
@@ -60,8 +60,8 @@ impl Default for DgcmTrainingOptions {
 }
 
 impl DgcmTrainingOptions {
-    /// The dissertation's (section 6.2.2): 25 positive and 25 negative pairs, Adam at a rate of 0.0001 that is divided by ten every 5
-    /// of 35 epochs, both losses alike.
+    /// The dissertation's options (section 6.2.2): 25 positive and 25 negative pairs, Adam at a rate of 0.0001 that is divided by
+    /// ten every 5 of 35 epochs, both losses with equal weights.
     pub fn published() -> Self {
         let default = Self::default();
         DgcmTrainingOptions {
@@ -98,13 +98,13 @@ impl DgcmTrainingOptions {
 pub struct DgcmTraining {
     learner: Learner<Network>,
     options: DgcmTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl DgcmTraining {
-    /// Of a network whose tensors are on the autodiff `device`.
+    /// Starts the training of a network whose tensors are on the autodiff `device`.
     pub fn new(network: Network, options: DgcmTrainingOptions, device: Device) -> Self {
         let learner = Learner::adam_w("network", network, &options.common);
         DgcmTraining { learner, options, pace: Pace::default(), device }
@@ -116,7 +116,7 @@ impl DgcmTraining {
     }
 }
 
-/// Pairs as tensors' numbers: the positive ones first.
+/// Pairs as tensor data: the positive ones first.
 pub struct Batch {
     input: Vec<f32>,
     experience: Vec<f32>,
@@ -153,9 +153,9 @@ fn make_batch(pool: &Pool, options: &DgcmTrainingOptions, step: u64) -> Batch {
     batch
 }
 
-/// A rate that is divided by ten so often, at even distances.
+/// A learning rate that is divided by ten `divisions` times, at equal intervals.
 fn divided(common: &TrainingOptions, divisions: u64) -> LearningRate {
-    // Of very few steps not every part has one.
+    // With very few steps some intervals are empty.
     let mut at: Vec<u64> = (1..=divisions).map(|n| n * common.steps / (divisions + 1)).collect();
     at.retain(|at| *at > 0);
     at.dedup();
@@ -240,7 +240,7 @@ impl Training for DgcmTraining {
     }
 }
 
-/// All that decides about the result.
+/// Everything that affects the result.
 #[derive(Serialize)]
 struct Settings<'a> {
     #[serde(flatten)]

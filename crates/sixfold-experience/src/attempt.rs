@@ -1,4 +1,4 @@
-//! A grasp that was tried, whatever came of it.
+//! A grasp that was tried, successful or not.
 
 use serde::{Deserialize, Serialize};
 use sixfold_grasp::{AntipodalQuality, GraspDescription};
@@ -6,26 +6,27 @@ use sixfold_grasp::{AntipodalQuality, GraspDescription};
 /// A grasp that was tried.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Attempt {
-    /// What was known of it before.
+    /// Its description before the trial.
     pub description: GraspDescription,
-    /// The fraction of experience that agreed with it, 0 to 1.
+    /// The fraction of experience that agreed with the grasp, 0 to 1.
     pub share: f64,
-    /// It was transferred from experience; else the planner proposed it.
+    /// Whether it was transferred from experience; otherwise the planner proposed it.
     pub transferred: bool,
-    /// Whether it held.
+    /// Whether the grasp held the object.
     pub held: bool,
-    /// The gripper's name: attempts of one say little of another.
+    /// The gripper's name: attempts with one gripper say little about another.
     pub gripper: String,
-    /// What was grasped.
+    /// The object's name.
     pub object: String,
     /// Seconds since 1970.
     pub time: i64,
-    /// Where it comes from.
+    /// Origin of the attempt.
     pub provenance: String,
 }
 
 impl Attempt {
-    /// The attempt with its numbers rounded to a millionth, so that they survive being written as text and read again.
+    /// The attempt with its numbers rounded to a millionth, so that writing them as text and reading them again does not change
+    /// them.
     pub fn rounded(mut self) -> Attempt {
         let d = &mut self.description;
         let q = &mut d.quality;
@@ -48,7 +49,7 @@ impl Attempt {
     /// Tests that all its numbers are finite.
     ///
     /// # Errors
-    /// The name of the first field that holds no finite number.
+    /// The name of the first field that is not finite.
     pub fn check(&self) -> Result<(), &'static str> {
         let GraspDescription { quality: q, overlap, lever, above_middle, table_room } = &self.description;
         let AntipodalQuality { alignment, support, centring, observed } = q;

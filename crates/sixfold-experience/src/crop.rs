@@ -1,5 +1,5 @@
-//! What the network sees of an object: a square around it that covers 30 cm at its distance, with surface normals, points
-//! and VD-NOC (dissertation, section 6.2.2).
+//! The network's input for an object: a square around it that covers 30 cm at its distance, with surface normals, points and VD-NOC
+//! (dissertation, section 6.2.2).
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{
@@ -11,51 +11,51 @@ use thiserror::Error;
 
 use crate::Extent;
 
-/// Why an object cannot be cut out of a depth image.
+/// Why an object cannot be cropped from a depth image.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum CropError {
-    /// Sizes do not fit together.
+    /// The sizes of depth image, mask and camera differ.
     #[error(
         "depth image {depth:?}, mask {mask:?} and camera {camera:?} (pixels): expected the same size for all three"
     )]
     Sizes {
-        /// Of the depth image.
+        /// Size of the depth image.
         depth: (usize, usize),
-        /// Of the mask.
+        /// Size of the mask.
         mask: (usize, usize),
-        /// Of the camera.
+        /// Image size of the camera.
         camera: (usize, usize),
     },
-    /// Next to nothing of the object was measured.
+    /// Too few pixels of the object have depth.
     #[error(
         "{found} pixels of the object have depth and a normal, expected at least {expected}: is this the mask of this depth image?"
     )]
     TooSmall {
         /// Pixels of the crop that show the object.
         found: usize,
-        /// How many are needed.
+        /// Number of pixels needed.
         expected: usize,
     },
 }
 
-/// How an object is cut out.
+/// Options of the crop.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CropOptions {
     /// Side of the crop in pixels.
     pub side: usize,
-    /// What the crop covers at the object's distance, metres.
+    /// Side of the area that the crop covers at the object's distance, metres.
     pub size: f64,
     /// Half width of the window from which normals are computed, pixels of the depth image.
     pub normal_radius: usize,
-    /// Fraction of points left out at the ends of each axis for the VD-NOC; 0 for equation 6.1 as it stands.
+    /// Fraction of points left out at the ends of each axis for the VD-NOC; 0 for equation 6.1 as published.
     pub trim: f64,
     /// Fewest pixels of an object.
     pub min_pixels: usize,
 }
 
 impl CropOptions {
-    /// The dissertation's: 128x128 pixels for 30 cm, the extent of all points.
+    /// The dissertation's options: 128x128 pixels for 30 cm, the extent of all points.
     pub fn paper() -> Self {
         CropOptions { side: 128, trim: 0.0, ..CropOptions::compact() }
     }
@@ -66,31 +66,31 @@ impl CropOptions {
     }
 }
 
-/// An object as the network sees it. Pixels that do not show it hold zeros.
+/// The network's input for an object. Pixels that do not show the object are zero.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Crop {
     /// Side in pixels.
     pub side: usize,
-    /// The camera of the crop: pixel (u, v) of the crop is its pixel.
+    /// The camera of the crop: its pixels are those of the crop.
     pub camera: Camera,
     /// Which pixels show the object.
     pub mask: Vec<bool>,
-    /// Which pixel of the depth image each comes from, counted row by row.
+    /// For every pixel of the crop, the index of its pixel in the depth image, row by row.
     pub source: Vec<u32>,
-    /// Unit normals in the camera's frame, turned to the camera; rows one after another.
+    /// Unit normals in the camera's frame, pointing towards the camera; row by row.
     pub normals: Vec<[f32; 3]>,
     /// Points in the camera's frame, metres.
     pub points: Vec<[f32; 3]>,
     /// VD-NOC, each value from -1 to 1.
     pub vd_noc: Vec<[f32; 3]>,
-    /// What turns points into VD-NOC.
+    /// The extent with which points are converted to VD-NOC.
     pub extent: Extent,
-    /// What the object stands on, in the camera's frame, its normal up; `None` where it is not known.
+    /// The plane on which the object stands, in the camera's frame, with its normal up; `None` if unknown.
     pub table: Option<Plane>,
 }
 
 impl Crop {
-    /// Cuts the object in `mask` out of a depth image in metres of a camera without distortion.
+    /// Crops the object in `mask` from a depth image (metres) of a camera without distortion.
     ///
     /// # Errors
     /// [`CropError`].
@@ -118,9 +118,9 @@ impl Crop {
         }
         let centroid = sum / count as f64;
         let centre = camera.project(&centroid).ok_or_else(|| too_small(0))?;
-        // Pixels of the depth image that 30 cm take up there.
+        // Size of the crop's area in pixels of the depth image.
         let pixels = options.size * 0.5 * (camera.fx + camera.fy) / centroid.z;
-        // In coordinates of pixel corners, half a pixel from those of pixel centres.
+        // In coordinates of pixel corners, which differ from those of pixel centres by half a pixel.
         let corner = |c: f64| c + 0.5 - 0.5 * pixels;
         let rect = Rect { x: corner(centre.x), y: corner(centre.y), width: pixels, height: pixels };
         let step = pixels / options.side as f64;
@@ -148,7 +148,7 @@ impl Crop {
         let mut seen = vec![];
         for (i, (u, v)) in (0..options.side).flat_map(|v| (0..options.side).map(move |u| (u, v))).enumerate()
         {
-            // The centre of the crop's pixel in the depth image; the nearest pixel there.
+            // The centre of the crop's pixel in the depth image, rounded to the nearest pixel.
             let x = (rect.x + (u as f64 + 0.5) * step - 0.5).round();
             let y = (rect.y + (v as f64 + 0.5) * step - 0.5).round();
             if x < 0.0 || y < 0.0 || x >= size.0 as f64 || y >= size.1 as f64 {
@@ -173,7 +173,7 @@ impl Crop {
         Ok(crop)
     }
 
-    /// Cuts the object of a view out, and keeps the table it stands on.
+    /// Crops the object of a view, and keeps the table on which it stands.
     ///
     /// # Errors
     /// [`CropError`].
@@ -215,12 +215,12 @@ impl Crop {
     }
 }
 
-/// Pixel by pixel to plane by plane.
+/// From interleaved to planar layout.
 fn planes(pixels: &[[f32; 3]]) -> Vec<f32> {
     (0..3).flat_map(|k| pixels.iter().map(move |p| p[k])).collect()
 }
 
-/// Normals of the part of a depth image around an object.
+/// Normals in the part of a depth image around an object.
 struct Part {
     normals: Image<[f32; 3]>,
     left: usize,
@@ -250,7 +250,7 @@ impl Part {
         Part { normals, left, top }
     }
 
-    /// The normal at a pixel of the whole image, zero outside of the part.
+    /// The normal at a pixel of the whole image, zero outside the part.
     fn normal(&self, x: usize, y: usize) -> [f32; 3] {
         match (x.checked_sub(self.left), y.checked_sub(self.top)) {
             (Some(u), Some(v)) => self.normals.get(u, v).copied().unwrap_or([0.0; 3]),
@@ -265,7 +265,7 @@ mod tests {
 
     fn scene() -> (DepthImage, Camera, Mask) {
         let camera = Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480).unwrap();
-        // A plane patch of 10 cm at 0.8 m, to the right of the middle.
+        // A plane patch of 10 cm at 0.8 m, to the right of the centre.
         let inside = |x: usize, y: usize| (400..472).contains(&x) && (200..272).contains(&y);
         let depth = Image::from_fn(640, 480, |x, y| if inside(x, y) { 0.8 } else { 1.5 });
         (depth, camera, Mask::from_fn(640, 480, inside))
@@ -277,7 +277,7 @@ mod tests {
         let crop = Crop::new(&depth, &camera, &mask, &CropOptions::compact()).unwrap();
         let middle = crop.camera.project(&Vec3::new(0.162, -0.0049, 0.8)).unwrap();
         assert!((middle - Vec2::new(47.5, 47.5)).norm() < 1.5, "{middle}");
-        // 10 of 30 cm squared, but for the edges, whose normals are there as well.
+        // 10 of 30 cm squared, except for the edges, which have normals as well.
         let share = crop.pixels().count() as f64 / (96.0 * 96.0);
         assert!((share - 1.0 / 9.0).abs() < 0.02, "{share}");
         for i in crop.pixels() {
@@ -300,7 +300,7 @@ mod tests {
         let small = Mask::filled(3, 3, true);
         let error = Crop::new(&depth, &camera, &small, &CropOptions::compact()).unwrap_err();
         assert!(error.to_string().contains("(3, 3)"), "{error}");
-        // An object at the edge of the image is cut out all the same.
+        // An object at the edge of the image is cropped as well.
         let edge = Mask::from_fn(640, 480, |x, y| mask[(x, y)] && x > 440);
         assert!(Crop::new(&depth, &camera, &edge, &CropOptions::paper()).is_ok());
     }

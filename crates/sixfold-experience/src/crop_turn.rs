@@ -1,12 +1,12 @@
-//! In-plane copies: a crop as the camera would see it, had it been rotated about its optical axis (dissertation, section
-//! 6.3.1). That is exact, for a turn about the optical axis moves no viewpoint.
+//! In-plane copies: a crop as the camera would record it after a rotation about its optical axis (dissertation, section 6.3.1). The
+//! result is exact, because a rotation about the optical axis does not move the viewpoint.
 
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Plane, Pose, Vec2, Vec3};
 
 use crate::Crop;
 
-/// The camera's rotation: takes points of the old camera's frame to the turned one's.
+/// The camera's rotation: takes points of the old camera's frame to the rotated one's.
 pub fn turn(angle: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle), Vec3::zeros())
 }
@@ -20,8 +20,8 @@ impl Crop {
         let (sin, cos) = angle.sin_cos();
         let rotate = |p: Vec2| Vec2::new(cos * p.x - sin * p.y, sin * p.x + cos * p.y);
         let back = |p: Vec2| Vec2::new(cos * p.x + sin * p.y, -sin * p.x + cos * p.y);
-        // The principal point turns about the crop's centre. Both focal lengths are alike but for sensors with pixels that
-        // are not square.
+        // The principal point rotates about the crop's centre. Both focal lengths are equal except for sensors whose pixels are not
+        // square.
         let principal = rotate(Vec2::new(self.camera.cx - middle, self.camera.cy - middle));
         let camera = Camera { cx: principal.x + middle, cy: principal.y + middle, ..self.camera };
         let total = self.side * self.side;
@@ -84,7 +84,7 @@ mod tests {
                 let pixel = Vec2::new((i % 96) as f64, (i / 96) as f64);
                 assert!((projected - pixel).norm() < 1.6, "{projected} {pixel}");
             }
-            // A turn keeps distances from the camera.
+            // A rotation preserves depth.
             let far = |c: &Crop| c.pixels().map(|i| c.point(i).z).fold(0.0, f64::max);
             assert!((far(&turned) - far(&crop)).abs() < 1e-3);
         }

@@ -1,4 +1,4 @@
-//! An experience for people: its numbers without the images, and an image.
+//! Human-readable descriptions of an experience: its numbers without the images, and a visualisation.
 
 use serde::Serialize;
 use sixfold_geometry::{Image, RgbImage};
@@ -10,10 +10,10 @@ use super::{Experience, Stored, Summary};
 /// An experience without its images, as `sixfold grasp store export` writes it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Description {
-    /// What a list says of it.
+    /// Its line in a list.
     #[serde(flatten)]
     pub summary: Summary,
-    /// The gripper when it closed, row by row, metres.
+    /// Pose of the gripper when it closed, row by row, metres.
     pub camera_from_gripper: [[f64; 4]; 4],
     /// Distance of the pads before closing, metres.
     pub opening: f64,
@@ -21,21 +21,21 @@ pub struct Description {
     pub camera: [f64; 4],
     /// Side of the crop, pixels.
     pub side: usize,
-    /// What the object stood on: unit normal and offset in metres, camera frame; `None` where that is not known.
+    /// The plane on which the object stood: unit normal and offset in metres, camera frame; `None` if unknown.
     pub table: Option<[f64; 4]>,
     /// Pixels that show the object.
     pub object_pixels: usize,
-    /// Those of them near the gripper.
+    /// Those of the object's pixels that are near the gripper.
     pub region_pixels: usize,
-    /// The experience and its in-plane copies.
+    /// Number of copies: the experience and its in-plane copies.
     pub copies: usize,
-    /// The feature, 256 numbers, where it is wanted.
+    /// The feature, 256 numbers, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub feature: Option<Vec<f32>>,
 }
 
 impl Description {
-    /// What is known of a stored experience.
+    /// The description of a stored experience.
     pub fn new(stored: &Stored, with_feature: bool) -> Description {
         let e = &stored.experience;
         let c = &e.crop.camera;

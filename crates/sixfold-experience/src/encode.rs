@@ -1,4 +1,4 @@
-//! Images and numbers as bytes: PNG for what people may want to look at, little-endian numbers for the rest.
+//! Images and numbers as bytes: PNG for images that people may want to view, little-endian numbers for the rest.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -53,13 +53,13 @@ fn png(image: DynamicImage) -> Option<Vec<u8>> {
     Some(bytes.into_inner())
 }
 
-/// An image of a column, of the crop's size: nothing larger is decoded.
+/// An image column, which must have the crop's size: larger images are not decoded.
 fn stored<'a>(bytes: &'a [u8], field: &'static str, side: usize) -> ImageFile<'a> {
     ImageFile::of_bytes(Path::new(field), bytes).with_limit((side * side) as u64)
 }
 
-/// The crop of stored images. Points follow from depth and camera; so does the extent, but it is stored, as it is what the
-/// VD-NOC was made with.
+/// The crop of stored images. Points are computed from depth and camera. The extent could be as well, but it is stored, so that it
+/// is exactly the one of the VD-NOC.
 pub(super) fn crop(
     images: &Images,
     camera: &Camera,
@@ -97,7 +97,7 @@ pub(super) fn crop(
     Ok(Crop { side, camera: *camera, mask, source, normals, points, vd_noc, extent, table })
 }
 
-/// Bits, eight to a byte, the first one lowest.
+/// Bits, eight per byte, the first in the lowest bit.
 pub(super) fn bits(values: &[bool]) -> Vec<u8> {
     values.chunks(8).map(|c| c.iter().enumerate().fold(0, |b, (k, v)| b | u8::from(*v) << k)).collect()
 }
@@ -139,7 +139,7 @@ pub(super) fn from_plane(bytes: &[u8]) -> Option<Plane> {
     ((normal.norm() - 1.0).abs() < 1e-6 && offset.is_finite()).then_some(Plane { normal, offset })
 }
 
-/// A pose to the micrometre, which reading and writing do not change.
+/// A pose rounded to a millionth, which does not change when it is written and read.
 pub(super) fn rounded(pose: &Pose) -> Vec<u8> {
     let m = pose.to_matrix();
     (0..12).flat_map(|i| ((m[(i / 4, i % 4)] * 1e6).round() as i64).to_le_bytes()).collect()
@@ -163,7 +163,7 @@ pub(super) fn vectors(vectors: &[Vec3]) -> Vec<u8> {
     vectors.iter().flat_map(|v| [v.x, v.y, v.z]).flat_map(f64::to_le_bytes).collect()
 }
 
-/// An attempt as text, and the key by which it is known again: everything but the time.
+/// An attempt as text, and the key that identifies it, computed from everything but the time.
 pub(super) fn attempt(attempt: &Attempt) -> Result<([u8; 16], String), StoreError> {
     let wrong = |field, found: String| StoreError::Field { id: 0, field, expected: "a finite number", found };
     attempt.check().map_err(|field| wrong(field, "none".to_owned()))?;

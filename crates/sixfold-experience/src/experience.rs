@@ -1,4 +1,4 @@
-//! One experience: what the camera saw, what the gripper did, and what is known about it.
+//! One experience: the crop of the depth image, the grasp, and further data about both.
 
 use std::f64::consts::FRAC_PI_4;
 
@@ -8,36 +8,36 @@ use sixfold_grasp::{Grasp, Gripper};
 use super::StoreError;
 use crate::{Crop, CropOptions};
 
-/// Turns of the in-plane copies, radians: -90 to 90 degrees in steps of 45 (dissertation, section 6.3.1).
+/// Rotations of the in-plane copies, radians: -90 to 90 degrees in steps of 45 (dissertation, section 6.3.1).
 pub const COPIES: [f64; 5] = [0.0, -2.0 * FRAC_PI_4, -FRAC_PI_4, FRAC_PI_4, 2.0 * FRAC_PI_4];
 
-/// What turns a crop into a feature: all that a store has to know of a network.
+/// Computes the feature of a crop: the only interface between a store and a network.
 pub trait FeatureExtractor {
-    /// A name that tells its features from those of another.
+    /// A name that distinguishes its features from those of another network.
     fn fingerprint(&self) -> String;
 
-    /// How objects are cut out for it.
+    /// Options of its crops.
     fn crop_options(&self) -> &CropOptions;
 
-    /// [`crate::FEATURE`] numbers for a crop of its size.
+    /// [`crate::FEATURE`] numbers for a crop of the size that [`FeatureExtractor::crop_options`] gives.
     fn feature(&self, crop: &Crop) -> Vec<f32>;
 }
 
-/// An in-plane copy: everything but its feature follows from the experience.
+/// An in-plane copy: everything but its feature can be computed from the experience.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Copy {
-    /// Turn about the optical axis, radians.
+    /// Rotation about the optical axis, radians.
     pub angle: f64,
     /// 256 numbers.
     pub feature: Vec<f32>,
 }
 
-/// A grasp that worked.
+/// A successful grasp.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Experience {
-    /// What was seen: depth, normals, VD-NOC and mask, in the camera's frame.
+    /// The crop: depth, normals, VD-NOC and mask, in the camera's frame.
     pub crop: Crop,
-    /// The gripper when it closed.
+    /// Pose of the gripper when it closed.
     pub camera_from_gripper: Pose,
     /// Distance of the pads before closing, metres.
     pub opening: f64,
@@ -47,17 +47,17 @@ pub struct Experience {
     pub region: Vec<bool>,
     /// The feature, and those of the in-plane copies; the first one's angle is 0.
     pub copies: Vec<Copy>,
-    /// The network that made the features.
+    /// Fingerprint of the network that computed the features.
     pub network: String,
     /// The gripper.
     pub gripper: Gripper,
-    /// What was grasped.
+    /// The object's name.
     pub object: String,
-    /// The part that was grasped, where it is known.
+    /// The part that was grasped, if known.
     pub part: Option<String>,
     /// Seconds since 1970.
     pub time: i64,
-    /// Where it comes from, in words.
+    /// Origin of the experience, as text.
     pub provenance: String,
 }
 
@@ -71,7 +71,7 @@ pub struct Stored {
 }
 
 impl Experience {
-    /// An experience of a grasp that worked: region and features are computed.
+    /// An experience from a successful grasp; region and features are computed.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
         model: &dyn FeatureExtractor,
@@ -117,7 +117,7 @@ impl Experience {
         Ok(Experience { copies, network: model.fingerprint(), ..self.clone() })
     }
 
-    /// Tests what a store relies on.
+    /// Tests the properties on which a store relies.
     ///
     /// # Errors
     /// [`StoreError::Field`].
@@ -156,8 +156,8 @@ fn copies(model: &dyn FeatureExtractor, crop: &Crop) -> Vec<Copy> {
         .collect()
 }
 
-/// Pixels whose points lie between the fingers or within a centimetre of them: where gripper and object overlap
-/// (dissertation, section 6.2.1).
+/// Pixels whose points are between the fingers or within a centimetre of them: where gripper and object overlap (dissertation,
+/// section 6.2.1).
 pub fn region(crop: &Crop, camera_from_gripper: &Pose, opening: f64, gripper: &Gripper) -> Vec<bool> {
     const AROUND: f64 = 0.01;
     let gripper_from_camera = camera_from_gripper.inverse();

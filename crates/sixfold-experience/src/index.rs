@@ -1,21 +1,21 @@
-//! The nearest experiences to a feature, exactly, over a copy of all features in memory.
+//! Exact search for the experiences nearest to a feature, over a copy of all features in memory.
 //!
-//! In 256 dimensions a tree finds nothing faster than comparing with everything. Everything is compared in whole numbers of 16
-//! bits first, whose distances are off by a known bound; most rows are given up after a quarter of their numbers. The few
-//! that may be among the nearest are then compared in full. The result is the same as of a plain search.
+//! In 256 dimensions a tree is not faster than exhaustive search. All features are first compared as 16-bit integers, whose
+//! distances have a bounded error; most rows are rejected after a quarter of their numbers. The few that may be among the nearest
+//! are then compared in full. The result is the same as that of a plain search.
 
 use rayon::prelude::*;
 
 use super::{ExperienceStore, Position, StoreError};
 use crate::FEATURE;
 
-/// Steps of the whole numbers from 0 to 1. 256 squared differences of twice this fit into 32 bits.
+/// Quantisation steps of the integers from 0 to 1. 256 squared differences of twice this fit into 32 bits.
 const STEPS: f32 = 1024.0;
-/// No feature in whole numbers is further than this from its own: half a step in every dimension.
+/// Largest distance between a feature and its quantised form: half a step in every dimension.
 const ROUNDING: f64 = 0.5 / STEPS as f64 * 16.0;
-/// Numbers of a row after which it may be given up.
+/// Numbers of a row after which it may be rejected.
 const FIRST: usize = 64;
-/// Features that one task looks at.
+/// Features per parallel task.
 const BLOCK: usize = 2048;
 
 /// A retrieved experience.
@@ -29,7 +29,7 @@ pub struct Match {
     pub distance: f64,
 }
 
-/// All features of a store that one network made.
+/// All features of a store that were computed by one network.
 #[derive(Debug, Clone)]
 pub struct FeatureIndex {
     network: String,
@@ -38,7 +38,7 @@ pub struct FeatureIndex {
     exact: Vec<f32>,
     coarse: Vec<i16>,
     position: Position,
-    /// Experiences with something else in place of a feature.
+    /// Experiences with an invalid feature.
     unusable: Vec<i64>,
 }
 
@@ -55,7 +55,7 @@ impl FeatureIndex {
         }
     }
 
-    /// Experiences that are not found, wholly or from some sides, as what stands in place of a feature is none; each once.
+    /// Experiences that have an invalid feature for some or all of their copies and are not found by these; each once.
     pub fn take_unusable(&mut self) -> Vec<i64> {
         std::mem::take(&mut self.unusable)
     }
@@ -65,12 +65,12 @@ impl FeatureIndex {
         self.owners.len()
     }
 
-    /// Whether there is none.
+    /// Whether the index is empty.
     pub fn is_empty(&self) -> bool {
         self.owners.is_empty()
     }
 
-    /// Takes over what has changed in the store.
+    /// Applies the changes of the store since the last call.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -106,7 +106,7 @@ impl FeatureIndex {
     /// Adds one feature.
     ///
     /// # Panics
-    /// If it has not 256 numbers. They lie between -1 and 1, as the networks' do; others are found as if they did.
+    /// If `feature` does not have 256 numbers. They should be between -1 and 1, as the networks' are.
     pub fn insert(&mut self, experience: i64, angle: f64, feature: &[f32]) {
         assert_eq!(feature.len(), FEATURE);
         self.owners.push((experience, angle));
@@ -114,14 +114,15 @@ impl FeatureIndex {
         self.coarse.extend(feature.iter().map(|v| quantise(*v)));
     }
 
-    /// The `count` nearest features, nearest first; equal ones in the order in which they were stored. `wanted` says which
-    /// experiences count.
+    /// The `count` nearest features, nearest first; ties in the order in which they were stored. `wanted` selects the experiences
+    /// that count.
     pub fn nearest(&self, feature: &[f32], count: usize, wanted: impl Fn(i64) -> bool + Sync) -> Vec<Match> {
         if count == 0 || self.is_empty() || feature.len() != FEATURE {
             return vec![];
         }
         let query: Vec<i16> = feature.iter().map(|v| quantise(*v)).collect();
-        // Whatever is further than the count-th nearest of its block, and than both rounding errors, is not among the nearest.
+        // A feature that is further than the count-th nearest of its block by more than both rounding errors is not among the
+        // nearest.
         let mut candidates: Vec<(usize, i32)> = self
             .coarse
             .par_chunks(BLOCK * FEATURE)
@@ -176,7 +177,7 @@ struct Nearest {
     count: usize,
     /// The smallest squared distances so far, smallest first, `count` at most.
     best: Vec<i32>,
-    /// What is further than this cannot be among the nearest.
+    /// Features further than this cannot be among the nearest.
     limit: i32,
     candidates: Vec<(usize, i32)>,
 }
@@ -197,7 +198,7 @@ impl Nearest {
     }
 }
 
-/// The largest squared distance in whole numbers of a feature that may still be nearer than one at `squared`.
+/// The largest squared integer distance of a feature that may still be nearer than one at `squared`.
 fn reach(squared: i32) -> i32 {
     let distance = f64::from(squared).sqrt() + 4.0 * ROUNDING * f64::from(STEPS) + 1.0;
     (distance * distance).min(f64::from(i32::MAX)) as i32
@@ -207,7 +208,7 @@ fn quantise(v: f32) -> i16 {
     (v * STEPS).round().clamp(-STEPS, STEPS) as i16
 }
 
-/// Squared distance of two rows of whole numbers.
+/// Squared distance of two rows of integers.
 fn squared(a: &[i16], b: &[i16]) -> i32 {
     a.iter()
         .zip(b)
@@ -232,7 +233,7 @@ mod tests {
         let base = draw();
         let features: Vec<Vec<f32>> = (0..3000)
             .map(|k| {
-                // Many near each other, so that rounding would change the order.
+                // Many features near each other, so that rounding would change the order.
                 let noise = draw();
                 base.iter()
                     .zip(noise)

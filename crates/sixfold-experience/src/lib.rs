@@ -1,15 +1,15 @@
-//! The memory of what worked: every successful grasp with what the camera saw (dissertation, section 6.2.1).
+//! The store of experiences: every successful grasp with its crop of the depth image (dissertation, section 6.2.1).
 //!
-//! An experience holds what was seen ([`Crop`]), what the gripper did and a feature by which it is found again. Where features come
-//! from ([`FeatureExtractor`]) the store does not know.
+//! An experience contains a crop of the depth image ([`Crop`]), the grasp, and a feature by which it is retrieved. The store does
+//! not depend on how features are computed ([`FeatureExtractor`]).
 //!
-//! [`ExperienceStore`] is what a store can do. `SqliteStore` is one in a single file, `PostgresStore` (feature `postgres`) one on
-//! a server for several robots, `OutboxStore` a robot's own copy of that one, which continues when the server is away.
-//! [`StorePlace`] opens either from what a user writes. Searching is not the store's task: [`FeatureIndex`] holds all features in
-//! memory, asks the store only for what has changed, and finds the nearest exactly.
+//! [`ExperienceStore`] is the interface of all stores. `SqliteStore` is a store in a single file, `PostgresStore` (feature
+//! `postgres`) one on a server for several robots, `OutboxStore` a robot's own copy of the latter, which also works while the
+//! server is unreachable. [`StorePlace`] opens any of them from a file name or an address. Searching is not the store's task:
+//! [`FeatureIndex`] keeps all features in memory, reads only changes from the store, and finds the nearest exactly.
 
 #![warn(unreachable_pub, unnameable_types)]
-// `!(x > 0.0)` refuses NaN, `x <= 0.0` does not: that is what the checks here mean.
+// `!(x > 0.0)` refuses NaN and `x <= 0.0` does not: the checks here rely on this.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 mod attempt;
@@ -55,7 +55,7 @@ pub use vd_noc::Extent;
 /// Length of a feature.
 pub const FEATURE: usize = 256;
 
-/// Why a store cannot do what was asked.
+/// Errors of stores.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum StoreError {
@@ -64,17 +64,17 @@ pub enum StoreError {
     Open {
         /// The file.
         file: PathBuf,
-        /// Why.
+        /// The cause.
         reason: String,
     },
-    /// The file holds something else.
+    /// The file is not a store.
     #[error(
         "{}: found {found}, expected an experience store; give one that `sixfold grasp learn` or `sixfold grasp store add` wrote", file.display()
     )]
     NotAStore {
         /// The file.
         file: PathBuf,
-        /// What it is.
+        /// Kind of file found.
         found: String,
     },
     /// The store was written by another version.
@@ -86,7 +86,7 @@ pub enum StoreError {
         file: PathBuf,
         /// Its version.
         found: i64,
-        /// The version this program knows.
+        /// The version that this program reads.
         expected: i64,
     },
     /// The file is damaged.
@@ -96,10 +96,10 @@ pub enum StoreError {
     Broken {
         /// The file.
         file: PathBuf,
-        /// What SQLite says.
+        /// SQLite's message.
         reason: String,
     },
-    /// There is no room.
+    /// The disk is full.
     #[error(
         "{}: the disk is full: the last experience was not stored, all earlier ones are safe; make room and continue", file.display()
     )]
@@ -107,7 +107,7 @@ pub enum StoreError {
         /// The file.
         file: PathBuf,
     },
-    /// Another process keeps writing.
+    /// Another process holds the write lock for too long.
     #[error("{}: another process has been writing for 20 s; try again when it is done", file.display())]
     Busy {
         /// The file.
@@ -119,34 +119,34 @@ pub enum StoreError {
         /// The file.
         file: PathBuf,
     },
-    /// The server does not answer. Nothing was asked of it, so nothing was stored.
+    /// The server does not answer. No request was sent, so nothing was stored.
     #[error(
         "{server}: the server of the experience store cannot be reached ({reason}); check that it runs, its name and port, and the network"
     )]
     Unreachable {
         /// The server, without the password.
         server: String,
-        /// Why.
+        /// The cause.
         reason: String,
     },
-    /// The connection broke off before the server had confirmed.
+    /// The connection was lost before the server confirmed.
     #[error(
         "{server}: the connection to the experience store was lost ({reason}); whether what was being stored has arrived is not known: do the same again, nothing is stored twice"
     )]
     Lost {
         /// The server, without the password.
         server: String,
-        /// Why.
+        /// The cause.
         reason: String,
     },
-    /// The server lets nobody in with this address, or not do this.
+    /// The server denies access with this address, or does not permit the operation.
     #[error(
         "{server}: the server refuses ({reason}); check user, database and password (PGPASSWORD, or in the address) and what the user may do there"
     )]
     Refused {
         /// The server, without the password.
         server: String,
-        /// What the server says.
+        /// The server's message.
         reason: String,
     },
     /// The server's database lacks pgvector.
@@ -159,12 +159,12 @@ pub enum StoreError {
         /// What is missing.
         reason: String,
     },
-    /// The address of a server cannot be understood.
+    /// The address of a server is invalid.
     #[error(
         "{server}: {reason}; expected postgres://user@host:port/database, a password in PGPASSWORD or behind the user's name"
     )]
     Address {
-        /// The address, without what may be a password.
+        /// The address, without anything that may be a password.
         server: String,
         /// What is wrong.
         reason: String,
@@ -186,9 +186,9 @@ pub enum StoreError {
         id: i64,
         /// The field.
         field: &'static str,
-        /// What it may hold.
+        /// The values allowed.
         expected: &'static str,
-        /// What it holds.
+        /// The value found.
         found: String,
     },
     /// An attempt cannot be used.
@@ -204,13 +204,13 @@ pub enum StoreError {
     Other {
         /// The file.
         file: PathBuf,
-        /// What SQLite says.
+        /// SQLite's message.
         reason: String,
     },
 }
 
 impl StoreError {
-    /// Whether the same may well succeed later, with nothing changed here: the server or the network is away, or the server is
+    /// Whether the same call may succeed later without changes here: the server or the network is unreachable, or the server is
     /// busy, full or a standby.
     pub fn is_passing(&self) -> bool {
         matches!(
@@ -223,13 +223,13 @@ impl StoreError {
         )
     }
 
-    /// Whether it is the fault of one row, which can be left out or removed, and not of the whole store.
+    /// Whether only one row is affected, which can be left out or removed, and not the whole store.
     pub fn is_of_one_row(&self) -> bool {
         matches!(self, StoreError::Field { .. } | StoreError::Attempt { .. })
     }
 }
 
-/// How far a reader has followed a store.
+/// Position up to which a reader has read the changes of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Position {
     /// The last feature read.
@@ -245,20 +245,20 @@ pub struct StoredFeature {
     pub experience: i64,
     /// The copy's rotation about the optical axis, radians; 0 for the experience itself.
     pub angle: f64,
-    /// The network that made it: features of different networks cannot be compared.
+    /// The network that computed it: features of different networks cannot be compared.
     pub network: String,
     /// 256 numbers.
     pub feature: Vec<f32>,
 }
 
-/// What happened in a store since a position.
+/// Changes of a store since a position.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Changes {
     /// New features, in the order in which they were stored.
     pub features: Vec<StoredFeature>,
     /// Experiences that were forgotten.
     pub forgotten: Vec<i64>,
-    /// Where the store is now.
+    /// The store's current position.
     pub position: Position,
 }
 
@@ -269,55 +269,55 @@ pub struct Summary {
     pub id: i64,
     /// Seconds since 1970.
     pub time: i64,
-    /// What was grasped.
+    /// The object's name.
     pub object: String,
-    /// The part that was grasped, where it is known.
+    /// The part that was grasped, if known.
     pub part: Option<String>,
     /// The gripper's name.
     pub gripper: String,
     /// Distance of the contacts, metres.
     pub width: f64,
-    /// The network that made its features.
+    /// The network that computed its features.
     pub network: String,
-    /// Where it comes from.
+    /// Origin of the experience.
     pub provenance: String,
 }
 
-/// All that came of one task of grasping: stored whole or not at all, so that who is interrupted does the task again.
+/// All results of one grasping task. They are stored completely or not at all, so that an interrupted task can be repeated.
 #[derive(Clone, Copy, Default)]
 pub struct TaskRecord<'a> {
-    /// What was tried, in that order.
+    /// The attempts, in order.
     pub attempts: &'a [Attempt],
     /// The grasp that held.
     pub experience: Option<&'a Experience>,
-    /// The row that a journal keeps of the task.
+    /// The task's row in a journal.
     pub journal: Option<JournalEntry<'a>>,
 }
 
-/// A row of a journal outside the store. The store keeps the row too, with what it is about: a journal can be completed from it
-/// after an interruption, and a journal whose store is another one is noticed.
+/// A row of a journal outside the store. The store keeps the row too, together with the results: after an interruption the journal
+/// can be completed from the store, and a journal that belongs to another store is detected.
 #[derive(Clone, Copy)]
 pub struct JournalEntry<'a> {
-    /// The journal's name, which no other has.
+    /// The journal's unique name.
     pub journal: &'a str,
-    /// The row, once the number of the stored experience is known.
+    /// Makes the row from the number of the stored experience.
     pub row: &'a dyn Fn(Option<i64>) -> String,
 }
 
-/// An attempt with its number, or what is wrong with it.
+/// An attempt with its number, or the error in reading it.
 pub type AttemptRow = (i64, Result<Attempt, StoreError>);
 
-/// What a store of experiences does. Numbers of experiences are never used twice.
+/// The interface of a store of experiences. Numbers of experiences are never reused.
 pub trait ExperienceStore {
-    /// Stores an experience with its in-plane copies and returns its number. When it returns, the experience survives
-    /// whatever happens to the process or to the power. An experience that is there already keeps its number, and the
-    /// second value is false.
+    /// Stores an experience with its in-plane copies and returns its number. When it returns, the experience is durable: it
+    /// survives a crash of the process or a power failure. An experience that is already stored keeps its number, and the second
+    /// value is false.
     ///
     /// # Errors
     /// [`StoreError`]; nothing is stored then.
     fn add(&mut self, experience: &Experience) -> Result<(i64, bool), StoreError>;
 
-    /// An experience by its number; `None` when there is none.
+    /// An experience by its number; `None` if there is none.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -329,32 +329,32 @@ pub trait ExperienceStore {
     /// [`StoreError`].
     fn list(&self) -> Result<Vec<Summary>, StoreError>;
 
-    /// Forgets an experience; false when there was none.
+    /// Removes an experience; false if there was none.
     ///
     /// # Errors
     /// [`StoreError`].
     fn forget(&mut self, id: i64) -> Result<bool, StoreError>;
 
-    /// What was stored and forgotten since a position ([`Position::default`]: everything).
+    /// The experiences stored and removed since a position ([`Position::default`]: everything).
     ///
     /// # Errors
     /// [`StoreError`].
     fn changes(&self, since: Position) -> Result<Changes, StoreError>;
 
-    /// Keeps a grasp that was tried, whatever came of it; false when it is there already.
+    /// Stores a grasp that was tried, successful or not; false if it is already stored.
     ///
     /// # Errors
     /// [`StoreError`]; nothing is stored then.
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError>;
 
-    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers. Those that cannot be
-    /// read are left out: [`ExperienceStore::attempt_rows`] has them.
+    /// The attempts after a number (0: all), in the order in which they were stored, with their numbers. Those that cannot be read
+    /// are left out: [`ExperienceStore::attempt_rows`] includes them.
     ///
     /// # Errors
     /// [`StoreError`].
     fn attempts(&self, after: i64) -> Result<Vec<(i64, Attempt)>, StoreError>;
 
-    /// As [`ExperienceStore::attempts`], with what is wrong with those that cannot be read.
+    /// As [`ExperienceStore::attempts`], with the errors of those that cannot be read.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -362,7 +362,7 @@ pub trait ExperienceStore {
         Ok(self.attempts(after)?.into_iter().map(|(id, attempt)| (id, Ok(attempt))).collect())
     }
 
-    /// Forgets an attempt; false when there was none. Who has read it keeps it until its next start.
+    /// Removes an attempt; false if there was none. A process that has read it keeps it until it restarts.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -371,8 +371,8 @@ pub trait ExperienceStore {
         Err(StoreError::Other { file: PathBuf::from("experience store"), reason })
     }
 
-    /// Stores all that came of one task at once; the number of its experience. A store that keeps no journals stores one thing
-    /// after another.
+    /// Stores all results of one task at once and returns the number of its experience. A store without journals stores the results
+    /// one after another.
     ///
     /// # Errors
     /// [`StoreError`]; nothing is stored then.
@@ -395,7 +395,7 @@ pub trait ExperienceStore {
         Ok(vec![])
     }
 
-    /// The numbers of all experiences, in order, those that cannot be read included.
+    /// The numbers of all experiences, in order, including those that cannot be read.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -403,7 +403,7 @@ pub trait ExperienceStore {
         Ok(self.list()?.into_iter().map(|summary| summary.id).collect())
     }
 
-    /// A name that no other store has, where the store has one: a server's, so that its robots notice when another one answers.
+    /// A unique name of the store, if it has one: servers do, so that robots detect when another server answers.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -411,10 +411,10 @@ pub trait ExperienceStore {
         Ok(None)
     }
 
-    /// Takes over all experiences and attempts of another store that are not here yet; how many experiences were new.
+    /// Copies all experiences and attempts of another store that are missing here; returns the number of new experiences.
     ///
     /// # Errors
-    /// [`StoreError`]; what was taken over until then is kept.
+    /// [`StoreError`]; whatever was copied before the error is kept.
     fn merge(&mut self, other: &dyn ExperienceStore) -> Result<usize, StoreError> {
         let mut added = 0;
         for summary in other.list()? {

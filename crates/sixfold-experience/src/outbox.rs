@@ -1,10 +1,10 @@
-//! A robot's own copy of a fleet's store, which continues when the server is away.
+//! A robot's own copy of a fleet's store, which continues to work while the server is unreachable.
 //!
-//! The copy is an ordinary store file. Everything is read from it, and whatever is added is in it, on the disk, before anything
-//! else happens; its numbers never change. At every contact three things follow, each of which may be cut off anywhere and done
-//! again: experiences of which the file does not say under which number the server has them are delivered, in order; what was
-//! forgotten here is forgotten there; and what others have stored and forgotten is taken over. The server's unique key makes
-//! a delivery that is repeated harmless.
+//! The copy is an ordinary store file. All reads use it, and additions are written to it, on disk, before anything else happens;
+//! its numbers never change. Every contact with the server has three steps, each of which may be interrupted and repeated:
+//! experiences for which the file has no server number are delivered, in order; experiences removed here are removed there; and
+//! additions and removals by others are copied. Attempts are exchanged as well. The server's unique key makes a repeated delivery
+//! harmless.
 
 use std::cell::{Cell, RefCell};
 use std::fmt;
@@ -20,8 +20,9 @@ use super::{
     TaskRecord,
 };
 
-/// `delivered`: the server's number of an experience, or why the server will not have it. `followed`: which server, and how far;
-/// `followed_attempts`: the last attempt of the copy that the server has, and the last one of the server that the copy has.
+/// `delivered`: the server's number of an experience, or why the server refused it. `followed`: the server's identity and the
+/// position up to which its changes were read. `followed_attempts`: the last attempt of the copy that the server has, and the last
+/// one of the server that the copy has.
 const TABLES: &str = "
     CREATE TABLE IF NOT EXISTS delivered (experience INTEGER PRIMARY KEY, number INTEGER, reason TEXT);
     CREATE INDEX IF NOT EXISTS delivered_number ON delivered(number);
@@ -33,57 +34,57 @@ const TABLES: &str = "
     INSERT OR IGNORE INTO followed_attempts (one, sent, taken) VALUES (1, 0, 0);
 ";
 
-/// What a user should know.
+/// Messages for the user.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Notice {
-    /// The server is away.
+    /// The server is unreachable.
     Away {
-        /// Why.
+        /// The cause.
         reason: String,
-        /// Experiences that wait.
+        /// Experiences not yet delivered.
         waiting: usize,
-        /// Where.
+        /// The file that contains them.
         file: PathBuf,
     },
-    /// The store is closed, and experiences wait.
+    /// The store was closed while experiences were not yet delivered.
     Waiting {
-        /// Experiences that wait.
+        /// Experiences not yet delivered.
         waiting: usize,
-        /// Where.
+        /// The file that contains them.
         file: PathBuf,
     },
-    /// What had waited is delivered.
+    /// Waiting experiences were delivered.
     Delivered {
-        /// Experiences.
+        /// Experiences delivered.
         delivered: usize,
-        /// Experiences that still wait.
+        /// Experiences not yet delivered.
         waiting: usize,
     },
-    /// Many experiences are taken over from the server, which takes a while.
+    /// Many experiences are being copied from the server, which takes a while.
     TakingOver {
-        /// Experiences.
+        /// Number of experiences.
         experiences: usize,
     },
-    /// The server will never take an experience.
+    /// The server refuses an experience permanently.
     Refused {
         /// Its number in the file.
         id: i64,
-        /// Why.
+        /// The cause.
         reason: String,
         /// The file, in which it stays.
         file: PathBuf,
     },
     /// An attempt is left out: it cannot be read.
     Attempt {
-        /// Which, and why.
+        /// Number of the attempt, and the cause.
         reason: String,
     },
     /// An experience of the server is left out.
     Unreadable {
         /// Its number on the server.
         number: i64,
-        /// Why.
+        /// The cause.
         reason: String,
     },
 }
@@ -126,10 +127,10 @@ impl fmt::Display for Notice {
     }
 }
 
-/// How an [`OutboxStore`] goes about its server.
+/// Options of an [`OutboxStore`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OutboxOptions {
-    /// How long a server that was away is left alone, at least.
+    /// Minimum time between two attempts to reach an unreachable server.
     pub retry: Duration,
 }
 
@@ -142,33 +143,33 @@ impl Default for OutboxOptions {
 /// Called with every [`Notice`].
 pub type NoticeListener = Box<dyn Fn(&Notice) + Send>;
 
-/// A copy of a remote store in a file, and the outbox for what was added to it.
+/// A copy of a remote store in a file, and an outbox for additions.
 pub struct OutboxStore {
     copy: RefCell<SqliteStore>,
     remote: RefCell<Box<dyn ExperienceStore + Send>>,
     listener: NoticeListener,
     retry: Duration,
-    /// The remote store is away, and left alone until then.
+    /// If the remote store is unreachable, the time of the next attempt.
     away: Cell<Option<Instant>>,
-    /// Whether the remote store is known to be the one that the copy is of.
+    /// Whether the remote store was confirmed to be the one of which this is a copy.
     known: Cell<bool>,
 }
 
-/// Whose fault it is.
+/// Which store an error comes from.
 enum Trouble {
-    /// The copy's: the caller has to know.
+    /// The copy: returned to the caller.
     Here(StoreError),
-    /// The remote store's: it has to wait.
+    /// The remote store: retried later.
     There(StoreError),
 }
 
 impl OutboxStore {
-    /// Opens the copy, or makes one, and contacts the remote store. Experiences that are in the file already, from an earlier
-    /// run or from a store without a server, are delivered.
+    /// Opens or creates the copy and contacts the remote store. Experiences that are already in the file, from an earlier run or
+    /// from a store without a server, are delivered.
     ///
     /// # Errors
-    /// [`StoreError`] for a file that is no store or belongs to another server, and for a server that answers but will not do;
-    /// not for one that is away ([`StoreError::is_passing`]): `listener` is notified of that.
+    /// [`StoreError`] for a file that is not a store or belongs to another server, and for a server that answers but cannot be
+    /// used. An unreachable server ([`StoreError::is_passing`]) is not an error: `listener` is notified.
     pub fn create(
         file: &Path,
         remote: Box<dyn ExperienceStore + Send>,
@@ -202,7 +203,7 @@ impl OutboxStore {
         self.undelivered().map(|w| w.len())
     }
 
-    /// Contacts the remote store now if it is time to; the local copy is as it should be whatever comes of it.
+    /// Contacts the remote store unless it was unreachable a short time ago; failures there do not affect the local copy.
     fn synchronise(&self, fresh: Option<i64>) -> Result<(), StoreError> {
         if self.away.get().is_some_and(|until| Instant::now() < until) {
             return Ok(());
@@ -219,7 +220,7 @@ impl OutboxStore {
     }
 
     fn leave_alone(&self, error: &StoreError, began: Instant) -> Result<(), StoreError> {
-        // Trying takes a tenth of the time at most, however long a try hangs.
+        // At most a tenth of the time is spent on attempts, however long one of them hangs.
         let pause = self.retry.max(10 * began.elapsed());
         if self.away.replace(Some(Instant::now() + pause)).is_none() {
             let waiting = self.waiting()?;
@@ -232,7 +233,7 @@ impl OutboxStore {
         self.copy.borrow().file.clone()
     }
 
-    /// Everything that there is to do with the remote store. `fresh` has not waited.
+    /// All steps of a contact with the remote store. `fresh` is an experience that was just added.
     fn contact(&self, fresh: Option<i64>) -> Result<(), Trouble> {
         self.recognise()?;
         self.deliver(fresh)?;
@@ -241,7 +242,7 @@ impl OutboxStore {
         self.exchange_attempts()
     }
 
-    /// Delivers attempts and takes over those of others. One that goes back and forth keeps its key, so nobody has it twice.
+    /// Delivers attempts and copies those of others. An attempt keeps its key, so that no store gets it twice.
     fn exchange_attempts(&self) -> Result<(), Trouble> {
         let (sent, taken) = self
             .numbers("SELECT sent, taken FROM followed_attempts")
@@ -277,7 +278,7 @@ impl OutboxStore {
         copy.checked(done).map(|_| ()).map_err(Trouble::Here)
     }
 
-    /// Makes sure that the remote store is the one of which the file is a copy.
+    /// Tests that the remote store is the one of which the file is a copy.
     fn recognise(&self) -> Result<(), Trouble> {
         if self.known.get() {
             return Ok(());
@@ -299,7 +300,7 @@ impl OutboxStore {
         Ok(())
     }
 
-    /// Experiences of which the file does not say that the server has them, in the order in which they were added.
+    /// Experiences that are not recorded as delivered, in the order in which they were added.
     fn undelivered(&self) -> Result<Vec<i64>, StoreError> {
         self.numbers(
             "SELECT e.id FROM experience e LEFT JOIN delivered d ON d.experience = e.id
@@ -308,7 +309,7 @@ impl OutboxStore {
         .map(|rows| rows.into_iter().map(|r| r.0).collect())
     }
 
-    /// One or two numbers a row.
+    /// Runs a query with one or two numbers per row.
     fn numbers(&self, question: &str) -> Result<Vec<(i64, i64)>, StoreError> {
         let copy = self.copy.borrow();
         copy.checked((|| {
@@ -326,9 +327,9 @@ impl OutboxStore {
             let stored = self.copy.borrow().get(id);
             let answer = match stored {
                 Ok(Some(stored)) => self.remote.borrow_mut().add(&stored.experience),
-                // Another process forgot it.
+                // Another process removed it.
                 Ok(None) => continue,
-                // The others need not wait for one that cannot be read.
+                // One that cannot be read does not block the others.
                 Err(error @ StoreError::Field { .. }) => Err(error),
                 Err(error) => return Err(Trouble::Here(error)),
             };
@@ -355,7 +356,7 @@ impl OutboxStore {
         trouble
     }
 
-    /// Writes down what became of an experience.
+    /// Records the result of delivering an experience.
     fn note(&self, id: i64, number: Option<i64>, reason: Option<&str>) -> Result<(), Trouble> {
         let copy = self.copy.borrow();
         let done = copy.connection.execute(
@@ -372,7 +373,7 @@ impl OutboxStore {
     }
 
     fn deliver_removals(&self) -> Result<(), Trouble> {
-        // Numbers in the file are never used twice: what is noted and not there was forgotten.
+        // Numbers in the file are never reused: an experience that is recorded but missing was removed.
         let removed = self
             .numbers(
                 "SELECT d.experience, coalesce(d.number, 0) FROM delivered d
@@ -439,7 +440,7 @@ impl OutboxStore {
         copy.checked(done).map(|_| ()).map_err(Trouble::Here)
     }
 
-    /// The number here of an experience of the server.
+    /// The local number of an experience of the server.
     fn local(&self, number: i64) -> Result<Option<i64>, Trouble> {
         let copy = self.copy.borrow();
         let found = copy
@@ -479,12 +480,12 @@ impl ExperienceStore for OutboxStore {
         Ok(forgotten)
     }
 
-    /// Delivered at the next contact.
+    /// The attempt is delivered at the next contact.
     fn add_attempt(&mut self, attempt: &Attempt) -> Result<bool, StoreError> {
         self.copy.borrow_mut().add_attempt(attempt)
     }
 
-    /// Delivered at the next contact, at once where there is an experience.
+    /// Delivered at the next contact; immediately if there is an experience.
     fn add_record(&mut self, record: &TaskRecord<'_>) -> Result<Option<i64>, StoreError> {
         let id = self.copy.borrow_mut().add_record(record)?;
         if id.is_some() {
@@ -505,7 +506,7 @@ impl ExperienceStore for OutboxStore {
         self.copy.borrow().attempt_rows(after)
     }
 
-    /// In the copy alone.
+    /// Removes it from the copy only.
     fn forget_attempt(&mut self, id: i64) -> Result<bool, StoreError> {
         self.copy.borrow_mut().forget_attempt(id)
     }

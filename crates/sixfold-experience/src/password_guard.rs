@@ -1,8 +1,8 @@
-//! A connection that ends when the server asks for the password in clear text, before anything is sent in answer.
+//! A connection that is closed when the server requests the password in clear text, before anything is sent in answer.
 //!
-//! The client library would answer. It takes encryption as a wrapper around the connection, and lets it begin without asking the
-//! server first; this wrapper encrypts nothing and reads along until the server has said how it authenticates (PostgreSQL's
-//! documentation, chapter "Frontend/Backend Protocol", message `AuthenticationCleartextPassword`).
+//! The client library would answer. Its interface for encryption is a wrapper around the connection, which can be started without
+//! asking the server first. This wrapper encrypts nothing; it inspects the server's answer until the authentication method is known
+//! (PostgreSQL's documentation, chapter "Frontend/Backend Protocol", message `AuthenticationCleartextPassword`).
 
 use std::future::{Ready, ready};
 use std::io;
@@ -13,7 +13,7 @@ use postgres::Socket;
 use postgres::tls::{ChannelBinding, MakeTlsConnect, TlsConnect, TlsStream};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-/// What a server is told that asks for the password in clear text: nothing, and the user this.
+/// The error message when a server requests the password in clear text (the server gets no answer).
 pub(super) const ASKED: &str = "it asks for the password in clear text, which this program never sends; let the server \
                                 ask for it by scram-sha-256 (in pg_hba.conf)";
 
@@ -41,17 +41,17 @@ impl TlsConnect<Socket> for PasswordGuard {
     }
 }
 
-/// A connection as it is, whose first message is watched.
+/// An unencrypted connection whose first message is inspected.
 pub(super) struct Guarded {
     socket: Socket,
-    /// The beginning of the server's first message, until it is known what it asks for.
+    /// The beginning of the server's first message, until the authentication method is known.
     heard: Option<Vec<u8>>,
 }
 
-/// Whether the first bytes of a server's answer ask for the password in clear text; `None` while that is not known.
+/// Whether the first bytes of a server's answer ask for the password in clear text; `None` while this is unknown.
 fn asks_for_clear_text(heard: &[u8]) -> Option<bool> {
     match heard {
-        // A letter, four bytes of length, four of the kind of authentication.
+        // A letter, four bytes of length, four bytes of the authentication method.
         [b'R', _, _, _, _, kind @ ..] => kind.first_chunk().map(|kind| u32::from_be_bytes(*kind) == 3),
         [b'R', ..] | [] => None,
         // The client library accepts no other first message than this one or an error.

@@ -1,7 +1,7 @@
-//! Where a store lies, as a user writes it: a file, or the address of a server.
+//! The location of a store as written by a user: a file, or the address of a server.
 //!
-//! This is the only parser of such places. A text that looks like an address and cannot be one is refused rather than taken for
-//! the name of a file, and no form of it, right or wrong, is shown with its password.
+//! This is the only parser of such locations. A text that looks like an address but is not valid is refused rather than used as a
+//! file name. Passwords are never shown, whether the address is valid or not.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -11,16 +11,16 @@ use serde::{Serialize, Serializer};
 
 use super::{ExperienceStore, StoreError};
 
-/// A store's place. Displayed, debugged or serialised it never shows a password.
+/// A store's location. Its display, debug and serialised forms never contain a password.
 #[derive(Clone, PartialEq, Eq)]
 pub enum StorePlace {
     /// A SQLite file.
     File(PathBuf),
     /// A PostgreSQL server: `postgres://user@host:port/database`.
     Server(String),
-    /// What looks like the address of a server and is none: it cannot be opened.
+    /// A text that looks like the address of a server but is invalid: it cannot be opened.
     Unusable {
-        /// What of it can be shown.
+        /// The part of it that can be shown.
         shown: String,
         /// What is wrong.
         reason: String,
@@ -73,12 +73,12 @@ impl Serialize for StorePlace {
 }
 
 impl StorePlace {
-    /// For messages, as of a path; a password is left out.
+    /// For messages, like `Path::display`; without the password.
     pub fn display(&self) -> &dyn fmt::Display {
         self
     }
 
-    /// Opens a store that is there.
+    /// Opens an existing store.
     ///
     /// # Errors
     /// [`StoreError`]; [`StoreError::Feature`] when this program was built without this kind of store.
@@ -93,7 +93,7 @@ impl StorePlace {
         }
     }
 
-    /// Opens a store to save what is in it: of a damaged file whatever can still be read.
+    /// Opens a store to save its contents; of a damaged file, whatever can still be read.
     ///
     /// # Errors
     /// As [`StorePlace::open`].
@@ -107,7 +107,7 @@ impl StorePlace {
         }
     }
 
-    /// Opens a store, or makes an empty one where there is none.
+    /// Opens a store, or creates an empty one if there is none.
     ///
     /// # Errors
     /// [`StoreError`]; [`StoreError::Feature`] when this program was built without this kind of store.
@@ -122,11 +122,11 @@ impl StorePlace {
         }
     }
 
-    /// A store for somebody who must continue when a server is away: a file as it is, a server through an `OutboxStore` whose
-    /// file `outbox` is. `notice` receives what the user should know.
+    /// A store that remains usable while a server is unreachable: a file is opened directly, a server through an `OutboxStore` with
+    /// the file `outbox`. `notice` receives messages for the user.
     ///
     /// # Errors
-    /// [`StoreError`], but none because a server cannot be reached.
+    /// [`StoreError`], but not for an unreachable server.
     #[cfg(feature = "sqlite")]
     pub fn create_with_outbox(
         &self,
@@ -147,7 +147,7 @@ impl StorePlace {
         }
     }
 
-    /// Why it cannot be opened: it is no place, or this program was built without its kind of store.
+    /// Why it cannot be opened: it is invalid, or this program was built without its kind of store.
     fn not_built(&self) -> StoreError {
         let feature = match self {
             StorePlace::File(_) => "sqlite",
@@ -160,7 +160,7 @@ impl StorePlace {
     }
 }
 
-/// Words before an equals sign in `host=server user=robot password=..` and its like.
+/// Keywords before an equals sign in connection strings such as `host=server user=robot password=..`.
 const KEYWORDS: [&str; 15] = [
     "host", "hostaddr", "port", "user", "password", "dbname", "database", "service", "passfile", "sslmode",
     "server", "username", "uid", "pwd", "passwd",
@@ -173,7 +173,7 @@ fn looks_like_an_address(text: &str) -> bool {
     if absolute || text.starts_with("./") || text.starts_with("../") || text.starts_with("~/") {
         return false;
     }
-    // A drive's letter is no scheme.
+    // A drive letter is not a scheme.
     let text = match text.as_bytes() {
         [drive, b':', b'\\' | b'/', ..] if drive.is_ascii_alphabetic() => &text[2..],
         _ => &text[..],
@@ -189,10 +189,10 @@ fn looks_like_an_address(text: &str) -> bool {
     text.contains("://") || of_postgres || credentials || keywords
 }
 
-/// The address in a text, its scheme in small letters and without blanks around it.
+/// The address in a text, with its scheme in lower case and without surrounding white space.
 ///
 /// # Errors
-/// What is wrong with it, without any part of it.
+/// The reason why it is invalid, without any part of the text.
 pub(super) fn address(text: &str) -> Result<String, String> {
     let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
     const FILE: &str = "if it is the name of a file, write ./ before it";
@@ -214,8 +214,8 @@ pub(super) fn address(text: &str) -> Result<String, String> {
     Ok(format!("{scheme}://{rest}"))
 }
 
-/// A server's address without what may be a password: user, host, port and database, no parameters. Of one that is not clear in
-/// that, nothing but the scheme.
+/// A server's address without anything that may be a password: user, host, port and database, no parameters. Of an ambiguous
+/// address only the scheme.
 pub(super) fn shown(text: &str) -> String {
     let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
     let plain = |part: &str, more: &str| {
@@ -231,14 +231,14 @@ pub(super) fn shown(text: &str) -> String {
     };
     let place = rest.split(['?', '#']).next().unwrap_or_default();
     let (hosts, database) = place.split_once('/').unwrap_or((place, ""));
-    // What stands behind a host's colon is a port, or else a password whose @ is missing.
+    // After a host's colon there is a port, or a password with its @ missing.
     let of_a_host = |host: &str| {
         let behind = host.rsplit(']').next().unwrap_or(host);
         let port = behind.split_once(':').map_or("", |(_, port)| port);
         plain(host, ":[]%") && port.chars().all(|c| c.is_ascii_digit())
     };
     let lower = rest.to_ascii_lowercase();
-    // Where another kind of address has its passwords is not known.
+    // The position of passwords in other kinds of addresses is unknown.
     let of_postgres = ["postgres", "postgresql"].iter().any(|known| scheme.eq_ignore_ascii_case(known));
     let clear = of_postgres
         && !["password", "%3a", "%40", "@"].iter().any(|word| lower.contains(word))

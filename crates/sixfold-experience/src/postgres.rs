@@ -1,11 +1,11 @@
-//! The experience store on a PostgreSQL server with pgvector: one memory for several robots.
+//! The experience store on a PostgreSQL server with pgvector: shared by several robots.
 //!
-//! The tables are those of the file, in a schema `sixfold`, with the features as `vector(256)`. Writers take turns by an advisory
-//! lock within their transaction. Without it two of them could commit in another order than that in which they drew their
-//! numbers, and a reader that has gone on to the higher number would never see the lower one.
+//! The tables are those of the file, in a schema `sixfold`, with the features as `vector(256)`. Writers are serialised by an
+//! advisory lock within their transaction. Without it two of them could commit in another order than that of their numbers, and a
+//! reader that has already read the higher number would never read the lower one.
 //!
-//! The connection is not encrypted: over a network that is not trusted it needs a tunnel. The password itself is never sent:
-//! a server that asks for it in clear text is refused.
+//! The connection is not encrypted: over an untrusted network it needs a tunnel. The password itself is never sent: a server that
+//! requests it in clear text is refused.
 
 use std::cell::{Cell, RefCell};
 use std::error::Error as _;
@@ -27,7 +27,7 @@ use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFe
 use crate::Attempt;
 use crate::FEATURE;
 
-/// Says that a schema `sixfold` is ours.
+/// Marks a schema `sixfold` as created by this program.
 const APPLICATION: &str = "sixfold experiences";
 /// Version of the tables.
 const VERSION: i64 = 1;
@@ -53,17 +53,17 @@ const TABLES: &str = "
         id bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY, key bytea NOT NULL UNIQUE, attempt text NOT NULL);
 ";
 
-/// A store on a server. A connection that was lost is opened again at the next call.
+/// A store on a server. A lost connection is reopened at the next call.
 pub struct PostgresStore {
     config: Config,
     /// The address without the password.
     server: String,
-    /// Whether a database without a store gets one.
+    /// Whether to create a store in a database without one.
     make: bool,
     client: RefCell<Option<Client>>,
-    /// Of the store that answered first.
+    /// Identity of the store that answered first.
     identity: RefCell<Option<String>>,
-    /// How often a connection was opened.
+    /// Number of connections opened.
     connections: Cell<u64>,
 }
 
@@ -73,23 +73,23 @@ impl fmt::Debug for PostgresStore {
     }
 }
 
-/// What a transaction does.
+/// Whether a transaction reads or writes.
 #[derive(Clone, Copy, PartialEq)]
 enum Access {
     Read,
     Write,
 }
 
-/// Why a transaction came to nothing.
+/// Why a transaction failed.
 enum Failure {
-    /// It never began: nothing has happened.
+    /// It did not begin: nothing was changed.
     NotBegun(Error),
     Failed(Error),
 }
 
 impl PostgresStore {
-    /// A store at an address, `postgres://user@host:port/database`, which is not contacted yet. The first call that reaches the
-    /// server makes the tables where there are none. Without a password in the address the environment's PGPASSWORD is used.
+    /// A store at an address, `postgres://user@host:port/database`, without contacting it yet. The first call that reaches the
+    /// server creates the tables if there are none. Without a password in the address the environment variable PGPASSWORD is used.
     ///
     /// # Errors
     /// [`StoreError::Address`].
@@ -120,7 +120,7 @@ impl PostgresStore {
         if config.get_connect_timeout().is_none() {
             config.connect_timeout(Duration::from_secs(5));
         }
-        // A server that vanishes without a word is noticed after half a minute.
+        // A server that disappears without closing the connection is detected after half a minute.
         config
             .application_name("sixfold")
             .tcp_user_timeout(Duration::from_secs(20))
@@ -137,7 +137,7 @@ impl PostgresStore {
         })
     }
 
-    /// Opens a store, or makes an empty one in a database that has none.
+    /// Opens a store, or creates an empty one in a database without one.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -147,7 +147,7 @@ impl PostgresStore {
         Ok(store)
     }
 
-    /// Opens a store that is there.
+    /// Opens an existing store.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -157,16 +157,16 @@ impl PostgresStore {
         Ok(store)
     }
 
-    /// How often a connection was opened, lost ones included.
+    /// Number of connections opened, including lost ones.
     pub fn connections(&self) -> u64 {
         self.connections.get()
     }
 
-    /// The `count` nearest features that a network made, found on the server, nearest first and equal ones in the order in
-    /// which they were stored; with `part`, only of experiences on that part. The same as of [`super::FeatureIndex::nearest`],
-    /// for robots that do not want all features in memory.
+    /// The `count` nearest features of a network, searched on the server, nearest first and ties in the order in which they were
+    /// stored; with `part`, only of experiences with that part. The result is that of [`super::FeatureIndex::nearest`], for robots
+    /// that cannot keep all features in memory.
     ///
-    /// The server looks at all features and counts in `f32`; what may be among the nearest is compared again here, in `f64`.
+    /// The server compares all features in `f32`; those that may be among the nearest are compared again here, in `f64`.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -177,7 +177,7 @@ impl PostgresStore {
         count: usize,
         part: Option<&str>,
     ) -> Result<Vec<Match>, StoreError> {
-        // 256 rounded terms are off by 256 / 2^24 at most: a hundred thousandth.
+        // The relative error of 256 rounded terms is at most 256 / 2^24, about a hundred thousandth.
         const NEAREST: &str = "
             WITH seen AS MATERIALIZED (
                 SELECT f.id, f.experience, f.angle, f.feature <-> $1::real[]::vector AS distance
@@ -209,7 +209,7 @@ impl PostgresStore {
     fn dial(&self) -> Result<Client, Error> {
         let mut config = self.config.clone();
         if config.get_hosts().iter().any(|host| !matches!(host, Host::Tcp(_))) {
-            // A socket of this machine, on which nobody listens.
+            // A Unix socket, on which nobody can eavesdrop.
             return config.connect(NoTls);
         }
         if config.get_hosts().is_empty() {
@@ -217,13 +217,13 @@ impl PostgresStore {
                 config.host(&address.to_string());
             }
         }
-        // Not encryption, but the way in which a wrapper around the connection is asked for.
+        // This does not enable encryption; it makes the client library use the wrapper around the connection.
         config.ssl_mode(SslMode::Require).ssl_negotiation(SslNegotiation::Direct).connect(PasswordGuard)
     }
 
     fn connect(&self) -> Result<Client, StoreError> {
         let mut client = self.dial().map_err(|e| match self.error(&e) {
-            // Nothing was asked yet.
+            // No request was sent yet.
             StoreError::Lost { server, reason } => StoreError::Unreachable { server, reason },
             error => error,
         })?;
@@ -241,7 +241,7 @@ impl PostgresStore {
         Ok(client)
     }
 
-    /// Tests that the store is there and ours, or makes it.
+    /// Tests that the store exists and was created by this program, or creates it.
     fn find_tables(&self, client: &mut Client) -> Result<(), StoreError> {
         let found = self.state(client)?;
         if !found.schema_used && !found.store {
@@ -285,7 +285,7 @@ impl PostgresStore {
             return Err(StoreError::NotAStore { file: self.place(), found });
         }
         *known = Some(identity);
-        // The type and its operators lie in the extension's schema.
+        // The type and its operators are in the extension's schema.
         client.batch_execute(&format!("SET search_path = sixfold, {extension}")).map_err(|e| self.error(&e))
     }
 
@@ -309,7 +309,7 @@ impl PostgresStore {
     }
 
     fn make_tables(&self, client: &mut Client) -> Result<(), StoreError> {
-        // Two robots may both find none: the lock decides who makes the tables.
+        // Two robots may both find no tables: the lock decides which one creates them.
         client
             .batch_execute("BEGIN")
             .and_then(|()| client.batch_execute(LOCK))
@@ -350,12 +350,12 @@ impl PostgresStore {
         StoreError::Extension { server: self.server.clone(), reason: reason.to_owned() }
     }
 
-    /// What errors of files and servers have in common.
+    /// The path for error variants that files and servers share.
     fn place(&self) -> PathBuf {
         PathBuf::from(&self.server)
     }
 
-    /// Does something in one transaction.
+    /// Runs `work` in one transaction.
     fn transaction<T>(
         &self,
         access: Access,
@@ -367,7 +367,7 @@ impl PostgresStore {
             None => self.connect()?,
         };
         let mut done = attempt(&mut client, access, &work);
-        // A connection that broke while it was not used shows it now: nothing has happened, so the same with a new one.
+        // A connection that was lost while idle fails here, before anything was changed, so the work is repeated with a new one.
         if let Err(Failure::NotBegun(error)) = &done
             && is_lost(error)
         {
@@ -389,7 +389,7 @@ impl PostgresStore {
         }
     }
 
-    /// PostgreSQL's errors in our words.
+    /// Converts PostgreSQL's errors.
     fn error(&self, error: &Error) -> StoreError {
         let (server, file) = (self.server.clone(), self.place());
         let reason = match (error.as_db_error(), error.source()) {
@@ -417,7 +417,7 @@ impl PostgresStore {
         }
     }
 
-    /// Errors of the client: everything before the first answer of the server is one of reaching it.
+    /// Errors of the client library: any error before the first answer of the server means that it is unreachable.
     fn without_code(&self, error: &Error, reason: String) -> StoreError {
         let server = self.server.clone();
         match error.to_string().as_str() {
@@ -427,13 +427,13 @@ impl PostgresStore {
     }
 }
 
-/// What a database holds of us.
+/// Which of our tables a database has.
 struct State {
-    /// There is something in the schema `sixfold`.
+    /// The schema `sixfold` is not empty.
     schema_used: bool,
-    /// `sixfold.store` is there.
+    /// The table `sixfold.store` exists.
     store: bool,
-    /// The schema is there.
+    /// The schema exists.
     schema: bool,
     /// The schema of pgvector, quoted.
     extension: Option<String>,
@@ -445,11 +445,11 @@ fn attempt<T>(
     work: &impl Fn(&mut Transaction<'_>) -> Result<T, Error>,
 ) -> Result<T, Failure> {
     let begin = match access {
-        // What is read in one call belongs together.
+        // All reads of one call must be consistent.
         Access::Read => {
             client.build_transaction().isolation_level(IsolationLevel::RepeatableRead).read_only(true)
         }
-        // Under this level what is read after the lock was waited for is as new as the lock.
+        // With this level, reads after waiting for the lock include everything committed before it was acquired.
         Access::Write => client.build_transaction().isolation_level(IsolationLevel::ReadCommitted),
     };
     let mut transaction = begin.start().map_err(Failure::NotBegun)?;
@@ -461,10 +461,10 @@ fn attempt<T>(
     Ok(value)
 }
 
-/// Whether there is no server behind this connection any more, or none at all.
+/// Whether the server of this connection is gone or was never reached.
 fn is_lost(error: &Error) -> bool {
     match error.code() {
-        // Class 08: connection; 57P: the server is stopped, crashed, or starting; 25P03: it gave the connection up.
+        // Class 08: connection; 57P: the server is stopped, crashed, or starting; 25P03: it closed the idle connection.
         Some(code) => ["08", "57P", "25P03"].iter().any(|c| code.code().starts_with(c)),
         None => {
             let io = error.source().is_some_and(|cause| cause.is::<std::io::Error>());
@@ -473,7 +473,7 @@ fn is_lost(error: &Error) -> bool {
     }
 }
 
-/// Whether it may work later.
+/// Whether it may succeed later.
 fn passes(error: &Error) -> bool {
     is_lost(error) || error.code() == Some(&SqlState::TOO_MANY_CONNECTIONS)
 }
@@ -498,7 +498,7 @@ fn raw(row: &Row) -> Result<Raw, Error> {
     })
 }
 
-/// An experience, and what it is stored by.
+/// An experience with its encoded images and key.
 struct Prepared<'a> {
     experience: &'a Experience,
     images: Images,
@@ -506,7 +506,7 @@ struct Prepared<'a> {
 }
 
 impl Prepared<'_> {
-    /// Tests what the server would refuse.
+    /// Tests for values that the server would refuse.
     fn new(experience: &Experience) -> Result<Prepared<'_>, StoreError> {
         let (images, key) = row::prepare(experience)?;
         if let Some(copy) = experience.copies.iter().find(|c| c.feature.len() != FEATURE) {

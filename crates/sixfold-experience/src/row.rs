@@ -1,4 +1,4 @@
-//! An experience as a row of a table, whichever database holds it.
+//! An experience as a row of a table, for all databases.
 
 use sixfold_geometry::{Camera, Vec3};
 use sixfold_grasp::{Gripper, parse_gripper};
@@ -8,7 +8,7 @@ use super::encode::{self, Images};
 use super::experience::{Copy, Experience};
 use crate::Extent;
 
-/// Tests an experience that is to be stored; its images, and the key that is the same for the same experience.
+/// Tests an experience before it is stored; returns its images and a key that is equal for equal experiences.
 ///
 /// # Errors
 /// [`StoreError::Field`].
@@ -20,7 +20,7 @@ pub(super) fn prepare(e: &Experience) -> Result<(Images, [u8; 16]), StoreError> 
         expected: "images that can be written as PNG",
         found: format!("{} pixels a side", e.crop.side),
     })?;
-    // Without the time: what is stored twice after an interruption is the same experience.
+    // Without the time, so that an experience stored again after an interruption is recognised as the same.
     let key = encode::key(&[
         &images.depth,
         &images.vd_noc,
@@ -35,20 +35,20 @@ pub(super) fn prepare(e: &Experience) -> Result<(Images, [u8; 16]), StoreError> 
     Ok((images, key))
 }
 
-/// A gripper as a gripper file, which says what kind it is.
+/// A gripper as the text of a gripper file, including its kind.
 pub(super) fn gripper_text(gripper: &Gripper) -> String {
     let mut value = serde_json::to_value(gripper).unwrap_or_default();
     value["kind"] = "parallel-jaws".into();
     value.to_string()
 }
 
-/// The name in such a text.
+/// The gripper's name in such a text.
 pub(super) fn gripper_name(text: &str) -> String {
     let value = serde_json::from_str::<serde_json::Value>(text).unwrap_or_default();
     value["name"].as_str().unwrap_or_default().to_owned()
 }
 
-/// The columns of an experience before they are understood.
+/// The columns of an experience before decoding.
 pub(super) struct Raw {
     pub time: i64,
     pub object: String,
@@ -68,7 +68,7 @@ pub(super) struct Raw {
 }
 
 impl Raw {
-    /// The experience, once every column holds what it may.
+    /// Decodes the experience and tests every column.
     ///
     /// # Errors
     /// [`StoreError::Field`].
@@ -121,7 +121,7 @@ impl Raw {
             time: self.time,
             provenance: self.provenance,
         };
-        // What holds for one that is stored has to hold for one that is read: a file may have been changed by others.
+        // The checks made before storing are repeated after reading: a file may have been changed by other programs.
         experience.check().map_err(|error| match error {
             StoreError::Field { field, expected, found, .. } => {
                 StoreError::Field { id, field, expected, found }

@@ -1,8 +1,8 @@
 //! The experience store in one SQLite file.
 //!
-//! A write-ahead log with full synchronisation: what `add` has returned for is on the disk, and readers in other processes go
-//! on reading while one writes. An experience, its features and its copies go in one transaction. Removals are kept as
-//! numbers, so that readers hear of them.
+//! It uses a write-ahead log with full synchronisation: when `add` returns, the data is on disk, and other processes can read while
+//! one writes. An experience, its features and its copies are written in one transaction. Removals are recorded by number, so that
+//! readers are notified of them.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -16,10 +16,10 @@ use super::row::{self, Raw};
 use super::{AttemptRow, Changes, ExperienceStore, Position, StoreError, StoredFeature, Summary, TaskRecord};
 use crate::Attempt;
 
-/// Says that a SQLite file is one of ours: "6fEx".
+/// Application id that marks a SQLite file as a store: "6fEx".
 const APPLICATION: i64 = 0x3666_4578;
-/// Version of the tables. A store of version 1 has no attempts, and knows no tables that objects stand on; it is brought up to
-/// date when it is written to.
+/// Version of the tables. A store of version 1 has no attempts and no planes on which objects stand; it is upgraded on the first
+/// write.
 const VERSION: i64 = 2;
 const TABLES: &str = "
     CREATE TABLE experience (
@@ -37,13 +37,13 @@ const TABLES: &str = "
 const ATTEMPTS: &str = "
     CREATE TABLE attempt (id INTEGER PRIMARY KEY AUTOINCREMENT, key BLOB NOT NULL UNIQUE, attempt TEXT NOT NULL);
 ";
-/// Rows of journals outside; made by who keeps a journal, so that others need not know of it.
+/// Rows of external journals. The table is created only by writers that keep a journal, so that other programs need not know it.
 const JOURNAL: &str = "
     CREATE TABLE IF NOT EXISTS journal (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, row TEXT NOT NULL);
 ";
-/// SQLite refuses a file that is shorter than its header says, but not to who may repair it.
+/// SQLite refuses a file that is shorter than stated in its header, unless this mode for repairs is on.
 const REPAIRS: &str = "PRAGMA writable_schema=ON";
-/// What an experience is read from.
+/// The columns from which an experience is read.
 const COLUMNS: [&str; 17] = [
     "time",
     "object",
@@ -66,10 +66,10 @@ const COLUMNS: [&str; 17] = [
 
 /// How long to wait for another process that writes.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Bytes of the index of a write-ahead log, the smallest there is.
+/// Smallest size of the index of a write-ahead log, bytes.
 const LOG_INDEX: usize = 32 << 10;
 
-/// Whether the folder of `file` has no room for the index of a write-ahead log, found by writing one.
+/// Whether the folder of `file` has no room for the index of a write-ahead log, tested by writing a file of that size.
 fn is_full_beside(file: &Path) -> bool {
     let probe = file.with_file_name(format!(".sixfold-{}.tmp", std::process::id()));
     let written = std::fs::write(&probe, [0; LOG_INDEX]);
@@ -82,15 +82,15 @@ fn is_full_beside(file: &Path) -> bool {
 pub struct SqliteStore {
     pub(super) connection: Connection,
     pub(super) file: PathBuf,
-    /// It was opened for reading alone because the disk is full.
+    /// Whether it was opened read-only because the disk is full.
     no_room: bool,
 }
 
 impl SqliteStore {
-    /// Opens a store, or makes an empty one where there is none.
+    /// Opens a store, or creates an empty one if there is none.
     ///
     /// # Errors
-    /// [`StoreError`] for what is no store, one of another version, or one that cannot be written.
+    /// [`StoreError`] for a file that is not a store, has another version, or cannot be written.
     pub fn create(path: &Path) -> Result<SqliteStore, StoreError> {
         if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder)
@@ -98,7 +98,7 @@ impl SqliteStore {
         }
         let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE;
         let store = Self::connect(path, flags)?;
-        // Two processes may both find the file empty: the lock decides who makes the tables.
+        // Two processes may both find the file empty: the lock decides which one creates the tables.
         store.run("BEGIN IMMEDIATE")?;
         let made = store.make_tables();
         store.run(if made.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
@@ -115,7 +115,8 @@ impl SqliteStore {
         Ok(store)
     }
 
-    /// Turns the write-ahead log on; the mode that came of it. SQLite waits for no other process here, which may be about the same.
+    /// Enables the write-ahead log and returns the resulting mode. SQLite itself does not wait here for other processes, which may
+    /// be doing the same.
     fn use_log(&self) -> Result<String, StoreError> {
         let start = Instant::now();
         loop {
@@ -129,7 +130,7 @@ impl SqliteStore {
         }
     }
 
-    /// Opens a store that is there.
+    /// Opens an existing store.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -140,7 +141,7 @@ impl SqliteStore {
                 reason: "there is no such file; `sixfold grasp learn` makes one".to_owned(),
             });
         }
-        // A reader of a write-ahead log takes part in it, so it opens for writing where it may.
+        // Readers of a write-ahead log also write to its index, so the file is opened for writing if that is permitted.
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         match Self::connect(path, OpenFlags::SQLITE_OPEN_READ_WRITE).and_then(checked) {
             Err(StoreError::Full { .. }) => {
@@ -154,11 +155,10 @@ impl SqliteStore {
         }
     }
 
-    /// Opens a damaged store, to save what can still be read: every call may fail for some rows and not for others. The file is
-    /// not changed.
+    /// Opens a damaged store, to save what can still be read: every call may fail for some rows only. The file is not changed.
     ///
     /// # Errors
-    /// [`StoreError`] where nothing can be read.
+    /// [`StoreError`] if nothing can be read.
     pub(crate) fn open_damaged(path: &Path) -> Result<SqliteStore, StoreError> {
         let checked = |store: SqliteStore| store.check_version().map(|()| store);
         Self::connect_as(path, path, OpenFlags::SQLITE_OPEN_READ_ONLY, REPAIRS)
@@ -166,7 +166,7 @@ impl SqliteStore {
             .or_else(|_| checked(Self::connect_to_unchanging(path, REPAIRS)?))
     }
 
-    /// Opens a file where no files may be made beside it, as a write-ahead log needs.
+    /// Opens a file in a folder where the files of a write-ahead log cannot be created.
     fn connect_to_unchanging(path: &Path, first: &str) -> Result<SqliteStore, StoreError> {
         let mut log = path.as_os_str().to_owned();
         log.push("-wal");
@@ -195,7 +195,7 @@ impl SqliteStore {
         Self::connect_as(path, path, flags, "")
     }
 
-    /// `file` is for the errors, `first` is done before anything is read.
+    /// `file` is used in errors; the statements `first` run before anything is read.
     fn connect_as(
         place: &Path,
         file: &Path,
@@ -223,7 +223,7 @@ impl SqliteStore {
         self.check_version()
     }
 
-    /// Adds what a store of an earlier version lacks.
+    /// Upgrades a store of an earlier version.
     fn bring_up(&self) -> Result<(), StoreError> {
         let version = self.number("PRAGMA user_version")?;
         if self.number("PRAGMA application_id")? == APPLICATION && (1..VERSION).contains(&version) {
@@ -237,7 +237,7 @@ impl SqliteStore {
     /// As [`SqliteStore::bring_up`], before something is written.
     fn bring_up_to_write(&self) -> Result<(), StoreError> {
         if self.number("PRAGMA user_version")? < VERSION {
-            // Another process may do so at the same time: the lock decides.
+            // Another process may upgrade it at the same time: the lock serialises them.
             self.run("BEGIN IMMEDIATE")?;
             let done = self.bring_up();
             self.run(if done.is_ok() { "COMMIT" } else { "ROLLBACK" })?;
@@ -271,7 +271,7 @@ impl SqliteStore {
         Err(StoreError::Broken { file: self.file.clone(), reason: answer })
     }
 
-    /// Lets the file grow to this many bytes only, as a small disk would.
+    /// Limits the size of the file to this many bytes, to simulate a full disk.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -288,7 +288,7 @@ impl SqliteStore {
         self.checked(self.connection.execute_batch(statements))
     }
 
-    /// SQLite's errors in our words.
+    /// Converts SQLite's errors.
     pub(super) fn checked<T>(&self, result: rusqlite::Result<T>) -> Result<T, StoreError> {
         result.map_err(|error| {
             let (file, reason) = (self.file.clone(), error.to_string());
@@ -298,7 +298,7 @@ impl SqliteStore {
                 }
                 Some(ErrorCode::DatabaseCorrupt) => StoreError::Broken { file, reason },
                 Some(ErrorCode::DiskFull) => StoreError::Full { file },
-                // What SQLite says of a full disk where it cannot make the log's index.
+                // SQLite reports this error when the disk is too full to create the index of the log.
                 Some(ErrorCode::SystemIoFailure) if is_full_beside(&file) => StoreError::Full { file },
                 Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => StoreError::Busy { file },
                 Some(ErrorCode::ReadOnly) if self.no_room => StoreError::Full { file },
@@ -309,19 +309,19 @@ impl SqliteStore {
         })
     }
 
-    /// Rows of a table that are read one at a time, where reading all at once fails: the numbers up to the last one that was ever
-    /// given or, where that cannot be read either, that the file has room for.
+    /// Numbers of the rows to read one at a time when reading all at once fails: up to the last number ever assigned or, if that
+    /// cannot be read either, as many as fit into the file.
     fn candidates(&self, table: &str) -> std::ops::RangeInclusive<i64> {
         let last: Result<Option<i64>, _> = self
             .connection
             .query_row("SELECT seq FROM sqlite_sequence WHERE name=?1", [table], |r| r.get(0))
             .optional();
-        // No row takes fewer bytes.
+        // No row is smaller than this.
         let room = std::fs::metadata(&self.file).map_or(0, |file| file.len() / 256) as i64;
         1..=last.map_or(room, |last| last.unwrap_or(0).min(room))
     }
 
-    /// The same for an experience that is not understood as for one that is: an error of one row.
+    /// Reports a column that cannot be decoded as an error of this row only.
     fn of_row<T>(&self, id: i64, result: rusqlite::Result<T>) -> Result<T, StoreError> {
         match result {
             Err(error) if error.sqlite_error_code().is_none() => {
@@ -416,7 +416,7 @@ fn insert_attempt(connection: &Connection, key: &[u8], text: &str) -> rusqlite::
     )
 }
 
-/// A text, or what stands in its place: a list shows broken rows too.
+/// A text column, or a placeholder for another type: lists show broken rows too.
 fn text(row: &Row<'_>, column: usize) -> rusqlite::Result<String> {
     Ok(match row.get_ref(column)? {
         ValueRef::Text(bytes) => String::from_utf8_lossy(bytes).into_owned(),
@@ -498,7 +498,7 @@ impl ExperienceStore for SqliteStore {
     fn numbers(&self) -> Result<Vec<i64>, StoreError> {
         match self.list() {
             Err(StoreError::Broken { .. }) => {
-                // An experience that is not there can be told from one that is broken.
+                // Distinguishes a missing experience from a broken one.
                 let there = |id: &i64| !matches!(self.get(*id), Ok(None));
                 Ok(self.candidates("experience").filter(there).collect())
             }
@@ -603,7 +603,7 @@ impl ExperienceStore for SqliteStore {
     }
 
     fn changes(&self, since: Position) -> Result<Changes, StoreError> {
-        // One transaction: what it reads belongs together.
+        // One transaction, so that all reads are consistent.
         self.checked((|| {
             let transaction = self.connection.unchecked_transaction()?;
             let mut changes = Changes { position: since, ..Changes::default() };
@@ -614,7 +614,7 @@ impl ExperienceStore for SqliteStore {
             let mut rows = query.query([since.feature])?;
             while let Some(row) = rows.next()? {
                 changes.position.feature = row.get(0)?;
-                // What is no feature becomes one of no length, which the index names.
+                // An invalid feature becomes an empty one, which the index reports.
                 let feature = row.get_ref(3)?.as_blob().map(encode::from_floats).unwrap_or_default();
                 changes.features.push(StoredFeature {
                     experience: row.get(1)?,

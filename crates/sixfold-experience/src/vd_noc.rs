@@ -1,24 +1,24 @@
-//! View-dependent normalised object coordinates, VD-NOC (dissertation, equation 6.1): the points that a depth image shows
-//! of an object, moved to the middle of their extent and divided by half of it, axis by axis, with z turned round so that
-//! nearer points have larger values.
+//! View-dependent normalised object coordinates, VD-NOC (dissertation, equation 6.1): the visible points of an object, shifted by
+//! the centre of their extent and divided by half the extent, axis by axis, with z negated so that nearer points have larger
+//! values.
 
 use sixfold_geometry::Vec3;
 
-/// The extent of an object in one view, which turns points into VD-NOC and back.
+/// The extent of an object in one view, which converts points to VD-NOC and back.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extent {
-    /// The middle between largest and smallest coordinates, metres, in the camera's frame.
+    /// The midpoint of the largest and smallest coordinates, metres, in the camera's frame.
     pub centre: Vec3,
-    /// Half the difference between largest and smallest coordinates, metres, each above zero.
+    /// Half the difference between largest and smallest coordinates, metres, each positive.
     pub half: Vec3,
 }
 
 impl Extent {
-    /// Half extents are at least this, metres: what is seen as a plane has no thickness to divide by.
+    /// Lower bound of half extents, metres: a plane seen face-on has no thickness to divide by.
     const LEAST: f64 = 0.002;
 
-    /// The extent of points in metres. `trim` is the fraction of points that is left out at both ends of each axis (flying
-    /// pixels): 0 for equation 6.1 as it stands. `None` without points.
+    /// The extent of points in metres. `trim` is the fraction of points that is left out at both ends of each axis (flying pixels):
+    /// 0 for equation 6.1 as published. `None` without points.
     pub fn of(points: &[Vec3], trim: f64) -> Option<Extent> {
         if points.is_empty() {
             return None;
@@ -59,7 +59,7 @@ mod tests {
         let points = [Vec3::new(0.1, -0.2, 1.0), Vec3::new(0.3, 0.2, 1.2), Vec3::new(0.15, 0.1, 1.05)];
         let extent = Extent::of(&points, 0.0).unwrap();
         assert!((extent.centre - Vec3::new(0.2, 0.0, 1.1)).norm() < 1e-12);
-        // Every axis has a factor of its own, and the nearest point has z = +1.
+        // Every axis has its own factor, and the nearest point has z = +1.
         assert!((extent.normalise(&points[0]) - Vec3::new(-1.0, -1.0, 1.0)).norm() < 1e-12);
         assert!((extent.normalise(&points[1]) - Vec3::new(1.0, 1.0, -1.0)).norm() < 1e-12);
         assert!((extent.normalise(&points[2]) - Vec3::new(-0.5, 0.5, 0.5)).norm() < 1e-12);

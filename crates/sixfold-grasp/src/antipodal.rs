@@ -1,10 +1,10 @@
 //! The geometric planner: two contacts whose normals face away from each other, sampled on the cloud of one view.
 //!
-//! A pair of contacts holds by friction when the line between them lies inside both friction cones (Nguyen 1988,
-//! "Constructing force-closure grasps"; for points with normals Chen and Burdick 1993). As in Ten Pas et al. 2017 ("Grasp
-//! pose detection in point clouds") a contact is drawn from the cloud, the closing direction from its normal or a second contact, and the
-//! approach from the directions around it; unlike there, no network judges the result, so this is no GPD but the
-//! antipodal planner that GPD filters. Nothing is known of the robot's arm: what it cannot reach is not left out.
+//! Friction holds an object between two contacts when the line between them is inside both friction cones (Nguyen 1988,
+//! "Constructing force-closure grasps"; for points with normals Chen and Burdick 1993). As in Ten Pas et al. 2017 ("Grasp pose
+//! detection in point clouds") a contact is sampled from the cloud, the closing direction from its normal or a second contact, and
+//! the approach from the directions around it. Unlike there, no network scores the result, so this is not GPD but the antipodal
+//! planner whose grasps GPD filters. The robot's arm is not considered: grasps that it cannot reach are included.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -27,37 +27,37 @@ use crate::{
 pub struct OptionsError {
     /// Name of the field.
     pub field: &'static str,
-    /// What it holds.
+    /// Its value.
     pub found: f64,
-    /// What it may hold.
+    /// The values allowed.
     pub expected: &'static str,
 }
 
 /// How the planner samples.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AntipodalOptions {
-    /// First contacts that are drawn in one round.
+    /// First contacts sampled in one round.
     pub samples: usize,
-    /// Most rounds; there is another one while fewer than `enough` grasps were found.
+    /// Maximum number of rounds; a further round starts while fewer than `enough` grasps were found.
     pub rounds: usize,
     /// See `rounds`.
     pub enough: usize,
-    /// Closing directions per contact: against its normal, and towards drawn second contacts.
+    /// Closing directions per contact: against its normal, and towards sampled second contacts.
     pub closings: usize,
     /// Approach directions around each closing direction, over 180 degrees about the one from above.
     pub approaches: usize,
-    /// Room between the object and each pad when the gripper comes, metres.
+    /// Clearance between the object and each pad during the approach, metres.
     pub clearance: f64,
-    /// As much more room where a contact is assumed and not seen, or half of it, if there is any, metres: an object is seldom
-    /// as symmetric as it looks.
+    /// Additional clearance where a contact is assumed and not seen (half of it if the full one does not fit), metres: an object is
+    /// seldom as symmetric as it appears.
     pub contact_clearance: f64,
-    /// Points this near to the outermost ones belong to the contact, metres.
+    /// Points within this distance of the outermost ones belong to the contact, metres.
     pub contact_depth: f64,
     /// Largest angle of the approach from straight down, radians. Without a table: from the viewing direction.
     pub max_tilt: f64,
-    /// Assume the unseen side from symmetry and, where that gives no grasp, walls under the outline.
+    /// Complete the unseen side by symmetry and, if that gives no grasp, by walls below the outline.
     pub completion: Option<CompletionOptions>,
-    /// Seed of the draws.
+    /// Seed of the samples.
     pub seed: u64,
 }
 
@@ -109,9 +109,9 @@ impl AntipodalOptions {
     }
 }
 
-/// Proposes grasps on the object of a view, in the order of the samples they came from. Every one stands clear of the
-/// cloud, of the assumed points and of the table, and has both contacts inside their friction cones. The same seed gives
-/// the same grasps at any number of threads.
+/// Proposes grasps on the object of a view, in the order of their samples. Every grasp is free of collisions with the cloud, the
+/// assumed points and the table, and both its contacts are inside their friction cones. The same seed gives the same grasps at any
+/// number of threads.
 ///
 /// # Errors
 /// [`OptionsError`].
@@ -163,13 +163,13 @@ fn search(
     grasps
 }
 
-/// Objects are taken to be this thick behind what is seen of them, metres, where the palm is concerned.
+/// Assumed thickness of objects behind their visible surface in the collision test of the palm, metres.
 pub(crate) const THICKNESS: f64 = 0.02;
 
 pub(crate) struct Planner<'a> {
     pub gripper: &'a Gripper,
     pub options: &'a AntipodalOptions,
-    /// The direction from which an approach may tilt.
+    /// The downward direction, from which the tilt of an approach is measured.
     pub down: Vec3,
     pub centre: Vec3,
     pub object: CompletedObject,
@@ -177,9 +177,9 @@ pub(crate) struct Planner<'a> {
     pub scene: CollisionScene,
     /// Half angle of the friction cone, radians.
     pub cone: f64,
-    /// A point stands for the square of this of surface, metres.
+    /// Spacing of the points, metres: each represents its square of surface area.
     pub step: f64,
-    /// No point lies 3 cm above the table.
+    /// Whether no point is more than 3 cm above the table.
     flat: bool,
 }
 
@@ -224,15 +224,15 @@ impl<'a> Planner<'a> {
         grasps
     }
 
-    /// The direction to a second contact that is drawn from the cloud: one of a few whose friction cones both hold the line
-    /// between the contacts. Half of the draws are from the neighbourhood: walls and handles are thin.
+    /// The direction to a second contact sampled from the cloud, such that the line between the contacts is inside both friction
+    /// cones. Half of the samples are from the neighbourhood, because walls and handles are thin.
     fn towards_partner(&self, p: &Vec3, n: &Vec3, random: &mut ChaCha8Rng) -> Option<Vec3> {
         const DRAWS: usize = 40;
         const NEIGHBOURHOOD: f64 = 0.02;
         let cloud = &self.object.cloud;
         let cosine = self.cone.cos();
         let mut near: Vec<usize> = self.tree.within(p, NEIGHBOURHOOD).iter().map(|n| n.index).collect();
-        // Behind the surface only: the other side of a wall faces away.
+        // Only points on the other side of a wall, whose normals face away.
         near.retain(|&i| cloud.normals[i].dot(n) < -0.5);
         (0..DRAWS).find_map(|k| {
             let i = if k % 2 == 0 && !near.is_empty() {
@@ -250,7 +250,7 @@ impl<'a> Planner<'a> {
         })
     }
 
-    /// Distances along the closing direction at which a second contact faces away, at most three.
+    /// Distances along the closing direction of second contacts that face away, at most three.
     fn widths(&self, p: &Vec3, closing: &Vec3) -> Vec<f64> {
         const RADIUS: f64 = 0.005;
         const GAP: f64 = 0.006;
@@ -278,7 +278,7 @@ impl<'a> Planner<'a> {
         widths.iter().take(3).map(|group| group[group.len() / 2]).collect()
     }
 
-    /// Approach directions upright to the closing direction, those from above first.
+    /// Approach directions perpendicular to the closing direction, those from above first.
     fn approaches(&self, closing: &Vec3) -> Vec<Vec3> {
         let steepest = (self.down - closing * self.down.dot(closing)).try_normalize(0.05);
         let start = steepest.unwrap_or_else(|| {
@@ -298,11 +298,11 @@ impl<'a> Planner<'a> {
             .collect()
     }
 
-    /// The grasp that reaches furthest over the object along an approach, if there is one.
+    /// The grasp whose pads reach furthest over the object along an approach, if there is one.
     fn deepest(&self, centre: &Vec3, closing: &Vec3, approach: &Vec3, width: f64) -> Option<Grasp> {
         let length = self.gripper.finger_length;
         let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
-        // The last one is for what lies flat: anything higher would be pinched by its edge.
+        // The last one is for flat objects only: higher ones would be held only at their edge.
         const SHARES: [f64; 5] = [0.9, 0.6, 0.35, 0.2, 0.1];
         let shares = if self.flat { &SHARES[..] } else { &SHARES[..4] };
         shares.iter().find_map(|share| {
@@ -312,7 +312,7 @@ impl<'a> Planner<'a> {
         })
     }
 
-    /// The grasp at about this pose: moved along x so that the object is midway between the pads, tested and judged.
+    /// The grasp at about this pose: moved along x so that the object is midway between the pads, with collision test and quality.
     pub(crate) fn grasp(&self, pose: &Pose, opening: f64) -> Option<Grasp> {
         if self.scene.hit(self.gripper, pose, opening).is_some() {
             return None;
@@ -330,7 +330,8 @@ impl<'a> Planner<'a> {
         Some(Grasp { camera_from_gripper: centred, opening, width, quality })
     }
 
-    /// The opening with room for what is assumed wrongly, if the fingers stand free then with nothing else between them.
+    /// The opening with additional clearance for errors of the assumed points, if the fingers are then free and nothing else is
+    /// between them.
     fn widened(&self, pose: &Pose, opening: f64, width: f64) -> f64 {
         let wider = |share: f64| {
             (opening + 2.0 * share * self.options.contact_clearance).min(self.gripper.max_opening)
@@ -364,7 +365,7 @@ impl<'a> Planner<'a> {
             .collect()
     }
 
-    /// How far the points between the pads reach along x, without the two outermost on each side.
+    /// Extent along x of the points between the pads, without the two outermost on each side.
     pub(crate) fn extent(&self, between: &[(usize, Vec3)]) -> Option<(f64, f64)> {
         if between.len() < 8 {
             return None;
@@ -378,7 +379,7 @@ impl<'a> Planner<'a> {
     fn judge(&self, between: &[(usize, Vec3)], pose: &Pose) -> Option<AntipodalQuality> {
         let (low, high) = self.extent(between)?;
         let closing = pose.transform_direction(&Vec3::x());
-        // Of a thin wall each pad meets its own side only.
+        // On a thin wall each pad touches only its own side.
         let depth = self.options.contact_depth.min(0.4 * (high - low));
         let mut angle = 0.0f64;
         let mut support = f64::INFINITY;
@@ -404,8 +405,8 @@ impl<'a> Planner<'a> {
         }
         let middle: Vec3 =
             between.iter().map(|(i, _)| self.object.cloud.points[*i]).sum::<Vec3>() / between.len() as f64;
-        // The horizontal distance from the middle of what is held to the line of gravity through the object's centre,
-        // less what lies along the closing axis, about which the pads' friction does not have to hold.
+        // The horizontal distance from the centre of the points between the pads to the vertical line through the object's centre,
+        // without its component along the closing axis, which loads the friction of the pads with no torque.
         let lever = self.centre - middle;
         let lever = lever - self.down * lever.dot(&self.down);
         let across = lever - closing * lever.dot(&closing);

@@ -1,17 +1,17 @@
-//! Proposals that mean the same grasp, joined: within 5 cm and 15 degrees (dissertation, section 6.3.2).
+//! Clusters of proposals of about the same grasp: within 5 cm and 15 degrees (dissertation, section 6.3.2).
 //!
-//! The dissertation executes the mean pose of the cluster with the highest summed score. A mean of free poses need not be
-//! free and its fingers need not stand across the object, so a cluster here is represented by its best member.
+//! The dissertation executes the mean pose of the cluster with the highest summed score. The mean of collision-free poses need not
+//! be collision-free, and its fingers need not enclose the object, so here a cluster is represented by its best member.
 
 use crate::learned::{ScoredGrasp, cluster_scored};
 use crate::{Grasp, OptionsError};
 
-/// How near two grasps are that count as one.
+/// How close two grasps of one cluster are.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClusterOptions {
-    /// Largest distance of the tips' middles, metres.
+    /// Largest distance of the centres between the tips, metres.
     pub distance: f64,
-    /// Largest angle between the orientations, radians; the gripper's half turn counts as none.
+    /// Largest angle between the orientations, radians; a half turn of the gripper counts as zero.
     pub angle: f64,
 }
 
@@ -25,7 +25,7 @@ impl ClusterOptions {
     /// Tests every field.
     ///
     /// # Errors
-    /// [`OptionsError`]: a distance or an angle that is not finite and above zero.
+    /// [`OptionsError`]: a distance or an angle that is not finite and positive.
     pub fn check(&self) -> Result<(), OptionsError> {
         for (field, found) in [("distance", self.distance), ("angle", self.angle)] {
             if !(found > 0.0 && found.is_finite()) {
@@ -36,21 +36,21 @@ impl ClusterOptions {
     }
 }
 
-/// Grasps that mean the same.
+/// A cluster of about equal grasps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GraspCluster {
     /// The member with the highest quality, or score.
     pub best: Grasp,
     /// Its quality, or its planner's score.
     pub best_score: f64,
-    /// How many proposals were joined.
+    /// Number of proposals in the cluster.
     pub members: usize,
     /// The sum of their qualities, or scores.
     pub score: f64,
 }
 
-/// Joins grasps by their quality, best first: the best grasp left takes all that are near to it. The clusters come in the order of
-/// their score, the highest first; equal ones in the order of their best members.
+/// Clusters grasps greedily by quality: the best remaining grasp takes all that are close to it. The clusters are sorted by their
+/// score, the highest first; ties by their best members.
 pub fn cluster_grasps(grasps: &[Grasp], options: &ClusterOptions) -> Vec<GraspCluster> {
     let scored: Vec<ScoredGrasp> =
         grasps.iter().map(|&grasp| ScoredGrasp { grasp, score: grasp.quality.total() }).collect();

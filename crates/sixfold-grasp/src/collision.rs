@@ -1,13 +1,13 @@
-//! May the gripper be there? Boxes of the gripper against the points of a cloud and the table's plane.
+//! Collision test: boxes of the gripper against the points of a cloud and the table's plane.
 //!
-//! A cloud is what was measured (and assumed), not what is there: a gripper that passes this test may still meet
-//! something nobody saw.
+//! A cloud contains only measured (and assumed) points: a gripper that passes this test may still collide with something that was
+//! not seen.
 
 use sixfold_geometry::{Plane, PointCloud, Pose, Vec3};
 
 use crate::{Gripper, GripperBox};
 
-/// What a gripper would hit.
+/// What a gripper would collide with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Hit {
     /// A finger meets a point of the cloud.
@@ -18,21 +18,21 @@ pub enum Hit {
     Table,
 }
 
-/// Everything a gripper can hit, in the camera's frame.
+/// Everything that a gripper can collide with, in the camera's frame.
 #[derive(Debug, Clone, Default)]
 pub struct CollisionScene {
     points: Vec<Vec3>,
-    /// What lies close behind seen points: the palm must not be there.
+    /// Points close behind visible ones, where the palm must not be.
     behind: Vec<Vec3>,
     table: Option<Plane>,
-    /// Points nearer to a part of the gripper than this are hit, metres.
+    /// Points closer to a part of the gripper than this collide with it, metres.
     pub margin: f64,
-    /// Least distance of the gripper from the table, metres.
+    /// Smallest distance of the gripper from the table, metres.
     pub table_clearance: f64,
 }
 
 impl CollisionScene {
-    /// Points closer together than this are one, metres.
+    /// Points closer together than this are merged, metres.
     const STEP: f64 = 0.004;
 
     /// A scene of clouds (thinned to 4 mm) and a table whose normal points up, with margins of 2 mm to points and 3 mm to the
@@ -43,8 +43,8 @@ impl CollisionScene {
         CollisionScene { points: all.points, behind: vec![], table, margin: 0.002, table_clearance: 0.003 }
     }
 
-    /// With the object this thick behind every seen point, metres: nobody saw that the palm could be there. Fingers may, for
-    /// they have to reach round the object.
+    /// Assumes that the object is this thick behind every visible point, metres, in the test of the palm. The fingers are exempt,
+    /// because they must reach around the object.
     pub(crate) fn with_thickness(mut self, seen: &[Vec3], thickness: f64) -> CollisionScene {
         let steps = (thickness / Self::STEP).floor() as usize;
         let behind = |p: &Vec3, k: usize| p + p.normalize() * (k as f64 * Self::STEP);
@@ -70,13 +70,13 @@ impl CollisionScene {
         corners.map(|c| table.distance(&camera_from_gripper.transform_point(&c))).min_by(f64::total_cmp)
     }
 
-    /// What the gripper would hit at a pose, with its pads `opening` metres apart; `None` when it is free.
+    /// What the gripper would collide with at a pose, with its pads `opening` metres apart; `None` when it is free.
     pub fn hit(&self, gripper: &Gripper, camera_from_gripper: &Pose, opening: f64) -> Option<Hit> {
         let boxes = gripper.boxes(opening);
         if self.above_table(&boxes, camera_from_gripper).is_some_and(|room| room < self.table_clearance) {
             return Some(Hit::Table);
         }
-        // All parts lie within the box around them: most points are sorted out by it.
+        // A bounding box around all parts rejects most points.
         let around = boxes
             .iter()
             .skip(1)
@@ -106,7 +106,7 @@ mod tests {
     #[test]
     fn the_palm_keeps_out_of_what_nobody_saw_behind_a_surface() {
         let gripper = Gripper::built_in("jaws-85").unwrap();
-        // The camera looks along z at a plate half a metre away, without anything behind it.
+        // The camera views a plate half a metre away along z, with nothing behind it.
         let mut plate = vec![];
         for i in -20..=20 {
             for j in -20..=20 {
@@ -114,7 +114,7 @@ mod tests {
             }
         }
         let free = |behind: f64, thickness: f64| {
-            // From behind the plate towards the camera, with the palm's front that far behind it.
+            // Approaching from behind the plate towards the camera, with the palm's front at this distance behind it.
             let tip = Vec3::new(0.0, 0.0, 0.5 + behind - gripper.finger_length);
             let pose = gripper_pose(&tip, &-Vec3::z(), &Vec3::x()).unwrap();
             let scene = CollisionScene::new(&[], None).with_thickness(&plate, thickness);
@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(free(0.01, 0.0), None);
         assert_eq!(free(0.01, 0.02), Some(Hit::Palm));
         assert_eq!(free(0.03, 0.02), None);
-        // Fingers may be there: only their tips are behind the plate, the palm is before it.
+        // Fingers are permitted: only their tips are behind the plate, the palm is in front of it.
         let tip = Vec3::new(0.0, 0.0, 0.515);
         let pose = gripper_pose(&tip, &Vec3::z(), &Vec3::x()).unwrap();
         let scene = CollisionScene::new(&[], None).with_thickness(&plate, 0.02);

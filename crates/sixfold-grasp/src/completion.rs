@@ -1,9 +1,9 @@
-//! What the camera did not see, assumed from symmetry.
+//! Completion of the unseen part of an object by symmetry.
 //!
-//! One view shows half of an object, and a gripper has to close on the other half as well. Most things that stand on
-//! tables are symmetric about an upright plane, so the seen points are mirrored at the plane that contradicts the image
-//! least: a mirrored point may lie behind what was seen, never in front of it (Bohg et al. 2011, "Mind the gap: robotic
-//! grasping under incomplete observation", ICRA). A second plane about upright to the first is used when it agrees as well.
+//! One view shows half of an object, but a gripper also touches the other half. Most objects on tables are symmetric about a
+//! vertical plane, so the visible points are mirrored at the plane that contradicts the image least: a mirrored point may be behind
+//! the measured surface, but not in front of it (Bohg et al. 2011, "Mind the gap: robotic grasping under incomplete observation",
+//! ICRA). A second plane about perpendicular to the first is used if it agrees as well.
 
 use std::collections::BTreeMap;
 
@@ -14,18 +14,18 @@ use crate::GraspView;
 /// How mirror planes are searched.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CompletionOptions {
-    /// Directions of upright planes that are tried.
+    /// Number of directions of vertical planes tried.
     pub directions: usize,
     /// Distance between the planes tried in one direction, metres.
     pub step: f64,
-    /// How far planes are shifted from the middle of the seen points, in steps to both sides.
+    /// Largest shift of planes from the centre of the visible points, in steps to each side.
     pub shifts: i32,
-    /// A mirrored point this far in front of what was measured contradicts it, metres.
+    /// A mirrored point this far in front of the measured surface contradicts the image, metres.
     pub tolerance: f64,
     /// Largest fraction of mirrored points that may contradict the image.
     pub max_contradiction: f64,
-    /// Least agreement of a second plane: the fraction of mirrored points that were seen (less where they
-    /// are off), plus half the fraction of hidden ones.
+    /// Minimum agreement of a second plane: the fraction of mirrored points that were measured (less with increasing distance),
+    /// plus half the fraction of hidden ones.
     pub min_agreement: f64,
 }
 
@@ -47,26 +47,26 @@ impl Default for CompletionOptions {
 pub struct CompletedObject {
     /// Points and their normals; the seen ones come first.
     pub cloud: PointCloud,
-    /// How many of them were seen.
+    /// Number of seen points.
     pub observed: usize,
     /// The mirror planes used, at most two.
     pub planes: Vec<Plane>,
 }
 
-/// What the image says of a point that nobody saw.
+/// Result of comparing an assumed point with the image.
 #[derive(Clone, Copy, PartialEq)]
 enum Verdict {
     /// Something further away was measured there.
     Contradicted,
-    /// The object's surface was measured there, this far off (metres).
+    /// The object's surface was measured there, at this distance (metres).
     Supported(f64),
-    /// It lies behind the object.
+    /// The point is behind the object's visible surface.
     Hidden,
-    /// The image does not say.
+    /// The image does not decide.
     Unknown,
 }
 
-/// Completes the object of a view. Without a table there is no upright, and nothing is assumed.
+/// Completes the object of a view. Without a table the vertical is unknown, and nothing is assumed.
 pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> CompletedObject {
     let mut done =
         CompletedObject { cloud: view.object.clone(), observed: view.object.len(), planes: vec![] };
@@ -133,7 +133,7 @@ fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionO
         }
     }
     let share = |count: f64| count / probes.len() as f64;
-    // Hidden points agree with everything, so they count for less than those that were seen again.
+    // Hidden points agree with any plane, so they count less than measured ones.
     (share(contradicted) <= options.max_contradiction)
         .then(|| share(supported) + 0.5 * share(hidden) - 2.0 * share(contradicted))
 }
@@ -157,23 +157,22 @@ fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
         return Verdict::Contradicted;
     }
     if !view.mask[at] {
-        // In front of the table or of another thing by less than the tolerance, or behind another thing.
+        // In front of the table or another object by less than the tolerance, or behind another object.
         return Verdict::Unknown;
     }
     if p.z - measured > tolerance { Verdict::Hidden } else { Verdict::Supported((p.z - measured).abs()) }
 }
 
-/// Adds upright walls under the outline of what was seen and mirrored, down to the table: the assumption for low things
-/// whose sides the camera looks over (a banana, a pair of scissors). Their normals are level and look outwards. Points that
-/// contradict the image or lie where a point is known are left out, so a second call adds nothing. Does nothing without a
-/// table.
+/// Adds vertical walls below the outline of seen and mirrored points, down to the table: an assumption for low objects whose sides
+/// are not visible from above (a banana, a pair of scissors). Their normals are horizontal and point outwards. Points that
+/// contradict the image or coincide with known points are left out, so a second call adds nothing. Does nothing without a table.
 pub(crate) fn assume_walls(view: &GraspView, object: &mut CompletedObject, options: &CompletionOptions) {
     let Some(table) = view.table else { return };
     let cell = view.step.max(1e-4);
     let any = if table.normal.x.abs() < 0.8 { Vec3::x() } else { Vec3::y() };
     let u = table.normal.cross(&any).normalize();
     let v = table.normal.cross(&u);
-    // The highest point over each cell of the table, in the order of the cells.
+    // The highest point above each cell of the table, in the order of the cells.
     let mut heights: BTreeMap<(i64, i64), f64> = BTreeMap::new();
     for p in &object.cloud.points {
         let key = ((u.dot(p) / cell).floor() as i64, (v.dot(p) / cell).floor() as i64);
@@ -190,7 +189,8 @@ pub(crate) fn assume_walls(view: &GraspView, object: &mut CompletedObject, optio
         if [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().all(|(i, j)| heights.contains_key(&(a + i, b + j))) {
             continue;
         }
-        // Outwards is away from the occupied cells around; holes of the cloud have such cells on all sides.
+        // The outward direction points away from the occupied cells around; holes of the cloud have such cells on all sides and get
+        // no wall.
         let inwards = near((a, b), 3)
             .filter(|(x, y, _, _)| heights.contains_key(&(*x, *y)))
             .fold((0.0, 0.0), |sum, (_, _, i, j)| (sum.0 + i as f64, sum.1 + j as f64));
@@ -215,7 +215,7 @@ pub(crate) fn assume_walls(view: &GraspView, object: &mut CompletedObject, optio
     object.cloud.normals.extend(normals);
 }
 
-/// Adds the mirror images of all points that lie where nothing was seen.
+/// Adds the mirror images of all points where no point was measured.
 fn add_mirrored(view: &GraspView, done: &mut CompletedObject, plane: &Plane, options: &CompletionOptions) {
     let tree = KdTree::new(&done.cloud.points);
     let mut points = vec![];

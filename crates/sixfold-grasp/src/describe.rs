@@ -1,11 +1,11 @@
-//! What is known of a grasp before it is tried, in numbers from which its outcome can be predicted.
+//! The description of a grasp before it is tried: numbers from which its outcome can be predicted.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::Vec3;
 
 use crate::{AntipodalQuality, Grasp, GraspFitter};
 
-/// What is known of a grasp before it is tried.
+/// The description of a grasp before it is tried.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GraspDescription {
     /// The quality of its contacts.
@@ -15,9 +15,9 @@ pub struct GraspDescription {
     /// Horizontal distance of the object's centre from the centre between the pads along the closing direction, metres: the
     /// lever that pulls the object out of one pad.
     pub lever: f64,
-    /// Height of what is between the pads over the object's centre, metres.
+    /// Height of the points between the pads above the object's centre, metres.
     pub above_middle: f64,
-    /// Distance of the gripper's lowest corner from the table, metres; `None` where no table is known.
+    /// Distance of the gripper's lowest corner from the table, metres; `None` if the table is unknown.
     pub table_room: Option<f64>,
 }
 
@@ -35,7 +35,7 @@ impl GraspFitter<'_> {
             quality: grasp.quality,
             overlap: -between.iter().map(|(_, q)| q.z).fold(0.0, f64::min),
             lever: level.dot(&grasp.closing()).abs(),
-            // Upwards the middle of what is held lies this far from the object's centre.
+            // `up` is the vertical offset of the object's centre from the centre of the points between the pads.
             above_middle: if between.is_empty() { 0.0 } else { -up },
             table_room: planner.scene.table_room(planner.gripper, &grasp.camera_from_gripper, grasp.opening),
         }
@@ -71,14 +71,14 @@ mod tests {
             let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
             fitter.describe(&Grasp { camera_from_gripper: pose, opening: 0.05, width: 0.02, quality })
         };
-        // Across the bar, 5 cm off its middle: no lever along the closing direction.
+        // Across the bar, 5 cm from its centre: no lever along the closing direction.
         let d = at(0.05, Vec3::y());
         assert!(d.lever < 1e-3, "{d:?}");
         assert!((d.overlap - 0.03).abs() < 0.002, "{d:?}");
         assert!((d.table_room.unwrap() - 0.03).abs() < 1e-9, "{d:?}");
-        // The pads reach over the upper half, whose middle is 15 mm above the bar's.
+        // The pads reach over the upper half, whose centre is 15 mm above the bar's.
         assert!((d.above_middle - 0.015).abs() < 0.002, "{d:?}");
-        // Along the bar (as if its end were held): all of the way is a lever.
+        // Along the bar (as if its end were held): the whole distance is a lever.
         assert!((at(0.05, Vec3::x()).lever - 0.05).abs() < 2e-3);
     }
 }

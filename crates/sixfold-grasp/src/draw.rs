@@ -6,10 +6,10 @@ use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::Gripper;
 
-/// One gripper to be drawn.
+/// One gripper to draw.
 #[derive(Debug, Clone, Copy)]
 pub struct DrawnGrasp {
-    /// Where it is.
+    /// Its pose.
     pub camera_from_gripper: Pose,
     /// Distance of its pads, metres.
     pub opening: f64,
@@ -24,7 +24,7 @@ pub struct DrawnGrasp {
 /// [`MeshError`] for a gripper whose sizes are not finite.
 ///
 /// # Panics
-/// When image or depth have another size than the camera: that is a mistake in the program.
+/// If image or depth have another size than the camera, which is a programming error.
 pub fn draw_grasps(
     image: &RgbImage,
     depth: Option<&DepthImage>,
@@ -42,7 +42,7 @@ pub fn draw_grasps(
         let rendered = frame.depth();
         let normals = frame.normals(&objects);
         let faces = frame.surfaces(&objects);
-        // Two triangles to a side of a box: edges run where the side changes.
+        // Two triangles per side of a box: edges are drawn where the side changes.
         let side = |x: usize, y: usize| faces.get(x, y).copied().flatten().map(|s| s.face / 2);
         for (x, y) in (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y))) {
             let here = side(x, y);

@@ -1,5 +1,5 @@
-//! A grasp that comes from elsewhere (transferred from experience, or from a person), fitted to what is seen: the object
-//! brought midway between the pads, tested for collision, its contacts judged as the planner judges its own.
+//! Fits a grasp from another source (transferred from experience, or given by a person) to the view: centred so that the object is
+//! midway between the pads, tested for collision, and with the same contact quality as the planner's grasps.
 
 use sixfold_geometry::Pose;
 
@@ -26,7 +26,7 @@ impl<'a> GraspFitter<'a> {
         self.planner.gripper
     }
 
-    /// What a grasp has to fulfil.
+    /// The options that a grasp must satisfy.
     pub fn options(&self) -> &'a AntipodalOptions {
         self.planner.options
     }
@@ -35,7 +35,7 @@ impl<'a> GraspFitter<'a> {
         &self.planner
     }
 
-    /// A fitter for a view and a gripper. The object's far side is assumed as the options say.
+    /// A fitter for a view and a gripper. The object's far side is completed according to the options.
     ///
     /// # Errors
     /// [`OptionsError`].
@@ -54,8 +54,8 @@ impl<'a> GraspFitter<'a> {
         Ok(GraspFitter { view, planner: Planner::new(view, gripper, object, options) })
     }
 
-    /// The grasp at about this pose, moved along the closing direction so that the object is midway between the pads;
-    /// `None` when the gripper would hit something or a contact lies outside its friction cone.
+    /// The grasp at about this pose, moved along the closing direction so that the object is midway between the pads; `None` when
+    /// the gripper would collide or a contact is outside its friction cone.
     pub fn fit(&self, camera_from_gripper: &Pose, opening: f64) -> Option<Grasp> {
         if self.planner.object.cloud.normals.len() != self.planner.object.cloud.len() {
             return None;
@@ -63,8 +63,8 @@ impl<'a> GraspFitter<'a> {
         self.planner.grasp(camera_from_gripper, opening)
     }
 
-    /// The grasp at this very pose when the gripper stands free and something is between its pads, whatever its contacts
-    /// look like: the sides that touch may be those that the camera does not see. Its quality has no alignment.
+    /// The grasp at exactly this pose if the gripper is free of collisions and something is between its pads, regardless of its
+    /// contacts: they may be on sides that the camera does not see. The alignment of its quality is 0.
     pub fn accept(&self, camera_from_gripper: &Pose, opening: f64) -> Option<Grasp> {
         let planner = &self.planner;
         if !(opening > 0.0 && opening <= planner.gripper.max_opening)
@@ -77,8 +77,8 @@ impl<'a> GraspFitter<'a> {
         Some(Grasp { camera_from_gripper: *camera_from_gripper, opening, width: high - low, quality })
     }
 
-    /// How far behind the finger tips the gripper first meets the object along its approach, metres (negative: the
-    /// tips reach over it); `None` when nothing is between the pads' planes.
+    /// The distance from the finger tips along the approach to the first point of the object, metres (negative: the tips reach over
+    /// it); `None` when nothing is between the pads' planes.
     pub fn reach(&self, camera_from_gripper: &Pose, opening: f64) -> Option<f64> {
         let gripper_from_camera = camera_from_gripper.inverse();
         let half = (0.5 * opening, 0.5 * self.planner.gripper.finger_width);
@@ -98,7 +98,7 @@ mod tests {
     use super::*;
     use crate::gripper_pose;
 
-    /// A wall of 2 cm on a table seen from above, of which the camera saw the side at y = 1 cm alone when `half`.
+    /// A wall of 2 cm on a table seen from above, of which the camera saw only the side at y = 1 cm if `half`.
     fn wall(half: bool) -> GraspView {
         let mut object = PointCloud::default();
         for side in [1.0, -1.0] {
@@ -132,7 +132,7 @@ mod tests {
         assert!((seen - 0.02 - 2.0 * options.clearance).abs() < 1e-6, "{seen}");
         let assumed = opening(&half, half.object.len()).unwrap();
         assert!((assumed - seen - 2.0 * options.contact_clearance).abs() < 1e-6, "{assumed} {seen}");
-        // Something stands where the finger would be then, or even with half of that room.
+        // An obstacle where the finger would be then, or even with half of that clearance.
         for (place, more) in [(-0.044, options.contact_clearance), (-0.0385, 0.0)] {
             let mut narrow = wall(true);
             for k in 0..=10 {

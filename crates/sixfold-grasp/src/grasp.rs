@@ -1,19 +1,19 @@
-//! A grasp: where the gripper goes, how far it opens, and how good the contacts look.
+//! A grasp: the pose of the gripper, its opening, and the quality of its contacts.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Mat3, Pose, Vec3};
 
-/// How good a two-finger grasp looks from its contacts alone. Every part lies in 0 to 1. Nothing here knows of the robot's
-/// reach, of forces or of the object's weight: it is the geometry of the contacts.
+/// The quality of a two-finger grasp from the geometry of its contacts alone. Every part is between 0 and 1. The robot's reach,
+/// forces and the object's weight are not considered.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AntipodalQuality {
-    /// How far the closing axis lies inside both friction cones: 1 along both contact normals, 0 on the edge of a cone
-    /// (two contacts hold against any disturbance when the axis lies inside both cones: Nguyen 1988).
+    /// How far the closing axis is inside both friction cones: 1 along both contact normals, 0 on the edge of a cone (two contacts
+    /// hold against any disturbance when the axis is inside both cones: Nguyen 1988).
     pub alignment: f64,
-    /// How much surface each pad meets: 1 from half a pad's width times 15 mm.
+    /// Surface area that each pad touches: 1 from half a pad's width times 15 mm on.
     pub support: f64,
-    /// How near the closing axis passes to the object's centre: `exp(-distance / 5 cm)`, the distance measured
-    /// horizontally, as gravity's lever is.
+    /// Closeness of the closing axis to the object's centre: `exp(-distance / 5 cm)`, with the horizontal distance, which is the
+    /// lever of gravity.
     pub centring: f64,
     /// Fraction of the contact points that were seen; the rest was assumed (see `complete_by_mirrors`).
     pub observed: f64,
@@ -32,11 +32,11 @@ impl AntipodalQuality {
 /// One grasp of a parallel-jaw gripper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grasp {
-    /// Where the gripper is when it closes: the gripper's frame is described on the crate's first page.
+    /// Pose of the gripper when it closes; its frame is defined in the crate documentation.
     pub camera_from_gripper: Pose,
     /// Distance of the pads before closing, metres.
     pub opening: f64,
-    /// Distance of the two contacts, as far as it is known, metres.
+    /// Distance of the two contacts, as far as known, metres.
     pub width: f64,
     /// The quality of its contacts.
     pub quality: AntipodalQuality,
@@ -53,8 +53,8 @@ impl Grasp {
         self.camera_from_gripper.transform_direction(&Vec3::x())
     }
 
-    /// Distance in metres and angle in radians to another grasp, with the gripper's half turn about its approach direction
-    /// counted as no difference.
+    /// Distance in metres and angle in radians to another grasp, where a half turn of the gripper about its approach direction
+    /// counts as no difference.
     pub fn difference(&self, other: &Grasp) -> (f64, f64) {
         let flipped = other.camera_from_gripper * half_turn();
         let angle = self.camera_from_gripper.rotation_angle_to(&other.camera_from_gripper);
@@ -68,13 +68,13 @@ pub(crate) fn half_turn() -> Pose {
     Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into())
 }
 
-/// The point that a gripper at this pose holds: a centimetre behind the tips, midway between the pads.
+/// The point at which a gripper at this pose holds: a centimetre behind the tips, midway between the pads.
 pub fn centre_between_pads(camera_from_gripper: &Pose) -> Vec3 {
     camera_from_gripper.transform_point(&(Vec3::z() * -0.01))
 }
 
-/// The pose of a gripper whose tips' middle is at `tip_centre` (metres), from approach and closing direction, which need
-/// not be unit nor exactly perpendicular: the approach keeps its direction. `None` when they are parallel or zero.
+/// The pose of a gripper with the centre between its tips at `tip_centre` (metres), from approach and closing direction. They need
+/// not be unit vectors nor exactly perpendicular: the approach keeps its direction. `None` when they are parallel or zero.
 pub fn gripper_pose(tip_centre: &Vec3, approach: &Vec3, closing: &Vec3) -> Option<Pose> {
     let z = approach.try_normalize(1e-9)?;
     let x = (closing - z * closing.dot(&z)).try_normalize(1e-9)?;

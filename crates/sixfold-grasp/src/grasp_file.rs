@@ -1,4 +1,4 @@
-//! Files of grasps: `grasps.json` of `sixfold grasp propose`, one grasp as a person writes it, a trial of `sixfold grasp measure`.
+//! Files of grasps: `grasps.json` of `sixfold grasp propose`, one grasp written by a person, or a trial of `sixfold grasp measure`.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use crate::{AntipodalQuality, Grasp};
 
-/// Why a file holds no grasp.
+/// Errors of grasp files.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GraspFileError {
@@ -19,17 +19,17 @@ pub enum GraspFileError {
     Io {
         /// The file.
         file: String,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The file is not JSON, or lacks something.
+    /// The file is not JSON, or lacks a field.
     #[error("{file}: expected {expected}: {source}")]
     Json {
         /// The file.
         file: String,
-        /// What it may hold.
+        /// The contents expected.
         expected: &'static str,
-        /// Where and why.
+        /// Position and cause.
         source: serde_json::Error,
     },
     /// A length is impossible.
@@ -39,17 +39,17 @@ pub enum GraspFileError {
         file: String,
         /// The field.
         field: &'static str,
-        /// What it holds.
+        /// Its value.
         found: f64,
     },
-    /// A matrix is no pose.
+    /// A matrix is not a pose.
     #[error("{file}: field {field}: {source}")]
     Pose {
         /// The file.
         file: String,
         /// The field.
         field: &'static str,
-        /// Why.
+        /// The cause.
         source: PoseError,
     },
     /// There is no grasp of this number.
@@ -57,9 +57,9 @@ pub enum GraspFileError {
     Number {
         /// The file.
         file: String,
-        /// The number.
+        /// The number given.
         found: usize,
-        /// How many there are.
+        /// Number of grasps in the file.
         count: usize,
     },
 }
@@ -80,7 +80,7 @@ enum Grasps {
     One(OneGrasp),
 }
 
-/// The grasp of a number, from 1, in a file with one grasp or with a list of them. It has no quality.
+/// Reads a grasp by its number, counted from 1, from a file with one grasp or a list of them. It has no quality.
 ///
 /// # Errors
 /// [`GraspFileError`].
@@ -109,9 +109,9 @@ pub fn read_grasp(path: &Path, number: usize) -> Result<Grasp, GraspFileError> {
 /// A grasp that was tried in simulation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TriedGrasp {
-    /// The object where it stood.
+    /// Pose of the object.
     pub world_from_object: Pose,
-    /// The gripper when it closed.
+    /// Pose of the gripper when it closed.
     pub world_from_gripper: Pose,
     /// Distance of the pads before closing, metres.
     pub opening: f64,

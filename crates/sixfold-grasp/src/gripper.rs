@@ -6,10 +6,10 @@ use sixfold_mesh::{Mesh, MeshError};
 
 use crate::gripper_file::{GripperError, parse_gripper};
 
-/// A parallel-jaw gripper. All parts are boxes along the axes of the gripper's frame (see the crate's first page).
+/// A parallel-jaw gripper. All parts are boxes along the axes of the gripper's frame (see the crate documentation).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Gripper {
-    /// What it is called.
+    /// Name of the gripper.
     pub name: String,
     /// Largest distance between the finger pads, metres.
     pub max_opening: f64,
@@ -19,11 +19,11 @@ pub struct Gripper {
     pub finger_width: f64,
     /// Thickness of a finger behind its pad (along x), metres.
     pub finger_thickness: f64,
-    /// The palm along x, metres.
+    /// Size of the palm along x, metres.
     pub palm_width: f64,
-    /// The palm along y, metres.
+    /// Size of the palm along y, metres.
     pub palm_depth: f64,
-    /// The palm along z, with what is mounted behind it and must not hit anything, metres.
+    /// Size of the palm along z, including parts mounted behind it that must not collide, metres.
     pub palm_height: f64,
     /// Largest force of one finger, newtons.
     pub force: f64,
@@ -41,7 +41,7 @@ pub struct GripperBox {
 }
 
 impl GripperBox {
-    /// Whether a point of the gripper's frame lies inside, or at most `margin` metres off each side.
+    /// Whether a point of the gripper's frame is inside, or at most `margin` metres outside each side.
     pub fn contains(&self, p: &Vec3, margin: f64) -> bool {
         (0..3).all(|k| p[k] > self.low[k] - margin && p[k] < self.high[k] + margin)
     }
@@ -53,7 +53,7 @@ impl GripperBox {
         })
     }
 
-    /// The middle.
+    /// The centre.
     pub fn centre(&self) -> Vec3 {
         (self.low + self.high) * 0.5
     }
@@ -65,7 +65,7 @@ impl GripperBox {
 }
 
 impl Gripper {
-    /// Whether a point of the gripper's frame lies between the pads, `opening` metres apart.
+    /// Whether a point of the gripper's frame is between the pads, `opening` metres apart.
     pub fn is_between_pads(&self, p: &Vec3, opening: f64) -> bool {
         p.x.abs() < 0.5 * opening
             && p.y.abs() < 0.5 * self.finger_width
@@ -73,11 +73,11 @@ impl Gripper {
             && p.z > -self.finger_length
     }
 
-    /// Names of the grippers that come with Sixfold. Their sizes are round numbers of their class (strokes of 140 mm and
-    /// of 85 mm), not measurements of a product.
+    /// Names of the built-in grippers. Their sizes are round numbers of their class (strokes of 140 mm and of 85 mm), not
+    /// measurements of a product.
     pub const BUILT_IN: [&'static str; 2] = ["jaws-140", "jaws-85"];
 
-    /// A gripper that comes with Sixfold, by name.
+    /// A built-in gripper by name.
     pub fn built_in(name: &str) -> Option<Gripper> {
         let text = match name {
             "jaws-140" => include_str!("../grippers/jaws-140.json"),
@@ -90,7 +90,7 @@ impl Gripper {
     /// Tests every field.
     ///
     /// # Errors
-    /// [`GripperError::Field`] with `file`, the field, what it holds and what it may hold.
+    /// [`GripperError::Field`] with `file`, the field, its value and the values allowed.
     pub fn check(&self, file: &str) -> Result<(), GripperError> {
         let sizes = [
             ("max_opening", self.max_opening, 0.001, 1.0),
@@ -131,8 +131,8 @@ impl Gripper {
         Ok(())
     }
 
-    /// The two fingers and the palm when the pads are `opening` metres apart, in the gripper's frame. The first finger
-    /// is the one at negative x.
+    /// The two fingers and the palm with the pads `opening` metres apart, in the gripper's frame. The first finger is at negative
+    /// x.
     pub fn boxes(&self, opening: f64) -> [GripperBox; 3] {
         let (half, width) = (opening / 2.0, self.finger_width / 2.0);
         let finger = |x0: f64, x1: f64| GripperBox {
@@ -150,8 +150,7 @@ impl Gripper {
         [finger(-half - self.finger_thickness, -half), finger(half, half + self.finger_thickness), palm]
     }
 
-    /// The gripper as a mesh in its own frame, for images. The palm is drawn a third as high as it is, so that it hides
-    /// less.
+    /// The gripper as a mesh in its own frame, for images. The palm is drawn at a third of its height, so that it hides less.
     ///
     /// # Errors
     /// [`MeshError::NotFinite`] for a gripper whose sizes are not finite, which [`Gripper::check`] refuses.

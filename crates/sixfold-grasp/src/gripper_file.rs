@@ -1,4 +1,4 @@
-//! Gripper files: a small JSON object, every field checked and none guessed.
+//! Gripper files: a small JSON object in which every field is required and checked.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use crate::Gripper;
 
-/// Why a file describes no gripper.
+/// Errors of gripper files.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GripperError {
@@ -16,7 +16,7 @@ pub enum GripperError {
     Io {
         /// The file.
         file: String,
-        /// What went wrong.
+        /// The cause.
         source: std::io::Error,
     },
     /// The file is not JSON.
@@ -24,7 +24,7 @@ pub enum GripperError {
     Json {
         /// The file.
         file: String,
-        /// Where and why.
+        /// Position and cause.
         source: serde_json::Error,
     },
     /// A field is missing, unknown or impossible.
@@ -34,19 +34,19 @@ pub enum GripperError {
         file: String,
         /// The field.
         field: &'static str,
-        /// What it holds.
+        /// Its value.
         found: String,
-        /// What it may hold.
+        /// The values allowed.
         expected: String,
     },
-    /// A field that no gripper has: most likely a slip of the pen.
+    /// An unknown field, most likely a typing error.
     #[error("gripper file {file}: field {field} is unknown, expected only {known}")]
     Unknown {
         /// The file.
         file: String,
         /// The field.
         field: String,
-        /// The fields that there are.
+        /// The known fields.
         known: String,
     },
 }
@@ -66,7 +66,7 @@ const FIELDS: [&str; 11] = [
     "friction",
 ];
 
-/// Reads a gripper file; [`parse_gripper`] says what it holds.
+/// Reads a gripper file; see [`parse_gripper`] for its contents.
 ///
 /// # Errors
 /// [`GripperError`].
@@ -79,7 +79,7 @@ pub fn read_gripper(path: impl AsRef<Path>) -> Result<Gripper, GripperError> {
 }
 
 /// The gripper in a text: a JSON object with `"kind": "parallel-jaws"`, `name`, and the fields of [`Gripper`] in metres and
-/// newtons. `file` is for the errors.
+/// newtons. `file` is used in errors.
 ///
 /// # Errors
 /// [`GripperError::Json`], and [`GripperError::Field`] or [`GripperError::Unknown`] for the first field that is wrong.
@@ -134,7 +134,7 @@ fn found(value: Option<&Value>) -> String {
     value.map_or_else(|| "nothing".to_owned(), short)
 }
 
-/// A value as a message can hold it.
+/// A value shortened for a message.
 fn short(value: &Value) -> String {
     let text = value.to_string();
     if text.chars().count() > 40 { format!("{}...", text.chars().take(37).collect::<String>()) } else { text }

@@ -1,13 +1,11 @@
-//! Grasps of a parallel-jaw gripper: the gripper, where it may go, and where it should.
+//! Grasps of a parallel-jaw gripper: the gripper, collision tests, and planners.
 //!
-//! The gripper's frame, everywhere in Sixfold: the origin lies midway between the two finger tips, `z` is the approach
-//! direction (from the palm to the tips and on to the object), `x` the closing direction (from one finger to the
-//! other), `y = z × x` runs across the fingers. Rotated by half a turn about `z`, the gripper is the same gripper.
-//! Lengths are in metres, forces in newtons.
+//! The gripper's frame, everywhere in Sixfold: the origin is midway between the two finger tips, `z` is the approach direction
+//! (from the palm to the tips and on to the object), `x` the closing direction (from one finger to the other), `y = z × x` is
+//! across the fingers. The gripper is symmetric under half a turn about `z`. Lengths are in metres, forces in newtons.
 //!
-//! A depth image becomes a [`GraspView`] (the object's cloud, what else is there, the table). [`antipodal_grasps`] proposes
-//! grasps on it from geometry alone, [`cluster_grasps`] joins proposals that mean the same grasp, and [`draw_grasps`]
-//! shows them.
+//! A depth image is converted to a [`GraspView`] (the object's cloud, obstacles, the table). [`antipodal_grasps`] proposes grasps
+//! on it from geometry alone, [`cluster_grasps`] merges proposals of about the same grasp, and [`draw_grasps`] draws them.
 //!
 //! ```
 //! use sixfold_grasp::Gripper;

@@ -1,4 +1,4 @@
-//! What one depth image tells about an object to be grasped: its points, the points around it, the table.
+//! One depth image prepared for grasping an object: its points, the points around it, the table.
 
 use std::collections::VecDeque;
 
@@ -9,14 +9,14 @@ use sixfold_geometry::{
 };
 use thiserror::Error;
 
-/// Why a depth image shows no object to grasp.
+/// Why a depth image cannot be used for grasping.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum ViewError {
-    /// The image does not belong to the camera.
+    /// The image does not have the camera's size.
     #[error(transparent)]
     Camera(#[from] CameraError),
-    /// The mask does not belong to the image.
+    /// The mask does not have the image's size.
     #[error(
         "the mask is {found_width}x{found_height}, the depth image {width}x{height}: give the mask of this image"
     )]
@@ -33,7 +33,7 @@ pub enum ViewError {
     /// An option is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// The depth image holds nothing that could be the scene.
+    /// The depth image has no usable depth.
     #[error(transparent)]
     Depth(#[from] DepthImageError),
     /// There is no plane that could be a table.
@@ -47,24 +47,24 @@ pub enum ViewError {
     /// The mask has no pixel.
     #[error("the mask is empty: no pixel is above zero; mark the pixels of the object")]
     EmptyMask,
-    /// The mask has pixels, but next to nothing was measured there.
+    /// The mask has pixels, but too few of them were measured.
     #[error(
         "the mask has {pixels} pixels, {measured} of them with depth, expected at least {expected}: the sensor saw nothing there (a glossy or transparent object?), or mask and depth do not belong together"
     )]
     NoDepthInMask {
         /// Pixels of the mask.
         pixels: usize,
-        /// Those with a valid depth above the table.
+        /// Pixels with a valid depth above the table.
         measured: usize,
-        /// How many are needed.
+        /// Number of pixels needed.
         expected: usize,
     },
-    /// The mask covers things that lie apart.
+    /// The mask covers separate objects.
     #[error(
         "the mask covers {parts} things that lie apart (the largest two have {first} and {second} pixels), expected one object: split the mask"
     )]
     SeveralObjects {
-        /// How many parts there are.
+        /// Number of parts.
         parts: usize,
         /// Pixels of the largest part.
         first: usize,
@@ -88,9 +88,9 @@ pub struct ViewOptions {
     pub gap: f64,
     /// Minimum number of measured pixels of an object.
     pub min_pixels: usize,
-    /// What lies within this distance around the object's box is kept as obstacle, metres.
+    /// Points within this distance around the object's bounding box are kept as obstacles, metres.
     pub surroundings: f64,
-    /// The object's cloud is thinned to this, metres.
+    /// Spacing to which the object's cloud is downsampled, metres.
     pub step: f64,
     /// Depth beyond this is left out, metres.
     pub max_depth: f64,
@@ -141,23 +141,23 @@ pub struct GraspView {
     pub camera: Camera,
     /// Depth as measured, metres, 0 where nothing was measured.
     pub depth: DepthImage,
-    /// The object's pixels: of the mask, measured, above the table.
+    /// The object's pixels: in the mask, measured, and above the table.
     pub mask: Mask,
     /// The table, its normal up; `None` when no plane was found.
     pub table: Option<Plane>,
-    /// The object's points with their normals, thinned.
+    /// The object's points with their normals, downsampled.
     pub object: PointCloud,
-    /// What else stands around the object, without the table and without normals.
+    /// Other points around the object, without the table and without normals.
     pub obstacles: PointCloud,
-    /// What the object's cloud was thinned to, metres.
+    /// Spacing of the object's cloud, metres.
     pub step: f64,
-    /// The object touches the edge of the image: a part of it was not seen.
+    /// Whether the object touches the border of the image, so that a part of it was not seen.
     pub cut_by_edge: bool,
 }
 
 #[cfg(test)]
 impl GraspView {
-    /// Points on a table that lies `table` metres before a camera that looks straight down, without an image of them.
+    /// A view of points on a table `table` metres below a camera that looks straight down, without a depth image.
     pub(crate) fn from_above(object: PointCloud, table: f64, step: f64) -> GraspView {
         GraspView {
             camera: Camera::new(500.0, 500.0, 31.5, 31.5, 64, 64).unwrap(),
@@ -173,8 +173,7 @@ impl GraspView {
 }
 
 impl GraspView {
-    /// Prepares the view of the object in `mask`, from a depth image in metres of a camera without distortion (undo it
-    /// first).
+    /// Prepares the view of the object in `mask`, from a depth image in metres of a camera without distortion (undistort it first).
     ///
     /// # Errors
     /// [`ViewError`].
@@ -212,7 +211,7 @@ impl GraspView {
             let large = parts.iter().filter(|p| p.len() >= options.min_pixels).count();
             return Err(ViewError::SeveralObjects { parts: large, first: largest, second: second.len() });
         }
-        // Specks are noise; parts of some size may be one object behind a bar.
+        // Small parts are noise; larger parts may be one object behind a bar.
         object = Mask::filled(depth.width(), depth.height(), false);
         for &pixel in parts.iter().filter(|p| 20 * p.len() >= largest).flatten() {
             object.as_mut_slice()[pixel] = true;
@@ -237,7 +236,7 @@ impl GraspView {
             }
         }
         let cut_by_edge = x0 == 0 || y0 == 0 || x1 + 1 == width || y1 + 1 == height;
-        // Only the surroundings are worked on: whole images cost ten times as much.
+        // Only the surroundings are processed: whole images cost ten times as much.
         let reach = (options.surroundings * camera.fx.max(camera.fy) / nearest.max(0.05)).ceil() as usize;
         let (left, top) = (x0.saturating_sub(reach), y0.saturating_sub(reach));
         let (right, bottom) = ((x1 + 1 + reach).min(width), (y1 + 1 + reach).min(height));
@@ -261,7 +260,7 @@ impl GraspView {
         if object.normals.len() != object.points.len() {
             object.normals.clear();
         }
-        // The table's noise reaches higher than its margin; what is as low as that the table's plane stands for.
+        // The table's noise exceeds its margin; points that low are represented by the table's plane.
         let above = above_table(&part, &near, table.as_ref(), 1.5 * options.table_margin);
         let obstacles = PointCloud::from_depth(&only(&|x, y| !inside(x, y) && above[(x, y)]), None, &near)
             .voxel_downsample(2.0 * options.step, 1.0);
@@ -270,13 +269,13 @@ impl GraspView {
     }
 }
 
-/// Points with at least two others within 2 cm: flying pixels are lonely.
+/// Points with at least two others within 2 cm: flying pixels are isolated.
 fn without_specks(points: Vec<Vec3>) -> Vec<Vec3> {
     let tree = sixfold_geometry::KdTree::new(&points);
     points.iter().filter(|p| tree.within(p, 0.02).len() > 3).copied().collect()
 }
 
-/// Masks of the things that stand on the table, largest first.
+/// Masks of the objects on the table, largest first.
 ///
 /// # Errors
 /// [`ViewError`] for a depth image that is unusable or of another size than the camera, and [`ViewError::NoTable`].
@@ -288,7 +287,7 @@ pub fn find_objects(
     let depth = checked(depth, camera, options)?;
     let table = table(&depth, camera, options)
         .ok_or(ViewError::NoTable { share: 100.0 * options.plane.min_share })?;
-    // What stands on the table stands over a measured part of it: the room behind the table's edge does not.
+    // Objects on the table are above a measured part of it; the background behind the table's edge is not.
     let above = above_table(&depth, camera, Some(&table), options.table_margin);
     let on_table = footprint(&depth, camera, &table, options);
     let candidates = Image::from_fn(depth.width(), depth.height(), |x, y| {
@@ -308,8 +307,8 @@ pub fn find_objects(
         .collect())
 }
 
-/// Whether a point lies over the part of the table that was measured: within the box around its points along two
-/// directions of the plane.
+/// Whether a point is above the measured part of the table: within the bounding box of the table's points along two directions of
+/// the plane.
 fn footprint(
     depth: &DepthImage,
     camera: &Camera,
@@ -372,7 +371,7 @@ fn above_table(depth: &DepthImage, camera: &Camera, table: Option<&Plane>, margi
     })
 }
 
-/// Pixels that hang together, largest part first: neighbours up to two pixels away whose points are nearer than `gap`.
+/// Connected components, largest first: neighbours are up to two pixels apart and their points closer than `gap`.
 fn components(mask: &Mask, depth: &DepthImage, camera: &Camera, gap: f64) -> Vec<Vec<usize>> {
     let (width, height) = mask.size();
     let mut left = mask.as_slice().to_vec();
@@ -400,12 +399,12 @@ fn components(mask: &Mask, depth: &DepthImage, camera: &Camera, gap: f64) -> Vec
         }
         parts.push(part);
     }
-    // Stable: equal parts stay in the order of their first pixels.
+    // A stable sort: parts of equal size keep the order of their first pixels.
     parts.sort_by_key(|part| std::cmp::Reverse(part.len()));
     parts
 }
 
-/// Whether two parts are two things: no point of one is within 4 cm of the other.
+/// Whether two parts are separate objects: no point of one is within 4 cm of the other.
 fn apart(a: &[usize], b: &[usize], depth: &DepthImage, camera: &Camera) -> bool {
     let points = |part: &[usize]| -> Vec<Vec3> {
         let width = depth.width();

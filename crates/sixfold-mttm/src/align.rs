@@ -1,36 +1,35 @@
-//! From a matched template to a pose: where the template's own surface fits the scene.
+//! From a matched template to a pose: aligns the template's own surface with the scene.
 //!
-//! The dissertation takes the centre of the visible part for the object's, and names the shift that this gives under occlusion
-//! as its main failure (section 5.3.3). Here the template's points are laid on the scene's, so hidden parts pull
-//! nowhere: first along the ray, then by ICP.
+//! The dissertation takes the centre of the visible part as the object's centre, and names the shift that results under occlusion
+//! as its main failure (section 5.3.3). Here the template's points are aligned with those of the scene, first along the ray, then
+//! by ICP, so hidden parts cause no shift.
 
 use sixfold_align::DepthRegion;
 use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, Vec2, Vec3, icp};
 
-/// Levels of the ICP: rejection distance as a multiple of the tolerance of depths, and iterations. Chosen by hand; not swept.
+/// Levels of the ICP: rejection distance as a multiple of the depth tolerance, and iterations. Chosen by hand; not swept.
 const LEVELS: [(f64, usize); 3] = [(1.5, 4), (0.8, 5), (0.5, 5)];
 /// Iterations before a region may be rejected (dissertation: 3).
 #[cfg(feature = "network")]
 const SHORT: usize = 3;
-/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+/// Largest angle between the normals of a correspondence, degrees; chosen by hand, not swept.
 const MAX_ANGLE: f64 = 50.0;
-/// A level ends at steps smaller than this, metres and radians; chosen by hand, below the noise of depth.
+/// A level stops when a step is smaller than this, metres and radians; chosen by hand, below the noise of depth.
 const CONVERGENCE: f64 = 2e-4;
 /// Fewest correspondences of the ICP; chosen by hand, not swept.
 const MIN_CORRESPONDENCES: usize = 10;
-/// An ICP that moves a template by more than this multiple of the tolerance has slid off to something else; chosen by hand, not
-/// swept.
+/// An ICP that moves a template by more than this multiple of the tolerance has slid to another surface; chosen by hand, not swept.
 const MAX_SHIFT: f64 = 4.0;
-/// The same for rotations, radians: views are some 8 degrees apart and turned in steps of 15. Chosen by hand; not swept.
+/// The same for rotations, radians: views are about 8 degrees apart, with in-plane rotations in steps of 15. Chosen by hand; not
+/// swept.
 const MAX_ROTATION: f64 = 0.7;
-/// Along the ray, differences to the scene count that are smaller than this multiple of the tolerance: the others are not the
-/// object's. Chosen by hand; not swept.
+/// Only differences along the ray below this multiple of the tolerance count: larger ones are not the object's. Chosen by hand; not
+/// swept.
 const NEAR: f64 = 1.5;
-/// Fewer differences say nothing of the distance; chosen by hand, not swept.
+/// With fewer differences the distance is not corrected; chosen by hand, not swept.
 const MIN_DIFFERENCES: usize = 8;
 
-/// Lays a template's points (view frame) on the scene, starting from a pose that is right within a few times `tolerance`
-/// metres.
+/// Aligns a template's points (view frame) with the scene. The initial pose must be right within a few times `tolerance` metres.
 pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
     let start = along_the_ray(scene, cloud, camera_from_view, tolerance);
     let target = DepthTarget { depth: scene.depth(), normals: scene.normals(), camera: scene.camera() };
@@ -53,7 +52,7 @@ pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, t
     }
 }
 
-/// Three iterations of ICP alone: what the dissertation looks at before it rejects a region (section 5.2.5).
+/// Three iterations of ICP alone, after which the dissertation decides whether to reject a region (section 5.2.5).
 #[cfg(feature = "network")]
 pub(crate) fn align_shortly(
     scene: &DepthRegion,
@@ -72,7 +71,7 @@ pub(crate) fn align_shortly(
     icp(cloud, &target, camera_from_view, &options).map_or(*camera_from_view, |r| r.target_from_source)
 }
 
-/// Moves the points along the ray by the median of the differences to the scene that are small enough to be the object's.
+/// Moves the points along the ray by the median of the differences to the scene that are small enough to belong to the object.
 fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, tolerance: f64) -> Pose {
     let camera = scene.camera();
     let centre = camera_from_view.translation();
@@ -101,7 +100,7 @@ fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pos
     camera_from_view.with_translation(centre + ray * shift)
 }
 
-/// The pose of a template's reference point for a match: the view turned in the region's frame.
+/// The pose of a template's reference point for a match: the view rotated by `turn` in the region's frame.
 pub fn camera_from_view(camera_from_roi: &Pose, turn: f64) -> Pose {
     let turned = sixfold_geometry::nalgebra::UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
     *camera_from_roi * Pose::new(turned, Vec3::zeros())

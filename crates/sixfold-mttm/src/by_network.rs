@@ -1,5 +1,5 @@
-//! Matching by the network: descriptors find templates, pairs say mask, rotation, place, and whether they match (dissertation,
-//! section 5.2.4).
+//! Matching by the network: descriptors find templates; for each pair of region and template the network predicts mask, rotation,
+//! position, and whether they match (dissertation, section 5.2.4).
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,33 +23,32 @@ use crate::published::{self, visible_centre};
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
-/// Regions of which pairs are compared: fewest and most. Chosen by hand; not swept.
+/// Regions compared with their templates as pairs: fewest and most. Chosen by hand; not swept.
 const LOOKED_AT: (usize, usize) = (64, 400);
-/// Pairs that go through the network at a time; of no influence on the result.
+/// Pairs that go through the network at a time; does not affect the result.
 const AT_A_TIME: usize = 32;
-/// The minimum trust that a pair leaves a pose whose surface agrees: the network is one witness of several. Chosen by
-/// hand; not swept.
+/// Lower bound of the trust in a pair, so that the network cannot reject a pose whose surface agrees. Chosen by hand; not swept.
 const MIN_TRUST: f64 = 0.1;
 
-/// Between those bounds, of the sampled regions one in [`ONE_IN`] less [`LESS`] is compared: the more there is in the scene, the more
-/// looks like the object at first sight. Chosen by hand; not swept.
+/// Between those bounds, the number of compared regions is the number of sampled ones divided by [`ONE_IN`], minus [`LESS`]: a
+/// fuller scene has more regions that resemble the object. Chosen by hand; not swept.
 const ONE_IN: usize = 5;
 /// See [`ONE_IN`].
 const LESS: usize = 30;
-/// Of the compared ones, so many in so many that match best are laid on the scene; chosen by hand, not swept.
+/// Fraction (numerator, denominator) of the compared regions, the best matching ones, whose templates are aligned with the scene;
+/// chosen by hand, not swept.
 const LAID: (usize, usize) = (3, 4);
-/// Nearest templates among which a region's hypotheses are looked for, for each of them: most of them are neighbours of one another.
-/// Chosen by hand; not swept.
+/// Nearest templates examined per hypothesis of a region: most of them are neighbours of one another. Chosen by hand; not swept.
 const NEAREST: usize = 60;
 impl KnownObject {
-    /// The same object as a network knows it too.
+    /// The same object, with the network's descriptors of its templates.
     pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
         self.learned = Some(Learned::new(model, &self.templates, self.matcher.entries()));
         self
     }
 
-    /// The same, with the network's descriptors kept in a file. The second value tells why a file that was there could not be
-    /// used, or that the new one could not be written.
+    /// The same, with the network's descriptors kept in a file. The second value says why an existing file could not be used or the
+    /// new one could not be written.
     pub fn with_network_cached(
         mut self,
         model: Arc<MttmModel>,
@@ -62,7 +61,8 @@ impl KnownObject {
 }
 
 impl MttmEstimator {
-    /// The same object as the network knows it too, where there is one; what went wrong with its file is added to `notes`.
+    /// The same object with the network's descriptors, if there is a network; problems with the descriptor file are added to
+    /// `notes`.
     pub(crate) fn described(
         &self,
         known: KnownObject,
@@ -82,8 +82,8 @@ impl MttmEstimator {
     }
 }
 
-/// Samples regions, finds the nearest template of each by descriptors, and lays the best on the scene where the network
-/// says. With `MatchedBy::Both` each is also matched by points there, and what agrees better with the scene is kept.
+/// Samples regions, finds the nearest template of each by descriptors, and aligns the best with the scene from the predicted pose.
+/// With `MatchedBy::Both` each region is also matched by points there, and the template that agrees better with the scene is kept.
 pub(crate) fn first_matching(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -115,7 +115,7 @@ pub(crate) fn first_matching(
     order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
     order.truncate(LAID.0 * looked_at / LAID.1);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
-        // Where the network sees the centre of the object.
+        // Regions centred on the predicted centre of the object.
         let centred: Vec<Roi> = order
             .iter()
             .map(|&k| {
@@ -147,8 +147,8 @@ pub(crate) fn first_matching(
         .collect()
 }
 
-/// Matches regions again, centred where their seeds (the first of `found` of each) say and without their background, and
-/// adds the nearest templates that differ, laid on the scene.
+/// Matches regions again, centred on their seeds (the first of `found` of each) and without their background, and adds the nearest
+/// templates that differ, aligned with the scene.
 pub(crate) fn second_matching(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -162,7 +162,7 @@ pub(crate) fn second_matching(
     }
     let model = learned.model();
     let rois: Vec<Roi> = seeds.iter().map(|s| Roi { centre: s.camera_from_view.translation() }).collect();
-    // Each seed's own template as it lies there, for a mask.
+    // Each seed's own template at its pose, for a mask.
     let own: Vec<Entry> = seeds
         .iter()
         .zip(&rois)
@@ -214,7 +214,7 @@ pub(crate) fn second_matching(
         .zip(&says)
         .map(|((region, entry), says)| {
             let start = start(scene, object, learned, &rois[*region], entry, says, options);
-            // The seed itself may start better here.
+            // The seed's own template may get a better initial pose here.
             let known = is_known(object, &found[*region][1..], entry.template, &start);
             (!known).then(|| place_at(scene, object, entry.template, start, trust(says), options))
         })
@@ -231,7 +231,7 @@ fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
     learned.model().encode(&patches.iter().collect::<Vec<_>>())
 }
 
-/// From where a template is aligned.
+/// The initial pose for aligning a template.
 fn start(
     scene: &DepthRegion,
     object: &KnownObject,

@@ -1,5 +1,5 @@
-//! Descriptors of an object's templates on disk, so that the network describes them once: magic, format version, what they were
-//! made from (network and templates), the numbers, a checksum; written as templates are.
+//! Descriptors of an object's templates on disk, so that they are computed once: magic, format version, fingerprints of network and
+//! templates, the numbers, a checksum; written in the same way as templates.
 
 use std::path::Path;
 
@@ -27,7 +27,7 @@ pub(crate) fn write(path: &Path, made_from: [u64; 2], descriptors: &[Descriptor]
     write_bytes(path, &out)
 }
 
-/// Reads what [`write`] wrote, if it was made from this.
+/// Reads what [`write`] wrote, if it was made from the same network and templates.
 pub(crate) fn read(path: &Path, made_from: [u64; 2]) -> Result<Vec<Descriptor>, StoreError> {
     let bytes = read_regular(path, limits::DERIVED)
         .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;

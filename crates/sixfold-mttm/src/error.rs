@@ -1,4 +1,4 @@
-//! What can be wrong with templates and with files of them.
+//! Errors of templates and of template files.
 
 use std::io;
 use std::path::PathBuf;
@@ -6,23 +6,23 @@ use std::path::PathBuf;
 use sixfold_geometry::{CameraError, OptionError};
 use thiserror::Error;
 
-/// Why there are no templates.
+/// Why templates could not be made.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum TemplateError {
     /// An option is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// There is nothing to render.
+    /// The mesh has no surface to render.
     #[error("the mesh has {faces} faces, templates need a surface: give a mesh, not a point cloud")]
     NoSurface {
         /// Faces found.
         faces: usize,
     },
-    /// The camera belongs to another image.
+    /// The camera has another image size.
     #[error(transparent)]
     Camera(#[from] CameraError),
-    /// The mask belongs to another image.
+    /// The mask has another image size.
     #[error("the mask is {found_width}x{found_height}, the depth image {width}x{height}")]
     MaskSize {
         /// Width of the mask.
@@ -34,7 +34,7 @@ pub enum TemplateError {
         /// Height of the depth image.
         height: usize,
     },
-    /// Too little of the object is measured.
+    /// Too few pixels of the object have depth.
     #[error(
         "only {found} of the mask's {pixels} pixels have depth, at least {needed} are needed: is it the mask of this image, and is the depth there?"
     )]
@@ -46,7 +46,7 @@ pub enum TemplateError {
         /// Pixels needed.
         needed: usize,
     },
-    /// Much of the mask shows something else.
+    /// Much of the mask does not show the object.
     #[error(
         "{:.0} % of the mask lies on the plane around it and {:.0} % beyond a depth edge, at most {:.0} % are left out: cut it closer to the object",
         100.0 * on_plane, 100.0 * beyond_edges, 100.0 * most
@@ -54,35 +54,35 @@ pub enum TemplateError {
     MaskTooLarge {
         /// Fraction of its pixels with depth on the plane that surrounds it.
         on_plane: f64,
-        /// Fraction beyond a depth edge, on surfaces that go on outside the mask.
+        /// Fraction beyond a depth edge, on surfaces that continue outside the mask.
         beyond_edges: f64,
-        /// Fraction that may be left out.
+        /// Largest fraction that may be left out.
         most: f64,
     },
-    /// What the mask shows has a size that no tabletop object has.
+    /// The object in the mask has a size that no tabletop object has.
     #[error(
         "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"
     )]
     Size {
         /// Largest extent in metres.
         found: f64,
-        /// Smallest extent that is taken.
+        /// Smallest extent accepted.
         low: f64,
-        /// Largest extent that is taken.
+        /// Largest extent accepted.
         high: f64,
     },
-    /// More views than templates that a file may hold.
+    /// There are more views than a file can contain templates.
     #[error("found {found} views, expected at most {most}: leave out views that look nearly the same")]
     TooManyViews {
         /// Views found.
         found: usize,
-        /// Views taken.
+        /// Most views accepted.
         most: usize,
     },
     /// No view was given.
     #[error("no view of the object was given")]
     NoViews,
-    /// Some views say where the object is and some do not.
+    /// Some views have a pose and some do not.
     #[error("view {view} has {found} pose, the first view {first}: poses for all views or for none")]
     MixedPoses {
         /// Number of the view.
@@ -103,7 +103,7 @@ pub enum StoreError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
     /// Not a file of templates, or damaged.
@@ -114,7 +114,7 @@ pub enum StoreError {
         /// What is wrong.
         what: &'static str,
     },
-    /// Of another version.
+    /// A file of another format version.
     #[error(
         "{}: written by another version of sixfold: found format {found}, expected {expected}",
         path.display()
@@ -127,7 +127,7 @@ pub enum StoreError {
         /// Format expected.
         expected: u32,
     },
-    /// They cannot be used, and there is no mesh to make them again from.
+    /// The templates cannot be used, and there is no mesh to render them again.
     #[error(
         "the templates of an object without a mesh cannot be used; make them again with `sixfold object add {object} --depth FILE --mask FILE --camera FILE --replace`"
     )]
@@ -137,7 +137,7 @@ pub enum StoreError {
         /// What is wrong with the file.
         source: Box<StoreError>,
     },
-    /// Whole and of this version, but made from something else.
+    /// An intact file of this version, but made from other templates or by another network.
     #[error("{}: made from other templates or by another network", path.display())]
     OtherInput {
         /// The file.

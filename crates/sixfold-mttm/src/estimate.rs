@@ -19,54 +19,54 @@ use crate::template::{ObjectTemplates, Source};
 use crate::views::ViewCoverage;
 use crate::{by_network, learned::Learned, published, regions::RegionCache};
 
-/// Who matches regions with templates.
+/// How regions are matched with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MatchedBy {
     /// [`Matcher`]: templates and regions point by point.
     Points,
     /// The network's descriptors alone (dissertation, section 5.2.4).
     Network,
-    /// The network's descriptors say where to look, and points and network with which templates.
+    /// The network's descriptors choose the regions; points and network both match them with templates.
     Both,
 }
 
-/// How objects are searched.
+/// Options of the search for objects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MttmOptions {
-    /// Who matches; without a network it is points alone.
+    /// How regions are matched; without a network always by points.
     pub matched_by: MatchedBy,
-    /// Take the rotation and the place that the network predicts for a matched template (dissertation, table 5.2: with and
+    /// Use the rotation and the position that the network predicts for a matched template (dissertation, table 5.2: with and
     /// without).
     pub predicted_pose: bool,
     /// Where regions are sampled.
     pub proposals: ProposalOptions,
-    /// Regions of the first matching that are laid on the scene.
+    /// Regions of the first matching whose templates are aligned with the scene.
     pub placed: usize,
     /// Those of them that get a mask.
     pub masked: usize,
     /// Regions left after merging.
     pub regions: usize,
-    /// Pose hypotheses of a region (dissertation: 5) by points, and as published.
+    /// Pose hypotheses of a region (dissertation: 5), for matching by points and for the published form.
     pub hypotheses: usize,
-    /// Pose hypotheses that the network adds to a region's; not as published.
+    /// Pose hypotheses that the network adds to those of a region; not used in the published form.
     pub network_hypotheses: usize,
-    /// Hypotheses that are refined and verified with the mesh, where there is one.
+    /// Hypotheses that are refined and verified with the mesh, if there is one.
     pub verified: usize,
-    /// Regions, masks and hypotheses as published, where there is a network: [`MttmOptions::published`].
+    /// Regions, masks and hypotheses as published, if there is a network; see [`MttmOptions::published`].
     pub published: bool,
-    /// Lay matched templates on the scene's surface; otherwise a pose is that of the nearest template, as it was matched.
+    /// Align matched templates with the scene's surface; otherwise the pose is that of the nearest template, as matched.
     pub align: bool,
     /// Thresholds of the scores.
     pub verification: VerificationOptions,
-    /// Most instances.
+    /// Maximum number of instances.
     pub max_instances: usize,
     /// Estimates with a lower confidence are not returned.
     pub min_score: f64,
 }
 
-/// [`MttmOptions::placed`]; chosen by hand for the time that it takes, not swept.
+/// [`MttmOptions::placed`]; chosen by hand for run time, not swept.
 const PLACED: usize = 160;
-/// [`MttmOptions::masked`]; chosen by hand for the time that it takes, not swept.
+/// [`MttmOptions::masked`]; chosen by hand for run time, not swept.
 const MASKED: usize = 50;
 /// [`MttmOptions::regions`]; chosen by hand, not swept.
 const REGIONS: usize = 10;
@@ -74,34 +74,33 @@ const REGIONS: usize = 10;
 const HYPOTHESES: usize = 5;
 /// [`MttmOptions::network_hypotheses`]; chosen by hand, not swept.
 const NETWORK_HYPOTHESES: usize = 2;
-/// [`MttmOptions::verified`]; chosen by hand for the time that it takes, not swept.
+/// [`MttmOptions::verified`]; chosen by hand for run time, not swept.
 const VERIFIED: usize = 16;
-/// [`MttmOptions::min_score`]: lower ones are guesses. Chosen by hand; not swept.
+/// [`MttmOptions::min_score`]: estimates below it are guesses. Chosen by hand; not swept.
 const MIN_SCORE: f64 = 0.05;
 
-/// Regions of the first matching lie further apart than this fraction of the diameter; chosen by hand, not swept.
+/// Smallest distance of regions of the first matching, as a fraction of the diameter; chosen by hand, not swept.
 pub(crate) const APART: f64 = 0.15;
-/// Poses whose rotations differ by less than this are the same hypothesis, radians: about the 15 degrees between turns in the image
-/// plane. Chosen by hand; not swept.
+/// Poses whose rotations differ by less than this are the same hypothesis, radians: about the step of 15 degrees between in-plane
+/// rotations. Chosen by hand; not swept.
 pub(crate) const SAME_ROTATION: f64 = 0.3;
-/// Two masks of the first matching are one region where this multiple of what they have in common exceeds the smaller of them: from
-/// half of it on. Chosen by hand; not swept.
+/// Two masks of the first matching are merged when this multiple of their intersection exceeds the smaller mask, that is when they
+/// share half of it. Chosen by hand; not swept.
 const OVERLAP: usize = 2;
-/// Fewest pixels of a region's mask, of every second column and row; chosen by hand, not swept.
+/// Fewest pixels of a region's mask, counted on every second column and row; chosen by hand, not swept.
 const MIN_MASK: usize = 20;
-/// Cells of the masks' grid by which a region is widened for the second matching: templates that differ reach further. Chosen by hand;
-/// not swept.
+/// Cells of the masks' grid by which a region is widened for the second matching, because other templates may extend beyond the
+/// mask. Chosen by hand; not swept.
 const WIDENED: usize = 2;
 /// Shift of the centres that the second matching tries along every axis, as a fraction of the diameter; chosen by hand, not swept.
 const SHIFT: f64 = 0.07;
-/// Best matches among which a region's hypotheses are looked for, for each of them: most of them are neighbours of one another. Chosen
-/// by hand; not swept.
+/// Best matches examined per hypothesis of a region: most of them are neighbours of one another. Chosen by hand; not swept.
 const RANKED: usize = 40;
 /// Fewest hypotheses that are verified for each instance; chosen by hand, not swept.
 const VERIFIED_OF_INSTANCE: usize = 2;
-/// How much the matched template says beside the verification with the mesh, as an exponent; chosen by hand, not swept.
+/// Exponent of the matched template's agreement, next to the verification with the mesh; chosen by hand, not swept.
 const TEMPLATE_POWER: f64 = 0.2;
-/// Fraction of its pixels, as a numerator and a denominator, that an estimate may share with a better one; as for point pair
+/// Largest fraction (numerator, denominator) of its pixels that an estimate may share with a better one; the same as for point pair
 /// features. Chosen by hand; not swept.
 const MAX_SHARED: (usize, usize) = (3, 10);
 
@@ -126,10 +125,10 @@ impl Default for MttmOptions {
     }
 }
 
-/// [`MttmOptions::verified`] for templates from all sides: of 16, 48, 120 and 400 the best ([`MttmOptions::for_templates`]).
+/// [`MttmOptions::verified`] for templates from all sides: the best of 16, 48, 120 and 400 ([`MttmOptions::for_templates`]).
 const AROUND_VERIFIED: usize = 400;
 /// [`MttmOptions::placed`], [`MttmOptions::masked`], [`MttmOptions::regions`], [`MttmOptions::hypotheses`] and
-/// [`MttmOptions::network_hypotheses`] for templates from all sides: better than half of each; not swept one by one.
+/// [`MttmOptions::network_hypotheses`] for templates from all sides: better than half as many of each; not swept one by one.
 const AROUND_PLACED: usize = 400;
 const AROUND_MASKED: usize = 160;
 const AROUND_REGIONS: usize = 40;
@@ -139,7 +138,7 @@ const AROUND_NETWORK_HYPOTHESES: usize = 12;
 const PUBLISHED_VERIFIED: usize = 15;
 
 impl MttmOptions {
-    /// The dissertation's form (sections 5.2.4, 5.2.5, 5.3.3): the network alone, masks before any alignment, five hypotheses a
+    /// The dissertation's form (sections 5.2.4, 5.2.5, 5.3.3): the network alone, masks before any alignment, five hypotheses per
     /// region, regions rejected after three iterations of ICP, at most 50 of them, 15 hypotheses verified by the published score.
     pub fn published() -> MttmOptions {
         let default = MttmOptions::default();
@@ -152,9 +151,9 @@ impl MttmOptions {
         }
     }
 
-    /// Enough masks, regions and hypotheses for these templates. Rendered from all sides there are seven times as many as from above,
-    /// more of them look right at first sight, and the right one is seldom among the few that suffice from above. Other fields, other
-    /// templates and the published form stay.
+    /// Enough masks, regions and hypotheses for these templates. Rendered from all sides there are seven times as many templates as
+    /// from above, more of them match well by chance, and the right one is seldom among the few candidates that suffice from above.
+    /// Other fields, options for other templates and the published form are unchanged.
     ///
     /// ADD(-S) on 90 instances in simulated piles, with the number of verified hypotheses: .58 (16), .68 (48), .74 (120), .79 (400,
     /// from twice as many regions); by point pair features .89 (docs/measured.md has the commands).
@@ -175,7 +174,7 @@ impl MttmOptions {
         }
     }
 
-    /// Checks every field, also those of proposals and verification.
+    /// Checks every field, including those of proposals and verification.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
@@ -211,7 +210,8 @@ pub struct KnownObject {
 const ICP_POINTS: usize = 160;
 
 impl KnownObject {
-    /// Prepares templates; `mesh` is what verification renders ([`sixfold_align::verification_mesh`]), `None` to judge by the templates alone.
+    /// Prepares templates; `mesh` is what verification renders ([`sixfold_align::verification_mesh`]), `None` to verify with the
+    /// templates alone.
     pub fn new(templates: ObjectTemplates, mesh: Option<Mesh>) -> KnownObject {
         let matcher = Matcher::new(&templates, &MatchOptions::default());
         let surfaces =
@@ -219,7 +219,7 @@ impl KnownObject {
         KnownObject { templates, matcher, surfaces, mesh, learned: None }
     }
 
-    /// The pose of the object's frame when a template lies at a pose.
+    /// The object's pose when a template has the pose `camera_from_view`.
     pub(crate) fn object_pose(&self, camera_from_view: &Pose, template: usize) -> Pose {
         *camera_from_view * self.templates.templates[template].view_from_object
     }
@@ -241,23 +241,23 @@ impl KnownObject {
     }
 }
 
-/// A pose with what speaks for it.
+/// A pose with its confidence and scores.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MttmEstimate {
-    /// The pose. Templates cut out of depth images without poses give that of the matched template's own frame.
+    /// The pose. For templates from depth images without poses it is the pose of the matched template's own frame.
     pub camera_from_object: Pose,
-    /// What decides between estimates, 0 to 1.
+    /// Confidence from 0 to 1, by which estimates are ranked.
     pub confidence: f64,
-    /// What the verification says, by the mesh or the template.
+    /// Scores of the verification, with the mesh or the template.
     pub score: VerificationScore,
     /// The matched template.
     pub template: usize,
-    /// Pixels of the object by the matched template, before any refinement with a mesh; as published by the network, before any
-    /// alignment.
+    /// Pixels of the object according to the matched template, before any refinement with a mesh; in the published form according
+    /// to the network, before any alignment.
     pub mask: Pixels,
 }
 
-/// Where the time went, in seconds, and how much there was to do.
+/// Run time of each stage in seconds, and numbers of regions.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Stages {
     /// Sampling and first matching.
@@ -275,25 +275,25 @@ pub struct Stages {
 }
 
 impl Stages {
-    /// Seconds until there are hypotheses: all but the verification.
+    /// Seconds of all stages before the verification.
     pub fn hypotheses(&self) -> f64 {
         self.matching + self.masks + self.rematching
     }
 }
 
-/// A template somewhere in the scene.
+/// A template placed in the scene.
 #[derive(Debug, Clone)]
 pub(crate) struct Placed {
     pub template: usize,
     pub camera_from_view: Pose,
     pub score: VerificationScore,
-    /// What decides: agreement of the surface, and of the match it came from.
+    /// Score by which they are ranked: agreement of the surface, and of the match it came from.
     pub support: f64,
-    /// The pixels that the network says are the object's, where it was asked before anything was aligned.
+    /// The object's pixels as predicted by the network, if it predicted them before any alignment.
     pub mask: Option<Arc<Pixels>>,
 }
 
-/// A scene in which several objects are searched: what the network predicts for its regions is kept for objects of about the same
+/// A scene in which several objects are searched. The network's predictions for its regions are shared by objects of about the same
 /// size.
 #[derive(Debug)]
 pub struct Search<'a> {
@@ -302,12 +302,12 @@ pub struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// Nothing is searched yet.
+    /// A scene before any search.
     pub fn new(scene: &'a DepthRegion) -> Search<'a> {
         Search { scene, regions: RegionCache::default() }
     }
 
-    /// Finds an object, as [`estimate`] does and with the same outcome.
+    /// Finds an object, as [`estimate`] does and with the same result.
     pub fn estimate(&self, object: &KnownObject, options: &MttmOptions) -> (Vec<MttmEstimate>, Stages) {
         search(self.scene, &self.regions, object, options)
     }
@@ -323,7 +323,7 @@ pub fn estimate(
     Search::new(scene).estimate(object, options)
 }
 
-/// As [`estimate`], with what the network predicts for the image's regions kept in `regions`.
+/// As [`estimate`]; the network's predictions for the image's regions are kept in `regions`.
 pub(crate) fn search(
     scene: &DepthRegion,
     regions: &RegionCache,
@@ -371,7 +371,7 @@ pub(crate) fn search(
         by_network::second_matching(scene, object, learned, options, &mut hypotheses);
     }
     let mut hypotheses = hypotheses.concat();
-    // A stable sort: equal ones stay in the order of their regions.
+    // A stable sort: ties keep the order of their regions.
     hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
     stages.rematching = lap();
     let estimates = verify_all(scene, object, &hypotheses, options);
@@ -379,7 +379,7 @@ pub(crate) fn search(
     (estimates, stages)
 }
 
-/// Samples regions, matches them, and lays the best matches on the scene.
+/// Samples regions, matches them, and aligns the best matches with the scene.
 fn first_matching(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -396,7 +396,7 @@ fn first_matching(
     chosen.par_iter().map(|&i| place(scene, object, &rois[i], matches[i], options)).collect()
 }
 
-/// The first of `order` that lie further apart than `distance` metres, at most `most` of them.
+/// The first regions of `order` that are further apart than `distance` metres, at most `most` of them.
 pub(crate) fn apart(rois: &[Roi], order: Vec<usize>, distance: f64, most: usize) -> Vec<usize> {
     let mut chosen: Vec<usize> = vec![];
     for i in order {
@@ -410,7 +410,7 @@ pub(crate) fn apart(rois: &[Roi], order: Vec<usize>, distance: f64, most: usize)
     chosen
 }
 
-/// Lays a matched template on the scene.
+/// Aligns a matched template with the scene.
 pub(crate) fn place(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -423,7 +423,7 @@ pub(crate) fn place(
     place_at(scene, object, entry.template, start, f64::from(matched.score).max(0.0).sqrt(), options)
 }
 
-/// Lays a template on the scene from a pose that is about right; `trust` (0 to 1) is in the match it came from.
+/// Aligns a template with the scene from an approximate pose; `trust` (0 to 1) rates the match that gave it.
 pub(crate) fn place_at(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -443,8 +443,8 @@ pub(crate) fn place_at(
     Placed { template, camera_from_view: pose, score, support, mask: None }
 }
 
-/// Whether a template at a pose says the same as one of those found. Views without poses have frames of their own: only the
-/// view itself can be compared.
+/// Whether a template at a pose is the same hypothesis as one of those found. Views without poses have their own frames, so only
+/// templates of the same view can be compared.
 pub(crate) fn is_known(object: &KnownObject, found: &[Placed], template: usize, start: &Pose) -> bool {
     let new = object.object_pose(start, template);
     found.iter().any(|f| {
@@ -453,7 +453,7 @@ pub(crate) fn is_known(object: &KnownObject, found: &[Placed], template: usize, 
     })
 }
 
-/// Masks are taken on every n-th column and row while regions are merged; chosen by hand, not swept.
+/// While regions are merged, masks use every n-th column and row; chosen by hand, not swept.
 const STRIDE: usize = 2;
 
 /// The masks of the placed templates, without those that overlap a better one by more than half.
@@ -488,8 +488,8 @@ fn merge(
     regions
 }
 
-/// Matches a region again, centred where its template says and without its background, and lays the nearest templates
-/// that differ on the scene.
+/// Matches a region again, centred on its template and without its background, and aligns the nearest templates that differ with
+/// the scene.
 fn second_matching(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -535,7 +535,7 @@ fn second_matching(
     }
 }
 
-/// The last word, by the mesh where there is one, and no two estimates of the same pixels.
+/// Final verification, with the mesh if there is one; removes estimates that explain the same pixels as a better one.
 fn verify_all(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -557,7 +557,7 @@ fn verify_all(
             .zip(&kept)
             .enumerate()
             .map(|(i, (v, p))| {
-                // Two witnesses: the rendered mesh, and the template it came from. As published it is the mesh alone.
+                // Both the rendered mesh and the matched template count. In the published form only the mesh does.
                 let power = if options.published { 0.0 } else { TEMPLATE_POWER };
                 let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(power);
                 (v.camera_from_object, confidence, v.score, i)
@@ -608,7 +608,7 @@ mod tests {
         let many = MttmOptions { verified: 1000, min_score: 0.4, max_instances: 3, ..default };
         let many = many.for_templates(&templates(ViewCoverage::Around, Source::Mesh));
         assert_eq!((many.verified, many.min_score, many.max_instances), (1000, 0.4, 3));
-        // Nothing changes for others, nor in the published form.
+        // Options for other templates and the published form are unchanged.
         assert_eq!(default.for_templates(&templates(ViewCoverage::Above, Source::Mesh)), default);
         assert_eq!(default.for_templates(&templates(ViewCoverage::Around, Source::Depth)), default);
         let published = MttmOptions::published();

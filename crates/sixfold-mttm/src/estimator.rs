@@ -17,9 +17,9 @@ use crate::template::{ObjectTemplates, Source, TemplateOptions};
 use crate::views::ViewCoverage;
 
 const METHOD: &str = "mttm";
-/// Where an object's templates are kept in its folder.
+/// File of an object's templates in its folder.
 pub const TEMPLATES_FILE: &str = "templates.bin";
-/// Where the mesh that verification renders is kept.
+/// File of the mesh that verification renders.
 const MESH_FILE: &str = "verification-mesh.bin";
 
 /// Objects never trained on, found in depth by their templates (dissertation, chapter 5).
@@ -27,21 +27,21 @@ const MESH_FILE: &str = "verification-mesh.bin";
 pub struct MttmEstimator {
     /// How depth images are prepared.
     pub depth: DepthOptions,
-    /// How objects are searched; instances and the minimum confidence are the query's.
+    /// Options of the search; the query sets the number of instances and the minimum confidence.
     pub options: MttmOptions,
-    /// Which templates are rendered from a mesh, where its folder holds none yet.
+    /// Which templates are rendered from a mesh if the object's folder has none yet.
     pub templates: TemplateOptions,
-    /// From which sides an object with a mesh is searched, whatever templates its folder holds; these are kept in files of their own.
-    /// `None`: those that it holds, or those that it draws.
+    /// From which sides an object with a mesh is searched, whatever templates its folder has; these templates are kept in files of
+    /// their own. `None`: the templates in its folder, or those rendered with the field `templates`.
     pub coverage: Option<ViewCoverage>,
-    /// The network (feature `network`); without one, points match alone.
+    /// The network (feature `network`); without one, matching is by points alone.
     #[cfg(feature = "network")]
     pub network: Option<Arc<crate::model::MttmModel>>,
-    /// Judge poses by the matched templates alone, as if there were no mesh.
+    /// Verify poses with the matched templates only, as if there were no mesh.
     pub templates_only: bool,
 }
 
-/// An object as template matching knows it.
+/// An object prepared for template matching.
 pub struct MttmObject {
     name: String,
     mesh: Option<Arc<Mesh>>,
@@ -107,7 +107,7 @@ impl MttmEstimator {
         let Some(file) = object.file(&self.file_name("templates")) else {
             return ObjectTemplates::from_mesh(mesh, &wanted).map_err(|e| wrap(Box::new(e)));
         };
-        // Templates that were asked for with other views stay as they are.
+        // Templates that were requested with other views are left as they are.
         let options = match self.coverage {
             None => ObjectTemplates::read(&file).map_or(wanted, |kept| kept.options),
             Some(_) => wanted,
@@ -132,8 +132,8 @@ impl PoseEstimator for MttmEstimator {
         self.depth
     }
 
-    /// Right poses in real frames have confidences of 0.36 to 0.73, wrong ones to 0.54 (LM-O frame 3, by
-    /// `cargo test --release -p sixfold-mttm --test real_frames -- --nocapture`).
+    /// Right poses in real frames have confidences of 0.36 to 0.73, wrong ones up to 0.54 (LM-O frame 3, by `cargo test --release
+    /// -p sixfold-mttm --test real_frames -- --nocapture`).
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: 0.45, dataset: MttmOptions::default().min_score }
     }
@@ -184,9 +184,9 @@ impl PoseEstimator for MttmEstimator {
     }
 }
 
-/// What is said of an estimate besides: the matched template (from 0 on; with views without poses the pose is that of this view's
-/// frame), whether the pose is that of the object's frame (a mesh, or views with poses) or only of the matched view's, what it
-/// was verified by, and where the time went.
+/// Details of an estimate: the matched template (counted from 0; for views without poses the pose is that of this view's frame),
+/// whether the pose is that of the object's frame (a mesh, or views with poses) or only of the matched view's, how it was verified,
+/// and the run time of each stage.
 fn details(object: &KnownObject, e: &MttmEstimate, stages: &Stages) -> Map<String, Value> {
     let of_view = object.templates().source == Source::Depth;
     Map::from_iter([

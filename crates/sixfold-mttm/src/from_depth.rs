@@ -1,4 +1,4 @@
-//! Templates cut out of real depth images: one masked view is enough to look for an object.
+//! Templates cut out of real depth images: one masked view is enough to find an object.
 
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec2, Vec3};
 
@@ -7,20 +7,20 @@ use crate::roi::ray_rotation;
 use crate::store::MAX_TEMPLATES;
 use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
 
-/// Sizes of tabletop objects, metres: smaller and larger ones are a wrong depth scale or mask. Chosen by hand; not swept.
+/// Sizes of tabletop objects, metres: other sizes indicate a wrong depth scale or mask. Chosen by hand; not swept.
 const SIZES: (f64, f64) = (0.015, 0.6);
-/// A view must have so many pixels with depth; chosen by hand, not swept.
+/// Fewest pixels with depth in a view; chosen by hand, not swept.
 const FEWEST_PIXELS: usize = 200;
-/// Points further from the median depth than this multiple of the deviation that [`WITHIN`] of them have do not belong to the object: masks
-/// bleed over edges. Chosen by hand; not swept.
+/// Points further from the median depth than this multiple of a deviation do not belong to the object, because masks bleed over
+/// edges. The deviation is the [`WITHIN`] quantile of all. Chosen by hand; not swept.
 const FAR_OFF: f64 = 5.0;
 /// See [`FAR_OFF`].
 const WITHIN: f64 = 0.8;
-/// Lower bound of that deviation, metres, for flat things that face the camera; chosen by hand, not swept.
+/// Lower bound of that deviation, metres, for flat objects that face the camera; chosen by hand, not swept.
 const MIN_DEVIATION: f64 = 0.01;
-/// Directions in which an extent is measured: about 15 degrees apart over all of the sphere.
+/// Directions in which an extent is measured: about 15 degrees apart over the whole sphere.
 const DIRECTIONS: usize = 120;
-/// Fractions of the points along a direction between which its extent lies: half a point in a hundred at either end may be astray.
+/// Quantiles of the points along a direction between which its extent is measured: half a per cent at either end may be outliers.
 /// Chosen by hand; not swept.
 const ENDS: (f64, f64) = (0.005, 0.995);
 
@@ -31,7 +31,7 @@ pub struct DepthView<'a> {
     pub depth: &'a DepthImage,
     /// Its pinhole camera.
     pub camera: &'a Camera,
-    /// Where the object is.
+    /// Pixels of the object.
     pub mask: &'a Mask,
     /// Its pose, if known.
     pub camera_from_object: Option<Pose>,
@@ -40,12 +40,12 @@ pub struct DepthView<'a> {
 impl ObjectTemplates {
     /// Cuts the templates of an object out of depth images.
     ///
-    /// Without poses every template stands for itself: a pose found with it is that of a frame parallel to the template's
-    /// camera, its origin in the middle of the points seen.
+    /// Without poses every template has a frame of its own: parallel to the template's camera, its origin at the centre of the
+    /// visible points. Poses found with it are those of this frame.
     ///
     /// # Errors
-    /// [`TemplateError`]: an option out of its range, no view, sizes that do not fit, too little depth within a mask, an object too small or large, or poses
-    /// for some views only.
+    /// [`TemplateError`]: an option out of its range, no view, image sizes that differ, too little depth within a mask, an object
+    /// too small or large, or poses for some views only.
     pub fn from_depth(
         views: &[DepthView<'_>],
         options: &TemplateOptions,
@@ -83,7 +83,7 @@ impl ObjectTemplates {
 /// A masked pixel and its point in the camera frame.
 type Seen = ([usize; 2], Vec3);
 
-/// The points under the mask, without those far off the others in depth: masks bleed over edges.
+/// The points under the mask, without outliers in depth, because masks bleed over edges.
 fn masked_points(view: &DepthView<'_>) -> Result<Vec<Seen>, TemplateError> {
     let (depth, camera, mask) = (view.depth, view.camera, view.mask);
     camera.check_lens()?;
@@ -144,7 +144,7 @@ fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
     for ([x, y], p) in seen {
         points[y * view.depth.width() + x] = (camera_from_patch.inverse() * p).z as f32;
     }
-    // A pixel of the patch takes what its ray meets in the image.
+    // A pixel of the patch takes the depth that its ray meets in the image.
     let depth = (0..SIDE * SIDE)
         .map(|i| {
             let ray = patch.unproject(&Vec2::new((i % SIDE) as f64, (i / SIDE) as f64), distance);

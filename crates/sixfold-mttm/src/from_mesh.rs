@@ -15,14 +15,14 @@ use crate::views::{view_directions, view_rotation};
 
 /// More faces than this are finer than a template's pixels; chosen by hand, not swept.
 const MAX_FACES: usize = 12_000;
-/// Times that a view is centred on the middle of what it shows: the perspective changes what is seen a little each time. Chosen by hand;
-/// not swept.
+/// Iterations of centring a view on the centre of its visible part: the perspective changes the visible part slightly each time.
+/// Chosen by hand; not swept.
 const CENTRINGS: usize = 3;
-/// How far a length in a file may be off that of the mesh, as a fraction of the diameter: rounding.
+/// Largest difference between a length in a file and that of the mesh, as a fraction of the diameter: rounding errors.
 const SAME_LENGTH: f64 = 1e-9;
 
 impl ObjectTemplates {
-    /// Draws `mesh` (metres) from all sides that the options ask for.
+    /// Renders `mesh` (metres) from all sides that the options request.
     ///
     /// # Errors
     /// [`TemplateError::Option`] and [`TemplateError::NoSurface`].
@@ -51,9 +51,8 @@ impl ObjectTemplates {
         Ok(ObjectTemplates { diameter, size, options: *options, source: Source::Mesh, made_from, templates })
     }
 
-    /// The templates of `mesh`, read from `path` when they are there and belong to this mesh and these options, otherwise
-    /// made and written there. The second value tells why a file that was there was not taken, or that the new one could
-    /// not be written.
+    /// The templates of `mesh`: read from `path` if the file belongs to this mesh and these options, otherwise rendered and written
+    /// there. The second value says why an existing file was not used or the new one could not be written.
     ///
     /// # Errors
     /// [`TemplateError`] as [`ObjectTemplates::from_mesh`].
@@ -83,10 +82,11 @@ impl ObjectTemplates {
 }
 
 impl ObjectTemplates {
-    /// Holds what a file says against the mesh that it says it was made from.
+    /// Checks that the contents of a file fit the mesh from which it claims to be made.
     fn fits(&self, mesh: &Mesh, options: &TemplateOptions) -> Result<(), &'static str> {
         let (low, high) = mesh.bounding_box();
-        // A view's reference point lies on the mesh, which is as far from its frame's origin as the furthest corner of its box.
+        // A view's reference point is on the mesh, so it is no further from the frame's origin than the furthest corner of the
+        // bounding box.
         let reach = low.abs().sup(&high.abs()).norm() + self.diameter;
         if self.source != Source::Mesh || self.options != *options {
             return Err("field source or options: not those of the mesh's templates");
@@ -116,7 +116,7 @@ fn fingerprint(mesh: &Mesh, options: &TemplateOptions) -> u64 {
     hash.value()
 }
 
-/// One view; `None` when nothing of the mesh is seen from there (a sheet seen edge-on).
+/// One view; `None` when nothing of the mesh is visible from there (a sheet seen edge-on).
 fn draw(mesh: &Mesh, direction: &Vec3, size: f64, distance: f64) -> Option<Template> {
     draw_rotated(mesh, view_rotation(direction), size, distance)
 }
@@ -131,7 +131,7 @@ pub(crate) fn draw_rotated(
     let camera = patch_camera(size, distance);
     let mut frame = VisibilityBuffer::new(&camera);
     let (low, high) = mesh.bounding_box();
-    // The centre of the box on the axis at first, then the middle of what is seen.
+    // First centred on the bounding box, then on the visible part.
     let mut pose = Pose::new(rotation, Vec3::z() * distance - rotation * ((low + high) * 0.5));
     for _ in 0..CENTRINGS {
         frame.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
@@ -182,7 +182,7 @@ mod tests {
                 let surface = off(p.x, 0.06).min(off(p.y, 0.08)).min(off(p.z, 0.10));
                 assert!(surface < 2e-4, "{p:?}");
             }
-            // The reference point is seen and lies in the centre of the patch.
+            // The reference point is visible and at the centre of the patch.
             assert!(t.relative_depth(SIDE / 2, SIDE / 2).is_some_and(|z| z.abs() < 0.01));
         }
     }
@@ -204,7 +204,7 @@ mod tests {
         assert!((other.diameter / first.diameter - 1.1).abs() < 1e-9);
     }
 
-    /// Files that are whole, of this version and of this mesh, as they say.
+    /// Files that claim to be intact, of this version and of this mesh.
     #[test]
     fn forged_templates_are_made_again_with_a_note_that_names_the_field() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
-//! Judging a pose without a mesh: the scores of the dissertation's section 5.2.5, computed with the template that was
-//! matched in place of a rendering (what its section 5.4 leaves for the future).
+//! Verification without a mesh: the scores of the dissertation's section 5.2.5, computed with the template that was matched in
+//! place of a rendering (what its section 5.4 leaves for the future).
 
 use sixfold_align::verification::{Agreement, pierced};
 use sixfold_align::{PreparedDepth, VerificationOptions, VerificationScore};
@@ -7,21 +7,21 @@ use sixfold_geometry::{PointCloud, Pose};
 
 use crate::template::{SIDE, Template};
 
-/// A template's point whose normal has a z (view frame) above this is seen at a grazing angle, less than 9 degrees, and slides out of
-/// its pixel: as in verification by rendering. Chosen by hand; not swept.
+/// A template's point whose normal has a z (view frame) above this is seen at a grazing angle, less than 9 degrees, and may move
+/// out of its pixel: as in verification by rendering. Chosen by hand; not swept.
 const GRAZING: f64 = -0.15;
-/// Least cosine between ray and normal by which a difference of depth counts as one along the normal, as in the screening of point
-/// pair features: grazing surface may miss by more in depth. Chosen by hand; not swept.
+/// Lower bound of the cosine between ray and normal with which a difference in depth is converted to one along the normal, as in
+/// the screening of point pair features: on grazing surfaces the depth may differ by more. Chosen by hand; not swept.
 const MIN_SLOPE: f64 = 0.3;
 
-/// What a template shows, for alignment and judgement.
+/// The surface that a template shows, for alignment and verification.
 #[derive(Debug, Clone)]
 pub struct Surface {
     /// Some of the points with normals, for ICP.
     pub sparse: PointCloud,
     /// All points with normals.
     pub dense: PointCloud,
-    /// Which of them lie on the outline.
+    /// Which of them are on the outline.
     pub outline: Vec<bool>,
     /// Their pixels in the template, row by row.
     pub pixels: Vec<u16>,

@@ -1,4 +1,4 @@
-//! An object's templates as the network knows them, and the search for the nearest of a region.
+//! The network's descriptors of an object's templates, and the search for those nearest to a region.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use crate::patch::{Patch, REACH, TemplateSurface};
 use crate::regions::shared_diameter;
 use crate::template::ObjectTemplates;
 
-/// The network, and every template at every rotation as it describes it.
+/// The network, and its descriptors of every template at every in-plane rotation.
 #[derive(Debug, Clone)]
 pub struct Learned {
     model: Arc<MttmModel>,
@@ -27,15 +27,15 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Describes templates; `entries` are the views with their turns.
+    /// Describes templates; `entries` are the views with their in-plane rotations.
     pub fn new(model: Arc<MttmModel>, object: &ObjectTemplates, entries: &[Entry]) -> Learned {
         let mut learned = Learned::without_descriptors(model, object);
         learned.descriptors = learned.model.describe_templates(entries.len(), |i| learned.patch(entries[i]));
         learned
     }
 
-    /// The same with descriptors read from `path`, when they are there and belong to this network and these templates; otherwise
-    /// made and written there. The second value tells why they could not be read or written.
+    /// The same, with descriptors read from `path` if the file belongs to this network and these templates, otherwise computed and
+    /// written there. The second value says why they could not be read or written.
     pub fn cached(
         path: &Path,
         model: Arc<MttmModel>,
@@ -81,13 +81,13 @@ impl Learned {
         self.surfaces[entry.template].patch(entry.turn, self.size, self.model.side())
     }
 
-    /// Templates at their turns, ready to be compared.
+    /// Maps of templates at their in-plane rotations, for comparison with regions.
     pub fn templates(&self, entries: &[Entry]) -> Encoded {
         let patches: Vec<Patch> = entries.iter().map(|e| self.patch(*e)).collect();
         self.model.encode_templates(&patches)
     }
 
-    /// Squared distance and number of the nearest entry of every descriptor: exact.
+    /// Squared distance and number of the nearest entry for every descriptor, by exhaustive search.
     pub fn nearest(&self, regions: &[Descriptor]) -> Vec<(f32, usize)> {
         regions
             .par_iter()
@@ -112,8 +112,8 @@ impl Learned {
         all
     }
 
-    /// Where the network lays a template in the camera's frame: rotation and place of the reference point; `None` where no place
-    /// was taught.
+    /// The pose that the network predicts for a template in the camera frame: rotation, and position of the reference point; `None`
+    /// if the network was not trained to predict the position.
     pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, says: &PairSays) -> Option<Pose> {
         let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let place = Vec3::from(says.offset?) * self.size;
@@ -181,7 +181,7 @@ mod tests {
         let (other, note) = Learned::cached(&path, learned_from(2).0, &object, &entries);
         assert!(note.is_none());
         assert_ne!(first.descriptors, other.descriptors);
-        // A damaged file is reported and made again.
+        // A damaged file is reported and computed again.
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         let (_, note) = Learned::cached(&path, learned_from(2).0, &object, &entries);

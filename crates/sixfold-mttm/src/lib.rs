@@ -1,13 +1,12 @@
-//! Objects never trained on, found in depth images by their templates: what chapter 5 of the dissertation is about.
+//! Objects never trained on, found in depth images by their templates (dissertation, chapter 5).
 //!
-//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh (`from_mesh`)
-//! or cut out of real depth images (`from_depth`). Adding an object is all there is to do: nothing is trained.
-//! In a scene, patches around sampled pixels ([`roi`]) are matched with all templates ([`matching`]), the best ones get
-//! masks ([`mask`]), masks of one object are merged, matched again without their background, and the nearest
-//! templates become poses by their geometry ([`align`]); [`estimate()`] puts it together, and [`judge`] says how well a pose
-//! agrees with the image when there is no mesh.
+//! An object is a set of [`ObjectTemplates`]: depth patches of a fixed metric size, rendered from a mesh (`from_mesh`) or cut out
+//! of real depth images (`from_depth`). Adding an object needs no training. In a scene, patches around sampled pixels ([`roi`]) are
+//! matched with all templates ([`matching`]). The best ones get masks ([`mask`]); masks of one object are merged and matched again
+//! without their background. The nearest templates are then aligned with the scene, which gives poses ([`align`]). [`estimate()`]
+//! runs all steps; [`judge`] measures how well a pose agrees with the image when there is no mesh.
 //!
-//! Without the feature `network` (default) there is matching point by point only, and nothing of Burn is compiled.
+//! Without the feature `network` (default) templates are matched point by point only, and Burn is not compiled.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

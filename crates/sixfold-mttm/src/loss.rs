@@ -11,8 +11,8 @@ pub(crate) fn squared_distance(a: &Tensor<2>, b: &Tensor<2>) -> Tensor<2> {
     (a.clone() - b.clone()).square().sum_dim(1)
 }
 
-/// Equation 5.3, for each row of descriptors of regions, their positive and their negative templates, with the dynamic margins
-/// of equation 5.4 (`batch x 1`); `counts` (`batch x 1`) says with 1 which rows have a negative template.
+/// Equation 5.3, for each row of descriptors of regions, their positive and their negative templates, with the dynamic margins of
+/// equation 5.4 (`batch x 1`); `counts` (`batch x 1`) is 1 in rows that have a negative template.
 pub(crate) fn triplet_loss(
     region: &Tensor<2>,
     positive: &Tensor<2>,
@@ -25,8 +25,8 @@ pub(crate) fn triplet_loss(
     (loss * counts.clone()).sum() / (counts.sum() + 1e-6)
 }
 
-/// Equation 5.3 with the positive templates of all other objects in the batch as negative ones: the same images say that much
-/// more. `different` (`batch x batch`) holds 1 where the objects differ.
+/// Equation 5.3 with the positive templates of all other objects in the batch as negative ones, which uses the same images for more
+/// comparisons. `different` (`batch x batch`) holds 1 where the objects differ.
 pub(crate) fn cross_loss(region: &Tensor<2>, positive: &Tensor<2>, different: Tensor<2>) -> Tensor<1> {
     let near = squared_distance(region, positive);
     let product = region.clone().matmul(positive.clone().transpose());
@@ -51,7 +51,7 @@ pub(crate) fn mask_loss<const D: usize>(logits: Tensor<D>, truth: Tensor<D>) -> 
 
 /// The Euclidean distance of rows, the mean: L_pose_reg for quaternions, and the same for places.
 pub(crate) fn distance_loss(found: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
-    // The root's slope at zero is infinite.
+    // The derivative of the root at zero is infinite.
     (squared_distance(&found, &truth) + 1e-8).sqrt().mean()
 }
 

@@ -1,4 +1,4 @@
-//! Which pixels of the scene belong to an object, by the template that lies on it.
+//! Which pixels of the scene belong to an object, given the template aligned with it.
 
 use sixfold_align::DepthRegion;
 use sixfold_geometry::{Mask, Pose, Vec2, Vec3};
@@ -8,8 +8,8 @@ use crate::template::{SIDE, Template};
 /// Pixels of an image (numbers `y * width + x`), ascending.
 pub type Pixels = Vec<u32>;
 
-/// Half the side of the cube about a template's reference point in which its mask is searched, as a multiple of the patch's side: a
-/// little more than half its diagonal. Chosen by hand; not swept.
+/// Half the side of the cube around a template's reference point in which its mask is searched, as a multiple of the patch's side:
+/// a little more than half its diagonal. Chosen by hand; not swept.
 const REACH: f64 = 0.75;
 
 /// The pixels whose depth agrees with the template within `tolerance` metres, every `stride`-th of every `stride`-th row.
@@ -57,7 +57,7 @@ pub(crate) fn template_mask(
     pixels
 }
 
-/// How many pixels two sets have in common.
+/// Number of pixels that two sets have in common.
 pub fn common(a: &[u32], b: &[u32]) -> usize {
     let (mut i, mut j, mut count) = (0, 0, 0);
     while i < a.len() && j < b.len() {

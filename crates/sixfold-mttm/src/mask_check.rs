@@ -1,9 +1,9 @@
-//! Masks held against depth: a mask cut a little too large takes in the table around an object and what lies behind its edges, and the
-//! object known from it would be as large as both.
+//! Checks masks against depth: a mask that is slightly too large includes the table around an object and whatever is behind its
+//! edges, and templates made from it would include them too.
 //!
-//! Two things are left out. Pixels on the plane around the mask, from its border inwards. Of what then remains, surfaces that a depth
-//! edge separates from the largest one and that go on outside the mask without an edge: they belong to something else. Another part of
-//! the same object (a handle, a step behind a tower) ends where the mask ends.
+//! Two kinds of pixels are left out: first those on the plane around the mask, from its border inwards. Then surfaces that a depth
+//! edge separates from the largest one and that continue outside the mask without an edge: they belong to something else. Another
+//! part of the same object (a handle, a step behind a tower) ends where the mask ends.
 
 use std::collections::VecDeque;
 
@@ -13,42 +13,43 @@ use sixfold_geometry::{
 
 use crate::error::TemplateError;
 
-/// More than this fraction of a mask is not left out silently nor with a warning: which surface is the object's is then a guess. Chosen
-/// by hand; not swept.
+/// If more than this fraction of a mask would be left out, it is an error: which surface is the object's is then a guess. Chosen by
+/// hand; not swept.
 pub(crate) const MAX_LEFT_OUT: f64 = 1.0 / 3.0;
-/// From this fraction on it is worth a warning: the lowest millimetres of an object that stands on the plane are left out of right
-/// masks too. Chosen by hand; not swept.
+/// From this fraction on there is a warning. It is not zero because the lowest millimetres of an object that stands on the plane
+/// are left out of correct masks too. Chosen by hand; not swept.
 pub const WORTH_A_WARNING: f64 = 0.03;
 
-/// A jump between neighbours of more than so many metres, and this fraction of the nearer depth, is a depth edge: as in the
+/// A jump between neighbours of more than this many metres plus this fraction of the nearer depth is a depth edge, as in the
 /// preparation of scenes.
 const EDGE: (f64, f64) = (0.005, 0.015);
 /// Width of the ring around the mask in which the plane is searched, as a fraction of the mask's longer side, and its minimum in
 /// pixels; chosen by hand, not swept.
 const RING: (f64, usize) = (0.25, 8);
-/// The plane: what holds at least this fraction of the ring; chosen by hand, not swept.
+/// The plane must contain at least this fraction of the ring; chosen by hand, not swept.
 const PLANE: PlaneOptions = PlaneOptions {
     threshold: 0.01,
     iterations: 200,
     min_share: 0.35,
     max_angle: std::f64::consts::FRAC_PI_6,
 };
-/// A pixel lies on the plane within this multiple of the median distance of the ring's, about three standard deviations of noise.
+/// A pixel is on the plane within this multiple of the median distance of the ring's points, about three standard deviations of
+/// noise.
 const DEVIATIONS: f64 = 4.5;
 /// Bounds of that distance, metres; chosen by hand, not swept.
 const ON_PLANE: (f64, f64) = (0.0015, 0.008);
 
-/// Pixels from what was left out within which thin remains are left out too; chosen by hand, not swept.
+/// Thin remains within this many pixels of what was left out are left out too; chosen by hand, not swept.
 const FRINGE: usize = 2;
 
-/// A mask without what is not the object's, and how much that was, as fractions of the mask's pixels with depth.
+/// A mask reduced to the object, and what was left out, as fractions of the mask's pixels with depth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CheckedMask {
     /// What is left of the mask.
     pub mask: Mask,
     /// On the plane around the object.
     pub on_plane: f64,
-    /// Beyond a depth edge, on surfaces that go on outside the mask.
+    /// Beyond a depth edge, on surfaces that continue outside the mask.
     pub beyond_edges: f64,
 }
 
@@ -59,10 +60,11 @@ impl CheckedMask {
     }
 }
 
-/// Leaves out of a mask what depth shows to be something else. Depth in metres, without lens distortion.
+/// Removes the pixels of a mask that, by their depth, do not show the object. Depth in metres, without lens distortion.
 ///
 /// # Errors
-/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] where more than `MAX_LEFT_OUT` would be left out.
+/// [`TemplateError::MaskSize`], [`TemplateError::Camera`], and [`TemplateError::MaskTooLarge`] if more than `MAX_LEFT_OUT` would be
+/// left out.
 pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<CheckedMask, TemplateError> {
     camera.check_lens()?;
     camera.check_image(depth.width(), depth.height())?;
@@ -102,7 +104,7 @@ pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<Ch
     Ok(checked)
 }
 
-/// The four neighbours of a pixel that lie in the image.
+/// The four neighbours of a pixel that are in the image.
 fn neighbours([x, y]: [usize; 2], (width, height): (usize, usize)) -> impl Iterator<Item = [usize; 2]> {
     let beside = [
         (x > 0).then(|| [x - 1, y]),
@@ -113,13 +115,13 @@ fn neighbours([x, y]: [usize; 2], (width, height): (usize, usize)) -> impl Itera
     beside.into_iter().flatten()
 }
 
-/// Whether two measured depths lie on one surface.
+/// Whether two measured depths belong to one surface.
 fn joined(a: f32, b: f32) -> bool {
     let (a, b) = (f64::from(a), f64::from(b));
     a > 0.0 && b > 0.0 && (a - b).abs() <= EDGE.0 + EDGE.1 * a.min(b)
 }
 
-/// The plane that holds the most of what lies around the mask, and the distance up to which a point lies on it.
+/// The dominant plane of the ring around the mask, and the largest distance of a point on it.
 fn plane_around(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Option<(Plane, f64)> {
     let [_, _, width, height] = mask.bounding_box()?;
     let side = width.max(height) as f64;
@@ -140,7 +142,7 @@ fn plane_around(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Option<(Pla
     Some((plane, tolerance.clamp(ON_PLANE.0, ON_PLANE.1)))
 }
 
-/// The mask without what lies on the plane around it, from its border inwards.
+/// The mask without the pixels on the plane around it, from its border inwards.
 fn without_plane(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Mask {
     let Some((plane, tolerance)) = plane_around(depth, camera, mask) else { return mask.clone() };
     let size = depth.size();
@@ -181,7 +183,7 @@ struct Part {
     going_on: usize,
 }
 
-/// The mask without surfaces that go on outside it, but for the largest one.
+/// The mask without surfaces that continue outside it, except for the largest one.
 fn without_background(depth: &DepthImage, kept: &Mask) -> Mask {
     let size = depth.size();
     let mut left = kept.clone();
@@ -201,8 +203,8 @@ fn without_background(depth: &DepthImage, kept: &Mask) -> Mask {
     result
 }
 
-/// `kept`, a part of `mask`, without what is thinner than three pixels and lies beside what was left out: noise and pixels between two
-/// surfaces.
+/// `kept`, a part of `mask`, without parts that are thinner than three pixels and next to what was left out: noise and pixels
+/// between two surfaces.
 fn without_fringe(depth: &DepthImage, mask: &Mask, kept: &Mask) -> Mask {
     let (width, height) = mask.size();
     let outer = Mask::from_fn(width, height, |x, y| !kept[(x, y)] || depth[(x, y)] <= 0.0);
@@ -213,7 +215,7 @@ fn without_fringe(depth: &DepthImage, mask: &Mask, kept: &Mask) -> Mask {
     Mask::from_fn(width, height, |x, y| kept[(x, y)] && (opened[(x, y)] || !beside[(x, y)]))
 }
 
-/// The surface of a pixel within `left`, which loses it.
+/// The surface that contains a pixel within `left`; its pixels are removed from `left`.
 fn part_from(start: [usize; 2], depth: &DepthImage, kept: &Mask, left: &mut Mask) -> Part {
     let mut part = Part::default();
     let mut queue = VecDeque::from([start]);
@@ -246,7 +248,7 @@ mod tests {
         Camera::new(150.0, 150.0, 79.5, 59.5, SIZE.0, SIZE.1).unwrap()
     }
 
-    /// A box's front at 0.8 m, its bottom edge where a tilted floor meets it, in front of that floor and a bumpy background.
+    /// A box's front at 0.8 m, its bottom edge touching a tilted floor, in front of that floor and a bumpy background.
     fn scene(bumpy: bool) -> (DepthImage, Mask) {
         let object = |x: usize, y: usize| (60..100).contains(&x) && (40..80).contains(&y);
         let depth = DepthImage::from_fn(SIZE.0, SIZE.1, |x, y| {

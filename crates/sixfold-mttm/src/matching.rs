@@ -1,10 +1,10 @@
-//! The hand-made descriptor: all templates of an object against a region of the scene, exactly.
+//! The hand-crafted descriptor: compares all templates of an object with a region of the scene, exhaustively.
 //!
 //! A template is some points of its surface, each in a cell of the region, with depth and normal. A cell agrees when its depth is
-//! near the template's and its normal looks the same way; it contradicts when the scene lies further away (one would see
-//! through the object), and says nothing when the scene lies in front (hidden) or nothing was measured. In contrast
-//! to a distance between descriptors of whole regions, what surrounds the object plays no part, and what hides it little.
-//! Sixteen regions are compared at a time, a number of each in one vector of the processor.
+//! near the template's and its normal has about the same direction. It contradicts when the scene is further away (one would see
+//! through the object). It does not count when the scene is in front (hidden) or nothing was measured. In contrast to a distance
+//! between descriptors of whole regions, the surroundings have no influence and occluders have little. Sixteen regions are compared
+//! at a time, with one number of each in a SIMD vector.
 
 use rayon::prelude::*;
 use sixfold_geometry::{OptionError, Vec3};
@@ -24,7 +24,7 @@ pub struct MatchOptions {
     pub depth: f64,
     /// Smallest and largest tolerance, metres.
     pub limits: (f64, f64),
-    /// Weight of what is hidden or not measured, next to what is seen: a template of which little is seen is a worse bet.
+    /// Weight of hidden or unmeasured points, relative to visible ones, so that a template of which little is visible scores lower.
     pub hidden: f32,
 }
 
@@ -34,12 +34,12 @@ const DEPTH: f64 = 0.14;
 const LIMITS: (f64, f64) = (0.012, 0.03);
 /// [`MatchOptions::hidden`]; chosen by hand, not swept.
 const HIDDEN: f32 = 0.25;
-/// An entry is left out that keeps fewer than one in so many of the [`POINTS`] within the region; chosen by hand, not swept.
+/// An entry is left out when fewer than one in this many of its [`POINTS`] are within the region; chosen by hand, not swept.
 const KEPT: usize = 4;
-/// What a cell counts by its depth alone, and by the squared cosine between the normals: those at edges are not to be trusted. Chosen
-/// by hand; not swept.
+/// Weight of a cell's depth, and of the squared cosine between the normals ([`BY_NORMALS`]): normals at edges are unreliable.
+/// Chosen by hand; not swept.
 const DEPTH_ALONE: f32 = 0.2;
-/// See [`DEPTH_ALONE`]; both together are 1.
+/// See [`DEPTH_ALONE`]; the two sum to 1.
 const BY_NORMALS: f32 = 0.8;
 
 impl Default for MatchOptions {
@@ -65,16 +65,16 @@ impl MatchOptions {
     }
 }
 
-/// A view at a rotation in the image plane.
+/// A view at an in-plane rotation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
     /// Number of the template.
     pub template: usize,
-    /// Turn in the image plane, radians: ROI from view.
+    /// In-plane rotation, radians: ROI from view.
     pub turn: f64,
 }
 
-/// A match: how well (0 to 1) and with what.
+/// A match: its score (0 to 1) and its entry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Match {
     /// Agreement.
@@ -90,24 +90,24 @@ struct Point {
     normal: [f32; 3],
 }
 
-/// Templates made ready to be compared.
+/// Templates prepared for the comparison.
 #[derive(Debug, Clone)]
 pub struct Matcher {
     entries: Vec<Entry>,
-    /// Those of the first matching: every other turn.
+    /// Entries of the first matching: every other in-plane rotation.
     coarse: Vec<usize>,
-    /// Points of all entries in turn, and where each entry's begin.
+    /// Points of all entries, one entry after another, and where each entry's points begin.
     points: Vec<Point>,
     starts: Vec<usize>,
     tolerance: f32,
     hidden: f32,
 }
 
-/// Regions side by side: for every cell, each of its four numbers of all regions together.
+/// Interleaved regions: for every cell, each of its four numbers for all regions.
 type Block = Vec<[[f32; LANES]; 4]>;
 
 impl Matcher {
-    /// Makes the templates ready, each at all of its rotations.
+    /// Prepares the templates, each at all of its in-plane rotations.
     pub fn new(object: &ObjectTemplates, options: &MatchOptions) -> Matcher {
         let turns = object.turns();
         let per_template: Vec<Vec<(Entry, Vec<Point>)>> = object
@@ -144,18 +144,18 @@ impl Matcher {
         matcher
     }
 
-    /// The views with their turns.
+    /// The views with their in-plane rotations.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The tolerance of depths, metres.
+    /// The depth tolerance, metres.
     pub fn tolerance(&self) -> f64 {
         f64::from(self.tolerance)
     }
 
-    /// The best entry for every region, given by their cells: every view at every other turn, which leaves 15 degrees to
-    /// the alignment and the second matching.
+    /// The best entry for every region, given by their cells: every view at every other in-plane rotation; the alignment and the
+    /// second matching correct the remaining 15 degrees.
     pub fn best<'a>(&self, count: usize, cells: impl Fn(usize) -> Vec<Cell> + Sync + 'a) -> Vec<Match> {
         let blocks: Vec<Vec<Match>> = (0..count.div_ceil(LANES))
             .into_par_iter()
@@ -177,8 +177,8 @@ impl Matcher {
         blocks.concat()
     }
 
-    /// All entries against a few regions (at most [`LANES`]) that show the same thing from slightly shifted centres: each entry's
-    /// best score over the regions and which of them it was, best first.
+    /// All entries against a few regions (at most [`LANES`]) that show the same part of the scene from slightly shifted centres:
+    /// each entry's best score over the regions and the number of that region, best first.
     pub fn ranked(&self, regions: &[Vec<Cell>]) -> Vec<(Match, usize)> {
         let block = side_by_side(regions.iter().take(LANES).cloned());
         let mut ranked: Vec<(Match, usize)> = (0..self.entries.len())
@@ -229,18 +229,18 @@ fn side_by_side(regions: impl Iterator<Item = Vec<Cell>>) -> Block {
     block
 }
 
-/// A point of a template with its place in the patch (pixels from the middle).
+/// A point of a template with its position in the patch (pixels from the centre).
 struct Chosen {
     place: [f64; 2],
     depth: f64,
     normal: Vec3,
 }
 
-/// Points evenly over what a template shows.
+/// Points spread evenly over the visible surface of a template.
 fn chosen_points(template: &Template, size: f64) -> Vec<Chosen> {
     let (cloud, pixels) = template.cloud(size);
     let centre = (SIDE as f64 - 1.0) / 2.0;
-    // Every so many pixels of a row, rows alternately shifted, as many as give about the wanted number.
+    // Every n-th pixel of a row, rows alternately shifted, spaced to give about the wanted number.
     let spacing = (cloud.len() as f64 / POINTS as f64).sqrt().max(1.0);
     let mut taken = std::collections::BTreeSet::new();
     let mut chosen = vec![];
@@ -285,7 +285,7 @@ mod tests {
     use crate::template::{Source, TemplateOptions};
     use sixfold_geometry::Pose;
 
-    /// A roof whose ridge runs across the patch, seen from above: no rotation but half a turn looks the same.
+    /// A roof whose ridge runs across the patch, seen from above: only a rotation by half a turn looks the same.
     fn roof() -> ObjectTemplates {
         let depth = (0..SIDE * SIDE)
             .map(|i| {

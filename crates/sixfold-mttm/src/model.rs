@@ -1,4 +1,4 @@
-//! A trained network as one file, and what it is asked: descriptors of regions and templates, and what pairs of them say.
+//! A trained network as one file, and its queries: descriptors of regions and templates, and predictions for pairs of them.
 
 use std::path::{Path, PathBuf};
 
@@ -16,10 +16,10 @@ use sixfold_nn::weights::{
 use crate::network::{DESCRIPTOR, MAP, Network, masked};
 use crate::patch::{PLANES, Patch};
 
-/// Patches that go through the network at a time.
+/// Patches per forward pass.
 const AT_A_TIME: usize = 64;
 
-/// Compact weights for all objects; see the card beside the file.
+/// Compact weights for all objects; see the card next to the file.
 static SHIPPED: &[u8] = include_bytes!("../weights/mttm-compact.safetensors");
 
 /// Why a model could not be read.
@@ -42,20 +42,20 @@ pub enum ModelError {
     },
 }
 
-/// A descriptor: regions and templates of the same object in about the same pose have near ones (Euclidean).
+/// A descriptor: regions and templates of the same object in about the same pose have close descriptors (Euclidean distance).
 pub type Descriptor = [f32; DESCRIPTOR];
 
-/// What the network predicts for a region and a template.
+/// Predictions of the network for a region and a template.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairSays {
-    /// How likely each of 14 x 14 cells of the region is the object's, row by row.
+    /// Probability that each of 14 x 14 cells of the region belongs to the object, row by row.
     pub mask: Vec<f32>,
     /// Region from template.
     pub rotation: UnitQuaternion<f64>,
-    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch's size; `None` where the
-    /// training did not teach it, as the dissertation's does not.
+    /// Position of the template's reference point relative to the region's centre, as a fraction of the patch's size; `None` if the
+    /// training had no loss for it, as in the dissertation.
     pub offset: Option<[f64; 3]>,
-    /// How likely both show the same object in about the same pose; 1 where the training did not teach it.
+    /// Probability that both show the same object in about the same pose; 1 if the training had no loss for it.
     pub matching: f32,
 }
 
@@ -66,16 +66,16 @@ pub struct Encoded {
 }
 
 impl Encoded {
-    /// Those of some of the patches, in the order of the numbers.
+    /// The maps of some of the patches, in the order of `numbers`.
     pub fn select(&self, numbers: &[usize]) -> Encoded {
         let rows = numbers.iter().map(|&i| self.maps.clone().narrow(0, i, 1)).collect();
         Encoded { maps: Tensor::cat(rows, 0) }
     }
 
-    /// Several in turn.
+    /// Concatenates several.
     ///
     /// # Panics
-    /// For none.
+    /// If `parts` is empty.
     pub fn joined(parts: &[Encoded]) -> Encoded {
         Encoded { maps: Tensor::cat(parts.iter().map(|p| p.maps.clone()).collect(), 0) }
     }
@@ -90,7 +90,7 @@ pub struct MttmModel {
 }
 
 impl MttmModel {
-    /// A model of a trained network. `card` gets the architecture filled in.
+    /// A model of a trained network; its architecture is written into `card`.
     pub fn new(network: Network, card: ModelCard) -> Self {
         let card = ModelCard { architecture: network.architecture().to_owned(), ..card };
         MttmModel { network: network.valid(), card, device: Device::flex() }
@@ -99,7 +99,7 @@ impl MttmModel {
     /// Reads a weight file.
     ///
     /// # Errors
-    /// [`ModelError`] for a file that cannot be read or holds another network.
+    /// [`ModelError`] for a file that cannot be read or contains another network.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let card = read_card(path)?;
         let device = Device::flex();
@@ -114,7 +114,7 @@ impl MttmModel {
         Ok(MttmModel { network: network.valid(), card, device })
     }
 
-    /// Reads a compact model from the bytes of a weight file; `name` stands for it in messages.
+    /// Reads a compact model from the bytes of a weight file; `name` is used in messages.
     ///
     /// # Errors
     /// [`ModelError`].
@@ -126,15 +126,15 @@ impl MttmModel {
         Ok(MttmModel { network: network.valid(), card, device })
     }
 
-    /// The network that comes with the program.
+    /// The shipped network.
     ///
     /// # Errors
-    /// [`ModelError`] if the program carries weights of another version than its own.
+    /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn shipped() -> Result<Self, ModelError> {
         Self::from_bytes(Path::new("mttm-compact.safetensors"), SHIPPED)
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
@@ -148,25 +148,25 @@ impl MttmModel {
         &self.card
     }
 
-    /// Side of the patches it takes, pixels.
+    /// Side of its input patches, pixels.
     pub fn side(&self) -> usize {
         self.network.side()
     }
 
-    /// A number that tells this network's descriptors from those of another: FNV-1a over its card.
+    /// A fingerprint that distinguishes this network's descriptors from those of another: FNV-1a over its card.
     pub fn fingerprint(&self) -> u64 {
         fnv1a(serde_json::to_string(&self.card).unwrap_or_default().as_bytes())
     }
 
-    /// Maps of patches: what everything else is asked with.
+    /// Maps of patches, the input of all other queries.
     ///
     /// # Panics
-    /// For patches of another side than the network's.
+    /// If the patches have another side than the network's input.
     pub fn encode(&self, patches: &[&Patch]) -> Encoded {
         Encoded { maps: self.network.maps(self.tensor(patches)) }
     }
 
-    /// Maps of templates: zeros where the object is not.
+    /// Maps of templates: zeros outside the object.
     ///
     /// # Panics
     /// As [`MttmModel::encode`].
@@ -180,13 +180,13 @@ impl MttmModel {
         Encoded { maps: masked(encoded.maps.clone(), self.cells(masks)) }
     }
 
-    /// The descriptor of each.
+    /// The descriptor of each patch.
     pub fn describe(&self, encoded: &Encoded) -> Vec<Descriptor> {
         let numbers = numbers(self.network.descriptor(encoded.maps.clone()));
         numbers.chunks_exact(DESCRIPTOR).map(|row| std::array::from_fn(|k| row[k])).collect()
     }
 
-    /// Descriptors of many templates, some at a time: `patch` gives the one of a number.
+    /// Descriptors of many templates, computed in batches: `patch` returns the template with a number.
     ///
     /// # Panics
     /// As [`MttmModel::encode`].
@@ -206,7 +206,7 @@ impl MttmModel {
         parts.concat()
     }
 
-    /// What the network predicts for pairs of a region and a template, each the same row of both.
+    /// The network's predictions for pairs of a region and a template, row by row.
     pub fn compare(&self, regions: &Encoded, templates: &Encoded) -> Vec<PairSays> {
         let compared = self.network.compare(regions.maps.clone(), templates.maps.clone());
         let masks = numbers(sigmoid(compared.mask));
@@ -229,7 +229,8 @@ impl MttmModel {
             .collect()
     }
 
-    /// Whether the training gave a loss of its own weight, as the card has it; files of before that was written down had it.
+    /// Whether the loss `weight` was used in the training, according to the card; files from before the card had this entry used
+    /// it.
     fn taught(&self, weight: &str) -> bool {
         self.card.extra["training"][weight].as_f64().is_none_or(|weight| weight > 0.0)
     }
@@ -247,7 +248,7 @@ impl MttmModel {
     }
 }
 
-/// The fraction of every one of 14 x 14 cells in which a patch has anything: for a template, the object.
+/// The fraction of each of 14 x 14 cells in which a patch has measurements: for a template, the object.
 pub(crate) fn template_mask(patch: &Patch) -> Vec<f32> {
     let (side, step) = (patch.side, patch.side / MAP);
     let known = &patch.values[4 * side * side..];
@@ -347,7 +348,7 @@ mod tests {
         save_weights(&whole.network, &paper, &file).unwrap();
         let error = MttmModel::load(&file).unwrap_err().to_string();
         assert!(error.contains("mttm.safetensors") && error.contains("differently configured"), "{error}");
-        // Sizes are the architecture's own: numbers beside it decide about nothing.
+        // The architecture determines the sizes: other numbers in the card have no effect.
         let extra = serde_json::json!({ "pool": { "anchors": { "side": u64::MAX } } });
         save_weights(&whole.network, &ModelCard { extra, ..whole.card.clone() }, &file).unwrap();
         assert_eq!(MttmModel::load(&file).unwrap().side(), whole.side());

@@ -1,7 +1,7 @@
-//! What the network sees: a region of a scene, or a template, as normals and depth on a grid of fixed metric size.
+//! The input of the network: a region of a scene, or a template, as normals and depth on a grid of fixed metric size.
 //!
 //! Five planes: the normal in the region's frame (dissertation, section 5.2.2), the depth along the region's axis relative to its
-//! centre as a fraction of half the patch, from -1 to 1, and whether anything was measured. Where nothing was, all are zero.
+//! centre as a fraction of half the patch, from -1 to 1, and whether the pixel was measured. Where it was not, all are zero.
 
 use sixfold_align::DepthRegion;
 
@@ -28,8 +28,8 @@ impl Patch {
         Patch { side, values: vec![0.0; PLANES * side * side] }
     }
 
-    /// The region about `roi`'s centre, `size` metres wide. Pixels (numbers in the image) that `seen` refuses are not
-    /// measured.
+    /// The region around `roi`'s centre, `size` metres wide. Pixels (by their number in the image) for which `seen` is false count
+    /// as not measured.
     pub fn of_scene(
         scene: &DepthRegion,
         roi: &Roi,
@@ -40,11 +40,11 @@ impl Patch {
         Patch::of_cells(&roi.look(scene, size, side, seen), size, side)
     }
 
-    /// Cells of a region of `size` metres, as [`Roi::look`] gives them.
+    /// Cells of a region of `size` metres, as [`Roi::look`] returns them.
     pub fn of_cells(cells: &[Cell], size: f64, side: usize) -> Patch {
         let mut patch = Patch::empty(side);
         for (i, [depth, x, y, z]) in cells.iter().enumerate() {
-            // Further in front than anything can be: not measured.
+            // Closer than anything can be: not measured.
             if *depth > -1e5 {
                 patch.set(i, [*x, *y, *z], *depth, size);
             }
@@ -62,12 +62,12 @@ impl Patch {
     }
 }
 
-/// A template made ready to be rendered as patches at any rotation.
+/// A template prepared for resampling as a patch at any rotation.
 #[derive(Debug, Clone)]
 pub struct TemplateSurface {
     /// Normal and relative depth (metres) of every pixel of the template that has both.
     pixels: Vec<Option<([f32; 3], f32)>>,
-    /// Metres of a pixel at the reference point.
+    /// Size of a pixel at the reference point, metres.
     pixel_size: f64,
 }
 
@@ -83,8 +83,8 @@ impl TemplateSurface {
         TemplateSurface { pixels, pixel_size: template_size / SIDE as f64 }
     }
 
-    /// The template rotated by `turn` radians in the image plane (region from view), as a patch of `size` metres: the object
-    /// alone.
+    /// The template rotated by `turn` radians in the image plane (region from view), as a patch of `size` metres that shows the
+    /// object alone.
     pub fn patch(&self, turn: f64, size: f64, side: usize) -> Patch {
         let mut patch = Patch::empty(side);
         let (sin, cos) = turn.sin_cos();
@@ -115,7 +115,7 @@ mod tests {
     use sixfold_mesh::Mesh;
     use sixfold_render::render_depth;
 
-    /// A wedge: no two sides alike.
+    /// A wedge, on which no two sides are alike.
     fn wedge() -> Mesh {
         let v = [
             [-0.05, -0.03, 0.0],
@@ -138,7 +138,7 @@ mod tests {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
         let roi = Roi { centre: Vec3::new(0.12, -0.08, 0.7) };
         for turn in [0.0, 0.6] {
-            // The object where the template's reference point falls on the region's centre.
+            // The object's pose at which the template's reference point is at the region's centre.
             let pose = camera_from_view(&roi.camera_from_roi(), turn) * template.view_from_object;
             let depth = render_depth(&mesh, &pose, &camera);
             let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };

@@ -1,17 +1,17 @@
-//! How different two poses of an object are to a depth camera (dissertation, equations 5.1 and 5.2): what looks the same is no
-//! distance apart, so symmetric objects need no special treatment.
+//! How different two poses of an object are to a depth camera (dissertation, equations 5.1 and 5.2): poses that look the same have
+//! distance 0, so symmetric objects need no special treatment.
 
 use sixfold_geometry::nalgebra::UnitQuaternion;
 
 use crate::template::{SIDE, Template};
 
-/// Mean differences of depth below this are none, metres.
+/// Mean differences of depth below this count as 0, metres.
 pub(crate) const LOWER: f64 = 0.1;
-/// And above this all there can be.
+/// Mean differences of depth above this count as the maximum, metres.
 pub(crate) const UPPER: f64 = 0.5;
 
-/// Equation 5.1 for two views of one object from the same distance: the mean difference of depth over the pixels that
-/// show it in one of them, where the background has depth 0; 0 below [`LOWER`], 1 above [`UPPER`].
+/// Equation 5.1 for two views of one object from the same distance: the mean difference of depth over the pixels that show it in at
+/// least one of them, where the background has depth 0; 0 below [`LOWER`], 1 above [`UPPER`].
 pub(crate) fn appearance_distance(a: &Template, b: &Template) -> f64 {
     let (mut sum, mut pixels) = (0.0, 0usize);
     for y in 0..SIDE {
@@ -31,8 +31,8 @@ pub(crate) fn appearance_distance(a: &Template, b: &Template) -> f64 {
     }
 }
 
-/// Equation 5.2: the angle between two rotations (half of it, as a quaternion's product gives it), radians, times how different
-/// they look.
+/// Equation 5.2: the angle between two rotations (half of it, as a quaternion's product gives it), radians, times their
+/// [`appearance_distance`].
 pub(crate) fn pose_distance(
     a: (&UnitQuaternion<f64>, &Template),
     b: (&UnitQuaternion<f64>, &Template),
@@ -82,7 +82,7 @@ mod tests {
     fn a_turn_that_cannot_be_seen_is_no_distance() {
         let round = prism(48, |_| 0.04);
         assert_eq!(distance(&round, 1.0), 0.0);
-        // A blade: seen from its narrow side it covers half as much.
+        // A blade: from its narrow side it covers half as many pixels.
         let blade = prism(24, |k| if k % 12 == 0 { 0.06 } else { 0.02 });
         let far = distance(&blade, 1.5);
         assert!(far > 0.15, "{far}");

@@ -1,10 +1,10 @@
-//! Regions and hypotheses as published (dissertation, section 5.2.4): descriptors alone choose templates, the mask head says which
-//! pixels are the object's before anything is aligned, masks that overlap are one region, and each region has the five nearest
+//! Regions and hypotheses as published (dissertation, section 5.2.4): descriptors alone choose templates, the mask head predicts
+//! the object's pixels before any alignment, overlapping masks are merged to one region, and each region has the five nearest
 //! templates of a second matching without its background. A region whose first hypothesis does not cover its mask after three
 //! iterations of ICP is left out (section 5.2.5).
 //!
-//! The text leaves open how many regions get a mask, and what the 30 % of overlap are of: here [`SELECTED`], and intersection over
-//! union. A template is placed where its visible centroid meets that of the predicted mask.
+//! The dissertation does not say how many regions get a mask, nor how the 30 % of overlap are defined: here [`SELECTED`], and
+//! intersection over union. A template is placed so that its visible centroid coincides with that of the predicted mask.
 
 use std::sync::Arc;
 
@@ -25,22 +25,22 @@ use crate::roi::{Roi, UNKNOWN, ray_rotation};
 
 /// Regions of the first matching whose masks are predicted: those with the nearest templates. Chosen by hand; not swept.
 const SELECTED: usize = 200;
-/// Pairs that go through the network at a time; of no influence on the result.
+/// Pairs that go through the network at a time; does not affect the result.
 const AT_A_TIME: usize = 32;
-/// A cell, or a pixel, belongs to the object from this probability on.
+/// A cell, or a pixel, belongs to the object if its probability is at least this.
 const INSIDE: f32 = 0.5;
-/// Masks that share more than this fraction of the smaller one are of one object (section 5.2.4).
+/// Masks whose intersection exceeds this fraction of the smaller one belong to one object (section 5.2.4).
 const MERGED: f64 = 0.5;
-/// Regions whose first hypothesis overlaps their mask by less are left out (section 5.2.5).
+/// Regions are left out when their first hypothesis overlaps their mask by less (section 5.2.5).
 const MIN_OVERLAP: f64 = 0.3;
 /// Masks are compared on every n-th column and row; chosen by hand, not swept.
 const STRIDE: usize = 2;
-/// Fewest pixels of a mask there; chosen by hand, not swept.
+/// Fewest pixels of a mask on these columns and rows; chosen by hand, not swept.
 const MIN_MASK: usize = 20;
-/// Nearest templates among which a region's hypotheses are looked for, for each of them. Chosen by hand; not swept.
+/// Nearest templates examined per hypothesis of a region. Chosen by hand; not swept.
 const NEAREST: usize = 60;
 
-/// A region's hypotheses, laid on the scene; all carry its mask.
+/// The hypotheses of all regions, aligned with the scene; each has the mask of its region.
 pub(crate) fn hypotheses(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -74,13 +74,13 @@ pub(crate) fn hypotheses(
         .into_iter()
         .filter_map(|(_, mask)| Some((Roi { centre: centroid(scene, &mask)? }, mask)))
         .collect();
-    // In turn: each region asks the network by itself.
+    // Sequentially: each region runs the network in parallel itself.
     let found: Vec<Vec<Placed>> =
         centred.par_iter().map(|(roi, mask)| region(scene, object, learned, roi, mask, options)).collect();
     found.concat()
 }
 
-/// The masks without those that overlap an earlier one, at most so many.
+/// The masks without those that overlap an earlier one, at most `most`.
 fn merged(masks: Vec<(Roi, Pixels)>, most: usize) -> Vec<(Roi, Pixels)> {
     let mut kept: Vec<(Roi, Pixels)> = vec![];
     for (roi, mask) in masks {
@@ -125,7 +125,7 @@ fn region(
     }
     let regions = Encoded::joined(&vec![encoded; entries.len()]);
     let says = model.compare(&regions, &learned.templates(&entries));
-    // One mask a region, by its first hypothesis.
+    // One mask per region, predicted for its first hypothesis.
     let mask = Arc::new(mask_pixels(scene, roi, size, &says[0].mask, 1));
     let Some(centre) = centroid(scene, &mask) else { return vec![] };
     let starts: Vec<Pose> = entries
@@ -146,7 +146,7 @@ fn region(
         .collect()
 }
 
-/// Where a template lies whose visible centroid is at `centre`, rotated as the network says.
+/// The pose of a template whose visible centroid is at `centre`, with the rotation that the network predicts.
 pub(crate) fn start(
     object: &KnownObject,
     camera_from_roi: &Pose,
@@ -182,7 +182,7 @@ fn overlap(a: &Pixels, b: &Pixels) -> f64 {
     both as f64 / (a.len() + b.len() - both).max(1) as f64
 }
 
-/// The measured pixels whose cell of a predicted mask (14 x 14) is the object's, of every `stride`-th column and row.
+/// The measured pixels whose cell of a predicted mask (14 x 14) belongs to the object, on every `stride`-th column and row.
 fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: usize) -> Pixels {
     let camera = scene.camera();
     let rotation = ray_rotation(&roi.centre);
@@ -203,7 +203,7 @@ fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: 
             if scene.depth()[(x, y)] <= 0.0 {
                 continue;
             }
-            // Where the pixel's ray meets the region's square.
+            // The intersection of the pixel's ray with the region's square.
             let ray = camera.unproject(&Vec2::new(x as f64, y as f64), 1.0);
             let p = ray * (distance / axis.dot(&ray)) - roi.centre;
             let cell = |along: f64| ((along / size + 0.5) * MAP as f64).floor();
@@ -217,7 +217,7 @@ fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: 
     pixels
 }
 
-/// Which cells of a region look at pixels of a mask that was taken on every [`STRIDE`]-th column and row.
+/// Which cells of a region show pixels of a mask that has only every [`STRIDE`]-th column and row.
 fn cells_of(scene: &DepthRegion, roi: &Roi, size: f64, mask: &Pixels) -> Vec<f32> {
     let width = scene.camera().width;
     let inside = |pixel: usize| {
@@ -228,8 +228,8 @@ fn cells_of(scene: &DepthRegion, roi: &Roi, size: f64, mask: &Pixels) -> Vec<f32
     cells.iter().map(|c| f32::from(u8::from(*c != UNKNOWN))).collect()
 }
 
-/// The centroid of what a mask's pixels show, camera frame: the median of depth decides what is the object's and what is seen past
-/// it, as a mask of 14 x 14 cells is coarse. `None` for an empty mask.
+/// The centroid of a mask's points, camera frame: their mean, scaled along its ray to the median depth. The median is robust to the
+/// background that a coarse mask of 14 x 14 cells includes. `None` for an empty mask.
 fn centroid(scene: &DepthRegion, mask: &Pixels) -> Option<Vec3> {
     let camera = scene.camera();
     let point = |&p: &u32| {
@@ -243,8 +243,8 @@ fn centroid(scene: &DepthRegion, mask: &Pixels) -> Option<Vec3> {
     Some(mean * (median / mean.z))
 }
 
-/// The centre of what a region's cells of the mask show, in the region's frame; the region's own centre where they show nothing. For
-/// a network whose place was never trained.
+/// The centre of the surface shown by the mask's cells of a region, in the region's frame; the region's own centre if they show
+/// nothing. For a network that was not trained to predict the position.
 pub(crate) fn visible_centre(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32]) -> Vec3 {
     let pixels = mask_pixels(scene, roi, size, mask, STRIDE);
     let centre = centroid(scene, &pixels).unwrap_or(roi.centre);
@@ -281,7 +281,7 @@ mod tests {
         assert!(low.abs_diff(93) <= 1 && high.abs_diff(159) <= 1, "{low} {high}");
         assert!(pixels.len().abs_diff(67 * 133) < 300, "{}", pixels.len());
         assert!(mask_pixels(&scene, &roi(0.0), 0.2, &[0.4; MAP * MAP], 1).is_empty());
-        // And back, in a region 2 cm to the right: its left half ends 1.4 cells further to the left.
+        // The inverse, in a region 2 cm to the right: the left half ends 1.4 cells further to the left.
         let coarse = mask_pixels(&scene, &roi(0.0), 0.2, &mask, STRIDE);
         let cells = cells_of(&scene, &roi(0.02), 0.2, &coarse);
         let in_row = |v: usize| (0..MAP).filter(|u| cells[v * MAP + u] > 0.5).count();

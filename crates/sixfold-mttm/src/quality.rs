@@ -10,26 +10,26 @@ use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
 use crate::samples::{Augmentation, Batch, PairBatchOptions, Pool};
 
-/// What a network achieves on regions with templates of about the right pose. Medians and fractions.
+/// Accuracy of a network on regions with templates of about the right pose. Medians and fractions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
-    /// Regions that were searched.
+    /// Number of regions.
     pub regions: usize,
-    /// Fraction of them whose own template is nearer than 39 templates of other objects and poses.
+    /// Fraction of the regions whose own template is nearer than 39 templates of other objects and poses.
     pub nearest: f64,
     /// Fraction of the masks with an intersection over union above one half.
     pub masks: f64,
-    /// Median angle between template and object, and what is left of it with the rotation applied, radians.
+    /// Median angle between template and object, and the remaining angle after the predicted rotation, radians.
     pub rotation: [f64; 2],
-    /// Median distance of the region's centre from the template's reference point, and of the predicted place, fractions of the
-    /// patch.
+    /// Median distance from the template's reference point to the region's centre, and to the predicted position, as fractions of
+    /// the patch.
     pub offset: [f64; 2],
     /// Fraction of pairs classified correctly: own template, template of another object or pose.
     pub matching: f64,
 }
 
 impl Quality {
-    /// Names and numbers, for people.
+    /// Names and values, for display.
     pub fn scores(&self) -> [(&'static str, f64); 7] {
         [
             ("own template the nearest of 40", self.nearest),

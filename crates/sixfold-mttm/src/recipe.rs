@@ -1,5 +1,5 @@
-//! A whole training: nothing but a seed in, a network for template matching out. Synthetic objects fall on a table, depth cameras
-//! look at them, and the network learns to match regions with templates. Interrupted at any time, it is resumed.
+//! A complete training of the template matching network from a seed alone. Synthetic objects are dropped on a table and rendered as
+//! depth cameras see them, and the network learns to match regions with templates. It can be interrupted at any time and resumed.
 
 use std::path::PathBuf;
 
@@ -25,16 +25,16 @@ use crate::quality::{Quality, quality};
 use crate::samples::{Arrangement, Batch, DepthPoolOptions, PairBatchOptions, Pool, preview};
 use crate::training::{MttmTraining, MttmTrainingOptions};
 
-/// Objects of a scene, fewest and most.
+/// Fewest and most objects in a scene.
 const OBJECTS: (usize, usize) = (5, 12);
-/// Scenes with objects of their own, for the card: one for so many of the training's, at least so many.
+/// Test scenes, with objects of their own, for the model's card: the training's number divided by the first, at least the second.
 const TEST_SCENES: (usize, usize) = (12, 4);
-/// Objects of theirs: one for so many of the training's, at least so many.
+/// Objects of the test scenes: the training's number divided by the first, at least the second.
 const TEST_OBJECTS: (usize, usize) = (4, 16);
-/// Scenes that are made between two checks of `stop`.
+/// Scenes simulated between two checks of `stop`.
 const AT_A_TIME: usize = 16;
 
-/// Which network learns.
+/// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum MttmKind {
     /// Plain convolutions on regions of 28x28 pixels; trains on two cores.
@@ -63,7 +63,7 @@ impl Choice for MttmKind {
 }
 
 impl MttmKind {
-    /// How it is trained unless something else is asked for.
+    /// Its default training options.
     pub fn options(self) -> MttmTrainingOptions {
         match self {
             MttmKind::Compact => MttmTrainingOptions::default(),
@@ -75,11 +75,11 @@ impl MttmKind {
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MttmRecipe {
-    /// Which network learns.
+    /// Which network is trained.
     pub network: MttmKind,
-    /// ImageNet weights of ResNet-50 in torchvision's layout for [`MttmKind::Paper`]; random ones without.
+    /// ImageNet weights of ResNet-50 in torchvision's layout for [`MttmKind::Paper`]; random ones if `None`.
     pub encoder: Option<PathBuf>,
-    /// Steps in all; `None`: the network's of [`MttmKind::options`], as for the next two.
+    /// Number of steps; `None`: the value of [`MttmKind::options`], as for the next two fields.
     pub steps: Option<u64>,
     /// Regions with an object in a step.
     pub anchors: Option<usize>,
@@ -87,11 +87,11 @@ pub struct MttmRecipe {
     pub learning_rate: Option<f64>,
     /// Synthetic objects: half of them household shapes, half of them toys.
     pub objects: usize,
-    /// Scenes in which they fall on a table, made at the start; each is seen by five cameras.
+    /// Scenes in which they are dropped on a table, simulated at the start; each is seen by five cameras.
     pub scenes: usize,
     /// Seed of weights, objects, scenes and samples.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -162,7 +162,7 @@ impl Recipe for MttmRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         #[rustfmt::skip]
         let MttmRecipe { network, encoder, objects, scenes, steps: _, anchors: _, learning_rate: _, seed: _, command: _ } = self;
         Fingerprint::of(&self.options())?
@@ -187,7 +187,7 @@ impl Recipe for MttmRecipe {
             }
         };
         let default = DepthPoolOptions::for_side(network.side());
-        // As published, objects of which less than half is visible are not learnt from.
+        // As published, objects of which less than half is visible are not used in the training.
         let visible = if self.network == MttmKind::Paper { 0.5 } else { default.visible };
         let pool = DepthPoolOptions { visible, seed: self.seed, ..default };
         let mut card =
@@ -219,7 +219,7 @@ impl Recipe for MttmRecipe {
         Ok(Some(pool))
     }
 
-    /// Measures how well the model matches objects and scenes that the training never saw.
+    /// Measures how well the model matches objects and scenes that were not used in the training.
     fn finish(
         &self,
         Prepared { training, mut card, context: pool }: Prepared<MttmTraining, DepthPoolOptions>,
@@ -241,7 +241,7 @@ impl Recipe for MttmRecipe {
     }
 }
 
-/// Makes objects, lets them fall, and looks at them; `None` when asked to stop meanwhile.
+/// Generates objects, drops them and renders them; `None` when stopped meanwhile.
 fn make_pool(
     objects: usize,
     scenes: usize,
@@ -264,7 +264,7 @@ fn make_pool(
         .collect::<Result<_, _>>()?;
     let (meshes, hulls): (Vec<Mesh>, Vec<ConvexParts>) = objects.into_iter().unzip();
     let pile = PileOptions::default();
-    // In parts, so that progress is shown and an interruption noticed.
+    // In batches, so that progress is reported and an interruption noticed.
     let mut arrangements: Vec<Arrangement> = vec![];
     for start in (0..scenes).step_by(AT_A_TIME) {
         let part: Vec<Arrangement> = (start..(start + AT_A_TIME).min(scenes))
@@ -279,7 +279,7 @@ fn make_pool(
     Ok(Pool::new(&meshes, &arrangements, options, &|done, _| progress.report(scenes + done, 2 * scenes)))
 }
 
-/// Some of the objects, fallen.
+/// Some of the objects, dropped on the table.
 fn arrange(hulls: &[ConvexParts], pile: &PileOptions, seed: u64, scene: u64) -> Arrangement {
     let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5ce7e);
     random.set_stream(scene);

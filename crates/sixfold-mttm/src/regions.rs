@@ -1,4 +1,4 @@
-//! What the network predicts for a scene's regions, kept for all objects of about the same size: they are described once.
+//! The network's predictions for a scene's regions, computed once and shared by all objects of about the same size.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,31 +11,31 @@ use crate::model::{Descriptor, Encoded};
 use crate::patch::{Patch, REACH};
 use crate::roi::{ProposalOptions, Roi, propose};
 
-/// Distance of sampled centres as a fraction of the diameter. The network was trained with regions that are off by half of it, and
-/// says how far they are off. Chosen by hand; not swept.
+/// Distance of sampled centres as a fraction of the diameter. The network was trained with regions shifted by up to half of it, and
+/// predicts the shift. Chosen by hand; not swept.
 const STEP: f64 = 0.3;
-/// Most regions that are described; chosen by hand for the time that it takes, not swept.
+/// Largest number of regions for which descriptors are computed; chosen by hand for run time, not swept.
 const MOST: usize = 3000;
-/// A region is worth describing when so many of its cells show something about as far away as its centre. Chosen by hand;
-/// not swept.
+/// Descriptors are computed for a region only when at least this fraction of its cells is about as far away as its centre. Chosen
+/// by hand; not swept.
 const MIN_CELLS: f32 = 0.08;
-/// Regions that go through the network at a time; of no influence on the result.
+/// Regions per forward pass; does not affect the result.
 const AT_A_TIME: usize = 64;
 /// Objects whose diameters differ by less than this factor share regions; chosen by hand, not swept.
 const RATIO: f64 = 1.25;
 
-/// What a patch holds for "measured" lies above this, for "not measured" below.
+/// Threshold of a patch's plane of measured pixels: above it a pixel was measured.
 const KNOWN: f32 = 0.5;
-/// A cell shows something as far away as the centre where its depth (in halves of the patch's size) is less than this off it.
-/// Chosen by hand; not swept.
+/// A cell is as far away as the centre if its relative depth (in halves of the patch's size) is smaller than this. Chosen by hand;
+/// not swept.
 const AT_CENTRE: f32 = 0.5;
 
-/// The diameter that stands for all about as large.
+/// The diameter that represents all objects of about the same size.
 pub(crate) fn shared_diameter(diameter: f64) -> f64 {
     RATIO.powf((diameter.ln() / RATIO.ln()).round())
 }
 
-/// Regions of a scene as the network describes them.
+/// Regions of a scene with their descriptors.
 #[derive(Debug)]
 pub(crate) struct Regions {
     pub rois: Vec<Roi>,
@@ -71,14 +71,14 @@ impl Regions {
     /// Maps of some of the regions.
     ///
     /// # Panics
-    /// For no numbers.
+    /// If `numbers` is empty.
     pub(crate) fn encoded(&self, numbers: &[usize]) -> Encoded {
         let one = |&i: &usize| self.encoded[i / AT_A_TIME].select(&[i % AT_A_TIME]);
         Encoded::joined(&numbers.iter().map(one).collect::<Vec<_>>())
     }
 }
 
-/// The fraction of a patch's cells that show something within a quarter of its size of the centre.
+/// The fraction of a patch's cells whose depth is within a quarter of its size from the centre's.
 fn share_at_centre(patch: &Patch) -> f32 {
     let pixels = patch.side * patch.side;
     let (depth, known) = (&patch.values[3 * pixels..4 * pixels], &patch.values[4 * pixels..]);
@@ -93,14 +93,14 @@ pub(crate) struct RegionCache {
 }
 
 impl RegionCache {
-    /// Those for an object's size; described now if they are asked for the first time.
+    /// The regions for an object's size; computed on the first call.
     pub(crate) fn of(&self, scene: &DepthRegion, learned: &Learned) -> Arc<Regions> {
         let key = (learned.model().fingerprint(), learned.size().to_bits());
         let known = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(regions) = known().get(&key) {
             return regions.clone();
         }
-        // The lock is not held meanwhile: two callers may both describe them, with the same outcome.
+        // The lock is not held meanwhile: two callers may both compute them, with the same result.
         let regions = Arc::new(Regions::new(scene, learned));
         known().insert(key, regions.clone());
         regions

@@ -1,8 +1,8 @@
-//! Regions of interest: squares of a fixed metric size around points of the scene, seen as a camera that looks straight at
-//! them would see them (dissertation, section 5.2.4).
+//! Regions of interest: squares of a fixed metric size around points of the scene, seen as by a camera that faces them directly
+//! (dissertation, section 5.2.4).
 //!
-//! The *ROI frame* has its origin at the centre and its z axis along the ray through it, so that a template matches wherever
-//! in the image its object stands.
+//! The *ROI frame* has its origin at the centre and its z axis along the ray through it, so that a template matches wherever in the
+//! image its object is.
 
 use sixfold_align::DepthRegion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
@@ -11,22 +11,21 @@ use sixfold_geometry::{OptionError, Pose, Vec2, Vec3};
 /// Cells along a side of a region; chosen by hand, not swept.
 pub const GRID: usize = 20;
 
-/// A region: its centre in the camera frame (metres) need not lie on a measured point.
+/// A region. Its centre need not be a measured point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Roi {
     /// Centre in the camera frame, metres.
     pub centre: Vec3,
 }
 
-/// What one cell of a region shows: depth along the region's axis relative to its centre (metres) and the normal in the
-/// region's frame.
+/// One cell of a region: depth along the region's axis relative to its centre (metres) and the normal in the region's frame.
 pub type Cell = [f32; 4];
 
-/// A cell in which nothing was measured, or which is left out: like something far in front, it neither agrees nor
-/// contradicts. A thousand kilometres are in front of any scene.
+/// A cell in which nothing was measured, or which is left out: like an occluder, it neither agrees nor contradicts. A thousand
+/// kilometres in front is nearer than any scene.
 pub const UNKNOWN: Cell = [-1e6, 0.0, 0.0, 0.0];
 
-/// The rotation camera from ROI: z to the ray through `point`, with as little turn as possible.
+/// The rotation camera from ROI: takes z to the ray through `point` by the smallest rotation.
 pub(crate) fn ray_rotation(point: &Vec3) -> UnitQuaternion<f64> {
     UnitQuaternion::rotation_between(&Vec3::z(), point).unwrap_or_else(UnitQuaternion::identity)
 }
@@ -37,8 +36,8 @@ impl Roi {
         Pose::new(ray_rotation(&self.centre), self.centre)
     }
 
-    /// The cells, row by row. `size` is the region's side in metres; pixels (numbers in the image) that `seen` refuses are
-    /// unknown.
+    /// The cells, row by row. `size` is the region's side in metres; pixels (by their number in the image) for which `seen` is
+    /// false are unknown.
     pub fn cells(&self, scene: &DepthRegion, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
         self.look(scene, size, GRID, seen)
     }
@@ -83,11 +82,11 @@ impl Roi {
 /// How regions are sampled.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProposalOptions {
-    /// Distance between centres as a fraction of the object's diameter (the dissertation takes 20 pixels for all objects).
+    /// Distance between centres as a fraction of the object's diameter (dissertation: 20 pixels for all objects).
     pub step: f64,
-    /// Depths further apart than this fraction of the diameter are distinguished.
+    /// Depths further apart than this fraction of the diameter get separate centres.
     pub layer: f64,
-    /// Most regions; beyond it the step grows.
+    /// Largest number of regions; if there would be more, the step grows.
     pub most: usize,
 }
 
@@ -95,16 +94,16 @@ pub struct ProposalOptions {
 const STEP_OF_DIAMETER: f64 = 0.12;
 /// [`ProposalOptions::layer`]; chosen by hand, not swept.
 const LAYER: f64 = 0.15;
-/// [`ProposalOptions::most`]; chosen by hand for the time that matching takes, not swept.
+/// [`ProposalOptions::most`]; chosen by hand for the run time of the matching, not swept.
 const MOST: usize = 4000;
-/// The grid is fine enough for what is as far as this fraction of the scene's points: a few beyond may be astray. Chosen by hand; not
-/// swept.
+/// The grid is fine enough for objects at this quantile of the points' distances: a few points further away may be outliers. Chosen
+/// by hand; not swept.
 const FAR: f64 = 0.95;
-/// Least distance of centres, pixels; chosen by hand, not swept.
+/// Smallest distance of centres, pixels; chosen by hand, not swept.
 const MIN_STEP: f64 = 3.0;
-/// Least factor by which the step grows while there are too many regions, so that the search ends.
+/// Smallest factor by which the step grows while there are too many regions, so that the loop ends.
 const GROWTH: f64 = 1.05;
-/// Fewest points of a layer that a region is centred on; chosen by hand, not swept.
+/// Fewest points of a layer that becomes a region's centre; chosen by hand, not swept.
 const MIN_POINTS: usize = 4;
 
 impl Default for ProposalOptions {
@@ -126,8 +125,8 @@ impl ProposalOptions {
     }
 }
 
-/// Regions whose centres lie on a grid of the image, wherever something off the table is near. An object's centre may be hidden
-/// by another thing: each place has a centre for every depth that occurs around it, not only for the one seen there.
+/// Regions whose centres are on a grid of the image, near points above the table. An object's centre may be hidden by another
+/// object: each grid position has a centre for every depth that occurs around it, not only for the depth measured there.
 pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) -> Vec<Roi> {
     let camera = scene.camera();
     let focal = 0.5 * (camera.fx + camera.fy);
@@ -135,7 +134,7 @@ pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) ->
     if depths.is_empty() {
         return vec![];
     }
-    // The grid is fine enough for what is far; for what is near only some of its places are taken.
+    // The grid is fine enough for far points; for near ones only some of its positions are used.
     let far = (FAR * (depths.len() - 1) as f64) as usize;
     let far = *depths.select_nth_unstable_by(far, f64::total_cmp).1;
     let mut share = options.step;
@@ -149,7 +148,7 @@ pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) ->
     }
 }
 
-/// Centres every `step` pixels, of near layers every `wanted / depth` pixels.
+/// Centres every `step` pixels; for near layers every `wanted / depth` pixels.
 fn sample(scene: &DepthRegion, step: f64, wanted: f64, layer: f64) -> Vec<Roi> {
     let camera = scene.camera();
     let columns = (camera.width as f64 / step).ceil() as usize;
@@ -231,7 +230,7 @@ mod tests {
         let at = |column: usize, row: usize| cells[row * GRID + column];
         let middle = at(GRID / 2, GRID / 2);
         assert!(middle[0].abs() < 0.003, "{middle:?}");
-        // The box faces the camera's axis; the region looks along a ray 20 degrees off it.
+        // The box faces the camera's axis; the region's axis is a ray 20 degrees from it.
         let axis = centre.normalize();
         assert!((f64::from(middle[3]) + axis.z).abs() < 0.01, "{middle:?}");
         let nothing = Roi { centre }.cells(&scene, 0.06, |_| false);

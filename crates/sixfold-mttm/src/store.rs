@@ -1,8 +1,8 @@
-//! Templates on disk: one file an object, little-endian: magic, format version, a hash of what they were made from, the
-//! numbers, and a checksum over all before it.
+//! Templates on disk: one file per object, little-endian: magic, format version, a hash of what they were made from, the numbers,
+//! and a checksum over all before it.
 //!
-//! A file is written beside its place, flushed to the disk and then moved there: a reader, a crash or a power cut never leaves
-//! half a file, and the old one stays until the new one is whole.
+//! A file is written under a temporary name, flushed to disk and then renamed: a crash or a power failure never leaves half a file,
+//! and the old one stays until the new one is complete.
 
 use std::io::Write;
 use std::path::Path;
@@ -19,25 +19,25 @@ const MAGIC: &[u8; 8] = b"SIXFTPL\0";
 const VERSION: u32 = 1;
 const NUMBERS_PER_TEMPLATE: usize = 8;
 const TEMPLATE_BYTES: usize = 8 * NUMBERS_PER_TEMPLATE + 2 * SIDE * SIDE;
-/// Most templates of an object: six times as many as a mesh is drawn from.
+/// Largest number of templates of an object: six times as many as are rendered from a mesh.
 pub(crate) const MAX_TEMPLATES: usize = 4096;
-/// Diameters, metres, and distances of views, metres, that a file may hold: wider than anything that makes one.
+/// Diameters, metres, and distances of views, metres, that a file may contain: a wider range than any caller produces.
 const DIAMETERS: (f64, f64) = (1e-4, 1e3);
 const DISTANCES: (f64, f64) = (1e-3, 1e3);
-/// Furthest origin of an object's frame from a view's reference point, metres.
+/// Largest distance of the origin of an object's frame from a view's reference point, metres.
 const FURTHEST: f64 = 1e5;
-/// How far the patch may be off the margin times the diameter, as a fraction: rounding.
+/// Largest relative difference between a patch's size and the margin times the diameter: rounding errors.
 const SAME_SIZE: f64 = 1e-9;
 const HEAD_BYTES: usize = 8 + 4 + 1 + 1 + 2 + 8 + 4 * 8 + 4;
 
-/// Puts a whole file in its place.
+/// Replaces a file atomically.
 pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
     write_atomically_with(path, |file| file.write_all(bytes))
         .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
 }
 
 impl ObjectTemplates {
-    /// The file's bytes: the same templates, the same bytes.
+    /// The file's bytes; the same templates give the same bytes.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Vec::with_capacity(HEAD_BYTES + self.templates.len() * TEMPLATE_BYTES + 8);
         out.extend_from_slice(MAGIC);
@@ -69,7 +69,7 @@ impl ObjectTemplates {
         out
     }
 
-    /// Writes the file; what was there before stays until the new one is whole and on the disk.
+    /// Writes the file; an existing file stays until the new one is complete and on disk.
     ///
     /// # Errors
     /// [`StoreError::Io`].
@@ -114,7 +114,7 @@ impl ObjectTemplates {
         Ok(templates)
     }
 
-    /// What holds of all templates, whatever they were made from: a checksum keeps accidents out, not forgery.
+    /// Checks what is true of all templates, whatever they were made from: a checksum detects accidental damage, not forgery.
     fn check(&self) -> Result<(), &'static str> {
         let within = |value: f64, (low, high): (f64, f64)| (low..=high).contains(&value);
         if !within(self.diameter, DIAMETERS) {
@@ -172,7 +172,7 @@ impl Reader<'_> {
         let [diameter, size] = [self.number()?, self.number()?];
         let options = TemplateOptions { coverage, margin: self.number()?, distance: self.number()? };
         let count = self.u32()? as usize;
-        // Exactly what is left, before anything is allocated.
+        // The count must match the remaining bytes exactly; checked before anything is allocated.
         if self.0.len() != count.checked_mul(TEMPLATE_BYTES)? {
             return None;
         }
@@ -224,7 +224,7 @@ mod tests {
         written.write(&path).unwrap();
         assert_eq!(ObjectTemplates::read(&path).unwrap(), written);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
-        // A process killed while writing leaves its own unfinished file; the old one is whole.
+        // A process killed while writing leaves its own unfinished file; the old one is intact.
         std::fs::write(path.with_extension("1.tmp"), &written.to_bytes()[..1000]).unwrap();
         assert_eq!(ObjectTemplates::read(&path).unwrap(), written);
     }

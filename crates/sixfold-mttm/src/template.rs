@@ -1,4 +1,4 @@
-//! A template: what an object looks like from one side, as a small depth image around a point of its surface.
+//! A template: the appearance of an object from one side, as a small depth image around a point of its surface.
 //!
 //! The *view frame* has its origin at that reference point and its z axis along the ray through it. A patch spans a fixed metric
 //! size at the reference point's distance, so a template looks the same from any distance (dissertation, section 5.2.4:
@@ -13,19 +13,20 @@ use crate::views::ViewCoverage;
 
 /// Pixels along a side of a template; chosen by hand, not swept.
 pub const SIDE: usize = 64;
-/// Metres of a step of stored depth: well below the noise of depth.
+/// Quantisation step of stored depth, metres: well below the depth noise.
 const DEPTH_STEP: f64 = 1e-4;
 /// Stored depth of the reference point; 0 is "nothing seen".
 const DEPTH_ZERO: i32 = 32_768;
-/// Normals of scenes are taken over windows of about so many metres; those of templates over the same. Chosen by hand; not swept.
+/// Width in metres of the windows over which normals are computed, about the same for scenes and templates. Chosen by hand; not
+/// swept.
 const NORMAL_REACH: f64 = 0.008;
 
 /// How templates are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TemplateOptions {
-    /// From which sides a mesh is rendered.
+    /// Directions from which a mesh is rendered.
     pub coverage: ViewCoverage,
-    /// Side of a patch as a fraction of the object's diameter (largest extent, where the object is known from depth images).
+    /// Side of a patch as a fraction of the object's diameter (the largest extent for objects from depth images).
     pub margin: f64,
     /// Distance from which a mesh is rendered, metres.
     pub distance: f64,
@@ -33,7 +34,7 @@ pub struct TemplateOptions {
 
 /// Radii of the window of a template's normals, pixels: the smallest and the largest. Chosen by hand; not swept.
 const NORMAL_RADII: (f64, f64) = (1.0, 4.0);
-/// [`TemplateOptions::margin`]: a little more than the object, whatever side is seen. Chosen by hand; not swept.
+/// [`TemplateOptions::margin`]: slightly larger than the object from any side. Chosen by hand; not swept.
 const MARGIN: f64 = 1.1;
 /// [`TemplateOptions::distance`]: about that of objects on a table. Chosen by hand; not swept.
 const DISTANCE: f64 = 0.8;
@@ -59,16 +60,16 @@ impl TemplateOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
-    /// Drawn from a mesh.
+    /// Rendered from a mesh.
     Mesh,
     /// Cut out of depth images whose poses are known.
     PosedDepth,
-    /// Cut out of depth images without poses: every view has an object frame of its own, parallel to its view frame, its
-    /// origin in the middle of what is seen.
+    /// Cut out of depth images without poses: every view has an object frame of its own, parallel to its view frame, with its
+    /// origin at the centre of the visible points.
     Depth,
 }
 
-/// An object as one camera sees it.
+/// An object seen from one direction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Template {
     /// From the object's frame to the view frame.
@@ -83,7 +84,7 @@ pub struct Template {
 /// All templates of an object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObjectTemplates {
-    /// Diameter of the object (largest extent seen, where it is known from depth images), metres.
+    /// Diameter of the object, metres (the largest visible extent for objects from depth images).
     pub diameter: f64,
     /// Side of a patch at the reference point's distance, metres.
     pub size: f64,
@@ -93,16 +94,16 @@ pub struct ObjectTemplates {
     pub source: Source,
     /// A hash of the mesh and the options they were made from; 0 for depth images.
     pub made_from: u64,
-    /// The views, without turns in the image plane: those are computed.
+    /// The views, without in-plane rotations, which are computed.
     pub templates: Vec<Template>,
 }
 
 impl ObjectTemplates {
-    /// Turns in the image plane in which every view is matched, radians.
+    /// In-plane rotations at which every view is matched, radians.
     pub fn turns(&self) -> Vec<f64> {
         match self.source {
             Source::Mesh => self.options.coverage.turns(),
-            // A photographed view may be met with the camera held in any way, but seldom upside down.
+            // The camera may be rolled relative to a recorded view, but is seldom upside down.
             Source::PosedDepth | Source::Depth => ViewCoverage::Above.turns(),
         }
     }
@@ -123,7 +124,7 @@ impl Template {
         steps.clamp(1, i32::from(u16::MAX)) as u16
     }
 
-    /// The camera that saw the patch; the view frame lies `distance` in front of it.
+    /// The camera of the patch; the view frame lies `distance` in front of it.
     pub fn camera(&self, size: f64) -> Camera {
         patch_camera(size, self.distance)
     }
@@ -135,7 +136,7 @@ impl Template {
         })
     }
 
-    /// What is seen, in the view frame: points and normals of pixels with a normal, row by row, with their columns and rows.
+    /// The visible surface in the view frame: points and normals of pixels with a normal, row by row, with their columns and rows.
     pub fn cloud(&self, size: f64) -> (PointCloud, Vec<[usize; 2]>) {
         let (camera, depth) = (self.camera(size), self.depth_image());
         let radius =

@@ -12,17 +12,18 @@ use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
 use crate::samples::{Batch, DepthPoolOptions, PairBatchOptions, Pool};
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MttmTrainingOptions {
     /// Steps, learning rate, seed.
     #[serde(flatten)]
     pub common: TrainingOptions,
-    /// What is in a step.
+    /// Contents of a batch.
     pub batch: PairBatchOptions,
-    /// Weight of the positive templates of all other objects in the batch as negative ones (equation 5.3), beside the triplets.
+    /// Weight of the positive templates of all other objects in the batch as negative ones (equation 5.3), in addition to the
+    /// triplets.
     pub cross: f64,
-    /// Weight of the loss of the place of the reference point, and of the loss of matching; 0 for the dissertation's.
+    /// Weight of the loss of the reference point's position, and of the loss of matching; 0 for the dissertation's.
     pub offset: f64,
     /// See `offset`.
     pub matching: f64,
@@ -83,13 +84,13 @@ impl MttmTrainingOptions {
 pub struct MttmTraining {
     learner: Learner<Network>,
     options: MttmTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl MttmTraining {
-    /// Of a network whose tensors are on the autodiff `device`.
+    /// Starts the training of a network whose tensors are on the autodiff `device`.
     pub fn new(network: Network, options: MttmTrainingOptions, device: Device) -> Self {
         let learner = Learner::adam_w("network", network, &options.common);
         MttmTraining { learner, options, pace: Pace::default(), device }
@@ -231,7 +232,7 @@ impl Training for MttmTraining {
     }
 }
 
-/// All that decides about the result.
+/// Everything that affects the result.
 #[derive(Serialize)]
 struct Settings<'a> {
     #[serde(flatten)]
@@ -288,7 +289,7 @@ mod tests {
             .map(|name| (name, losses[29][name] / losses[0][name]))
             .collect();
         println!("{ratios:.2?}");
-        // Whether pairs match is what a new network learns last.
+        // The matching head learns last in a new network.
         let most = |name: &str| if name == "matching" { 1.0 } else { 0.6 };
         assert!(ratios.iter().all(|(name, ratio)| *ratio < most(name)), "{ratios:?}");
     }
@@ -349,7 +350,7 @@ mod tests {
             }
         }
         assert!((40..=88).contains(&others) && others + own == 128, "{others} of 128");
-        // Ours has its negative templates of the same object alone.
+        // By default negative templates are of the same object only.
         let batch = Batch::of_step(&pool, &PairBatchOptions::default(), 3, 0);
         assert!(batch.margins.iter().all(|m| *m < GAMMA as f32));
     }
@@ -360,7 +361,7 @@ mod tests {
         let batch = |step| Batch::of_step(&pool, &PairBatchOptions::default(), 7, step);
         assert_eq!(batch(3), batch(3));
         assert_ne!(batch(3), batch(4));
-        // What is said of a pair holds in its numbers: the object's cells are known in region and template.
+        // A pair's labels must agree with its patches: the object's cells are known in region and template.
         let b = batch(5);
         let on_object = b.region_masks.iter().filter(|m| **m > 0.5).count();
         assert!(on_object > 40 * 15, "{on_object}");

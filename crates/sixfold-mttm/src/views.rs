@@ -1,5 +1,5 @@
-//! Where templates look from: the corners of a subdivided icosahedron (dissertation, section 5.3.1, after Hinterstoisser et
-//! al. 2012), and turns in the image plane.
+//! Viewing directions of templates: the vertices of a subdivided icosahedron (dissertation, section 5.3.1, after Hinterstoisser et
+//! al. 2012), and in-plane rotations.
 
 use std::collections::BTreeMap;
 
@@ -7,19 +7,19 @@ use serde::{Deserialize, Serialize};
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::{Mat3, Vec3};
 
-/// From which sides an object is seen.
+/// Directions from which an object is seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ViewCoverage {
-    /// From above, the camera held upright within 45 degrees: 305 directions with 7 turns, 2135 templates (dissertation: 301
-    /// and 2107). For objects that stand on a table with their z axis up.
+    /// From above, the camera held upright within 45 degrees: 305 directions with 7 in-plane rotations, 2135 templates
+    /// (dissertation: 301 and 2107). For objects that stand on a table with their z axis up.
     Above,
-    /// From everywhere and however the camera is held: 642 directions with 24 turns.
+    /// From all directions and with any roll of the camera: 642 directions with 24 in-plane rotations.
     Around,
 }
 
 impl ViewCoverage {
-    /// Turns in the image plane, radians.
+    /// In-plane rotations, radians.
     pub fn turns(self) -> Vec<f64> {
         let (count, first) = match self {
             ViewCoverage::Above => (7, -45.0),
@@ -28,7 +28,7 @@ impl ViewCoverage {
         (0..count).map(|k| (first + 15.0 * f64::from(k)).to_radians()).collect()
     }
 
-    /// As it is typed.
+    /// Its name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             ViewCoverage::Above => "above",
@@ -37,8 +37,8 @@ impl ViewCoverage {
     }
 }
 
-/// Unit vectors from the object to the camera: the corners of an icosahedron divided three times, all 642 or the 305 that
-/// lie above the horizon (the dissertation has 301; how its icosahedron stands is not said).
+/// Unit vectors from the object to the camera: the vertices of an icosahedron subdivided three times, all 642 or the 305 above the
+/// horizon (the dissertation has 301 and does not give the orientation of its icosahedron).
 pub fn view_directions(coverage: ViewCoverage) -> Vec<Vec3> {
     let phi = (1.0 + 5f64.sqrt()) / 2.0;
     let mut corners: Vec<Vec3> = vec![];
@@ -47,7 +47,7 @@ pub fn view_directions(coverage: ViewCoverage) -> Vec<Vec3> {
         corners.push(Vec3::new(a, b, 0.0).normalize());
         corners.push(Vec3::new(b, 0.0, a).normalize());
     }
-    // Faces: triples of corners that are neighbours (an edge is 63.4 degrees long).
+    // Faces: triples of neighbouring vertices (an edge is 63.4 degrees long).
     let near = |a: &Vec3, b: &Vec3| a.dot(b) > 0.4;
     let mut faces = vec![];
     for i in 0..12 {
@@ -115,7 +115,7 @@ mod tests {
     fn the_object_stands_upright_in_the_view() {
         for d in view_directions(ViewCoverage::Around) {
             let r = view_rotation(&d);
-            // The camera lies where the direction says, on the view's negative z axis.
+            // The camera is in the given direction, on the view's negative z axis.
             assert!((r * d + Vec3::z()).norm() < 1e-9);
             if d.z.abs() < 0.99 {
                 let up = r * Vec3::z();

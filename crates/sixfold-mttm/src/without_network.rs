@@ -1,5 +1,5 @@
-//! In the place of `by_network`, `learned`, `published` and `regions` when the feature `network` is off: no object is known to a network, so
-//! none of this is ever called.
+//! Replaces `by_network`, `learned`, `published` and `regions` when the feature `network` is off: no object has network
+//! descriptors, so these functions are never called.
 
 use sixfold_align::DepthRegion;
 use sixfold_estimator::Object;
@@ -7,12 +7,12 @@ use sixfold_estimator::Object;
 use crate::estimate::{KnownObject, MttmOptions, Placed, Stages};
 use crate::estimator::MttmEstimator;
 
-/// There is none.
+/// Empty: there is no network.
 #[derive(Debug, Clone)]
 pub(crate) enum Learned {}
 
 impl MttmEstimator {
-    /// The same object.
+    /// Returns the object unchanged.
     pub(crate) fn described(
         &self,
         known: KnownObject,
@@ -23,7 +23,7 @@ impl MttmEstimator {
     }
 }
 
-/// Keeps nothing.
+/// An empty cache.
 #[derive(Debug, Default)]
 pub(crate) struct RegionCache;
 

@@ -1,11 +1,11 @@
 //! Checkpoints: everything a training needs to resume as if it had never stopped.
 //!
-//! A folder holds the last two checkpoints, one file each (`step-000001000.checkpoint`). A file has named sections (networks
-//! in f32, optimiser states, the caller's own state as JSON) and a checksum, and is there whole or not at all. A trainer
-//! with several networks, such as a generator and a discriminator, gives each a name.
+//! A folder contains the last two checkpoints, one file each (`step-000001000.checkpoint`). A file has named sections (networks in
+//! f32, optimiser states, the caller's own state as JSON) and a checksum, and is written atomically. A trainer with several
+//! networks, such as a generator and a discriminator, gives each a name.
 //!
-//! The state of Burn's random numbers is not in it, because Burn does not hand it out: a training that draws random numbers
-//! on the device seeds it again at every step from its own seed and the step.
+//! The state of Burn's random number generator is not included, because Burn does not expose it: a training that uses random
+//! numbers on the device must seed it again at every step from its own seed and the step.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -26,10 +26,10 @@ use crate::parameters::{Changeable, Network, Parameters, Visitable};
 
 const MAGIC: &[u8; 8] = b"sixfckp1";
 const ENDING: &str = ".checkpoint";
-/// Files kept in the folder.
+/// Number of files kept in the folder.
 const KEPT: usize = 2;
 
-/// Why a checkpoint could not be written or a training not be resumed from one.
+/// Why a checkpoint could not be written, or a training could not be resumed from one.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// A file or the folder could not be read.
@@ -37,7 +37,7 @@ pub enum CheckpointError {
     Read {
         /// File or folder.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
     /// A file could not be written. The checkpoints before it are unchanged.
@@ -45,20 +45,20 @@ pub enum CheckpointError {
     Write {
         /// File or folder.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A network, optimiser or state could not be turned into bytes.
+    /// A network, optimiser or state could not be serialised.
     #[error("checkpoint of step {step}: {section}: cannot be recorded: {reason}")]
     Record {
         /// The checkpoint's step.
         step: u64,
         /// Name of the section.
         section: String,
-        /// What went wrong.
+        /// The cause.
         reason: String,
     },
-    /// Checkpoints are there, but none of them is whole.
+    /// There are checkpoints, but none of them is intact.
     #[error("{}: expected a whole checkpoint, found only broken ones ({}); remove them to start again", folder.display(),
         reasons.join("; "))]
     NoneWhole {
@@ -74,7 +74,7 @@ pub enum CheckpointError {
         /// The file.
         file: PathBuf,
     },
-    /// The checkpoint is whole, but a part that was asked for is not in it or does not fit.
+    /// The checkpoint is intact, but a requested part is missing or does not fit.
     #[error("{}: {section}: expected {expected}, found {found}; continue with the same options as before, or start again in \
         another folder", file.display())]
     Section {
@@ -82,17 +82,17 @@ pub enum CheckpointError {
         file: PathBuf,
         /// Name of the section.
         section: String,
-        /// What was asked for.
+        /// What was requested.
         expected: String,
-        /// What is there.
+        /// What was found.
         found: String,
     },
 }
 
-/// The state that says what a training depends on.
+/// Section with the inputs on which a training depends.
 const FINGERPRINT: &str = "fingerprint";
 
-/// A checkpoint that is put together to be written.
+/// Builder of a checkpoint.
 pub struct CheckpointWriter {
     step: u64,
     sections: BTreeMap<String, Vec<u8>>,
@@ -113,7 +113,7 @@ impl CheckpointWriter {
     /// # Errors
     /// [`CheckpointError::Record`].
     pub fn module<M: Module>(mut self, name: &str, module: &M) -> Result<Self, CheckpointError> {
-        // `valid` settles running statistics that still wait for their threads.
+        // `valid` applies running statistics that are still pending in other threads.
         let bytes = record_of(&module.valid()).map_err(|e| self.error(name, e))?;
         self.sections.insert(module_section(name), bytes.to_vec());
         Ok(self)
@@ -129,7 +129,7 @@ impl CheckpointWriter {
         Ok(self)
     }
 
-    /// Adds the caller's own state. Numbers that JSON has no word for (infinite, not a number) are lost.
+    /// Adds the caller's own state. Numbers that JSON cannot represent (infinite, NaN) are lost.
     ///
     /// # Errors
     /// [`CheckpointError::Record`].
@@ -139,7 +139,7 @@ impl CheckpointWriter {
         Ok(self)
     }
 
-    /// Adds what the training depends on.
+    /// Adds the inputs on which the training depends.
     ///
     /// # Errors
     /// [`CheckpointError::Record`].
@@ -147,11 +147,11 @@ impl CheckpointWriter {
         self.state(FINGERPRINT, fingerprint)
     }
 
-    /// Writes the file into `folder`, which is made if need be, then removes what is older than the last two
-    /// checkpoints and what a training that was taken up again at an earlier step has left.
+    /// Writes the file into `folder`, which is created if necessary, then removes all but the last two checkpoints, and those of
+    /// later steps that remain from before the training was resumed at an earlier step.
     ///
     /// # Errors
-    /// [`CheckpointError::Write`]; the checkpoints before are unchanged then.
+    /// [`CheckpointError::Write`]; earlier checkpoints are then unchanged.
     pub fn write(self, folder: &Path) -> Result<PathBuf, CheckpointError> {
         fs::create_dir_all(folder)
             .map_err(|source| CheckpointError::Write { file: folder.to_owned(), source })?;
@@ -196,7 +196,7 @@ fn load_record(module: &mut dyn Changeable, record: ModuleRecord) -> Result<(), 
     Ok(())
 }
 
-/// A whole checkpoint that was read.
+/// An intact checkpoint, read from a file.
 #[derive(Debug)]
 pub struct Checkpoint {
     file: PathBuf,
@@ -206,8 +206,7 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// The newest whole checkpoint in `folder`, none if there is no checkpoint. A broken newer one is passed over with a
-    /// note.
+    /// The newest intact checkpoint in `folder`, `None` if there is no checkpoint. A newer broken one is skipped with a note.
     ///
     /// # Errors
     /// [`CheckpointError::Read`] and [`CheckpointError::NoneWhole`].
@@ -240,12 +239,12 @@ impl Checkpoint {
         self.step
     }
 
-    /// The file it was read from.
+    /// The file from which it was read.
     pub fn file(&self) -> &Path {
         &self.file
     }
 
-    /// Messages about newer files that are broken, to be shown to the user.
+    /// Messages about newer broken files, for the user.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -264,7 +263,7 @@ impl Checkpoint {
         }
     }
 
-    /// Fills a network with the recorded parameters and running statistics.
+    /// Restores a network's recorded parameters and running statistics.
     ///
     /// # Errors
     /// [`CheckpointError::Section`] if it is not in the checkpoint or is another network.
@@ -273,14 +272,14 @@ impl Checkpoint {
         let bytes = Bytes::from_bytes_vec(self.section(&section)?.to_vec());
         let unfit = |e: RecordError| self.error(&section, "the parameters of this network", e);
         let record = ModuleRecord::from_bytes(bytes).map_err(unfit)?;
-        // Running statistics that still wait for their threads would replace the loaded ones later.
+        // Running statistics still pending in other threads would later replace the loaded ones.
         drop(module.valid());
         let mut module = Network::new(module);
         load_record(&mut module, record).map_err(unfit)?;
         Ok(module.into_inner())
     }
 
-    /// Fills an optimiser, configured as before, with the recorded state.
+    /// Restores the recorded state of an optimiser that is configured as before.
     ///
     /// # Errors
     /// [`CheckpointError::Section`] if it is not in the checkpoint or is of another kind of optimiser.
@@ -295,7 +294,7 @@ impl Checkpoint {
         let record = OptimizerRecord::from_bytes(bytes).map_err(unfit)?;
         let expected = record.len();
         let optimiser = optimiser.load_record(record);
-        // Burn leaves out what it cannot use without a word.
+        // Burn silently ignores what it cannot use.
         let found = optimiser.to_record().len();
         if found != expected {
             let of_this = format!("a state of {found} tensors that this kind of optimiser can use");
@@ -314,7 +313,7 @@ impl Checkpoint {
         serde_json::from_slice(bytes).map_err(|e| self.error(&section, "a state of the same form", e))
     }
 
-    /// What the training depends on.
+    /// The inputs on which the training depends.
     ///
     /// # Errors
     /// [`CheckpointError::NoFingerprint`] for a checkpoint of an earlier version.
@@ -358,7 +357,7 @@ fn checkpoint_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointErro
     Ok(files)
 }
 
-/// Step and sections of a file, or what is wrong with it.
+/// Step and sections of a file, or the reason why it is invalid.
 fn parse(bytes: &[u8]) -> Result<(u64, BTreeMap<String, Vec<u8>>), String> {
     let content_length = bytes.len().checked_sub(8).ok_or("it ends too early")?;
     let (content, sum) = bytes.split_at(content_length);
@@ -366,7 +365,7 @@ fn parse(bytes: &[u8]) -> Result<(u64, BTreeMap<String, Vec<u8>>), String> {
         return Err("it does not start as a checkpoint does".to_owned());
     }
     let mut hash = Checksum::default();
-    // The checksum runs over the same pieces as when it was written.
+    // The checksum is computed over the same pieces as when writing.
     let mut rest = content;
     let mut take = |length: u64| -> Result<&[u8], String> {
         let length = usize::try_from(length).ok().filter(|l| *l <= rest.len()).ok_or("it ends too early")?;
@@ -446,7 +445,7 @@ mod tests {
         }
     }
 
-    /// A training whose data follow from the step, as a real one's do.
+    /// A training whose data depend on the step, as in a real one.
     fn train(net: Net, optimiser: &mut ModuleOptimizer, steps: std::ops::Range<u64>, device: &Device) -> Net {
         steps.fold(net, |net, step| {
             let values: Vec<f32> =
@@ -503,7 +502,7 @@ mod tests {
                 .unwrap();
             drop((half, first));
 
-            // Networks begin with random numbers, so nothing but the checkpoint can make them equal.
+            // Networks are initialised randomly, so only the checkpoint can make them equal.
             let checkpoint = Checkpoint::latest(dir.path()).unwrap().unwrap();
             assert_eq!((checkpoint.step(), checkpoint.notes().len()), (10, 0));
             assert_eq!(checkpoint.state::<Own>("trainer").unwrap(), own);
@@ -531,7 +530,7 @@ mod tests {
             write(&folder, step);
         }
         assert_eq!(steps(&folder), [40, 30]);
-        // Taken up again at 30 and written at 35: 40 belongs to a training that is no more.
+        // Resumed at 30 and written at 35: 40 belongs to the abandoned part of the training.
         write(&folder, 35);
         assert_eq!(steps(&folder), [35, 30]);
     }

@@ -1,17 +1,17 @@
 //! Enumerations whose values users type, such as the networks of a recipe: one list for the command line and Python.
 
-/// A value out of few, by its name.
+/// An enumeration whose values have names.
 pub trait Choice: Copy + 'static {
     /// All values, in the order in which they are listed.
     const ALL: &'static [Self];
 
-    /// As it is typed.
+    /// Its name, as typed.
     fn name(self) -> &'static str;
 
     /// One line about it, for help.
     fn help(self) -> &'static str;
 
-    /// The value of that name.
+    /// The value with that name.
     fn named(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|choice| choice.name() == name)
     }

@@ -1,8 +1,8 @@
 //! A convolution without bias followed by batch normalisation, a residual and a rectifier: the building block of ResNets
 //! and DenseNets.
 //!
-//! In training the normalisation takes the batch's statistics; in inference, and where the layer is frozen, it is folded
-//! into the convolution.
+//! In training the normalisation uses the batch's statistics; in inference, and if the layer is frozen, it is folded into the
+//! convolution.
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData, activation};
@@ -56,7 +56,7 @@ impl BareConvConfig {
     }
 }
 
-/// A convolution without bias, made by [`BareConvConfig`].
+/// A convolution without bias, created by [`BareConvConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct BareConv {
@@ -74,7 +74,7 @@ impl BareConv {
         conv(x, weight, bias, spec)
     }
 
-    /// `batch x inputs x height x width` to `batch x outputs x height / stride x width / stride`.
+    /// From `batch x inputs x height x width` to `batch x outputs x height / stride x width / stride`.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let weight = self.weight.val();
         let bias = Tensor::zeros([weight.dims()[0]], &x.device());

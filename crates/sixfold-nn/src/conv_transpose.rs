@@ -3,7 +3,7 @@
 //! It is the input gradient of a convolution, and its own input gradient is that convolution: both are the kernels of
 //! [`crate::kernels`] with input and output exchanged.
 
-// Burn's extensions take every tensor as an argument of its own.
+// Burn's extensions take every tensor as a separate argument.
 #![allow(clippy::too_many_arguments)]
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -20,12 +20,12 @@ use rand::Rng;
 use crate::kernels::{Activation, ConvShape, ConvSpec, conv_backward, conv_forward};
 use crate::layers::normal;
 
-/// How the output lies over the input.
+/// Alignment of output and input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TransposedSpec {
     /// Output pixels per input pixel in both directions.
     pub stride: usize,
-    /// Rows and columns cut off before and after, as the padding of the convolution that goes the other way.
+    /// Rows and columns cut off before and after, as the padding of the convolution in the opposite direction.
     pub padding: [usize; 2],
 }
 
@@ -54,7 +54,7 @@ pub trait TransposedConvOps: Backend {
         spec: TransposedSpec,
     ) -> FloatTensor<Self>;
 
-    /// Gradients with respect to input and weight; those not wanted are tensors of length 0.
+    /// Gradients with respect to input and weight; those not requested are tensors of length 0.
     fn sixfold_conv_transpose_backward(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -78,7 +78,7 @@ fn tensor(values: Vec<f32>, shape: impl Into<Shape>) -> FlexTensor {
     FlexTensor::new(burn::tensor::Bytes::from_elems(values), Layout::contiguous(shape.into()), DType::F32)
 }
 
-/// The convolution from the transposed one's output to its input.
+/// The convolution from the output of the transposed one to its input.
 fn conv_shape(x: &FlexTensor, weight: &FlexTensor, spec: &TransposedSpec) -> ConvShape {
     let (x, w) = (x.shape(), weight.shape());
     let size = [spec.side(x[2], w[2]), spec.side(x[3], w[2])];
@@ -94,7 +94,7 @@ impl TransposedConvOps for Flex {
         let (x, weight) = (contiguous(x), contiguous(weight));
         let shape = conv_shape(&x, &weight, &spec);
         let size = [shape.batch, shape.inputs, shape.size[0], shape.size[1]];
-        // Only its length counts; the kernel does not read it for the input's gradient.
+        // Only its length matters; the kernel does not read it for the input's gradient.
         let unread = vec![0.0; size.iter().product()];
         let (x, wanted) = (values(&x), [true, false]);
         let y = conv_backward(&unread, values(&weight), x, x, &shape, &spec.conv(), wanted).x;
@@ -179,7 +179,7 @@ impl<B: TransposedConvOps, C: CheckpointStrategy> TransposedConvOps for Autodiff
 /// `x` is `batch x inputs x height x width`, `weight` `inputs x outputs x kernel x kernel`.
 ///
 /// # Panics
-/// If the shapes do not fit each other or the padding is larger than the output.
+/// If the shapes are inconsistent or the padding is larger than the output.
 pub fn conv_transpose(x: Tensor<4>, weight: Tensor<4>, spec: TransposedSpec) -> Tensor<4> {
     let ([_, channels, height, width], [inputs, _, kernel, second]) = (x.dims(), weight.dims());
     assert!(
@@ -203,13 +203,13 @@ pub struct ConvTransposeConfig {
     pub kernel: usize,
     /// Output pixels per input pixel in both directions.
     pub stride: usize,
-    /// Whether a bias is added, which is idle before batch normalisation.
+    /// Whether a bias is added; it has no effect before batch normalisation.
     pub bias: bool,
 }
 
 impl ConvTransposeConfig {
-    /// A layer with random weights of variance `gain * stride^2 / (inputs x kernel x kernel)` (He et al. 2015 for a gain of
-    /// 2: so many numbers add up to an output) and bias 0.
+    /// A layer with random weights of variance `gain * stride^2 / (inputs x kernel x kernel)` (He et al. 2015 for a gain of 2: this
+    /// is the number of terms in each output) and bias 0.
     pub fn init(&self, gain: f32, rng: &mut impl Rng, device: &Device) -> ConvTranspose {
         let [inputs, outputs] = self.channels;
         let shape = [inputs, outputs, self.kernel, self.kernel];
@@ -224,7 +224,7 @@ impl ConvTransposeConfig {
     }
 }
 
-/// Transposed convolution with TensorFlow's `SAME` border, made by [`ConvTransposeConfig`].
+/// Transposed convolution with TensorFlow's `SAME` border, created by [`ConvTransposeConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct ConvTranspose {
@@ -238,7 +238,7 @@ pub struct ConvTranspose {
 crate::displayed_by_name!(ConvTranspose);
 
 impl ConvTranspose {
-    /// `batch x inputs x height x width` to `batch x outputs x height * stride x width * stride`.
+    /// From `batch x inputs x height x width` to `batch x outputs x height * stride x width * stride`.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let weight = self.weight.val();
         let [_, outputs, kernel, _] = weight.dims();

@@ -1,4 +1,4 @@
-//! A discriminator in training, and the losses of a training against it (dissertation, equations 3.4 and 3.5).
+//! A discriminator in training, and the losses of adversarial training (dissertation, equations 3.4 and 3.5).
 
 use burn::tensor::{Device, Tensor};
 use rand::{RngExt, SeedableRng};
@@ -7,11 +7,11 @@ use rand_chacha::ChaCha8Rng;
 use crate::discriminator::{Discriminator, DiscriminatorConfig};
 use crate::learner::Learner;
 
-/// Distinguishes generated images from true ones, and learns to.
+/// A discriminator in training: learns to distinguish generated images from true ones.
 ///
-/// Generated and true images go through it in batches of their own, as in the author's code. Batch normalisation, which stands
-/// behind its last convolution too, then brings both kinds to the same mean: what is left to distinguish them by is little. (Even
-/// slopes against noise, 32 pixels: after 120 steps the mean logits differ by 0.05.)
+/// Generated and true images are in separate batches, as in the author's code. Batch normalisation, which also follows its last
+/// convolution, then brings both kinds to the same mean, so that they can hardly be distinguished. (Smooth gradients against noise,
+/// 32 pixels: after 120 steps the mean logits differ by 0.05.)
 pub struct Critic {
     /// The network in training.
     pub learner: Learner<Discriminator>,
@@ -19,12 +19,13 @@ pub struct Critic {
 }
 
 impl Critic {
-    /// A new one; `name` is its part of checkpoints.
+    /// A new discriminator; `name` is its section in checkpoints.
     pub fn new(name: impl Into<String>, seed: u64, device: &Device) -> Self {
         Critic { learner: Learner::adam(name, DiscriminatorConfig { seed }.init(device)), seed }
     }
 
-    /// One step on generated, then on true images (`batch x 3 x side x side`, of which no gradient is taken); its mean loss.
+    /// One step on generated, then on true images (`batch x 3 x side x side`, without gradients through them); returns the mean
+    /// loss.
     pub fn step(
         &mut self,
         generated: Tensor<4>,
@@ -33,7 +34,7 @@ impl Critic {
         rate: f64,
         device: &Device,
     ) -> f64 {
-        // Soft labels, now and then swapped for a whole batch, as in the author's code.
+        // Soft labels, sometimes swapped for a whole batch, as in the author's code.
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(step + 1);
         let mut sum = 0.0;
@@ -51,7 +52,7 @@ impl Critic {
         sum
     }
 
-    /// The generator's adversarial loss: how surely generated images are recognised as such.
+    /// The generator's adversarial loss: how confidently generated images are recognised as such.
     pub fn generator_loss(&self, generated: Tensor<4>) -> Tensor<1> {
         entropy(self.learner.network().forward(generated), 1.0)
     }
@@ -88,7 +89,7 @@ mod tests {
         let step = 0.02;
         let slope = (loss(moved(step)) - loss(moved(-step))) / f64::from(2.0 * step);
         assert!((slope / f64::from(length) - 1.0).abs() < 0.1, "{slope} {length}");
-        // Against it lies what is taken for true: the loss is the entropy to the label of true images.
+        // A step against the gradient lowers the loss: the images are then classified as true with a higher probability.
         assert!(loss(moved(-0.5)) < loss(pixels.clone()));
     }
 

@@ -1,11 +1,11 @@
-//! Burn's dense layer with weights that follow from a seed; Burn's own come from the device's random numbers.
+//! Burn's dense layer with weights from a given seed; Burn itself uses the device's random numbers.
 
 use burn::module::Param;
 use burn::nn::{Linear, LinearConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{Rng, RngExt};
 
-/// `batch x inputs` to `batch x outputs`, with weights and bias even within `1 / sqrt(inputs)` of 0, as in PyTorch.
+/// From `batch x inputs` to `batch x outputs`, with weights and bias uniform within `1 / sqrt(inputs)` of 0, as in PyTorch.
 pub fn dense([inputs, outputs]: [usize; 2], rng: &mut impl Rng, device: &Device) -> Linear {
     let bound = 1.0 / (inputs as f32).sqrt();
     let mut numbers = |count: usize| -> Vec<f32> {

@@ -24,17 +24,17 @@ const GROWTH: usize = 32;
 /// Channels between a dense layer's two convolutions.
 const INNER: usize = 4 * GROWTH;
 
-/// How much of DenseNet-121 to build.
+/// Which part of DenseNet-121 to build.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DenseNet121Config {
     /// Dense blocks after the first convolution, 0 to 4.
     pub blocks: usize,
-    /// Classes of the classifier after the fourth block, if there is to be one.
+    /// Classes of the classifier after the fourth block, if there is one.
     pub classes: Option<usize>,
 }
 
 impl DenseNet121Config {
-    /// The whole network with its classifier of 1000 ImageNet classes (8.0 million parameters).
+    /// The complete network with its classifier of 1000 ImageNet classes (8.0 million parameters).
     pub fn imagenet() -> Self {
         DenseNet121Config { blocks: 4, classes: Some(1000) }
     }
@@ -73,8 +73,8 @@ impl DenseNet121Config {
         DenseNet121 { features, classifier }
     }
 
-    /// The network with torchvision's weights from a `.pth` or `.safetensors` file; the names that the published files
-    /// still have (`norm.1` for `norm1`) are known. What is not built is left out.
+    /// The network with torchvision's weights from a `.pth` or `.safetensors` file; the older names in the published files
+    /// (`norm.1` for `norm1`) are supported. Tensors of parts that are not built are ignored.
     ///
     /// # Errors
     /// [`PretrainedError`].
@@ -98,8 +98,8 @@ impl DenseNet121Config {
     }
 }
 
-/// torchvision's name of a tensor, which counts from 1 and without dots (`denseblock1.denselayer2` for
-/// `denseblock.0.denselayer.1`), and the older one.
+/// torchvision's name of a tensor, which counts from 1 and has no dots (`denseblock1.denselayer2` for `denseblock.0.denselayer.1`),
+/// and the older one.
 fn names(field: &str) -> Vec<String> {
     let mut name = String::new();
     let mut counts = false;
@@ -126,8 +126,8 @@ fn names(field: &str) -> Vec<String> {
     if old == name { vec![name] } else { vec![name, old] }
 }
 
-/// DenseNet-121, made by [`DenseNet121Config`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456,
-/// 0.406) over deviation (0.229, 0.224, 0.225).
+/// DenseNet-121, created by [`DenseNet121Config`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456, 0.406)
+/// over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct DenseNet121 {
@@ -141,7 +141,7 @@ struct Features {
     conv0: BareConv,
     norm0: BatchNorm,
     denseblock: Vec<DenseBlock>,
-    /// Between the blocks, one fewer than they.
+    /// The transitions between the blocks, one fewer than blocks.
     transition: Vec<Transition>,
     norm5: Option<BatchNorm>,
 }
@@ -152,7 +152,7 @@ struct DenseBlock {
     denselayer: Vec<DenseLayer>,
 }
 
-/// Normalise, rectify, 1x1, normalise, rectify, 3x3: 32 more channels from all that are there.
+/// Normalise, rectify, 1x1, normalise, rectify, 3x3: adds 32 channels, computed from all earlier ones.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct DenseLayer {
@@ -162,7 +162,7 @@ struct DenseLayer {
     conv2: BareConv,
 }
 
-/// Half the channels at half the resolution.
+/// A transition: half the channels at half the resolution.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct Transition {
@@ -196,9 +196,9 @@ impl Transition {
 }
 
 impl DenseNet121 {
-    /// `batch x 3 x height x width` to the maps after the first convolution and after every dense block that was built:
-    /// 64, 256, 512, 1024 and 1024 channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution. The map of the fourth block
-    /// is normalised and rectified (torchvision's `norm5`), the others are as the block gives them.
+    /// From `batch x 3 x height x width` to the maps after the first convolution and after every dense block that was built: 64,
+    /// 256, 512, 1024 and 1024 channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution. The map of the fourth block is
+    /// normalised and rectified (torchvision's `norm5`), the others are the direct outputs of their blocks.
     pub fn features(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
         let f = &self.features;
         let mut maps = vec![f.conv0.forward_norm(x, &f.norm0, None, 0.0)];
@@ -221,7 +221,7 @@ impl DenseNet121 {
         maps
     }
 
-    /// `batch x 3 x height x width` to `batch x classes` logits; none if the network has no classifier.
+    /// From `batch x 3 x height x width` to `batch x classes` logits; `None` if the network has no classifier.
     pub fn classify(&self, x: Tensor<4>) -> Option<Tensor<2>> {
         self.classify_map(self.features(x).pop()?)
     }

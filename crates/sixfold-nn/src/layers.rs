@@ -6,11 +6,11 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
 
-/// How a convolution treats the border.
+/// Padding of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Padding {
-    /// TensorFlow's `SAME`: the output has `ceil(side / stride)` pixels; with a stride of two more zeros may come after
-    /// than before.
+    /// TensorFlow's `SAME`: the output has `ceil(side / stride)` pixels; with a stride of two there may be more zeros after than
+    /// before.
     Same,
     /// This many zeros on every side.
     Zeros(usize),
@@ -19,17 +19,17 @@ pub enum Padding {
 /// A square convolution's sizes and options.
 #[derive(Debug, Clone, Copy)]
 pub struct ConvConfig {
-    /// Channels in.
+    /// Input channels.
     pub inputs: usize,
-    /// Channels out.
+    /// Output channels.
     pub outputs: usize,
     /// Side of the kernel in pixels.
     pub kernel: usize,
     /// Step in pixels.
     pub stride: usize,
-    /// One kernel a channel instead of one over all of them.
+    /// Whether there is one kernel per channel instead of one over all channels.
     pub depthwise: bool,
-    /// The border.
+    /// Padding at the border.
     pub padding: Padding,
     /// Applied to the result.
     pub activation: Activation,
@@ -68,7 +68,7 @@ impl ConvConfig {
     /// A layer with the given weights (in the order of [`ConvConfig::weight_shape`]) and bias.
     ///
     /// # Panics
-    /// If a length does not fit.
+    /// If a length is wrong.
     pub fn with_values(&self, weight: Vec<f32>, bias: Vec<f32>, device: &Device) -> Conv {
         Conv {
             weight: Param::from_tensor(Tensor::from_data(
@@ -86,7 +86,7 @@ impl ConvConfig {
 
 pub use sixfold_geometry::random::normal;
 
-/// `activation(conv(x) + bias)`, made by [`ConvConfig`].
+/// `activation(conv(x) + bias)`, created by [`ConvConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Conv {
@@ -105,7 +105,7 @@ pub struct Conv {
 crate::displayed_by_name!(Conv);
 
 impl Conv {
-    /// `batch x inputs x height x width` to `batch x outputs x height / stride x width / stride`.
+    /// From `batch x inputs x height x width` to `batch x outputs x height / stride x width / stride`.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let [_, inputs, height, width] = x.dims();
         let weight = self.weight.val();

@@ -1,4 +1,4 @@
-//! A network with its optimiser: one step of both, and their part of a checkpoint.
+//! A network with its optimiser: steps of both, and their sections of a checkpoint.
 
 use burn::grad_clipping::GradientClippingConfig;
 use burn::module::Module;
@@ -9,15 +9,15 @@ use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointWriter};
 use crate::options::TrainingOptions;
 use crate::parameters::{Changeable, Network, Parameters, gradients_of};
 
-/// What a checkpoint holds and gives back.
+/// State that is saved to and restored from a checkpoint.
 pub trait Checkpointed {
-    /// Adds it to a checkpoint.
+    /// Adds the state to a checkpoint.
     ///
     /// # Errors
     /// [`CheckpointError`].
     fn save(&self, checkpoint: CheckpointWriter) -> Result<CheckpointWriter, CheckpointError>;
 
-    /// Takes it from a checkpoint.
+    /// Restores the state from a checkpoint.
     ///
     /// # Errors
     /// [`CheckpointError`].
@@ -32,24 +32,24 @@ pub struct Learner<N> {
 }
 
 impl<N: Module> Learner<N> {
-    /// With AdamW, as `options` say. `name` stands for both in checkpoints.
+    /// With AdamW and these options. `name` identifies both in checkpoints.
     pub fn adam_w(name: impl Into<String>, network: N, options: &TrainingOptions) -> Self {
         let clip = options.max_grad_norm.map(GradientClippingConfig::Norm);
         let config = AdamWConfig::new().with_weight_decay(options.weight_decay).with_grad_clipping(clip);
         Learner { name: name.into(), network, optimiser: config.init() }
     }
 
-    /// With Adam (Kingma and Ba 2015), its published moments, no weight decay and no clip.
+    /// With Adam (Kingma and Ba 2015), its published moments, without weight decay and gradient clipping.
     pub fn adam(name: impl Into<String>, network: N) -> Self {
         Learner { name: name.into(), network, optimiser: AdamConfig::new().init() }
     }
 
-    /// The network as it is now.
+    /// The current network.
     pub fn network(&self) -> &N {
         &self.network
     }
 
-    /// Changes the network in another way than by a step, such as by freezing parts of it.
+    /// Changes the network other than by a training step, for example by freezing parts of it.
     pub fn change(&mut self, change: impl FnOnce(N) -> N) {
         self.network = change(self.network.clone());
     }
@@ -59,18 +59,18 @@ impl<N: Module> Learner<N> {
         self.network.valid()
     }
 
-    /// One step down the gradients of `loss` (one number) at a learning rate.
+    /// One training step on the gradients of `loss` (a scalar) at a learning rate.
     pub fn descend(&mut self, rate: f64, loss: Tensor<1>) {
         let gradients = gradients_of(&mut loss.backward(), &self.network);
         self.step(rate, gradients);
     }
 
-    /// One step of the whole network at a learning rate.
+    /// One training step of the whole network at a learning rate.
     pub fn step(&mut self, rate: f64, gradients: GradientsParams) {
         self.step_part(rate, gradients, |network| network);
     }
 
-    /// One step of a part of the network, such as a pretrained encoder at a rate of its own.
+    /// One training step of a part of the network, such as a pretrained encoder with its own rate.
     pub fn step_part<P: Module>(
         &mut self,
         rate: f64,

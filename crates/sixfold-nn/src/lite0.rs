@@ -1,8 +1,8 @@
 //! EfficientNet-Lite0 (Tan, Le 2019; the "lite" variant without squeeze-excite and with ReLU6), with its batch
 //! normalisation folded into the convolutions.
 //!
-//! Folded, a pretrained network keeps the statistics it was trained with and trains on as plain convolutions with bias:
-//! what small data and small batches ask for, and a third of the memory traffic.
+//! After folding, a pretrained network keeps the statistics of its training and is trained further as plain convolutions with bias.
+//! This suits little data and small batches, and needs a third of the memory traffic.
 
 use crate::kernels::Activation;
 use crate::layers::{Conv, ConvConfig};
@@ -17,10 +17,10 @@ use std::path::{Path, PathBuf};
 /// Name of the five-stage encoder in weight files.
 pub const ENCODER_ARCHITECTURE: &str = "efficientnet-lite0-5-stages";
 
-/// Its stages, all of which may stay as they are in a training.
+/// Number of its stages, all of which may be frozen in a training.
 pub(crate) const ENCODER_STAGES: usize = 5;
 
-/// The ImageNet encoder that this crate carries (1.4 MB, Apache-2.0; its card lies beside it).
+/// The ImageNet encoder shipped with this crate (1.4 MB, Apache-2.0; its card is next to it).
 const ENCODER: &[u8] = include_bytes!("../weights/efficientnet-lite0-encoder.safetensors");
 
 /// Batch normalisation's epsilon in the published weights.
@@ -45,7 +45,7 @@ pub enum Lite0Error {
     File {
         /// The file.
         path: PathBuf,
-        /// What the reader said.
+        /// The reader's error.
         reason: String,
     },
     /// A tensor is missing or has another shape.
@@ -57,12 +57,12 @@ pub enum Lite0Error {
         name: String,
         /// Its length in the network.
         expected: usize,
-        /// What the file holds.
+        /// The content found in the file.
         found: String,
     },
 }
 
-/// An inverted residual block (Sandler et al. 2018): expand, depthwise, project, and add where the shapes allow it.
+/// An inverted residual block (Sandler et al. 2018): expand, depthwise, project, and add the input if the shapes allow it.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct Block {
@@ -83,10 +83,10 @@ impl Block {
     }
 }
 
-/// How much of the network to build.
+/// Which part of the network to build.
 #[derive(Debug, Clone, Copy)]
 pub struct Lite0Config {
-    /// Stages, of seven. Five end at a sixteenth of the resolution with 112 channels (0.7 million parameters).
+    /// Number of stages, of seven. Five end at a sixteenth of the resolution with 112 channels (0.7 million parameters).
     pub stages: usize,
 }
 
@@ -106,7 +106,7 @@ pub struct Lite0 {
 
 crate::displayed_by_name!(Block, Lite0);
 
-/// Where a convolution's numbers come from.
+/// Source of a convolution's weights.
 trait Source {
     fn conv(&mut self, config: ConvConfig, weight: &str, norm: &str) -> Result<Conv, Lite0Error>;
 }
@@ -155,10 +155,10 @@ impl Source for File<'_> {
     }
 }
 
-/// The five-stage encoder with ImageNet weights, from within the program.
+/// The five-stage encoder with ImageNet weights, which is shipped with the program.
 ///
 /// # Errors
-/// [`WeightsError`] if the program carries other weights than its own version's.
+/// [`WeightsError`] if the shipped weights have another version than the program.
 pub fn imagenet_encoder(device: &Device) -> Result<Lite0, WeightsError> {
     let network = Lite0Config::default().init(0, device);
     let name = Path::new("efficientnet-lite0-encoder.safetensors");
@@ -211,13 +211,13 @@ impl Lite0Config {
 }
 
 impl Lite0 {
-    /// Last feature map of every stage. `x` is `batch x 3 x height x width`; the maps have 16, 24, 40, 80, 112, 192 and
-    /// 320 channels at 1/2, 1/4, 1/8, 1/16, 1/16, 1/32 and 1/32 of the resolution, as many as there are stages.
+    /// Last feature map of every stage. `x` is `batch x 3 x height x width`; the maps have 16, 24, 40, 80, 112, 192 and 320
+    /// channels at 1/2, 1/4, 1/8, 1/16, 1/16, 1/32 and 1/32 of the resolution, one map per stage.
     pub fn forward(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
         self.forward_stages(x, STAGES.len())
     }
 
-    /// [`Self::forward`] up to this number of stages.
+    /// As [`Self::forward`], up to this number of stages.
     pub fn forward_stages(&self, x: Tensor<4>, stages: usize) -> Vec<Tensor<4>> {
         let mut x = self.stem.forward(x);
         let mut blocks = self.blocks.iter();
@@ -235,8 +235,8 @@ impl Lite0 {
         maps
     }
 
-    /// Keeps the stem and the first `stages` stages as they are while the rest trains: their gradients, the costliest
-    /// of all because their maps are the largest, are then never computed.
+    /// Freezes the stem and the first `stages` stages while the rest is trained: their gradients, the most costly because their
+    /// maps are the largest, are then not computed.
     pub fn freeze(mut self, stages: usize) -> Self {
         let frozen: usize = STAGES.iter().take(stages).map(|stage| stage.0).sum();
         self.stem = self.stem.no_grad();

@@ -1,8 +1,8 @@
-//! The kernels as operations of Burn: a backend extension with gradients, so that one network definition trains and
-//! infers with them.
+//! The kernels as operations of Burn: a backend extension with gradients, so that training and inference use the same network
+//! definition.
 //!
-//! Burn's `flex` backend derives the gradients of a convolution from further convolutions, which is slow; these take
-//! matrix products over patches instead, and one pass for bias and activation.
+//! Burn's `flex` backend derives the gradients of a convolution from further convolutions, which is slow; these use matrix products
+//! over patches instead, and a single pass for bias and activation.
 
 use crate::kernels::{
     Activation, ConvShape, ConvSpec, Upsampling, conv_backward, conv_forward, upsample_2x,
@@ -28,7 +28,7 @@ pub trait SixfoldOps: Backend {
         spec: ConvSpec,
     ) -> FloatTensor<Self>;
 
-    /// Gradients with respect to input, weight and bias; those not wanted are tensors of length 0.
+    /// Gradients with respect to input, weight and bias; those not requested are tensors of length 0.
     fn sixfold_conv_backward(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -195,7 +195,7 @@ impl<B: SixfoldOps, C: CheckpointStrategy> SixfoldOps for Autodiff<B, C> {
 /// `outputs x inputs / groups x kernel x kernel`, `bias` `outputs`.
 ///
 /// # Panics
-/// If the shapes do not fit each other, as Burn's own convolution does.
+/// If the shapes are inconsistent, like Burn's own convolution.
 pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) -> Tensor<4> {
     let ([_, inputs, ..], [outputs, per_group, kernel, second], [biases]) =
         (x.dims(), weight.dims(), bias.dims());
@@ -217,21 +217,22 @@ pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) ->
     ))
 }
 
-/// Doubles an image by repeating pixels: `batch x channels x height x width` to twice the rows and columns.
+/// Upsamples an image by two, repeating pixels: `batch x channels x height x width` to twice the rows and columns.
 pub fn upsample(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Repeated))
 }
 
-/// Doubles an image bilinearly, as PyTorch's `interpolate` without aligned corners: `batch x channels x height x width` to twice
-/// the rows and columns.
+/// Upsamples an image by two bilinearly, as PyTorch's `interpolate` without aligned corners: `batch x channels x height x width` to
+/// twice the rows and columns.
 pub fn doubled(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Bilinear))
 }
 
-/// Channels become pixels: `batch x (factor * factor * c) x h x w` to `batch x c x (factor * h) x (factor * w)` (Shi et al. 2016).
+/// Rearranges channels to pixels: `batch x (factor * factor * c) x h x w` to `batch x c x (factor * h) x (factor * w)` (Shi et al.
+/// 2016).
 ///
 /// # Panics
-/// When the channels are no multiple of `factor * factor`.
+/// If the number of channels is not a multiple of `factor * factor`.
 pub fn pixel_shuffle(x: Tensor<4>, factor: usize) -> Tensor<4> {
     let [batch, channels, height, width] = x.dims();
     let c = channels / (factor * factor);

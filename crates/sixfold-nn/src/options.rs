@@ -1,4 +1,4 @@
-//! What all trainings have in common: the optimiser's options, the pace, and the error of an option out of its range.
+//! Options common to all trainings: the optimiser's options, the pace, and the error for an option out of its range.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,19 +11,19 @@ use crate::schedule::LearningRate;
 pub struct OptionError {
     /// Its name.
     pub field: &'static str,
-    /// What it held.
+    /// Its value.
     pub found: String,
-    /// What it should hold.
+    /// The values allowed.
     pub expected: &'static str,
 }
 
 impl OptionError {
-    /// An option that is out of its range.
+    /// The error for an option out of its range.
     pub fn new(field: &'static str, found: impl ToString, expected: &'static str) -> Self {
         OptionError { field, found: found.to_string(), expected }
     }
 
-    /// This error unless the option `fits`.
+    /// Returns this error unless `fits` is true.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -36,17 +36,17 @@ impl OptionError {
         if fits { Ok(()) } else { Err(OptionError::new(field, found, expected)) }
     }
 
-    /// This error unless `value` is a fraction, 0 to 1.
+    /// Returns this error unless `value` is a fraction, 0 to 1.
     ///
     /// # Errors
     /// [`OptionError`].
     pub fn unless_fraction(field: &'static str, value: impl Into<f64>) -> Result<(), OptionError> {
         let value = value.into();
-        // Numbers of f32 are written as they were given.
+        // Printed as f32, so that f32 values appear as given.
         OptionError::unless((0.0..=1.0).contains(&value), field, value as f32, "0 to 1")
     }
 
-    /// This error unless `value` is a number of steps that a training can take.
+    /// Returns this error unless `value` is a valid number of steps of a training.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -55,7 +55,7 @@ impl OptionError {
         OptionError::unless(value <= MOST_STEPS, "steps", value, "at most 100000000")
     }
 
-    /// This error unless so many samples fit into a step: at least `least`, and not more than a memory holds.
+    /// Returns this error unless the number of samples per step is at least `least` and not more than fit into memory.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -69,7 +69,7 @@ impl OptionError {
         OptionError::unless(value <= MOST_SAMPLES, field, value, "at most 1024")
     }
 
-    /// This error unless `value` is a number of stages of the five-stage ImageNet encoder that stay as they are.
+    /// Returns this error unless `value` is a valid number of frozen stages of the five-stage ImageNet encoder.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -77,7 +77,7 @@ impl OptionError {
         OptionError::unless(value <= ENCODER_STAGES, "frozen_stages", value, "0 to 5")
     }
 
-    /// This error unless `value` is the weight of a loss: finite, 0 or more.
+    /// Returns this error unless `value` is a valid weight of a loss: finite, 0 or more.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -87,28 +87,28 @@ impl OptionError {
     }
 }
 
-/// Highest learning rate: with more, the first step ends in no numbers, after all samples were made.
+/// Largest learning rate: with larger ones the first step gives NaN, after all samples were generated.
 const MOST_RATE: f64 = 1000.0;
-/// Most that a part of a loss weighs.
+/// Largest weight of a part of a loss.
 const MOST_WEIGHT: f64 = 1e6;
-/// Most steps of a training.
+/// Largest number of steps of a training.
 const MOST_STEPS: u64 = 100_000_000;
-/// Most samples in a step: they are in memory at once.
+/// Largest number of samples per step: they are in memory at the same time.
 const MOST_SAMPLES: usize = 1024;
 
-/// How long and how strongly a network is trained: AdamW (Loshchilov and Hutter 2019) on a cosine schedule. All of it
-/// decides about the result. Methods flatten it into options of their own.
+/// Length, learning rate and regularisation of a training: AdamW (Loshchilov and Hutter 2019) with a cosine schedule. All fields
+/// affect the result. Methods flatten them into their own options.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrainingOptions {
     /// Optimiser steps, 1 or more.
     pub steps: u64,
     /// Highest learning rate, above 0; it falls to zero as a cosine.
     pub learning_rate: f64,
-    /// Steps over which the rate rises at first, in a straight line. A shorter training rises until its last step.
+    /// Initial steps over which the rate rises linearly. In a shorter training it rises until the last step.
     pub warm_up: u64,
     /// Decoupled weight decay, as a multiple of the learning rate, 0 or more.
     pub weight_decay: f32,
-    /// Gradient-norm clip: a tensor's gradient of a larger Euclidean norm is scaled down to it. None: gradients as they are.
+    /// Gradient-norm clip: a tensor's gradient of a larger Euclidean norm is scaled down to it. `None`: no clipping.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_grad_norm: Option<f32>,
     /// Seed of weights and samples.
@@ -132,7 +132,7 @@ impl TrainingOptions {
         OptionError::unless(positive(f64::from(norm)), "max_grad_norm", norm, above)
     }
 
-    /// The same with what a user asks for, where it is given.
+    /// The same with the values given by a user.
     pub fn with(self, steps: Option<u64>, learning_rate: Option<f64>, seed: u64) -> Self {
         TrainingOptions {
             steps: steps.unwrap_or(self.steps),
@@ -142,7 +142,7 @@ impl TrainingOptions {
         }
     }
 
-    /// The learning rate of every step.
+    /// The schedule of the learning rate.
     pub fn schedule(&self) -> LearningRate {
         LearningRate::Cosine {
             rate: self.learning_rate,
@@ -153,14 +153,14 @@ impl TrainingOptions {
     }
 }
 
-/// How often a training is logged and saved, and by how many threads its samples are made. The result does not depend on it.
+/// How often a training is logged and saved, and the number of threads that generate its samples. It does not affect the result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pace {
     /// Steps between checkpoints, 1 or more.
     pub checkpoint_every: u64,
     /// Steps between records of the log, 1 or more.
     pub log_every: u64,
-    /// Threads that make batches beside the training itself.
+    /// Threads that generate batches, in addition to the training itself.
     pub sample_threads: usize,
 }
 

@@ -1,8 +1,9 @@
 //! A network's parameters without the network's type.
 //!
-//! Burn compiles what visits or changes parameters (an optimiser, a record, a file of weights) once for each kind of network, and
+//! Burn compiles code that visits or changes parameters (an optimiser, a record, a weight file) once for each type of network, and
 //! there once for each number of dimensions and each kind of number: 27 times. Here it is compiled once for all networks, in this
-//! crate; a crate with a network of its own compiles a way in and out only. It makes the build 5 % shorter (docs/build.md).
+//! crate; a crate with its own network compiles only the conversion to and from this form. It makes the build 5 % shorter
+//! (docs/build.md).
 
 use std::any::Any;
 
@@ -18,7 +19,7 @@ pub(crate) enum Kind {
     Bool,
 }
 
-/// `body` with the constant `D` for the number of dimensions; Burn has tensors of up to 8.
+/// Expands `body` with the constant `D` for the number of dimensions; Burn has tensors of up to 8.
 macro_rules! with_rank {
     ($rank:expr, $d:ident => $body:expr) => {
         with_rank!(@ $rank, $d, $body, 0, 1, 2, 3, 4, 5, 6, 7, 8)
@@ -31,7 +32,7 @@ macro_rules! with_rank {
     };
 }
 
-/// A [`ModuleVisitor`] whose methods have no type parameters. `parameter` is the `Param<Tensor<D, K>>` that `kind` and `rank` say.
+/// A [`ModuleVisitor`] whose methods have no type parameters. `parameter` is the `Param<Tensor<D, K>>` given by `kind` and `rank`.
 pub(crate) trait AnyVisitor {
     fn enter(&mut self, name: &str, container: &str);
     fn exit(&mut self, name: &str, container: &str);
@@ -62,7 +63,7 @@ fn typed<T: Any>(parameter: &dyn Any) -> &T {
         .unwrap_or_else(|| unreachable!("a parameter of the kind and rank that go with it"))
 }
 
-/// A [`ModuleMapper`] whose methods have no type parameters; it gives back a parameter of the same type.
+/// A [`ModuleMapper`] whose methods have no type parameters; it returns a parameter of the same type.
 pub(crate) trait AnyMapper {
     fn enter(&mut self, name: &str, container: &str);
     fn exit(&mut self, name: &str, container: &str);
@@ -92,7 +93,7 @@ fn owned<T: Any>(parameter: Box<dyn Any>) -> T {
     *parameter.unwrap_or_else(|_| unreachable!("a parameter of the kind and rank that go with it"))
 }
 
-/// A module whose parameters can be visited. This and [`Changeable`] are what each crate compiles for each of its networks.
+/// A module whose parameters can be visited. Only this and [`Changeable`] are compiled for each network in its crate.
 pub(crate) trait Visitable {
     fn show(&self, visitor: &mut dyn AnyVisitor);
 }
@@ -122,7 +123,7 @@ impl<N> Network<N> {
     }
 }
 
-/// Burn's `map` takes the module and gives it back.
+/// Burn's `map` takes the module by value and returns it.
 const AWAY: &str = "a module is away only while it is changed";
 
 impl<N: Module> Changeable for Network<N> {
@@ -182,8 +183,8 @@ impl ModuleMapper for WithoutTypes<'_, dyn AnyMapper + '_> {
     }
 }
 
-/// All parameters of a network in their order, as a module of their own: for what Burn offers for modules only. They are the
-/// network's, with its tensors, ids and names.
+/// All parameters of a network in their order, as a separate module, for functions that Burn offers only for modules. They share
+/// the network's tensors, ids and names.
 #[derive(Debug, Clone)]
 pub(crate) struct Parameters(Vec<Parameter>);
 
@@ -203,7 +204,7 @@ trait Value: Any + Send + std::fmt::Debug {
     fn changed(self: Box<Self>, change: Change<'_>) -> Box<dyn Value>;
 }
 
-/// What a module can be asked to do with its parameters.
+/// Operations on the parameters of a module.
 #[derive(Clone, Copy)]
 enum Change<'a> {
     Fork(&'a Device),
@@ -246,7 +247,7 @@ impl Parameters {
         Parameters(gathered.parameters)
     }
 
-    /// Puts them into the module that they come from.
+    /// Puts the parameters back into their module.
     pub(crate) fn put_into(self, module: &mut dyn Changeable) {
         module.change(&mut Replaced(self.0.into_iter()));
     }
@@ -342,7 +343,7 @@ impl Module for Parameters {
     }
 }
 
-/// Takes the gradients of a module's parameters out of `gradients`.
+/// Removes the gradients of a module's parameters from `gradients` and returns them.
 pub fn gradients_of<M: Module>(gradients: &mut Gradients, module: &M) -> GradientsParams {
     taken_out(gradients, module)
 }
@@ -356,7 +357,7 @@ fn taken_out(gradients: &mut Gradients, module: &dyn Visitable) -> GradientsPara
 pub struct GradientSum(GradientsAccumulator<Parameters>);
 
 impl GradientSum {
-    /// Nothing yet.
+    /// An empty sum.
     pub fn new() -> Self {
         Self::default()
     }
@@ -388,7 +389,7 @@ mod tests {
     use crate::learner::Learner;
     use crate::options::TrainingOptions;
 
-    /// Parameters of one to four dimensions, running statistics, whole numbers and truth values.
+    /// Parameters of one to four dimensions, running statistics, integers and booleans.
     #[derive(Module, Debug)]
     struct Net {
         conv: Conv2d,
@@ -439,7 +440,7 @@ mod tests {
         assert_eq!(parameters.num_params(), original.num_params());
         assert_eq!(parameters.devices(), original.devices());
         assert_eq!(parameters.into_record().into_bytes().unwrap().to_vec(), record(&original));
-        // Into another network of the same kind, which then is the first one to Burn.
+        // Loads them into another network of the same kind, which Burn then treats as the first one.
         device.seed(4);
         let mut other = Network::new(net(&device.clone()).map(&mut Doubled));
         assert_ne!(numbers(&original), numbers(other.0.as_ref().unwrap()));
@@ -447,7 +448,7 @@ mod tests {
         assert_eq!(numbers(&original), numbers(&other.into_inner()));
     }
 
-    /// What a file of weights holds: all but the ids, which running statistics keep.
+    /// The content of a weight file: everything but the ids, which running statistics keep.
     fn numbers(net: &Net) -> Vec<u8> {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.safetensors");

@@ -1,7 +1,7 @@
-//! Weights that others trained: PyTorch's `.pth` files and `.safetensors` files with PyTorch's names.
+//! Weights trained by others: PyTorch's `.pth` files and `.safetensors` files with PyTorch's names.
 //!
-//! A network whose tensors have the names of the PyTorch model takes them one by one; names may differ by a renaming that
-//! the network gives. Everything must fit: a file of another network is refused with the first tensor that does not.
+//! A network whose tensors have the names of the PyTorch model reads them one by one; names may differ by a mapping that the
+//! network defines. Everything must match: a file of another network is refused with the first tensor that does not match.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -17,11 +17,11 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use crate::files::explain;
 use crate::parameters::{Changeable, Network};
 
-/// What training scripts put around the names: data-parallel wrappers and dictionaries around the state.
+/// Prefixes that training scripts add to the names: data-parallel wrappers and dictionaries around the state.
 const PREFIXES: [&str; 7] =
     ["", "module.", "state_dict.", "state_dict.module.", "model.", "model_state_dict.", "model.module."];
 
-/// Why somebody's weights could not be used.
+/// Why the weights could not be used.
 #[derive(Debug, thiserror::Error)]
 pub enum PretrainedError {
     /// The file could not be read.
@@ -29,20 +29,20 @@ pub enum PretrainedError {
     Read {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file's content is not what its ending says.
+    /// The file's content does not match its ending.
     #[error("{}: expected {expected}, found {reason}; download it again", file.display())]
     Broken {
         /// The file.
         file: PathBuf,
-        /// What the ending promises.
+        /// The format according to the ending.
         expected: &'static str,
         /// What is wrong.
         reason: String,
     },
-    /// The ending is none that is known.
+    /// The ending is unknown.
     #[error("{}: expected a file that ends in .pth, .pt or .safetensors, found ending {found:?}", file.display())]
     Ending {
         /// The file.
@@ -58,7 +58,7 @@ pub enum PretrainedError {
         file: PathBuf,
         /// PyTorch's name of the tensor.
         tensor: String,
-        /// The shape the network needs.
+        /// The shape that the network needs.
         expected: Vec<usize>,
         /// The network.
         network: String,
@@ -71,7 +71,7 @@ pub enum PretrainedError {
         file: PathBuf,
         /// PyTorch's name of the tensor.
         tensor: String,
-        /// The shape the network needs.
+        /// The shape that the network needs.
         expected: Vec<usize>,
         /// The shape in the file.
         found: Vec<usize>,
@@ -99,12 +99,12 @@ pub enum PretrainedError {
         file: PathBuf,
         /// Its name in the file.
         tensor: String,
-        /// What is there.
+        /// The content found.
         found: String,
     },
 }
 
-/// Where a tensor's numbers lie.
+/// Location of a tensor's numbers.
 enum Source {
     PyTorch(pytorch_reader::Tensor),
     /// Number type, and first and last byte in the file's content.
@@ -116,11 +116,11 @@ struct Entry {
     source: Source,
 }
 
-/// A weight file that is open: names and shapes are known, numbers are read when they are asked for.
+/// An open weight file: names and shapes are in memory, numbers are read on request.
 pub struct PretrainedFile {
     path: PathBuf,
     entries: BTreeMap<String, Entry>,
-    /// The whole content of a safetensors file, else empty.
+    /// The whole content of a safetensors file, otherwise empty.
     content: Vec<u8>,
 }
 
@@ -185,10 +185,10 @@ impl PretrainedFile {
         self.entries.iter().map(|(name, entry)| (name.as_str(), entry.shape.as_slice()))
     }
 
-    /// The numbers of one tensor; `network` is for the message.
+    /// The numbers of one tensor; `network` is used in messages.
     ///
     /// # Errors
-    /// [`PretrainedError`] where it is missing, of another shape or not of finite numbers.
+    /// [`PretrainedError`] if it is missing, has another shape or has numbers that are not finite.
     pub fn tensor(&self, name: &str, shape: &[usize], network: &str) -> Result<Vec<f32>, PretrainedError> {
         let (file, tensor, expected) = (self.path.clone(), name.to_owned(), shape.to_vec());
         let network = network.to_owned();
@@ -246,23 +246,22 @@ fn decode<const N: usize>(bytes: &[u8], from: impl Fn([u8; N]) -> f32) -> Vec<f3
     bytes.as_chunks::<N>().0.iter().map(|b| from(*b)).collect()
 }
 
-/// How a network's names meet a file's.
+/// Mapping of a network's names to those of a file.
 pub struct Naming<'a> {
-    /// The network, in words, for errors.
+    /// Description of the network, for errors.
     pub network: &'a str,
     /// PyTorch's names of a tensor, the usual one first, from the module's fields' names joined with dots.
     pub names: &'a dyn Fn(&str) -> Vec<String>,
-    /// Which of the file's tensors (without prefix) may be left over.
+    /// Which of the file's tensors (without prefix) may be unused.
     pub unused: &'a dyn Fn(&str) -> bool,
 }
 
-/// Fills a module with the tensors of a file. Weights of Burn's `Linear` are transposed, PyTorch's counts of batches are
-/// left out.
+/// Loads the tensors of a file into a module. Weights of Burn's `Linear` are transposed, PyTorch's batch counters are ignored.
 ///
 /// # Errors
 /// [`PretrainedError`] with the first tensor that is missing, of another shape, unknown or not finite.
 pub fn fill<M: Module>(module: M, file: &PretrainedFile, naming: &Naming<'_>) -> Result<M, PretrainedError> {
-    // Running statistics that still wait for their threads would replace the loaded ones later.
+    // Running statistics still pending in other threads would later replace the loaded ones.
     drop(module.valid());
     let mut module = Network::new(module);
     fill_parameters(&mut module, file, naming)?;
@@ -305,7 +304,7 @@ fn fill_parameters(
 struct Filler<'a> {
     file: &'a PretrainedFile,
     naming: &'a Naming<'a>,
-    /// Found with the first tensor.
+    /// Determined with the first tensor.
     prefix: Option<&'static str>,
     path: Vec<String>,
     containers: Vec<String>,
@@ -404,7 +403,7 @@ mod tests {
 
     type Numbered = (String, Vec<usize>, Vec<f32>);
 
-    /// The network's tensors as PyTorch names and lays them out.
+    /// The network's tensors with PyTorch's names and layout.
     fn tensors() -> Vec<Numbered> {
         let shapes = [
             ("conv.weight", vec![4, 2, 3, 3]),

@@ -1,6 +1,6 @@
-//! Whole trainings, data in and a model file out: the one driver of all methods. It makes samples ready, resumes from the
-//! last checkpoint of a training on the same inputs, trains, and has the method save its model and measure it. One training
-//! runs in a folder at a time.
+//! Complete trainings, from data to a model file: the common driver of all methods. It prepares samples, resumes from the last
+//! checkpoint of a training on the same inputs, trains, and lets the method save its model and measure it. Only one training runs
+//! in a folder at a time.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,30 +19,30 @@ use crate::training::{Outcome, Training, fit_on, restore};
 use crate::training_log::TrainingRecord;
 use crate::weights::{ModelCard, WeightsError, read_card};
 
-/// Name of a model's file, where its recipe has none of its own.
+/// Default name of a model's file.
 const MODEL_FILE: &str = "model.safetensors";
 
-/// What a training reports while it runs.
+/// Events that a training reports while it runs.
 #[derive(Debug, Clone, Copy)]
 pub enum TrainingEvent<'a> {
-    /// Something that the user should know, such as what begins now.
+    /// Information for the user, such as the stage that starts now.
     Note(&'a str),
-    /// Something that is probably wrong.
+    /// A probable mistake.
     Warning(&'a str),
-    /// What is made ready before the first step: done, and in all.
+    /// Progress of the preparation before the first step: done, and total.
     Preparing(usize, usize),
-    /// Steps were taken; steps in all.
+    /// Progress of the steps: the latest record, and the total number of steps.
     Steps(&'a TrainingRecord, u64),
-    /// What is measured after the last step: done, and in all.
+    /// Progress of the measurement after the last step: done, and total.
     Measuring(usize, usize),
 }
 
 /// Receives the events, from any thread, one at a time.
 pub type TrainingEvents<'a> = dyn FnMut(TrainingEvent<'_>) + Send + 'a;
 
-/// The caller's side of a training: where it is kept, when it is to stop, and who is shown how far it is.
+/// The caller's side of a training: its folder, the flag to stop it, and the receiver of its events.
 pub struct Session<'a> {
-    /// The folder that gets the model, and in `training` checkpoints, log and curves.
+    /// The folder for the model; its subfolder `training` has checkpoints, log and curves.
     pub out: &'a Path,
     /// Set to end the training after the current step.
     pub stop: &'a AtomicBool,
@@ -51,7 +51,7 @@ pub struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    /// A training in `out`.
+    /// A session of a training in `out`.
     pub fn new(out: &'a Path, stop: &'a AtomicBool, events: &'a mut TrainingEvents<'a>) -> Self {
         Session { out, stop, events }
     }
@@ -85,37 +85,37 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Says something that the user should know.
+    /// Sends information for the user.
     pub fn note(&mut self, text: &str) {
         (self.events)(TrainingEvent::Note(text));
     }
 
-    /// Says something that is probably wrong.
+    /// Sends a warning about a probable mistake.
     pub fn warn(&mut self, text: &str) {
         (self.events)(TrainingEvent::Warning(text));
     }
 }
 
-/// How one method's model is trained: options with their defaults (`Default`), and what the method does for [`train`].
+/// The training of one method's model: options with their defaults (`Default`), and the method's part of [`train`].
 pub trait Recipe: Default {
-    /// What is learnt from beside the options; `()` where everything is generated.
+    /// Training data in addition to the options; `()` if everything is generated.
     type Data;
-    /// What batches are made from.
+    /// The samples from which batches are made.
     type Samples;
     /// Networks with their optimisers.
     type Training: Training<Samples = Self::Samples>;
-    /// What else is known before the first step, for the samples and the model.
+    /// Further data prepared before the first step, for the samples and the model.
     type Context;
-    /// What is measured of the trained model.
+    /// Result of measuring the trained model.
     type Report;
 
-    /// Steps in all. With 0 the initial network is saved and measured as it is.
+    /// Number of steps. With 0 the initial network is saved and measured unchanged.
     fn steps(&self) -> u64;
 
     /// Seed of weights and samples.
     fn seed(&self) -> u64;
 
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     fn command(&self) -> &str;
 
     /// Name of the model's file in [`Session::out`].
@@ -129,15 +129,15 @@ pub trait Recipe: Default {
     /// [`OptionError`] with the first one that is out of its range.
     fn check(&self) -> Result<(), OptionError>;
 
-    /// What the result depends on: every option, and the contents of `data` and of each file that is read. Not what the result
-    /// is the same without, such as names and threads.
+    /// Everything on which the result depends: every option, and the contents of `data` and of each file that is read. Values that
+    /// do not affect the result, such as names and threads, are excluded.
     ///
     /// # Errors
     /// [`TrainError`] for a file that cannot be read.
     fn inputs(&self, data: &Self::Data) -> Result<Fingerprint, TrainError>;
 
-    /// The initial network with its optimisers, and the card as far as it is known. Tells of wrong weights and data before
-    /// anything else begins.
+    /// The initial network with its optimisers, and the card as far as known. Reports invalid weights and data before anything else
+    /// starts.
     ///
     /// # Errors
     /// [`TrainError`].
@@ -147,7 +147,7 @@ pub trait Recipe: Default {
         session: &mut Session<'_>,
     ) -> Result<Prepared<Self::Training, Self::Context>, TrainError>;
 
-    /// Makes what batches are made from; `None` when asked to stop meanwhile.
+    /// Generates the samples; `None` when stopped meanwhile.
     ///
     /// # Errors
     /// [`TrainError`].
@@ -157,8 +157,8 @@ pub trait Recipe: Default {
         session: &mut Session<'_>,
     ) -> Result<Option<Self::Samples>, TrainError>;
 
-    /// Saves the model in [`Session::model`], first as it is: nothing that was trained may be lost. Then measures it and saves
-    /// it with the result; `None` when asked to stop meanwhile.
+    /// Saves the model in [`Session::model`], first without measuring, so that the training is not lost. Then measures it and saves
+    /// it with the result; `None` when stopped meanwhile.
     ///
     /// # Errors
     /// [`TrainError`].
@@ -169,36 +169,36 @@ pub trait Recipe: Default {
     ) -> Result<Option<Self::Report>, TrainError>;
 }
 
-/// What stands before the first step, and with other weights after the last.
+/// The state before the first step and, with trained weights, after the last.
 pub struct Prepared<T, C> {
     /// Networks with their optimisers.
     pub training: T,
-    /// Says how the model came about.
+    /// Describes the origin of the model.
     pub card: ModelCard,
-    /// What else is known.
+    /// Further data for the samples and the model.
     pub context: C,
 }
 
-/// What a training came to.
+/// The result of a training.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Trained<R = ()> {
     /// The model file.
     pub model: PathBuf,
-    /// Steps in all.
+    /// Number of steps.
     pub steps: u64,
-    /// Of training; `None` where a model was only exported.
+    /// Seconds of training; `None` if a model was only exported.
     pub seconds: Option<f64>,
     /// The last record's losses by name.
     pub losses: BTreeMap<String, f64>,
-    /// What was measured of the model.
+    /// Result of measuring the model.
     pub report: R,
 }
 
 /// Trains, or resumes the training in the session's folder, and writes the model there.
 ///
 /// # Errors
-/// [`TrainError`]; the last checkpoints stay. Among them [`TrainError::OtherTraining`] where the folder holds a training on other
-/// inputs, and [`TrainError::Lock`] while another one runs there.
+/// [`TrainError`]; the last checkpoints are kept. In particular [`TrainError::OtherTraining`] if the folder contains a training on
+/// other inputs, and [`TrainError::Lock`] while another one runs there.
 pub fn train<R: Recipe>(
     recipe: &R,
     data: R::Data,
@@ -212,7 +212,7 @@ pub fn train<R: Recipe>(
         return finish(recipe, prepared, None, session);
     }
     let inputs = recipe.inputs(&data)?;
-    // Before anything is made ready, which may take hours.
+    // Checked before the preparation, which may take hours.
     if let Some(checkpoint) = Checkpoint::latest(&folder)? {
         check_inputs(&checkpoint, &inputs, &folder)?;
     }
@@ -236,7 +236,7 @@ pub fn train<R: Recipe>(
 /// Writes the model of the last checkpoint in the session's folder, as [`train`] does at the end.
 ///
 /// # Errors
-/// As [`train`]; [`TrainError::NoCheckpoint`] where nothing was trained yet.
+/// As [`train`]; [`TrainError::NoCheckpoint`] if nothing was trained yet.
 pub fn export<R: Recipe>(
     recipe: &R,
     data: R::Data,
@@ -255,7 +255,7 @@ pub fn export<R: Recipe>(
     finish(recipe, prepared, None, session)
 }
 
-/// An error unless the training in `folder` was one on these inputs.
+/// Returns an error unless the training in `folder` has these inputs.
 fn check_inputs(checkpoint: &Checkpoint, inputs: &Fingerprint, folder: &Path) -> Result<(), TrainError> {
     match checkpoint.fingerprint()?.difference_from_part(inputs) {
         None => Ok(()),
@@ -285,10 +285,10 @@ fn finish<R: Recipe>(
     Ok(Outcome::Finished(Trained { model, steps, seconds, losses, report }))
 }
 
-/// What a card says of the weights that a training began with: how they came about, and theirs in turn.
+/// The origin of a training's initial weights for its card, including that of their own initial weights.
 ///
 /// # Errors
-/// [`WeightsError`] for a file that is no weight file.
+/// [`WeightsError`] for a file that is not a weight file.
 pub fn continued_from(init: Option<&Path>) -> Result<serde_json::Value, WeightsError> {
     let Some(file) = init else { return Ok(serde_json::Value::Null) };
     let card = read_card(file)?;
@@ -312,7 +312,7 @@ mod tests {
     use crate::training::{Batches, Losses, Plan};
     use crate::weights::ModelCard;
 
-    /// Sums its batches; the model file holds the sum.
+    /// Sums its batches; the model file contains the sum.
     struct Sum {
         value: u64,
         steps: u64,
@@ -428,7 +428,7 @@ mod tests {
         let interrupted = train(&recipe, 10, &mut session).unwrap();
         assert!(matches!(interrupted, Outcome::Interrupted { step: 2 }));
         assert!(!session.model().exists());
-        // Stopped before there are samples: nothing more is done.
+        // Stopped before there are samples: nothing more happens.
         assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Interrupted { step: 2 }));
         let Outcome::Finished(exported) = export(&recipe, 10, &mut session).unwrap() else { panic!() };
         assert_eq!((exported.steps, exported.seconds, exported.report.as_str()), (2, None, "sum 7 2"));
@@ -483,13 +483,13 @@ mod tests {
         assert!(!session.model().exists());
         assert!(matches!(train(&recipe, 10, &mut session).unwrap(), Outcome::Finished(_)));
         let model = std::fs::read(session.model()).unwrap();
-        // Done already: not for other inputs, and for other steps only after samples are made.
+        // Already finished, but not for other inputs; for another number of steps only after samples are generated.
         assert!(said(train(&recipe, 11, &mut session).unwrap_err()).contains("offset was 10, is 11"));
         assert!(
             said(train(&SumRecipe { steps: 5 }, 10, &mut session).unwrap_err()).contains("steps was 4, is 5")
         );
         assert_eq!(std::fs::read(session.model()).unwrap(), model);
-        // Samples were made of the right inputs alone: begun, resumed, and of other steps.
+        // Samples were generated only for the right inputs: started, resumed, and with another number of steps.
         assert_eq!(notes, 3);
     }
 
@@ -528,7 +528,7 @@ mod tests {
         };
         let mut session = Session::new(&out, &stop, &mut events);
         assert!(matches!(train(&SumRecipe { steps: 4 }, 10, &mut session).unwrap(), Outcome::Finished(_)));
-        // And when it is done the next one may.
+        // When it is finished the next one may run.
         assert!(matches!(export(&SumRecipe { steps: 4 }, 10, &mut session).unwrap(), Outcome::Finished(_)));
         assert!(refused.len() == 8 && refused.iter().all(|e| e.contains("another process")), "{refused:?}");
     }

@@ -1,5 +1,5 @@
-//! Two operations of networks that look an object up in several images: the cell of a convolutional LSTM, and feature maps
-//! gathered at given places. Backend extensions with gradients, like [`crate::ops`].
+//! Two operations of networks that sample an object in several images: the cell of a convolutional LSTM, and feature maps sampled
+//! at given positions. Backend extensions with gradients, like [`crate::ops`].
 
 use std::sync::Arc;
 
@@ -17,10 +17,10 @@ use crate::kernels::{Places, gather_backward, gather_forward, lstm_backward, lst
 /// Operations that this file adds to a backend.
 #[backend_extension(Flex, Autodiff)]
 pub trait RecurrentOps: Backend {
-    /// Gates and state before to hidden state and state, one after the other along the batch.
+    /// From gates and previous state to hidden state and new state, concatenated along the batch.
     fn sixfold_lstm(gates: FloatTensor<Self>, before: FloatTensor<Self>) -> FloatTensor<Self>;
 
-    /// Gradients with respect to gates and state before.
+    /// Gradients with respect to gates and previous state.
     fn sixfold_lstm_backward(
         gates: FloatTensor<Self>,
         before: FloatTensor<Self>,
@@ -28,7 +28,7 @@ pub trait RecurrentOps: Backend {
         dout: FloatTensor<Self>,
     ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    /// Maps to images of what they hold at the places.
+    /// From maps to images of their values at the positions.
     fn sixfold_gather(maps: FloatTensor<Self>, places: Arc<Places>) -> FloatTensor<Self>;
 
     /// Gradient with respect to maps of this size.
@@ -167,12 +167,12 @@ impl<B: RecurrentOps, C: CheckpointStrategy> RecurrentOps for Autodiff<B, C> {
     }
 }
 
-/// The cell of a convolutional LSTM (Shi et al. 2015, equation 3, without peepholes): hidden state and new state, each
-/// `batch x channels x height x width`, from the gates (`batch x 4 channels x height x width`; of every channel input, forget
-/// and output gate and the candidate, before their activations) and the state before.
+/// The cell of a convolutional LSTM (Shi et al. 2015, equation 3, without peepholes): hidden state and new state, each `batch x
+/// channels x height x width`, from the gates (`batch x 4 channels x height x width`; of every channel input, forget and output
+/// gate and the candidate, before their activations) and the previous state.
 ///
 /// # Panics
-/// If the shapes do not fit each other.
+/// If the shapes are inconsistent.
 pub fn lstm_cell(gates: Tensor<4>, before: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let ([batch, all, height, width], shape) = (gates.dims(), before.dims());
     assert_eq!([batch, all, height, width], [shape[0], 4 * shape[1], shape[2], shape[3]], "gates of an LSTM");
@@ -181,10 +181,10 @@ pub fn lstm_cell(gates: Tensor<4>, before: Tensor<4>) -> (Tensor<4>, Tensor<4>) 
     (out.clone().narrow(0, 0, batch), out.narrow(0, batch, batch))
 }
 
-/// Looks maps (`images x channels x any size`) up at the places: `images x channels x places.size`, 0 where there is none.
+/// Samples maps (`images x channels x any size`) at the positions: `images x channels x places.size`, 0 where there is no position.
 ///
 /// # Panics
-/// If there are not places for every image, or a place's pixel lies outside.
+/// If positions are missing for some image, or a position's pixel is outside.
 pub fn gather(maps: Tensor<4>, places: Arc<Places>) -> Tensor<4> {
     assert_eq!(maps.dims()[0], places.images.len(), "places for every map");
     Tensor::from_dispatch(Dispatch::sixfold_gather(maps.into_dispatch(), places))

@@ -1,5 +1,5 @@
-//! ResNet-50 (He et al. 2016, table 1) in torchvision's layout: names of the tensors, and the stride in the 3x3
-//! convolution of a bottleneck. [`Bottlenecks`] gives networks of the same kind other sizes.
+//! ResNet-50 (He et al. 2016, table 1) in torchvision's layout: names of the tensors, and the stride in the 3x3 convolution of a
+//! bottleneck. [`Bottlenecks`] configures networks of the same kind with other sizes.
 
 use std::path::Path;
 
@@ -18,13 +18,13 @@ use crate::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
 
 /// Layers after the first convolution.
 const LAYERS: usize = 4;
-/// A layer's output has so many times its inner channels.
+/// Ratio of a layer's output channels to its inner channels.
 const EXPANSION: usize = 4;
 
 /// Sizes of a network of bottlenecks (He et al. 2016, table 1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bottlenecks {
-    /// Bottlenecks of the four layers.
+    /// Number of bottlenecks in each of the four layers.
     pub blocks: [usize; 4],
     /// Channels of the first convolution, and inner channels of the first layer; each further layer has twice as many.
     pub width: usize,
@@ -95,17 +95,17 @@ impl Bottlenecks {
     }
 }
 
-/// How much of ResNet-50 to build.
+/// Which part of ResNet-50 to build.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ResNet50Config {
     /// Layers after the first convolution, 0 to 4.
     pub layers: usize,
-    /// Classes of the classifier after the fourth layer, if there is to be one.
+    /// Classes of the classifier after the fourth layer, if there is one.
     pub classes: Option<usize>,
 }
 
 impl ResNet50Config {
-    /// The whole network with its classifier of 1000 ImageNet classes (25.6 million parameters).
+    /// The complete network with its classifier of 1000 ImageNet classes (25.6 million parameters).
     pub fn imagenet() -> Self {
         ResNet50Config { layers: 4, classes: Some(1000) }
     }
@@ -120,7 +120,8 @@ impl ResNet50Config {
         Bottlenecks::default().build(self.layers, self.classes, seed, device)
     }
 
-    /// The network with torchvision's weights from a `.pth` or `.safetensors` file. What is not built is left out.
+    /// The network with torchvision's weights from a `.pth` or `.safetensors` file. Tensors of parts that are not built are
+    /// ignored.
     ///
     /// # Errors
     /// [`PretrainedError`].
@@ -140,8 +141,8 @@ impl ResNet50Config {
     }
 }
 
-/// ResNet-50, made by [`ResNet50Config`], or one of other sizes, made by [`Bottlenecks`]. Input: RGB, for torchvision's weights in 0..1 minus mean (0.485, 0.456, 0.406)
-/// over deviation (0.229, 0.224, 0.225).
+/// ResNet-50, created by [`ResNet50Config`], or a network of other sizes, created by [`Bottlenecks`]. Input: RGB, for torchvision's
+/// weights in 0..1 minus mean (0.485, 0.456, 0.406) over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct ResNet50 {
@@ -154,7 +155,7 @@ pub struct ResNet50 {
     fc: Option<Linear>,
 }
 
-/// 1x1 to fewer channels, 3x3, 1x1 to more, and the input added.
+/// A bottleneck: 1x1 to fewer channels, 3x3, 1x1 to more, and the input added.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct Bottleneck {
@@ -164,7 +165,7 @@ struct Bottleneck {
     bn2: BatchNorm,
     conv3: BareConv,
     bn3: BatchNorm,
-    /// Where stride or channels change: PyTorch's `downsample.0` and `downsample.1`.
+    /// Shortcut if stride or channels change: PyTorch's `downsample.0` and `downsample.1`.
     downsample: Option<(BareConv, BatchNorm)>,
 }
 
@@ -190,8 +191,7 @@ impl Bottleneck {
 }
 
 impl ResNet50 {
-    /// For a training in which all normalisations stay as they are, and of the five stages (the first convolution, the four layers) the
-    /// first `stages`.
+    /// Freezes all normalisations and, of the five stages (the first convolution, the four layers), the first `stages`.
     pub fn freeze_stages(self, stages: usize) -> ResNet50 {
         let layer = |number: usize, blocks: Vec<Bottleneck>| {
             let frozen = |block: Bottleneck| {
@@ -211,7 +211,7 @@ impl ResNet50 {
         }
     }
 
-    /// `batch x 3 x height x width` to the maps after the first convolution and after every layer that was built: 64, 256,
+    /// From `batch x 3 x height x width` to the maps after the first convolution and after every layer that was built: 64, 256,
     /// 512, 1024 and 2048 channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution.
     pub fn features(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
         let first = self.conv1.forward_norm(x, &self.bn1, None, 0.0);
@@ -228,7 +228,7 @@ impl ResNet50 {
         maps
     }
 
-    /// `batch x 3 x height x width` to `batch x classes` logits; none if the network has no classifier.
+    /// From `batch x 3 x height x width` to `batch x classes` logits; `None` if the network has no classifier.
     pub fn classify(&self, x: Tensor<4>) -> Option<Tensor<2>> {
         self.classify_map(self.features(x).pop()?)
     }

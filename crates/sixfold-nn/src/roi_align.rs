@@ -16,7 +16,7 @@ use crate::kernels::{Regions, roi_align_backward, roi_align_forward};
 /// RoIAlign for a backend.
 #[backend_extension(Flex, Autodiff)]
 pub trait RoiAlignOps: Backend {
-    /// A map (`1 x channels x height x width`) to `boxes x channels x side x side`.
+    /// From a map (`1 x channels x height x width`) to `boxes x channels x side x side`.
     fn sixfold_roi_align(map: FloatTensor<Self>, regions: Arc<Regions>) -> FloatTensor<Self>;
 
     /// Gradient with respect to a map of this size.
@@ -97,10 +97,10 @@ impl<B: RoiAlignOps, C: CheckpointStrategy> RoiAlignOps for Autodiff<B, C> {
     }
 }
 
-/// The boxes of one image's map (`1 x channels x height x width`), each at one size: `boxes x channels x side x side`.
+/// Samples the boxes of one image's map (`1 x channels x height x width`) to a common size: `boxes x channels x side x side`.
 ///
 /// # Panics
-/// For a batch of several images, without any box, and without bins or samples.
+/// For a batch of several images, and without boxes, bins or samples.
 pub fn roi_align(map: Tensor<4>, regions: Regions) -> Tensor<4> {
     assert_eq!(map.dims()[0], 1, "RoIAlign takes the map of one image");
     assert!(

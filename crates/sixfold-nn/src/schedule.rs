@@ -1,4 +1,4 @@
-//! How the learning rate changes over a training.
+//! Schedules of the learning rate.
 
 use std::f64::consts::PI;
 
@@ -19,13 +19,13 @@ pub enum LearningRate {
     StepDecay {
         /// Rate before the first decay, above 0.
         rate: f64,
-        /// What the rate is multiplied by, above 0 and at most 1.
+        /// Factor on the rate, above 0 and at most 1.
         factor: f64,
-        /// Steps from which on the rate is lower, in rising order.
+        /// Steps at which the rate is reduced, in rising order.
         at: Vec<u64>,
     },
-    /// A straight rise to `rate` over `warm_up` steps, then half a cosine down to `last` at step `steps` (Loshchilov and
-    /// Hutter 2017, without restarts).
+    /// A linear rise to `rate` over `warm_up` steps, then half a cosine down to `last` at step `steps` (Loshchilov and Hutter 2017,
+    /// without restarts).
     Cosine {
         /// Highest rate, above 0.
         rate: f64,
@@ -33,7 +33,7 @@ pub enum LearningRate {
         last: f64,
         /// Steps of the rise; 0 for none.
         warm_up: u64,
-        /// Length of the training in steps, rise included.
+        /// Length of the training in steps, including the rise.
         steps: u64,
     },
 }

@@ -1,4 +1,4 @@
-//! Why nothing could be trained, whatever it was.
+//! Errors of trainings.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -11,20 +11,20 @@ use crate::options::OptionError;
 use crate::training_log::TrainingLogError;
 use crate::weights::WeightsError;
 
-/// Why a training could not begin or be continued. What was trained until the last checkpoint is kept.
+/// Why a training could not start or continue. The state of the last checkpoint is kept.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainError {
     /// An option is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// Reading or writing a checkpoint.
+    /// Error in reading or writing a checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// Reading or writing the log.
+    /// Error in reading or writing the log.
     #[error(transparent)]
     Log(#[from] TrainingLogError),
-    /// Weights to begin with, or those that came out.
+    /// Error in the initial weights or in saving the trained ones.
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// Another training runs in the folder, or the folder cannot be locked.
@@ -33,14 +33,14 @@ pub enum TrainError {
     /// An input cannot be read.
     #[error("{name}: {}: cannot be read: {}", file.display(), explain(source))]
     Input {
-        /// What it is for.
+        /// Name of the input.
         name: String,
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The folder holds a training with other options, or on other inputs.
+    /// The folder contains a training with other options or inputs.
     #[error(
         "{}: holds a training with other options or on other inputs ({difference}); continue with the same ones, or start again in \
          another folder",
@@ -52,7 +52,7 @@ pub enum TrainError {
         /// Which option or input differs, and how.
         difference: String,
     },
-    /// The loss is no number any more.
+    /// The loss is not finite.
     #[error(
         "step {step}: the loss is not a number; start again from the last checkpoint with a lower learning rate (now {rate})"
     )]
@@ -62,32 +62,32 @@ pub enum TrainError {
         /// The learning rate.
         rate: f64,
     },
-    /// There is nothing to export.
+    /// There is no checkpoint to export.
     #[error("{}: holds no checkpoint; train first", folder.display())]
     NoCheckpoint {
         /// The training's folder.
         folder: PathBuf,
     },
-    /// What the method itself could not do: its samples, its model, its evaluation.
+    /// Error of the method itself: in its samples, its model or its evaluation.
     #[error(transparent)]
     Method(Box<dyn Error + Send + Sync>),
-    /// The same where the reason does not say what it is about.
+    /// The same, with the part it concerns.
     #[error("{part}: {source}")]
     Part {
-        /// What it is about.
+        /// The part it concerns.
         part: String,
-        /// Why.
+        /// The cause.
         source: Box<dyn Error + Send + Sync>,
     },
 }
 
 impl TrainError {
-    /// An error of the method's own.
+    /// An error of the method.
     pub fn method(error: impl Error + Send + Sync + 'static) -> Self {
         TrainError::Method(Box::new(error))
     }
 
-    /// An error of the method's own with what it is about before it.
+    /// An error of the method, with the part it concerns.
     pub fn about<E: Error + Send + Sync + 'static>(part: impl Into<String>) -> impl FnOnce(E) -> Self {
         let part = part.into();
         move |error| TrainError::Part { part, source: Box::new(error) }

@@ -1,4 +1,4 @@
-//! The training's log: one JSON object a line, only ever added to, and its learning curves as a figure.
+//! The training's log: one JSON object per line, only appended to, and its learning curves as a figure.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -14,23 +14,23 @@ use crate::files::explain;
 /// Means over the steps since the last record.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrainingRecord {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Time since the training began, in seconds.
+    /// Time since the start of the training, in seconds.
     #[serde(deserialize_with = "number")]
     pub seconds: f64,
     /// Learning rate of the step.
     #[serde(deserialize_with = "number")]
     pub learning_rate: f64,
-    /// Training samples a second since the record before.
+    /// Training samples per second since the previous record.
     #[serde(deserialize_with = "number")]
     pub samples_per_second: f64,
-    /// Losses and scores by name. Not a number where the training diverged; JSON's `null` stands for it.
+    /// Losses and scores by name. NaN if the training diverged, written as JSON's `null`.
     #[serde(deserialize_with = "numbers")]
     pub losses: BTreeMap<String, f64>,
 }
 
-/// JSON has no word for numbers that are not finite and `null` is written for them.
+/// JSON cannot represent numbers that are not finite, so they are written as `null`.
 fn number<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     Ok(Option::<f64>::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
@@ -48,7 +48,7 @@ pub enum TrainingLogError {
     Read {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The file could not be written.
@@ -56,10 +56,10 @@ pub enum TrainingLogError {
     Write {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A line that is not the last one is no record.
+    /// A line before the last one is not a valid record.
     #[error("{}: line {line}: expected a training record as JSON, found {found:?} ({reason}); remove the line or the file",
         file.display())]
     Line {
@@ -67,12 +67,12 @@ pub enum TrainingLogError {
         file: PathBuf,
         /// Line number from 1.
         line: usize,
-        /// The line's beginning.
+        /// The beginning of the line.
         found: String,
         /// What is wrong with it.
         reason: String,
     },
-    /// The figure could not be made.
+    /// The figure could not be drawn.
     #[error("{}: expected records with losses to draw, found none; train a few steps first", file.display())]
     NothingToDraw {
         /// The figure's file.
@@ -80,7 +80,7 @@ pub enum TrainingLogError {
     },
 }
 
-/// An open log that records are added to.
+/// An open log to which records are appended.
 #[derive(Debug)]
 pub struct TrainingLog {
     path: PathBuf,
@@ -88,8 +88,8 @@ pub struct TrainingLog {
 }
 
 impl TrainingLog {
-    /// Opens the log of a training that begins (`resumed_step` 0) or resumes after `resumed_step` steps. Records of later
-    /// steps and a last line that was torn by an interruption are taken out: those steps are done again.
+    /// Opens the log of a training that starts (`resumed_step` 0) or resumes after `resumed_step` steps. Records of later steps and
+    /// an incomplete last line are removed: those steps are repeated.
     ///
     /// # Errors
     /// [`TrainingLogError::Read`], [`TrainingLogError::Write`] and [`TrainingLogError::Line`].
@@ -109,7 +109,7 @@ impl TrainingLog {
         Ok(TrainingLog { path: path.to_owned(), file })
     }
 
-    /// Adds a record as one line; it is with the operating system when this returns.
+    /// Appends a record as one line; it has been passed to the operating system when this returns.
     ///
     /// # Errors
     /// [`TrainingLogError::Write`].
@@ -124,7 +124,7 @@ fn line(record: &TrainingRecord) -> io::Result<String> {
     Ok(serde_json::to_string(record)? + "\n")
 }
 
-/// All records of a log. A torn last line is left out.
+/// All records of a log. An incomplete last line is left out.
 ///
 /// # Errors
 /// [`TrainingLogError::Read`] and [`TrainingLogError::Line`].
@@ -134,7 +134,7 @@ pub fn read_training_log(path: &Path) -> Result<Vec<TrainingRecord>, TrainingLog
 
 struct Lines {
     records: Vec<TrainingRecord>,
-    /// The last line was no whole record or had no end.
+    /// Whether the last line was incomplete or not terminated.
     torn: bool,
 }
 
@@ -146,7 +146,7 @@ fn read_lines(path: &Path) -> Result<Lines, TrainingLogError> {
     let count = text.lines().count();
     for (i, line) in text.lines().enumerate() {
         match serde_json::from_str(line) {
-            // A last record without its end is whole by chance at best: a number may have lost digits.
+            // A last record without a line end may be incomplete even if it is valid JSON: a number may have lost digits.
             Ok(record) if i + 1 < count || !torn => records.push(record),
             Err(e) if i + 1 < count => {
                 return Err(TrainingLogError::Line {
@@ -168,11 +168,11 @@ const LEFT: f64 = 84.0;
 const RIGHT: f64 = 32.0;
 const TOP: f64 = 44.0;
 const BOTTOM: f64 = 56.0;
-/// More losses than this are not drawn.
+/// Maximum number of losses that are drawn.
 const MAX_PANELS: usize = 24;
 
-/// Draws every loss over the steps, then learning rate and speed: a panel each, faint the values themselves, strong their
-/// running mean. A panel is logarithmic where all its values are above zero and span more than a factor of 20.
+/// Draws every loss over the steps, then learning rate and speed: one panel each, with the values in a faint and their running mean
+/// in a strong colour. A panel is logarithmic if all its values are positive and span more than a factor of 20.
 ///
 /// # Errors
 /// [`TrainingLogError::NothingToDraw`] without records, [`TrainingLogError::Write`].
@@ -210,7 +210,7 @@ fn panel(canvas: &mut Canvas, corner: (f64, f64), name: &str, points: &[(f64, f6
     let lowest = finite.iter().map(|p| p.1).fold(f64::INFINITY, f64::min);
     let highest = finite.iter().map(|p| p.1).fold(f64::NEG_INFINITY, f64::max);
     let logarithmic = lowest > 0.0 && highest > 20.0 * lowest;
-    // A schedule that ends near zero must not press the rest together.
+    // A schedule that ends near zero must not compress the rest of the curve.
     let lowest = if logarithmic { lowest.max(1e-4 * highest) } else { lowest };
     let vertical = if logarithmic { ticks_logarithmic(lowest, highest) } else { ticks(lowest, highest) };
     let last_step = points.last().map_or(1.0, |p| p.0).max(1.0);
@@ -271,7 +271,7 @@ fn running_mean(points: &[(f64, f64)], window: usize) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Keeps lowest and highest of every stretch, so that no outlier is lost.
+/// Keeps the lowest and highest value of every interval, so that no outlier is lost.
 fn at_most_one_a_pixel(points: &[(f64, f64)], max: usize) -> Vec<(f64, f64)> {
     if points.len() <= max {
         return points.to_vec();
@@ -378,7 +378,7 @@ mod tests {
         draw_curves(&log, &png).unwrap();
         let picture = image::open(&png).unwrap().to_rgb8();
         assert_eq!(picture.dimensions(), (2 * PANEL_WIDTH, 2 * PANEL_HEIGHT));
-        // Down a column half across the first panel: the level line at a quarter of the height.
+        // Down a column halfway across the first panel: the horizontal line at a quarter of the height.
         let x = (LEFT + 0.53 * (f64::from(PANEL_WIDTH) - LEFT - RIGHT)) as u32;
         let rows: Vec<u32> = (TOP as u32..PANEL_HEIGHT - BOTTOM as u32)
             .filter(|y| picture.get_pixel(x, *y).0 == COLORS[0])

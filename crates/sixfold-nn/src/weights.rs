@@ -1,8 +1,8 @@
-//! Weight files: a network's tensors and what is known about it, in one safetensors file.
+//! Weight files: a network's tensors and its model card in one safetensors file.
 //!
-//! Tensors of two or more dimensions are stored as f16, vectors (biases, batch norm) as f32, because a variance may leave
-//! f16's range; so does any tensor with a value above 65504. The [`ModelCard`] is JSON under the key `sixfold_card` of the
-//! file's metadata. Names are the fields' names joined with dots, as in `layer1.0.conv1.weight`.
+//! Tensors of two or more dimensions are stored as f16, vectors (biases, batch norm) as f32, because a variance may exceed f16's
+//! range; so is any tensor with a value above 65504. The [`ModelCard`] is JSON under the key `sixfold_card` of the file's metadata.
+//! Names are the fields' names joined with dots, as in `layer1.0.conv1.weight`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -24,23 +24,23 @@ use crate::parameters::{Changeable, Network, Visitable};
 pub(crate) const FORMAT_VERSION: u32 = 1;
 
 const CARD_KEY: &str = "sixfold_card";
-/// The longest header that is read. The largest networks have a few thousand tensors, 100 bytes each.
+/// The largest header that is read. The largest networks have a few thousand tensors, 100 bytes each.
 const MAX_HEADER: u64 = 32 << 20;
 
-/// What is known about a set of weights: which network, trained on what, how, and how well it does.
+/// Information about a set of weights: network, training data, training, and scores.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ModelCard {
-    /// Name of the network's architecture. Loading asks for it.
+    /// Name of the network's architecture. It is checked when loading.
     pub architecture: String,
     /// Version of the file's layout, see `FORMAT_VERSION`. [`save_weights`] fills it in.
     pub format_version: u32,
-    /// One line for people.
+    /// One line for display.
     pub title: String,
-    /// What it was trained on, for people.
+    /// Description of the training data, for display.
     pub data: String,
-    /// The frames of a dataset that it was trained on, in order, those of trainings that it continues from included; empty for
-    /// a training without any, `None` where nobody said. Scores on these frames are worth nothing.
+    /// The frames of a dataset on which it was trained, in order, including those of the trainings that it continues; empty for a
+    /// training without any, `None` if unknown. Scores on these frames are meaningless.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub training_frames: Option<Vec<FrameId>>,
     /// Training steps done.
@@ -49,16 +49,16 @@ pub struct ModelCard {
     pub seed: u64,
     /// Command that repeats the training.
     pub command: String,
-    /// The objects it knows, in the words of the method that uses it.
+    /// Its objects, in a form defined by the method.
     pub objects: Vec<serde_json::Value>,
     /// Measured scores by name.
     pub scores: BTreeMap<String, f64>,
-    /// What else the method needs to use the weights.
+    /// Further data that the method needs to use the weights.
     pub extra: serde_json::Value,
 }
 
 impl ModelCard {
-    /// A card with a name and a title, the rest empty.
+    /// A card with a name and a title, everything else empty.
     pub fn new(architecture: &str, title: &str) -> Self {
         ModelCard {
             architecture: architecture.to_owned(),
@@ -68,17 +68,17 @@ impl ModelCard {
         }
     }
 
-    /// Whether the weights have seen a frame in their training; `None` where the card does not say.
+    /// Whether a frame was used in the training of the weights; `None` if the card does not say.
     pub fn was_trained_on(&self, frame: FrameId) -> Option<bool> {
         self.training_frames.as_ref().map(|frames| frames.contains(&frame))
     }
 }
 
-/// What a card says of the frames of a training: these, and those of the weights that it continues from. `None` where the card
-/// of those does not say.
+/// The training frames for a card: these, and those of the weights that the training continues. `None` if the card of those weights
+/// does not say.
 ///
 /// # Errors
-/// [`WeightsError`] for a file that is no weight file.
+/// [`WeightsError`] for a file that is not a weight file.
 pub fn training_frames(
     init: Option<&Path>,
     frames: &[FrameId],
@@ -100,18 +100,18 @@ pub enum WeightsError {
     Read {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file could not be written. What was there before is unchanged.
+    /// The file could not be written. An existing file is unchanged.
     #[error("{}: cannot be written: {}", file.display(), explain(source))]
     Write {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file is no safetensors file or it is broken.
+    /// The file is not a safetensors file, or it is broken.
     #[error("{}: expected a safetensors file, found {reason}; download or train the weights again", file.display())]
     Broken {
         /// The file.
@@ -119,13 +119,13 @@ pub enum WeightsError {
         /// What is wrong with it.
         reason: String,
     },
-    /// The file is a safetensors file, but no model card is in it.
+    /// The file is a safetensors file, but has no model card.
     #[error("{}: expected a model card under {CARD_KEY} in the metadata, found {found}; give a weight file that Sixfold wrote",
         file.display())]
     Card {
         /// The file.
         file: PathBuf,
-        /// What is there instead.
+        /// What was found instead.
         found: String,
     },
     /// The weights are of another network.
@@ -134,9 +134,9 @@ pub enum WeightsError {
     Architecture {
         /// The file.
         file: PathBuf,
-        /// The architecture that was asked for.
+        /// The requested architecture.
         expected: String,
-        /// The architecture the card names.
+        /// The architecture in the card.
         found: String,
     },
     /// The file was written in another layout.
@@ -156,7 +156,7 @@ pub enum WeightsError {
         file: PathBuf,
         /// Name of the tensor.
         tensor: String,
-        /// The shape the network needs.
+        /// The shape that the network needs.
         expected: Vec<usize>,
     },
     /// A tensor has another shape than the network's.
@@ -167,7 +167,7 @@ pub enum WeightsError {
         file: PathBuf,
         /// Name of the tensor.
         tensor: String,
-        /// The shape the network needs.
+        /// The shape that the network needs.
         expected: Vec<usize>,
         /// The shape in the file.
         found: Vec<usize>,
@@ -183,19 +183,19 @@ pub enum WeightsError {
         /// The shape in the file.
         found: Vec<usize>,
     },
-    /// A tensor's numbers are of a type that does not fit.
+    /// A tensor has an unsupported number type.
     #[error("{}: tensor {tensor}: expected {expected}, found {found}", file.display())]
     NumberType {
         /// The file.
         file: PathBuf,
         /// Name of the tensor.
         tensor: String,
-        /// Number types that fit.
+        /// Supported number types.
         expected: &'static str,
         /// Number type in the file.
         found: String,
     },
-    /// A tensor holds a number that is infinite or not a number.
+    /// A tensor contains an infinite number or NaN.
     #[error("{}: tensor {tensor}: expected finite numbers, found {found}; the training went astray: \
         go back to an earlier checkpoint or lower the learning rate", file.display())]
     NotFinite {
@@ -206,25 +206,25 @@ pub enum WeightsError {
         /// The first such number.
         found: f32,
     },
-    /// The tensors could not be taken out of the network.
+    /// The tensors could not be read from the network.
     #[error("{}: tensor {tensor}: expected numbers, found {reason}", file.display())]
     Tensor {
         /// The file.
         file: PathBuf,
         /// Name of the tensor.
         tensor: String,
-        /// What went wrong.
+        /// The cause.
         reason: String,
     },
 }
 
-/// Saves all tensors of `module` and the card as one safetensors file. The same weights and card give the same bytes.
-/// The file is written under a temporary name and renamed, so a file that was at `path` stays whole on any error.
+/// Saves all tensors of `module` and the card as one safetensors file. The same weights and card give the same bytes. The file is
+/// written under a temporary name and renamed, so an existing file at `path` stays intact on any error.
 ///
 /// # Errors
-/// [`WeightsError::Write`], and [`WeightsError::NotFinite`] for weights that nobody can use.
+/// [`WeightsError::Write`], and [`WeightsError::NotFinite`] for weights that are not usable.
 pub fn save_weights<M: Module>(module: &M, card: &ModelCard, path: &Path) -> Result<(), WeightsError> {
-    // `valid` settles running statistics that still wait for their threads.
+    // `valid` applies running statistics that are still pending in other threads.
     save_parameters(&module.valid(), card, path)
 }
 
@@ -249,7 +249,7 @@ fn save_parameters(module: &dyn Visitable, card: &ModelCard, path: &Path) -> Res
     write_atomically_with(path, |file| file.write_all(&bytes)).map_err(write_error)
 }
 
-/// Fills `module` with the tensors of a file that [`save_weights`] wrote and gives it back with the file's card.
+/// Loads the tensors of a file written by [`save_weights`] into `module` and returns it with the file's card.
 ///
 /// # Errors
 /// [`WeightsError`]: an unreadable or broken file, another architecture or format version, and every tensor that is
@@ -259,14 +259,14 @@ pub fn load_weights<M: Module>(
     path: &Path,
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
-    // The card first: it is small, and says best what is wrong with a file of another kind.
+    // The card is read first: it is small, and gives the best error for a file of another kind.
     read_card(path)?;
     let bytes = sixfold_io::read_regular(path, sixfold_io::limits::WEIGHTS)
         .map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
     load_weights_from_bytes(module, path, &bytes, expected_architecture)
 }
 
-/// [`load_weights`] from the content of a file, for weights that are part of the program; `path` names them in errors.
+/// [`load_weights`] from the content of a file, for shipped weights; `path` names them in errors.
 ///
 /// # Errors
 /// As [`load_weights`].
@@ -276,7 +276,7 @@ pub fn load_weights_from_bytes<M: Module>(
     bytes: &[u8],
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
-    // Running statistics that still wait for their threads would replace the loaded ones later.
+    // Running statistics still pending in other threads would later replace the loaded ones.
     drop(module.valid());
     let mut module = Network::new(module);
     let card = load_parameters(&mut module, path, bytes, expected_architecture)?;
@@ -319,7 +319,7 @@ fn load_parameters(
     Ok(card)
 }
 
-/// Reads the card of a weight file and nothing else of it.
+/// Reads only the card of a weight file.
 ///
 /// # Errors
 /// [`WeightsError::Read`], [`WeightsError::Broken`] and [`WeightsError::Card`].
@@ -351,7 +351,7 @@ pub fn read_card(path: &Path) -> Result<ModelCard, WeightsError> {
     serde_json::from_str(card).map_err(|e| card_error(format!("one that is not readable ({e})")))
 }
 
-/// Writes a card for people as a markdown file, usually beside the weights.
+/// Writes a card as a markdown file, usually next to the weights.
 ///
 /// # Errors
 /// [`WeightsError::Write`].
@@ -412,7 +412,7 @@ struct NamedTensor {
     bytes: Vec<u8>,
 }
 
-/// Takes every tensor out of a module as bytes.
+/// Collects every tensor of a module as bytes.
 struct Collector<'a> {
     file: &'a Path,
     path: Vec<String>,
@@ -492,7 +492,7 @@ struct Filler<'a> {
 }
 
 impl<'a> Filler<'a> {
-    /// The tensor of the current name if its shape fits, else none and the error is kept.
+    /// The tensor with the current name if its shape fits; otherwise `None`, and the error is kept.
     fn take(&mut self, expected: &[usize]) -> Option<TensorView<'a>> {
         if self.error.is_some() {
             return None;
@@ -626,7 +626,7 @@ mod tests {
         let path = dir.path().join("net.safetensors");
         let device = Device::default();
         let original = net(4, &device.clone().autodiff());
-        // Running statistics off their start, the last update not yet settled.
+        // Running statistics different from their initial values, with the last update still pending.
         let x = Tensor::<4>::random([2, 3, 8, 8], Distribution::Normal(3.0, 2.0), &device.clone().autodiff());
         forward(&original, x.clone());
         save_weights(&original, &card(), &path).unwrap();
@@ -639,7 +639,7 @@ mod tests {
         }
         let mean: Vec<f32> = loaded.norm.running_mean.value().try_into_vec_as().unwrap();
         assert!(mean.iter().any(|v| *v != 0.0), "the last update of the running mean is in the file");
-        // Bytes do not depend on the run, and what is loaded is saved as the same bytes.
+        // Bytes do not depend on the run, and loaded weights are saved as the same bytes.
         let again = dir.path().join("again.safetensors");
         save_weights(&loaded, &card(), &again).unwrap();
         assert_eq!(fs::read(&path).unwrap(), fs::read(&again).unwrap());
@@ -657,7 +657,7 @@ mod tests {
         assert_eq!(card.training_frames.as_ref().map(Vec::len), Some(3));
         assert_eq!([old, new, other].map(|f| card.was_trained_on(f)), [Some(true), Some(true), Some(false)]);
         assert_eq!(training_frames(None, &[]).unwrap(), Some(vec![]));
-        // A card that does not say leaves it open, and is written as before.
+        // A card without this information leaves it open, and is written as before.
         let silent = ModelCard::new("test-net", "");
         assert_eq!(silent.was_trained_on(old), None);
         assert!(!serde_json::to_string(&silent).unwrap().contains("training_frames"));

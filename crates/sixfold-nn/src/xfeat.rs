@@ -1,8 +1,8 @@
-//! XFeat (Potje, Cadar, Araujo, Martins and Nascimento 2024, "XFeat: Accelerated Features for Lightweight Image Matching"):
-//! local features of images of anything, 64 numbers per 8x8 pixels, with weights that its authors trained.
+//! XFeat (Potje, Cadar, Araujo, Martins and Nascimento 2024, "XFeat: Accelerated Features for Lightweight Image Matching"): local
+//! features of arbitrary images, 64 numbers per 8x8 pixels, with its authors' weights.
 //!
-//! Batch normalisation, which has no parameters there, is folded into the convolutions, and the average over 4x4 pixels of the
-//! shortcut into the 1x1 convolution behind it.
+//! Batch normalisation, which has no parameters there, is folded into the convolutions, and the shortcut's average over 4x4 pixels
+//! into the following 1x1 convolution.
 
 use std::path::Path;
 
@@ -17,30 +17,30 @@ use crate::weights::{WeightsError, load_weights_from_bytes};
 
 /// Name of the network in weight files.
 pub const ARCHITECTURE: &str = "xfeat";
-/// Numbers of a feature.
+/// Length of a feature.
 pub const CHANNELS: usize = 64;
-/// Pixels along each side of a feature's cell.
+/// Side of a feature's cell, pixels.
 pub const CELL: usize = 8;
-/// Sides of images are multiples of this many pixels.
+/// Sides of images must be multiples of this many pixels.
 pub const MULTIPLE: usize = 32;
 
-/// The weights that this crate carries (3.1 MB, Apache-2.0; their card lies beside them).
+/// The weights shipped with this crate (3.1 MB, Apache-2.0; their card is next to them).
 const WEIGHTS: &[u8] = include_bytes!("../weights/xfeat.safetensors");
 /// PyTorch's epsilon of batch and instance normalisation.
 const EPSILON: f32 = 1e-5;
-/// Side of the pixels that the shortcut averages.
+/// Side of the blocks of pixels that the shortcut averages.
 const SHORTCUT: usize = 4;
 
-/// What the network sees in a batch of images.
+/// Output of the network for a batch of images.
 #[derive(Debug, Clone)]
 pub struct XFeatOutput {
     /// Features before normalisation to length 1, `batch x 64 x height / 8 x width / 8`.
     pub features: Tensor<4>,
-    /// How reliable each feature is, 0 to 1, `batch x 1 x height / 8 x width / 8`.
+    /// Reliability of each feature, 0 to 1, `batch x 1 x height / 8 x width / 8`.
     pub reliability: Tensor<4>,
 }
 
-/// The part that makes features; other networks begin with it.
+/// The part that computes features; other networks start with it.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Backbone {
@@ -71,7 +71,7 @@ impl Backbone {
     }
 }
 
-/// The network. Made by [`XFeat::shipped`] or [`XFeat::from_pytorch`].
+/// The network. Created by [`XFeat::shipped`] or [`XFeat::from_pytorch`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct XFeat {
@@ -83,7 +83,8 @@ pub struct XFeat {
 
 crate::displayed_by_name!(Backbone, XFeat);
 
-/// A convolution of the network: kernel, stride, channels in and out, normalised and rectified or plain with bias.
+/// A convolution of the network: kernel, stride, input and output channels, and whether it is normalised and rectified (otherwise
+/// plain with bias).
 struct Layer(usize, usize, [usize; 2], bool);
 
 impl Layer {
@@ -139,10 +140,10 @@ fn shortcut_config() -> ConvConfig {
 }
 
 impl XFeat {
-    /// The network with its authors' weights, from within the program.
+    /// The network with its authors' weights, which are shipped with the program.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped(device: &Device) -> Result<XFeat, WeightsError> {
         let empty = |config: ConvConfig| {
             let count = config.weight_shape().iter().product();
@@ -162,7 +163,8 @@ impl XFeat {
         let numbers = |name: String, shape: &[usize]| file.tensor(&name, shape, "XFeat");
         let mut all = Vec::new();
         for (stage, layers) in stages() {
-            // Linear layers, normalisations and rectifiers in one row there, a module of three for each convolution elsewhere.
+            // In PyTorch this stage is one sequence of linear layers, normalisations and rectifiers; the others have a module of
+            // three for each convolution.
             let linear = stage == "fine_matcher";
             let mut convs = Vec::new();
             for (i, layer) in layers.iter().enumerate() {
@@ -176,7 +178,7 @@ impl XFeat {
                     (false, false) => format!("{stage}.{i}"),
                 };
                 let mut weight = numbers(format!("{name}.weight"), &shape)?;
-                // Only the plain layers and the linear ones have a bias.
+                // Only plain and linear layers have a bias.
                 let mut bias = if linear || !layer.3 {
                     numbers(format!("{name}.bias"), &[outputs])?
                 } else {
@@ -216,13 +218,13 @@ impl XFeat {
         XFeat { backbone, reliability, keypoints, fine_matcher }
     }
 
-    /// The part that makes features.
+    /// The part that computes features.
     pub fn into_backbone(self) -> Backbone {
         self.backbone
     }
 
-    /// Grey images with mean 0 and variance 1 each (instance normalisation), `batch x 1 x height x width`, from images of any number
-    /// of channels, whose mean is the grey value.
+    /// Grey images with mean 0 and variance 1 each (instance normalisation), `batch x 1 x height x width`, from images with any
+    /// number of channels, whose mean is the grey value.
     pub fn normalised(images: Tensor<4>) -> Tensor<4> {
         let grey = images.mean_dim(1);
         let [batch, _, height, width] = grey.dims();
@@ -239,8 +241,8 @@ impl XFeat {
         XFeatOutput { features, reliability }
     }
 
-    /// Where in each cell a keypoint is, of [normalised](XFeat::normalised) images: logits of its 64 pixels, row by row, and of none,
-    /// `batch x 65 x height / 8 x width / 8`.
+    /// Position of the keypoint in each cell of [normalised](XFeat::normalised) images: logits of its 64 pixels, row by row, and of
+    /// no keypoint, `batch x 65 x height / 8 x width / 8`.
     pub fn keypoints(&self, normalised: Tensor<4>) -> Tensor<4> {
         let [batch, _, height, width] = normalised.dims();
         let (rows, columns) = (height / CELL, width / CELL);
@@ -251,8 +253,8 @@ impl XFeat {
         run(&self.keypoints, cells)
     }
 
-    /// Where the second of two matched features lies within the first one's cell: logits of its 64 pixels. `pairs` are both features,
-    /// before normalisation to length 1, one behind the other: `pairs x 128`.
+    /// Position of the second of two matched features within the first one's cell: logits of its 64 pixels. `pairs` has both
+    /// features, before normalisation to length 1, concatenated: `pairs x 128`.
     pub fn fine_matches(&self, pairs: Tensor<2>) -> Tensor<2> {
         let [count, channels] = pairs.dims();
         run(&self.fine_matcher, pairs.reshape([count, channels, 1, 1])).reshape([count, CELL * CELL])
@@ -268,7 +270,7 @@ mod tests {
     use super::*;
     use burn::tensor::TensorData;
 
-    /// What PyTorch 2.13 gives with the package's weights for the image below: channel, row, column, value.
+    /// Result of PyTorch 2.13 with the package's weights for the image below: channel, row, column, value.
     const FEATURES: [(usize, usize, usize, f32); 5] =
         [(0, 0, 0, 2.4525), (5, 3, 7, -1.0866), (17, 7, 11, -0.3959), (31, 4, 2, 1.0493), (63, 6, 5, 1.3129)];
     const RELIABILITY: [(usize, usize, usize, f32); 3] =
@@ -276,8 +278,8 @@ mod tests {
     const KEYPOINTS: [(usize, usize, usize, f32); 3] =
         [(0, 0, 0, -0.8805), (64, 3, 7, 0.5330), (20, 7, 11, -0.3299)];
 
-    /// `checks/backbones_vs_pytorch.py` compares all numbers in full precision to 1e-4; the weights within the program are rounded to
-    /// half precision.
+    /// `checks/backbones_vs_pytorch.py` compares all numbers in full precision to 1e-4; the shipped weights are rounded to half
+    /// precision.
     #[test]
     fn the_shipped_weights_see_what_pytorch_sees() {
         let device = Device::default();

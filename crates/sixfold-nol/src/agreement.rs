@@ -1,7 +1,7 @@
-//! What lies in front of the object in some photographs and no mask knows of: places where one photograph shows another colour
-//! than the others agree on are taken out of its visible part.
+//! Occluders that appear in some photographs and are not in any mask: where the colour of one photograph differs from that on which
+//! the others agree, the pixels are removed from its visible part.
 //!
-//! It goes beyond the dissertation, whose network has to weigh such pixels down by itself.
+//! This goes beyond the dissertation, whose network must learn to give such pixels a low weight.
 
 use rayon::prelude::*;
 use sixfold_mesh::Mesh;
@@ -15,13 +15,13 @@ use crate::surface::outwards;
 const POINTS: usize = 6000;
 /// Blur of the colours, crop pixels.
 const BLUR: f32 = 2.0;
-/// Difference in colour (root of the mean square over channels, 0 to 1) from which a photograph shows something else.
+/// Difference in colour (root of the mean square over channels, 0 to 1) from which a photograph shows another object.
 const OTHER: f32 = 0.13;
-/// Fewer photographs' weight of opinion does not outvote one.
+/// Smallest total weight of the other photographs at a point that is compared.
 const MIN_OPINION: f32 = 1.2;
 
-/// Takes what does not agree with the other sources out of the visible parts of `sources`, whose poses should be good already.
-/// Returns the fraction of each source's visible points that was taken out.
+/// Removes pixels that do not agree with the other sources from the visible parts of `sources`, whose poses should already be
+/// refined. Returns the fraction of each source's visible points that was removed.
 pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f64> {
     let surface = mesh.sample_surface(POINTS, 1);
     let normals = outwards(mesh, &surface.normals);
@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn what_stands_before_the_object_in_one_photograph_is_left_out() {
         let (mesh, truth, list) = photographs(40, [0.0, 0.0], 5);
-        // Something bright stands before half of the block in the first one.
+        // A bright occluder hides half of the block in the first one.
         let side = 96;
         let middle = list[0].camera().project(&truth[0].translation()).unwrap().x;
         let mut image = (**list[0].image()).clone();
@@ -119,7 +119,7 @@ mod tests {
         let shares = leave_out_what_differs(&mut views, &mesh);
         assert!((0.3..0.7).contains(&shares[0]), "{shares:?}");
         assert!(shares[1..].iter().all(|s| *s < 0.08), "{shares:?}");
-        // Left of the middle it is gone, right of it it is there, and beside the object nothing is said.
+        // Left of the centre the pixels are removed, right of it they are kept, and outside the object nothing changes.
         let view = &views[0];
         let column = view.camera.project(&truth[0].translation()).unwrap().x;
         let share = |wanted: &dyn Fn(usize) -> bool| {

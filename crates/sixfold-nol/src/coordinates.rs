@@ -1,4 +1,4 @@
-//! Object coordinates of a view as an image of 16 bits: what Pix2Pose learns from.
+//! Object coordinates of a view as an image of 16 bits: training data of Pix2Pose.
 
 use std::io;
 use std::path::Path;
@@ -8,10 +8,11 @@ use sixfold_io::write_atomically_with;
 use sixfold_mesh::Mesh;
 use sixfold_render::{BoundingBoxScale, RenderOptions, SceneObject, VisibilityBuffer};
 
-/// Writes object coordinates as colours of 16 bits: -1 to 1 over the object's box becomes 1 to 65535, 0 is beside the object.
+/// Writes object coordinates as colours of 16 bits: -1 to 1 over the object's bounding box becomes 1 to 65535, 0 is outside the
+/// object.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub(crate) fn write_coordinates(path: &Path, mesh: &Mesh, camera: &Camera, pose: &Pose) -> io::Result<()> {
     let (low, high) = mesh.bounding_box();
     let scale = BoundingBoxScale::of_corners(&low, &high);

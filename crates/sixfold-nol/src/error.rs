@@ -1,33 +1,33 @@
-//! What is wrong with posed images or options.
+//! Errors of posed images and options.
 
 use sixfold_data::PosedImageError;
 
-/// What is wrong with posed images or options.
+/// Errors of posed images and options.
 #[derive(Debug, thiserror::Error)]
 pub enum NolError {
     /// An image does not fit its camera, mask or pose.
     #[error(transparent)]
     Image(#[from] PosedImageError),
-    /// The mask is empty, or shows something else.
+    /// The mask is empty, or does not show the object.
     #[error(
         "photograph {name}: the mask covers {share:.0} % of the object's outline at the given pose, expected at least {least:.0} %; check that the mask belongs to this object and image"
     )]
     Mask {
-        /// The photograph.
+        /// Name of the photograph.
         name: String,
-        /// Covered part of the outline, per cent.
+        /// Part of the outline that the mask covers, per cent.
         share: f64,
-        /// What it should be at least.
+        /// Smallest value accepted, per cent.
         least: f64,
     },
     /// An option is out of range.
     #[error("{field}: expected {expected}, found {found}")]
     Option {
-        /// Which.
+        /// Name of the option.
         field: &'static str,
-        /// What it must be.
+        /// The values allowed.
         expected: &'static str,
-        /// What it is.
+        /// The value found.
         found: String,
     },
 }

@@ -1,4 +1,4 @@
-//! Encoded photographs: colours and reduced maps that are looked up at any place.
+//! Encoded photographs: colours and reduced maps that can be sampled at any position.
 
 use sixfold_nn::kernels::neighbours;
 
@@ -13,7 +13,7 @@ pub(crate) struct Map {
     pub values: Vec<f32>,
 }
 
-/// What the encoder makes of a [`SourceView`](crate::SourceView): kept for many target views.
+/// The encoder's output for a [`SourceView`](crate::SourceView), kept for many target views.
 #[derive(Debug, Clone)]
 pub struct SourceFeatures {
     /// Side of the crop, pixels.
@@ -23,12 +23,13 @@ pub struct SourceFeatures {
 }
 
 impl SourceFeatures {
-    /// Values at a place: 3 colours (-1 to 1) and 13 features, the first sixteen channels of X^S.
+    /// Number of channels: 3 colours (-1 to 1) and 13 features, the first sixteen channels of X^S.
     pub fn channels(&self) -> usize {
         COLOURS + FEATURES
     }
 
-    /// Bilinear values at a pixel of the crop (pixel centres at whole numbers); the outer pixels' values go on beyond them.
+    /// Bilinear values at a pixel of the crop (pixel centres at whole numbers); beyond the border the values of the outer pixels
+    /// are repeated.
     ///
     /// # Panics
     /// If `out` is shorter than [`Self::channels`].

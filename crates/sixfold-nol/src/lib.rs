@@ -1,9 +1,8 @@
-//! Neural Object Learning: renders an object in new poses from few cluttered photographs with rough poses and an untextured
-//! mesh, and makes those poses better (K. Park, *6D Pose Estimation of Objects Using Limited Training Data*, TU Wien 2020,
-//! chapter 4).
+//! Neural Object Learning: renders an object in new poses from few cluttered photographs with rough poses and an untextured mesh,
+//! and refines those poses (K. Park, *6D Pose Estimation of Objects Using Limited Training Data*, TU Wien 2020, chapter 4).
 //!
-//! A [`PosedImage`](sixfold_data::PosedImage) is cut to the object ([`SourceView`]); what a pixel of a new view shows ([`TargetSurface`]) is looked up in
-//! every photograph that sees the same place of the surface ([`SourceView::project`]).
+//! A [`PosedImage`](sixfold_data::PosedImage) is cropped to the object ([`SourceView`]). The surface points that a new view shows
+//! ([`TargetSurface`]) are projected into every photograph that shows the same points ([`SourceView::project`]).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

@@ -1,8 +1,8 @@
 //! The losses of the training (dissertation, equations 4.1 and 4.2; the perceptual part: Johnson et al. 2016).
 //!
-//! What the text leaves open: colours run from -1 to 1 and their differences are summed over the channels; differences of features
-//! are averaged over channels and taken in units of the true image's mean feature, so that one weight fits any backbone; second
-//! differences are averaged over the channels.
+//! Choices that the dissertation leaves open: colours are from -1 to 1 and their differences are summed over the channels;
+//! differences of features are averaged over channels and divided by the true image's mean feature, so that one weight fits any
+//! backbone; second differences are averaged over the channels.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -18,17 +18,17 @@ pub const WEIGHTS: [f64; 3] = [5.0, 10.0, 1.0];
 /// The frozen backbone whose first two maps the perceptual loss compares.
 #[derive(Debug)]
 pub enum Perceptual {
-    /// Of the compact network.
+    /// For the compact network.
     Lite0(Box<Lite0>),
-    /// Of the dissertation's.
+    /// For the dissertation's network.
     DenseNet(Box<DenseNet121>),
 }
 
 impl Perceptual {
-    /// The backbone that belongs to a network as it is now.
+    /// The backbone for a network, with its current weights.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries another encoder than its own version's.
+    /// [`WeightsError`] if the shipped encoder has another version than the program.
     pub fn of(network: &Network, device: &Device) -> Result<Self, WeightsError> {
         Ok(match network {
             Network::Compact(_) => Perceptual::Lite0(Box::new(imagenet_encoder(device)?.no_grad())),
@@ -55,7 +55,7 @@ pub(crate) fn image_loss(
 ) -> (Tensor<1>, Tensor<1>) {
     let count = mask.clone().sum() + 1e-3;
     let colours = ((image.clone() - truth.clone()).abs() * mask.clone()).sum() / count.clone();
-    // Beside the mask both images are the same, so that a feature differs only for what lies in it.
+    // Outside the mask both images are equal, so that features differ only because of pixels in it.
     let inside = image * mask.clone() + truth.clone() * (mask.clone() * -1.0 + 1.0);
     let [_, _, height, width] = truth.dims();
     let mut features = Tensor::zeros([1], &mask.device());
@@ -72,8 +72,8 @@ pub(crate) fn image_loss(
     (colours, features)
 }
 
-/// Equation 4.2 without its weight: the absolute second differences of X^S (`B x 17 x height x width`) in rows, in columns and
-/// mixed, where all pixels that they are taken from lie in the mask.
+/// Equation 4.2 without its weight: the absolute second differences of X^S (`B x 17 x height x width`) along rows, along columns
+/// and mixed, where all pixels involved are in the mask.
 pub(crate) fn smooth_loss(sum: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     let [_, channels, height, width] = sum.dims();
     let part = |x: &Tensor<4>, y: usize, left: usize, rows: usize, columns: usize| {
@@ -94,13 +94,13 @@ pub(crate) fn smooth_loss(sum: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     (x.sum() + y.sum() + mixed.sum() * 2.0) / count
 }
 
-/// Mean squared error of colours (-1 to 1, `B x 3`) over the mask, as of values from 0 to 1.
+/// Mean squared error of colours (-1 to 1, `B x 3`) over the mask, converted to values from 0 to 1.
 pub(crate) fn squared_error(image: Tensor<4>, truth: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     let error = ((image - truth) * 0.5).square() * mask.clone();
     error.sum() / (mask.sum() * COLOURS as f64 + 1e-3)
 }
 
-/// Peak signal-to-noise ratio in decibels of a mean squared error.
+/// Peak signal-to-noise ratio in decibels for a mean squared error.
 pub fn psnr(squared_error: f64) -> f64 {
     -10.0 * squared_error.max(1e-10).log10()
 }
@@ -146,8 +146,8 @@ mod tests {
         // Second difference 2 in rows, at 6 of 8 pixels of a row.
         let bent = number(smooth_loss(plane(&|x, _| x * x), all));
         assert!((bent - 2.0 * 48.0 / 64.0).abs() < 1e-3, "{bent}");
-        // Bent to and fro, in rows and columns, which do not outweigh each other: of 8 rows the four odd ones have six second
-        // differences of 2 or -2, columns too, and all 49 mixed ones are 1 or -1, counted twice.
+        // A zigzag in rows and columns: of 8 rows the four odd ones have six second differences of 2 or -2, columns too, and all 49
+        // mixed ones are 1 or -1, counted twice.
         let zigzag = plane(&|x, y| (x % 2.0) * (y % 2.0));
         let bent = number(smooth_loss(zigzag, plane(&|_, _| 1.0)));
         assert!((bent - (48.0 + 48.0 + 98.0) / 64.0).abs() < 1e-3, "{bent}");

@@ -1,8 +1,8 @@
-//! Square images of any number of channels that are looked up between pixels, with their gradients.
+//! Square images of any number of channels that are interpolated between pixels, with their gradients.
 
 use sixfold_synth::augment::Patch;
 
-/// Channels over a square crop, interleaved: what one lookup needs lies together.
+/// Channels over a square crop, interleaved, so that the values of one lookup are adjacent in memory.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Maps {
     channels: usize,
@@ -12,10 +12,10 @@ pub struct Maps {
 }
 
 impl Maps {
-    /// From planes, channel by channel.
+    /// Converts planar data, channel by channel.
     ///
     /// # Panics
-    /// When `planes` does not hold `channels * side * side` numbers.
+    /// If `planes` does not have `channels * side * side` numbers.
     pub(crate) fn from_planes(planes: &[f32], channels: usize, side: usize) -> Self {
         let area = side * side;
         assert_eq!(planes.len(), channels * area, "one number per pixel and channel");
@@ -35,9 +35,9 @@ impl Maps {
         Maps::from_planes(&patch.data, 3, patch.width)
     }
 
-    /// The colours of a square patch without what changes slowly: blurred by `sigma` pixels, less the mean over a wide
-    /// neighbourhood (`wide` pixels) of what lies `inside` (0 to 1 per pixel). Shading and shadows change slowly, paint does
-    /// not; and what lies beside the object has no part in either mean.
+    /// The colours of a square patch, high-pass filtered: blurred by `sigma` pixels, minus the mean over a wide neighbourhood
+    /// (`wide` pixels), both over pixels `inside` (0 to 1 per pixel) only. This removes shading and shadows, which vary slowly, and
+    /// keeps the texture; pixels outside the object have no influence.
     pub(crate) fn of_detail(patch: &Patch, inside: &[f32], sigma: f32, wide: f32) -> Self {
         let area = patch.width * patch.height;
         let mean = |sigma: f32| {
@@ -59,7 +59,7 @@ impl Maps {
         Maps::from_planes(&fine.data, 3, patch.width)
     }
 
-    /// Channels.
+    /// Number of channels.
     pub fn channels(&self) -> usize {
         self.channels
     }
@@ -75,7 +75,7 @@ impl Maps {
         (y0 as usize * self.side + x0 as usize, (x - x0).clamp(0.0, 1.0), (y - y0).clamp(0.0, 1.0))
     }
 
-    /// The channels at a pixel, bilinearly; the border's beyond it.
+    /// The channels at a pixel, bilinearly interpolated; beyond the border its values are repeated.
     pub fn sample(&self, x: f32, y: f32, out: &mut [f32]) {
         let (i, fx, fy) = self.corner(x, y);
         let c = self.channels;

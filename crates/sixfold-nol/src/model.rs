@@ -1,4 +1,4 @@
-//! A trained network as one file, and what it is asked: encoded photographs, and renderings of new views.
+//! A trained network as one file, which encodes photographs and renders new views.
 
 use std::path::{Path, PathBuf};
 
@@ -16,10 +16,10 @@ use crate::projection::TargetSurface;
 use crate::samples::{Looked, look_up, order};
 use crate::source::SourceView;
 
-/// Pixels about what is seen that take part, so that its edge lies among zeros as in the training.
+/// Border around the visible pixels that is processed too, so that they are surrounded by zeros as in the training.
 const BORDER: usize = 8;
 
-/// Compact weights for all objects; see the card beside the file.
+/// Compact weights for all objects; see the card next to the file.
 static SHIPPED: &[u8] = include_bytes!("../weights/nol-compact.safetensors");
 
 /// Why a model could not be read.
@@ -45,13 +45,13 @@ pub enum ModelError {
 /// A view, rendered from photographs. All lists are in the order of [`TargetSurface::pixels`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rendering {
-    /// X^D: red, green and blue, 0 to 1; mid-grey where no source sees the place.
+    /// X^D: red, green and blue, 0 to 1; mid-grey where no source shows the point.
     pub colours: Vec<[f32; 3]>,
-    /// X^S: colours (-1 to 1), 13 features and the cosine; zeros where no source sees the place.
+    /// X^S: colours (-1 to 1), 13 features and the cosine; zeros where no source shows the point.
     pub channels: Vec<[f32; CHANNELS]>,
-    /// Whether any source sees the place.
+    /// Whether any source shows the point.
     pub seen: Vec<bool>,
-    /// Weights of the sources at each place: those of place `i` begin at `i` times the number of sources, in the sources' order.
+    /// Weights of the sources at each point: those of point `i` begin at `i` times the number of sources, in the sources' order.
     pub weights: Vec<f32>,
 }
 
@@ -64,7 +64,7 @@ pub struct NolModel {
 }
 
 impl NolModel {
-    /// A model of a trained network. `card` gets architecture and parts filled in.
+    /// A model of a trained network. Its architecture and parts are written into `card`.
     pub fn new(network: Network, parts: Parts, card: ModelCard) -> Self {
         let mut extra = card.extra.clone();
         if !extra.is_object() {
@@ -78,7 +78,7 @@ impl NolModel {
     /// Reads a weight file.
     ///
     /// # Errors
-    /// [`ModelError`] for a file that cannot be read or holds another network.
+    /// [`ModelError`] for a file that cannot be read or contains another network.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let card = read_card(path)?;
         let network = Self::described(path, &card)?;
@@ -86,7 +86,7 @@ impl NolModel {
         Ok(NolModel { network: network.valid(), card, device: Device::flex() })
     }
 
-    /// Reads a compact model with all its parts from the bytes of a weight file; `name` stands for it in messages.
+    /// Reads a compact model with all its parts from the bytes of a weight file; `name` is used in messages.
     ///
     /// # Errors
     /// [`ModelError`].
@@ -98,10 +98,10 @@ impl NolModel {
         Ok(NolModel { network: network.valid(), card, device })
     }
 
-    /// The network that comes with the program.
+    /// The shipped network.
     ///
     /// # Errors
-    /// [`ModelError`] if the program carries weights of another version than its own.
+    /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn shipped() -> Result<Self, ModelError> {
         Self::from_bytes(Path::new("nol-compact.safetensors"), SHIPPED)
     }
@@ -115,7 +115,7 @@ impl NolModel {
             .ok_or_else(|| wrong("architecture", "nol-compact or nol-paper", card.architecture.clone()))
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`ModelError::Weights`].
@@ -134,10 +134,10 @@ impl NolModel {
         &mut self.card
     }
 
-    /// Encoded sources, kept for many target views and for refinement. They do not depend on the sources' poses.
+    /// Encoded sources, kept for many target views and for refinement. The features do not depend on the sources' poses.
     ///
     /// # Panics
-    /// For a crop whose side is no multiple of 16.
+    /// If a crop's side is not a multiple of 16.
     pub fn encode(&self, sources: &[SourceView]) -> Vec<SourceFeatures> {
         sources
             .iter()
@@ -156,11 +156,11 @@ impl NolModel {
             .collect()
     }
 
-    /// Renders a view from sources, at their present poses, and their [`Self::encode`]d features. In which order the sources come
-    /// does not matter.
+    /// Renders a view from sources, at their current poses, and their [`Self::encode`]d features. The order of the sources does not
+    /// matter.
     ///
     /// # Panics
-    /// If there are not features for every source.
+    /// If there are no features for some source.
     pub fn render(
         &self,
         target: &TargetSurface,
@@ -219,7 +219,7 @@ impl NolModel {
     }
 }
 
-/// The part of the image that is worked on.
+/// The part of the image that is processed.
 struct Area {
     left: usize,
     top: usize,
@@ -228,7 +228,7 @@ struct Area {
 }
 
 impl Area {
-    /// The box about the pixels that are seen and a border; `None` where none is.
+    /// The bounding box of the visible pixels with a border; `None` if there are none.
     fn around(target: &TargetSurface, seen: &[bool]) -> Option<Area> {
         let columns = target.camera.width;
         let (mut low, mut high) = ([usize::MAX; 2], [0; 2]);

@@ -1,4 +1,4 @@
-//! Renderings with random weights: what must hold before anything was learnt.
+//! Renderings with random weights: properties that hold before any training.
 
 use std::sync::Arc;
 
@@ -52,7 +52,7 @@ fn pose(angle: f64) -> Pose {
     Pose::new(tilt * turn, Vec3::new(0.0, 0.0, 0.5))
 }
 
-/// What a camera without noise sees in even light.
+/// The image of a camera without noise under uniform light.
 fn photograph(mesh: &Mesh, angle: f64, mask: Option<Mask>) -> PosedImage {
     let (camera, pose) = (camera(), pose(angle));
     let mut frame = VisibilityBuffer::new(&camera);
@@ -73,7 +73,7 @@ fn model(integrator: IntegratorKind) -> NolModel {
     NolModel::new(Network::Compact(network), parts, ModelCard::new("", "test"))
 }
 
-/// Mean difference of colours to the truth where something is seen, and the fraction that is.
+/// Mean difference of colours to the truth over the visible pixels, and their fraction.
 fn off(rendering: &Rendering, mesh: &Mesh, target: &TargetSurface, angle: f64) -> (f32, f32) {
     let truth = photograph(mesh, angle, None);
     let (mut sum, mut count) = (0.0, 0);
@@ -105,12 +105,12 @@ fn exact_poses_give_the_truth_whatever_the_weights() {
             let sum: f32 = rendering.weights[4 * i..4 * i + 4].iter().sum();
             assert!((sum - 1.0).abs() < 1e-4);
         }
-        // In which order the sources come does not matter.
+        // The order of the sources does not matter.
         let turned: Vec<SourceView> = [2, 0, 3, 1].map(|k: usize| sources[k].clone()).into();
         let again = model.render(&target, &turned, &model.encode(&turned));
         assert_eq!(again.channels, rendering.channels);
         assert!((0..target.pixels.len()).all(|i| again.weights[4 * i + 1] == rendering.weights[4 * i]));
-        // One source is what it shows.
+        // With one source the rendering shows that source.
         let one = views(&[0.0]);
         let rendering = model.render(&target, &one, &model.encode(&one));
         let (difference, seen) = off(&rendering, &mesh, &target, 0.3);
@@ -123,7 +123,7 @@ fn what_no_source_sees_is_said() {
     let mesh = printed_box();
     let model = model(IntegratorKind::Lstm);
     let target = TargetSurface::new(&mesh, &camera(), &pose(0.0));
-    // The back shows the top alone, and a mask can leave nothing at all.
+    // From behind only the top is visible, and an empty mask leaves nothing.
     let behind = SourceView::new(&photograph(&mesh, std::f64::consts::PI, None), &mesh, 128).unwrap();
     let hidden =
         SourceView::new(&photograph(&mesh, 0.0, Some(Mask::filled(320, 240, false))), &mesh, 128).unwrap();

@@ -16,11 +16,11 @@ const GIVEN: [u8; 3] = [255, 220, 0];
 const REFINED: [u8; 3] = [0, 255, 120];
 
 impl PoseFile {
-    /// Two rows of square images for each object, a column per photograph: the outline at the given pose, below it at the refined
-    /// one. Each image comes with the text to write into it, often empty. `file` is named in errors.
+    /// Two rows of square images for each object, with a column per photograph: above the outline at the given pose, below at the
+    /// refined one. Each image has a text to write into it, often empty. `file` is used in errors.
     ///
     /// # Errors
-    /// When a pose does not belong to the images, or an image shows nothing of its object.
+    /// When a pose does not belong to the images, or an image does not show its object.
     pub fn outlines(
         &self,
         images: &RoughImages,

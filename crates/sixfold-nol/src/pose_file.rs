@@ -1,4 +1,4 @@
-//! The poses of roughly posed images, made better once and kept in a file: what a run that continues starts from.
+//! The poses of roughly posed images, refined once and kept in a file, from which a resumed run starts.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,10 +19,10 @@ use crate::refine::{
 /// A pose as four rows, translation in metres.
 type Rows = [[f64; 4]; 4];
 
-/// Other photographs in the published rule's first rendering (section 4.3.3: six at inference).
+/// Number of other photographs in the first rendering of the published rule (section 4.3.3: six at inference).
 const PER_VIEW: usize = 6;
 
-/// Why there are no better poses.
+/// Why poses could not be refined.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseFileError {
     /// The images cannot be used.
@@ -36,10 +36,10 @@ pub enum PoseFileError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The file holds something else.
+    /// The file has other contents.
     #[error("{}: not the poses of these images: {reason}; remove it to have them made again", path.display())]
     Content {
         /// The file.
@@ -49,28 +49,28 @@ pub enum PoseFileError {
     },
 }
 
-/// One image's poses of one object, as they are written.
+/// One image's poses of one object, as written to the file.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PoseRecord {
     /// The object.
     pub object: u32,
-    /// The image.
+    /// Name of the image.
     pub name: String,
-    /// Its number.
+    /// Number of the image.
     pub image: usize,
-    /// Scene and image of a dataset.
+    /// Scene and image in a dataset.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub frame: Option<(u32, u32)>,
-    /// As given (disturbed, where that was asked for): four rows, translation in metres.
+    /// The given pose (disturbed, if that was requested): four rows, translation in metres.
     pub given: Rows,
-    /// Before it was disturbed.
+    /// The pose before it was disturbed.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub undisturbed: Option<Rows>,
-    /// Used.
+    /// The pose that is used.
     pub camera_from_object: Rows,
-    /// How far the object's centre moved, millimetres.
+    /// Distance by which the object's centre moved, millimetres.
     pub moved_mm: f64,
-    /// How far it was rotated, degrees.
+    /// Angle by which it was rotated, degrees.
     pub turned_degrees: f64,
     /// Mean difference in colour to the other images of the object, 0 to 1, before and after.
     pub difference: [Option<f64>; 2],
@@ -83,7 +83,7 @@ impl PoseRecord {
     /// The pose that is used.
     ///
     /// # Errors
-    /// When it is no pose.
+    /// If it is not a valid pose.
     pub fn pose(&self) -> Result<Pose, String> {
         let matrix = Matrix4::from_fn(|i, j| self.camera_from_object[i][j]);
         Pose::from_matrix(&matrix).map_err(|error| format!("{}: {error}", self.name))
@@ -93,14 +93,14 @@ impl PoseRecord {
 /// All poses, and whether the objects stood still.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PoseFile {
-    /// Whether they were made better.
+    /// Whether they were refined.
     pub refined: bool,
     /// Whether the objects stood still in all images.
     pub still: bool,
-    /// At how many places the objects stood; as many as objects if nothing moved, or nothing is known of it.
+    /// Number of places at which objects stood; equal to the number of objects if nothing moved or this is unknown.
     #[serde(default)]
     pub places: usize,
-    /// Disagreement of the given poses with one arrangement, in units of what their roughness explains.
+    /// Disagreement of the given poses with one arrangement, in units of the disagreement that their roughness explains.
     pub disagreement: Option<f64>,
     /// By object, then in the order of the images.
     pub photographs: Vec<PoseRecord>,
@@ -118,7 +118,7 @@ fn all(images: &RoughImages) -> Vec<(usize, &RoughImage)> {
 }
 
 impl PoseFile {
-    /// The poses as given; `disturbed` says whether they are not those of the input.
+    /// The poses as given; `disturbed` says whether they differ from those of the input.
     fn given(images: &RoughImages, refined: bool, disturbed: bool) -> PoseFile {
         let record = |(object, image): &(usize, &RoughImage)| PoseRecord {
             object: images.objects[*object].id,
@@ -142,7 +142,7 @@ impl PoseFile {
         }
     }
 
-    /// Makes the poses better unless `file` has them already or `options` are none, and keeps them there. `None` once
+    /// Refines the poses, unless `file` already has them or `options` is `None`, and writes them there. Returns `None` if
     /// `progress` stops it.
     ///
     /// # Errors
@@ -164,18 +164,19 @@ impl PoseFile {
                 let stops = !progress.report(done, total);
                 !(stopped.fetch_or(stops, Ordering::Relaxed) || stops)
             })?;
-            // The last step may have been the one that was not wanted any more.
+            // `progress` may have stopped the last step.
             if stopped.into_inner() || !progress.report(1, 1) {
                 return Ok(None);
             }
         }
         poses.write(file)?;
-        // Numbers in text may lose their last digit, and a run that continues must not differ from one that was never stopped.
+        // Numbers written as text may lose their last digit: the file is read back, so that a resumed run does not differ from one
+        // that was never stopped.
         PoseFile::read(file).map(Some)
     }
 
-    /// The same by the published rule (section 4.2.3), without knowledge of what stood still; without a network each photograph is
-    /// compared with the mean of the others.
+    /// The same by the published rule (section 4.2.3), without detecting which objects stood still; without a network each
+    /// photograph is compared with the mean of the others.
     ///
     /// # Errors
     /// [`PoseFileError`].
@@ -255,10 +256,10 @@ impl PoseFile {
             .map_err(|source| PoseFileError::Io { path: file.to_owned(), source })
     }
 
-    /// Puts these poses in place of the given ones and leaves out the images that were dropped; a note for each of those.
+    /// Replaces the given poses by these and removes dropped images; returns a note for each of those.
     ///
     /// # Errors
-    /// When they are those of other images; `file` is where they were read.
+    /// If these are the poses of other images; `file` is the file from which they were read.
     pub fn apply(&self, images: &mut RoughImages, file: &Path) -> Result<Vec<String>, PoseFileError> {
         let mut records = self.photographs.iter();
         let (mut refined, mut notes) = (vec![], vec![]);

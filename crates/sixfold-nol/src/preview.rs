@@ -1,4 +1,4 @@
-//! An image of what the training has come to, drawn with every checkpoint.
+//! An image of the training's progress, written with every checkpoint.
 
 use std::path::Path;
 
@@ -14,21 +14,21 @@ const ROWS: u64 = 5;
 const SOURCES: usize = 5;
 const SIDE: usize = 128;
 
-/// The same synthetic objects every time.
+/// The same synthetic objects in every image.
 pub(crate) struct Preview {
     batch: Batch,
 }
 
 impl Preview {
     pub(crate) fn new(textures: &Backgrounds, options: &ViewSampleOptions, seed: u64) -> Self {
-        // Numbers that no training comes to.
+        // Sample numbers that no training reaches.
         let sample = |row| make_sample(textures, options, SIDE, SOURCES, seed, u64::MAX - row);
         let samples: Vec<_> = (0..ROWS).map(sample).collect();
         Preview { batch: Batch::of_samples(&samples) }
     }
 
-    /// Draws sources, the true target, the sources' average, X^D and X^phi into `folder`. An image that cannot be written is no
-    /// reason to stop a training.
+    /// Writes an image with sources, the true target, the sources' average, X^D and X^phi to `folder`. A failure to write it does
+    /// not stop the training.
     pub(crate) fn draw(&self, network: &Network, folder: &Path) {
         let passed = pass(network, self.batch.clone(), &Device::flex());
         let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
@@ -61,11 +61,11 @@ impl Preview {
         }
         let (width, height) = ((columns * SIDE) as u32, (rows * SIDE) as u32);
         let file = folder.join("preview.png");
-        // The first image comes before the first checkpoint, which makes the folder.
+        // The first image is written before the first checkpoint, which creates the folder.
         let saved = std::fs::create_dir_all(folder).map_err(image::ImageError::IoError).and_then(|()| {
             image::save_buffer(&file, &picture, width, height, image::ExtendedColorType::Rgb8)
         });
-        // A folder that cannot take the image cannot take the checkpoint after it either, whose error is reported.
+        // If the image cannot be written, neither can the checkpoint after it, whose error is reported.
         let _ = saved;
     }
 }

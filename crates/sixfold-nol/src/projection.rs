@@ -1,11 +1,11 @@
-//! What the pixels of a new view show, and where photographs show the same (dissertation, section 4.2.1: UV coordinates in the
-//! source, rendered in the target pose; here per pixel instead of per vertex, so that perspective is exact).
+//! The surface points in the pixels of a new view, and their pixels in the photographs (dissertation, section 4.2.1: UV coordinates
+//! in the source, rendered in the target pose; here per pixel instead of per vertex, so that perspective is exact).
 
 use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
-/// The places of the surface that a new view shows.
+/// The surface points that a new view shows.
 #[derive(Debug, Clone)]
 pub struct TargetSurface {
     /// The view's camera.
@@ -14,14 +14,14 @@ pub struct TargetSurface {
     pub camera_from_object: Pose,
     /// Numbers of the covered pixels, row by row.
     pub pixels: Vec<u32>,
-    /// What they show, object frame, metres.
+    /// Surface points of these pixels, object frame, metres.
     pub points: Vec<Vec3>,
-    /// Unit normals there, object frame, on the side that is seen.
+    /// Unit normals there, object frame, on the visible side.
     pub normals: Vec<Vec3>,
 }
 
 impl TargetSurface {
-    /// Draws the mesh at a pose.
+    /// Renders the mesh at a pose.
     pub fn new(mesh: &Mesh, camera: &Camera, camera_from_object: &Pose) -> Self {
         let mut frame = VisibilityBuffer::new(camera);
         let objects = [SceneObject { mesh, camera_from_object: *camera_from_object }];
@@ -49,11 +49,11 @@ impl TargetSurface {
     }
 }
 
-/// Where one photograph shows the places of a [`TargetSurface`], in its order.
+/// The pixels of one photograph that show the points of a [`TargetSurface`], in its order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Projection {
     /// Pixel of the crop.
     pub pixels: Vec<[f32; 2]>,
-    /// Cosine of the angle between normal and line of sight; 0 where the place is not seen.
+    /// Cosine of the angle between normal and line of sight; 0 where the point is not visible.
     pub cosines: Vec<f32>,
 }

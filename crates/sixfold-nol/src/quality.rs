@@ -1,4 +1,4 @@
-//! How well a model renders synthetic objects that it was not trained on, beside plain averaging of the same sources.
+//! How well a model renders synthetic objects that it was not trained on, compared with plain averaging of the same sources.
 
 use std::collections::BTreeMap;
 
@@ -13,16 +13,16 @@ use crate::model::NolModel;
 use crate::network::COLOURS;
 use crate::samples::{Batch, ViewSampleOptions, make_sample};
 
-/// What to measure on.
+/// Options of the measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QualityOptions {
-    /// Objects.
+    /// Number of objects.
     pub objects: u64,
-    /// Sources of each.
+    /// Sources per object.
     pub sources: usize,
     /// Side of all crops, pixels.
     pub side: usize,
-    /// Seed of the objects; another than the training's.
+    /// Seed of the objects; different from the training's.
     pub seed: u64,
 }
 
@@ -32,30 +32,30 @@ impl Default for QualityOptions {
     }
 }
 
-/// Means over the objects, where any source sees something.
+/// Means over the objects, over the pixels that any source shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct TruthSimilarity {
-    /// Peak signal-to-noise ratio, decibels. It forgives blur.
+    /// Peak signal-to-noise ratio, decibels. Insensitive to blur.
     pub psnr: f64,
-    /// Difference of features, as in equation 4.1 for the compact network. It does not.
+    /// Difference of features, as in equation 4.1 for the compact network. Sensitive to blur.
     pub features: f64,
 }
 
-/// X^D and the average of the same sources beside the truth.
+/// Similarity of X^D and of the average of the same sources to the truth.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Quality {
-    /// X^D, with poses off as table 4.1 has it.
+    /// X^D, with pose errors as in table 4.1.
     pub rough: TruthSimilarity,
-    /// The sources' average there.
+    /// The sources' average with these poses.
     pub rough_average: TruthSimilarity,
     /// X^D with exact poses.
     pub exact: TruthSimilarity,
-    /// The sources' average there.
+    /// The sources' average with these poses.
     pub exact_average: TruthSimilarity,
 }
 
 impl Quality {
-    /// For a model card.
+    /// Scores for a model card.
     pub fn scores(&self) -> BTreeMap<String, f64> {
         [
             ("rough poses", self.rough),
@@ -77,7 +77,7 @@ impl Quality {
 /// Measures a model on objects with these textures.
 ///
 /// # Errors
-/// [`WeightsError`] if the program carries another encoder than its own version's.
+/// [`WeightsError`] if the shipped encoder has another version than the program.
 pub fn quality(
     model: &NolModel,
     textures: &Backgrounds,

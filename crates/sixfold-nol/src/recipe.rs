@@ -1,5 +1,5 @@
-//! A whole training: nothing but a seed in (better: photographs for textures too), a network that renders new views out.
-//! Interrupted at any time, it is resumed.
+//! A complete training of the network that renders new views, from a seed alone (better: with photographs for textures). It can be
+//! interrupted at any time and resumed.
 
 use std::path::PathBuf;
 
@@ -19,10 +19,10 @@ use crate::network::{CompactConfig, Network, PaperConfig, Parts};
 use crate::quality::{Quality, QualityOptions, quality};
 use crate::training::{NolLosses, NolTraining, NolTrainingOptions};
 
-/// Fraction of procedural textures between the photographs.
+/// Fraction of procedural textures among the photographs.
 const PROCEDURAL_FRACTION: f32 = 0.2;
 
-/// Which network learns.
+/// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum NolKind {
     /// On a frozen EfficientNet-Lite0; trains on two cores.
@@ -51,7 +51,7 @@ impl Choice for NolKind {
 }
 
 impl NolKind {
-    /// How it is trained unless something else is asked for.
+    /// Its default training options.
     pub fn options(self) -> NolTrainingOptions {
         match self {
             NolKind::Compact => NolTrainingOptions::default(),
@@ -63,23 +63,23 @@ impl NolKind {
 /// How the network is trained.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct NolRecipe {
-    /// Which network learns.
+    /// Which network is trained.
     pub network: NolKind,
-    /// ImageNet weights of DenseNet-121 in torchvision's layout for [`NolKind::Paper`]; random ones without.
+    /// ImageNet weights of DenseNet-121 in torchvision's layout for [`NolKind::Paper`]; random ones if `None`.
     pub encoder: Option<PathBuf>,
     /// How sources are integrated, and whether there is a decoder.
     pub parts: Parts,
-    /// Which losses are summed up; `None`: the network's of [`NolKind::options`].
+    /// Which losses are summed; `None`: those of [`NolKind::options`].
     pub losses: Option<NolLosses>,
-    /// Folder of photographs for textures, backgrounds and clutter; procedural textures only without.
+    /// Folder of photographs for textures, backgrounds and clutter; procedural textures only if `None`.
     pub backgrounds: Option<PathBuf>,
-    /// Steps in all; `None`: the network's of [`NolKind::options`], as for the next one.
+    /// Number of steps; `None`: the value of [`NolKind::options`], as for the next field.
     pub steps: Option<u64>,
     /// Highest learning rate.
     pub learning_rate: Option<f64>,
     /// Seed of weights and samples.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -130,7 +130,7 @@ impl Recipe for NolRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         #[rustfmt::skip]
         let NolRecipe { network, encoder, parts, backgrounds, losses: _, steps: _, learning_rate: _, seed: _, command: _ } = self;
         let backgrounds =
@@ -182,7 +182,7 @@ impl Recipe for NolRecipe {
         Ok(Some(textures.clone()))
     }
 
-    /// Measures how similar to the ground truth it renders synthetic objects that it was not trained on.
+    /// Measures the similarity of its renderings to the ground truth, on synthetic objects that it was not trained on.
     fn finish(
         &self,
         Prepared { training, card, context: textures }: Prepared<NolTraining, Backgrounds>,
@@ -230,7 +230,7 @@ mod tests {
         assert_eq!(of(&photographs), before);
         std::fs::write(file("a.png"), b"two").unwrap();
         assert!(before.difference(&of(&photographs)).unwrap().starts_with("backgrounds was"));
-        // What is asked for in words changes nothing, and a default that is written down is the default.
+        // The text of the command has no effect, and stating a default value explicitly gives the same result.
         let command = "another".to_owned();
         assert_eq!(of(&NolRecipe { command, steps: Some(default().steps()), ..default() }), of(&default()));
     }

@@ -1,8 +1,8 @@
-//! Which photographs to use (dissertation, section 4.3.3): by the surface they show that is not seen yet, by the distance of
-//! their poses, and for one new view.
+//! Selection of photographs (dissertation, section 4.3.3): by the additional surface that they show, by the distance of their
+//! poses, and for one new view.
 //!
-//! The dissertation counts vertices. Points spread evenly over the surface take their place: a scan has its vertices where its
-//! shape is complicated, not where there is much to see.
+//! The dissertation counts vertices. Here points spread evenly over the surface are used instead: the vertices of a scan are dense
+//! where its shape is complicated, independent of the visible area.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -13,19 +13,19 @@ use sixfold_geometry::{Pose, Vec3};
 use crate::error::NolError;
 use crate::source::SourceView;
 
-/// An image is left out where its mask covers less of the object's outline.
+/// An image is left out if its mask covers a smaller fraction of the object's outline.
 const MIN_MASK: f64 = 0.1;
-/// A further image of an object must add so many of its [`POINTS`].
+/// Number of its [`POINTS`] that a further image of an object must add.
 const MIN_GAIN: f64 = 15.0;
 /// Points of the surface by which images are chosen.
 const POINTS: usize = 3000;
-/// Side of the crops in which they are looked up, pixels.
+/// Side of the crops in which these points are looked up, pixels.
 const SIDE: usize = 96;
 
-/// Images whose cameras are nearer than this (metres, and radians) are not both taken (section 4.3.3).
+/// Of two images whose cameras are closer than this (metres, and radians) only one is used (section 4.3.3).
 const APART: [f64; 2] = [0.3, std::f64::consts::FRAC_PI_4];
 
-/// Leaves the images that add most of the object's surface, at most `most` of them; a note for each that cannot be used.
+/// Keeps the images that add most of the object's surface, at most `most` of them; returns a note for each that cannot be used.
 ///
 /// # Errors
 /// [`NolError::Image`] for an image that does not show the object.
@@ -59,8 +59,8 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
     Ok(notes)
 }
 
-/// As [`choose_images`], by the distance of the poses: `choose_by_pose` with the dissertation's numbers for images in which nothing
-/// hides the objects.
+/// As [`choose_images`], by the distance of the poses: `choose_by_pose` with the dissertation's values, for images without
+/// occlusion.
 pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
     let poses: Vec<Pose> = object.images.iter().map(|i| *i.posed.camera_from_object()).collect();
     let chosen = choose_by_pose(&poses, APART, most, seed);
@@ -71,8 +71,8 @@ pub fn choose_images_by_pose(object: &mut RoughObject, most: usize, seed: u64) {
     });
 }
 
-/// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times
-/// the fraction of its mask there; 0 where it does not.
+/// How well one photograph shows every point of the surface: the cosine of the angle between normal and line of sight times the
+/// fraction of its mask there; 0 where the point is not visible.
 pub(crate) fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3]) -> Vec<f32> {
     let side = source.side();
     points
@@ -87,11 +87,11 @@ pub(crate) fn shown_points(source: &SourceView, points: &[Vec3], normals: &[Vec3
         .collect()
 }
 
-/// Chooses photographs one by one, each time the one that adds most: the sum over points of `tanh(1.5 s)`, where `s` is how well
-/// the chosen ones show a point together (the author's code; the text counts points that were not seen). Ends after `most`, or
-/// when the best one adds less than `min_gain` points.
+/// Greedy selection of photographs by the sum over points of `tanh(1.5 s)`, where `s` is the sum of `shown` of the selected
+/// photographs at a point (the author's code; the dissertation counts points not seen before). Stops after `most`, or when the best
+/// photograph adds less than `min_gain` points.
 ///
-/// `shown` has [`shown_points`] of every photograph; `only` says which points count, all if `None`.
+/// `shown` has [`shown_points`] of every photograph; `only` selects the points that count, all if `None`.
 pub(crate) fn choose_by_surface(
     shown: &[Vec<f32>],
     only: Option<&[bool]>,
@@ -111,7 +111,7 @@ pub(crate) fn choose_by_surface(
                 .sum()
         };
         let left = (0..shown.len()).filter(|k| !chosen.contains(k));
-        // The first of equals: the result does not depend on how it is computed.
+        // Ties go to the first, so that the result does not depend on the order of the computation.
         let best = left.map(|k| (k, gain(k))).fold(None, |best: Option<(usize, f64)>, next| match best {
             Some(best) if best.1 >= next.1 => Some(best),
             _ => Some(next),
@@ -126,9 +126,9 @@ pub(crate) fn choose_by_surface(
     chosen
 }
 
-/// Chooses photographs at random such that no two have poses nearer than `apart` (metres between cameras in the object's frame
-/// and radians between their directions; both must be undercut for a photograph to be left out). The dissertation's numbers
-/// are 0.3 m and 45 degrees.
+/// Chooses photographs at random such that no two have poses nearer than `apart` (metres between cameras in the object's frame and
+/// radians between their directions; a photograph is left out only if both are smaller). The dissertation's values are 0.3 m and 45
+/// degrees.
 pub(crate) fn choose_by_pose(
     camera_from_object: &[Pose],
     apart: [f64; 2],
@@ -177,7 +177,7 @@ mod tests {
         assert_eq!(choose_by_surface(&shown, None, 2, 0.0), vec![0, 2]);
         assert_eq!(choose_by_surface(&shown, Some(&[true, true, false, false]), 1, 0.0), vec![0]);
         assert_eq!(choose_by_surface(&shown, Some(&[false, false, false, true]), 3, 0.0), vec![2]);
-        // A gain of less than half a point is not worth a photograph.
+        // A gain of less than half a point does not justify another photograph.
         assert_eq!(choose_by_surface(&shown, None, 3, 0.5), vec![0, 2]);
         assert_eq!(unseen_fraction(&shown), 0.0);
         assert_eq!(unseen_fraction(&shown[..2]), 0.25);

@@ -1,5 +1,5 @@
-//! How like a photograph a rendering is, where the object is seen: peak signal-to-noise ratio, structural similarity (Wang et
-//! al., *Image Quality Assessment: From Error Visibility to Structural Similarity*, 2004) and a perceptual distance on the
+//! Similarity of a rendering and a photograph where the object is visible: peak signal-to-noise ratio, structural similarity (Wang
+//! et al., *Image Quality Assessment: From Error Visibility to Structural Similarity*, 2004) and a perceptual distance on the
 //! features of a trained network (Zhang et al., *The Unreasonable Effectiveness of Deep Features as a Perceptual Metric*, 2018,
 //! without its learned weights).
 
@@ -12,7 +12,7 @@ use sixfold_synth::augment::Patch;
 
 use crate::loss::psnr;
 
-/// Standard deviation of the window of structural similarity, pixels; it ends 5 pixels from its middle.
+/// Standard deviation of the window of structural similarity, pixels; the window extends 5 pixels from its centre.
 const SIGMA: f64 = 1.5;
 const REACH: isize = 5;
 /// The constants of structural similarity for values from 0 to 1.
@@ -21,7 +21,7 @@ const C2: f64 = 0.03 * 0.03;
 /// Feature maps that the perceptual distance compares: those at 1/2, 1/4 and 1/8 of the resolution.
 const TAPS: usize = 3;
 
-/// The measures.
+/// Values of the three measures.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Similarity {
     /// Peak signal-to-noise ratio, decibels; larger is better.
@@ -46,8 +46,9 @@ pub(crate) fn psnr_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f
     (count > 0).then(|| psnr(sum / count as f64))
 }
 
-/// Structural similarity: the mean over the pixels of a mask and over red, green and blue. The window (Gaussian of 1.5 pixels,
-/// 11 x 11) counts only what lies in the mask, so that nothing beside the object has a part in it. `None` for an empty mask.
+/// Structural similarity: the mean over the pixels of a mask and over red, green and blue. The Gaussian
+/// window (sigma 1.5 pixels, 11 x 11 pixels) includes only pixels in the mask, so that pixels outside the object have no influence.
+/// `None` for an empty mask.
 pub(crate) fn ssim_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f64> {
     let (width, height) = mask.size();
     let area = width * height;
@@ -84,7 +85,7 @@ pub(crate) fn ssim_within(image: &Patch, truth: &Patch, mask: &Mask) -> Option<f
     Some(sum / (3.0 * count))
 }
 
-/// Sums under the Gaussian window; nothing lies beyond the image.
+/// Sums under the Gaussian window, with zeros beyond the image.
 fn window(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     let taps: Vec<f64> = (-REACH..=REACH).map(|k| (-(k * k) as f64 / (2.0 * SIGMA * SIGMA)).exp()).collect();
     let along = |values: &[f64], step: usize, lines: usize, line_step: usize, length: usize| {
@@ -106,8 +107,8 @@ fn window(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     along(&rows, width, width, 1, height)
 }
 
-/// The image in the light of the truth: gain and offset per channel by least squares over the mask, cut to 0 to 1. Photographs
-/// under another lamp or exposure can then be compared by what they show.
+/// The image adjusted to the light of the truth: gain and offset per channel by least squares over the mask, clipped to 0 to 1.
+/// This makes images under different lamps or exposures comparable.
 pub fn in_light_of(image: &Patch, truth: &Patch, mask: &Mask) -> Patch {
     let area = mask.as_slice().len();
     let mut lit = image.clone();
@@ -122,7 +123,7 @@ pub fn in_light_of(image: &Patch, truth: &Patch, mask: &Mask) -> Patch {
         }
         let (mx, my) = (s[1] / s[0], s[2] / s[0]);
         let variance = s[3] / s[0] - mx * mx;
-        // One colour alone says nothing of the gain; a negative one would be another image.
+        // A single colour does not determine the gain; a negative gain would mean a different image.
         let gain = if variance > 1e-8 { ((s[4] / s[0] - mx * my) / variance).max(0.0) } else { 1.0 };
         let offset = my - gain * mx;
         for v in &mut lit.data[c * area..(c + 1) * area] {
@@ -132,7 +133,7 @@ pub fn in_light_of(image: &Patch, truth: &Patch, mask: &Mask) -> Patch {
     lit
 }
 
-/// The pixels of a mask about which everything within `reach` pixels along both axes is in it as well.
+/// The pixels of a mask for which all pixels within `reach` along both axes are in the mask too.
 pub fn without_border(mask: &Mask, reach: usize) -> Mask {
     let (width, height) = mask.size();
     Mask::from_fn(width, height, |x, y| {
@@ -144,9 +145,9 @@ pub fn without_border(mask: &Mask, reach: usize) -> Mask {
     })
 }
 
-/// The image moved by whole pixels, up to `reach` along both axes, to where it is most similar to the ground truth in the pixels of a mask that
-/// keeps as far from the image's border ([`without_border`]). Poses of photographs are annotated within a few
-/// pixels; renderings can then be compared by what they show.
+/// The image shifted by whole pixels, up to `reach` along both axes, to the position where it is most similar to the ground truth
+/// in the pixels of a mask that is at least as far from the image's border ([`without_border`]). Annotated poses have errors of a
+/// few pixels; this keeps them out of the comparison.
 pub fn in_place_of(image: &Patch, truth: &Patch, mask: &Mask, reach: usize) -> Patch {
     let (width, height) = mask.size();
     let area = width * height;
@@ -189,7 +190,7 @@ pub struct ImageSimilarity {
     device: Device,
 }
 
-/// A photograph that renderings are compared with, and where.
+/// A photograph with which renderings are compared, and the mask of compared pixels.
 #[derive(Debug)]
 pub struct Truth<'a> {
     patch: &'a Patch,
@@ -197,7 +198,7 @@ pub struct Truth<'a> {
     maps: Vec<Map>,
 }
 
-/// Features with length 1 at every place: channels, then rows.
+/// Features normalised to length 1 at every position: channels, then rows.
 #[derive(Debug)]
 struct Map {
     channels: usize,
@@ -206,21 +207,21 @@ struct Map {
 }
 
 impl ImageSimilarity {
-    /// With the EfficientNet-Lite0 encoder (trained on ImageNet) from within the program.
+    /// With the shipped EfficientNet-Lite0 encoder (trained on ImageNet).
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries another encoder than its own version's.
+    /// [`WeightsError`] if the shipped encoder has another version than the program.
     pub fn new() -> Result<Self, WeightsError> {
         let device = Device::flex();
         Ok(ImageSimilarity { encoder: imagenet_encoder(&device)?, device })
     }
 
-    /// What renderings are to be compared with: a photograph, in the pixels of a mask of its size.
+    /// Prepares the reference for comparisons: a photograph, in the pixels of a mask of its size.
     pub fn truth<'a>(&self, patch: &'a Patch, mask: &'a Mask) -> Truth<'a> {
         Truth { patch, mask, maps: self.features(patch) }
     }
 
-    /// All measures of a rendering (of the truth's size, values from 0 to 1); `None` where the mask is empty.
+    /// All measures of a rendering (of the truth's size, values from 0 to 1); `None` if the mask is empty.
     pub fn compare(&self, image: &Patch, truth: &Truth<'_>) -> Option<Similarity> {
         Some(Similarity {
             psnr: psnr_within(image, truth.patch, truth.mask)?,
@@ -229,8 +230,8 @@ impl ImageSimilarity {
         })
     }
 
-    /// Squared differences of features that have length 1 at every place: the mean over the mask, then over the maps. Beside the
-    /// mask both images show the truth.
+    /// Squared differences of features normalised to length 1 at every position: the mean over the mask, then over the maps.
+    /// Outside the mask both images show the truth.
     fn perceptual(&self, image: &Patch, truth: &Truth<'_>) -> Option<f64> {
         let area = truth.mask.as_slice().len();
         let mut within = truth.patch.clone();
@@ -310,7 +311,7 @@ mod tests {
     fn signal_to_noise_counts_the_mask_alone() {
         let left = Mask::from_fn(32, 32, |x, _| x < 16);
         let truth = patch(|_, _| 0.5);
-        // 0.1 off in half of the mask, far off beside it: a mean squared error of 0.005, 23.0103 dB.
+        // An error of 0.1 in half of the mask, large errors outside it: a mean squared error of 0.005, 23.0103 dB.
         let image = patch(|x, y| if x >= 16 { 0.0 } else { 0.5 + 0.1 * (y % 2) as f32 });
         assert!((psnr_within(&image, &truth, &left).unwrap() - 23.0103).abs() < 1e-3);
         assert_eq!(psnr_within(&truth, &truth, &left), Some(100.0));
@@ -329,7 +330,7 @@ mod tests {
         let placed = in_place_of(&image, &truth, &middle, 4);
         assert_eq!(psnr_within(&placed, &truth, &middle), Some(100.0), "{before}");
         assert!(before < 30.0);
-        // No further than it may: the nearest place that it can reach is not this one.
+        // The shift is limited: it cannot reach this position.
         let near = in_place_of(&image, &truth, &middle, 1);
         assert!(psnr_within(&near, &truth, &middle).unwrap() < 60.0);
         // A hole in a mask is a border.
@@ -340,13 +341,13 @@ mod tests {
     #[test]
     fn structural_similarity_has_the_values_of_its_formula() {
         let left = Mask::from_fn(32, 32, |x, _| x < 16);
-        // Without structure the means remain: (2 x 0.4 x 0.6 + C1) / (0.16 + 0.36 + C1). What lies beside the mask is nothing.
+        // Without structure the means remain: (2 x 0.4 x 0.6 + C1) / (0.16 + 0.36 + C1). Pixels outside the mask have no influence.
         let a = patch(|x, _| if x < 16 { 0.4 } else { 0.9 });
         let b = patch(|_, _| 0.6);
         let expected = 0.4801 / 0.5201;
         assert!((ssim_within(&a, &b, &left).unwrap() - expected).abs() < 1e-5);
         assert!((ssim_within(&a, &a, &left).unwrap() - 1.0).abs() < 1e-9);
-        // A board of fields of one pixel, and the same with black for white: covariance -0.04, variances 0.04.
+        // A checkerboard with squares of one pixel, and its inverse: covariance -0.04, variances 0.04.
         let board = |sign: f32| patch(move |x, y| 0.5 + sign * if (x + y) % 2 == 0 { 0.2 } else { -0.2 });
         let middle = Mask::filled(32, 32, true);
         let found = ssim_within(&board(1.0), &board(-1.0), &middle).unwrap();

@@ -1,4 +1,4 @@
-//! A photograph cut to the object, with what is known of its geometry at the present pose.
+//! A photograph cropped to the object, with the depth of the mesh at the current pose.
 
 use crate::error::NolError;
 use crate::projection::{Projection, TargetSurface};
@@ -9,35 +9,35 @@ use sixfold_mesh::Mesh;
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::{Coverage, Patch};
 
-/// Colour where the crop reaches out of the image.
+/// Colour where the crop extends beyond the image.
 const OUTSIDE: f32 = 0.5;
-/// The crop's side in units of the object's box: room for a pose that is off.
+/// The crop's side in units of the object's box in the image, with a margin for pose errors.
 pub(crate) const MARGIN: f64 = 1.3;
-/// A point counts as seen up to this depth behind what the mesh shows there, in units of the mesh's diameter.
+/// A point counts as visible up to this depth behind the rendered surface, in units of the mesh's diameter.
 const BEHIND: f64 = 0.02;
 
-/// A square crop of a photograph about the object.
+/// A square crop of a photograph around the object.
 #[derive(Debug, Clone)]
 pub struct SourceView {
     /// Colours, `side x side`.
     pub patch: Patch,
-    /// Where the object is visible, 0 to 1: the mask, or 1 wherever the image reaches.
+    /// Where the object is visible, 0 to 1: the mask, or 1 everywhere within the image.
     pub visible: Coverage,
     /// The crop's camera.
     pub camera: Camera,
-    /// The present pose.
+    /// The current pose.
     camera_from_object: Pose,
-    /// Depth of the mesh at that pose, row by row, metres; 0 beside it.
+    /// Depth of the mesh at that pose, row by row, metres; 0 outside it.
     depth: Vec<f32>,
-    /// Depth by which a point may lie behind, metres.
+    /// Largest depth of a visible point behind the rendered surface, metres.
     behind: f32,
 }
 
 impl SourceView {
-    /// Cuts the object out at the photograph's pose, `side` pixels wide.
+    /// Crops the object at the photograph's pose, `side` pixels wide.
     ///
     /// # Errors
-    /// [`PosedImageError::OutsideImage`] where the mesh reaches behind the camera.
+    /// [`PosedImageError::OutsideImage`] if the mesh extends behind the camera.
     pub fn new(photograph: &PosedImage, mesh: &Mesh, side: usize) -> Result<Self, NolError> {
         let (camera, pose) = (photograph.camera(), photograph.camera_from_object());
         let Some(window) = object_window(camera, mesh, pose, MARGIN) else {
@@ -56,7 +56,7 @@ impl SourceView {
         Ok(Self::of_crop(patch, visible, window.camera(camera, side), *pose, mesh))
     }
 
-    /// A view from a crop that is there already.
+    /// A view from an existing crop.
     pub(crate) fn of_crop(patch: Patch, visible: Coverage, camera: Camera, pose: Pose, mesh: &Mesh) -> Self {
         let (low, high) = mesh.bounding_box();
         let mut view = SourceView {
@@ -71,7 +71,7 @@ impl SourceView {
         view
     }
 
-    /// Fraction of the mesh's silhouette at the present pose that the mask leaves visible, 0 to 1.
+    /// Fraction of the mesh's silhouette at the current pose that the mask leaves visible, 0 to 1.
     pub fn visible_fraction(&self) -> f64 {
         let (mut all, mut seen) = (0usize, 0usize);
         for (z, visible) in self.depth.iter().zip(&self.visible.data) {
@@ -81,7 +81,7 @@ impl SourceView {
         seen as f64 / all.max(1) as f64
     }
 
-    /// The present pose.
+    /// The current pose.
     pub fn camera_from_object(&self) -> &Pose {
         &self.camera_from_object
     }
@@ -91,12 +91,12 @@ impl SourceView {
         self.patch.width
     }
 
-    /// Depth of the mesh at the present pose, row by row, metres; 0 beside it.
+    /// Depth of the mesh at the current pose, row by row, metres; 0 outside it.
     pub fn depth(&self) -> &[f32] {
         &self.depth
     }
 
-    /// Another pose for the same crop.
+    /// Sets another pose for the same crop.
     pub(crate) fn set_pose(&mut self, mesh: &Mesh, camera_from_object: Pose, frame: &mut VisibilityBuffer) {
         self.camera_from_object = camera_from_object;
         frame.set_camera(&self.camera);
@@ -106,15 +106,15 @@ impl SourceView {
         self.depth.extend(inverse.map(|z| if *z > 0.0 { 1.0 / z } else { 0.0 }));
     }
 
-    /// Where the crop shows a place of the surface (object frame, metres; unit normal), and the cosine of the angle between
-    /// normal and line of sight. `None` where it is turned away, hidden by the object itself, or outside the crop. What else
-    /// hides it, `visible` says.
+    /// The pixel at which the crop shows a surface point (object frame, metres; unit normal), and the cosine of the angle between
+    /// normal and line of sight. `None` if the surface faces away, is hidden by the object itself, or is outside the crop.
+    /// Occlusion by other objects is in `visible`.
     #[inline]
     pub fn see(&self, point: &Vec3, normal: &Vec3) -> Option<([f32; 2], f32)> {
         self.see_at(&self.camera_from_object, point, normal)
     }
 
-    /// The same with another pose near the present one, whose depth decides about what hides what.
+    /// The same with another pose near the current one; visibility is decided with the depth of the current one.
     #[inline]
     pub(crate) fn see_at(&self, pose: &Pose, point: &Vec3, normal: &Vec3) -> Option<([f32; 2], f32)> {
         let p = pose.transform_point(point);
@@ -139,7 +139,7 @@ impl SourceView {
         seen.then_some(([pixel.x as f32, pixel.y as f32], cosine as f32))
     }
 
-    /// Every place of a new view, looked up in this crop.
+    /// Projects every point of a new view into this crop.
     pub fn project(&self, target: &TargetSurface) -> Projection {
         let mut projection = Projection {
             pixels: Vec::with_capacity(target.points.len()),
@@ -165,7 +165,7 @@ mod tests {
 
     #[test]
     fn what_the_object_hides_of_itself_is_not_seen() {
-        // A plate of 10 cm, and one of 4 cm three centimetres before it, both facing the camera.
+        // A plate of 10 cm, and one of 4 cm three centimetres in front of it, both facing the camera.
         let plate = |half: f64, z: f64| {
             [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
                 .map(|(x, y)| Vec3::new(x * half, y * half, z))

@@ -1,10 +1,10 @@
-//! Points on the surface with normals on the side that can be seen.
+//! Points on the surface with outward normals.
 
 use sixfold_geometry::Vec3;
 use sixfold_mesh::Mesh;
 
-/// Normals of a surface sample, turned outwards as a whole: files wind their faces either way. By the volume's sign, which
-/// for a surface that is not closed still says where most of it faces.
+/// Normals of a surface sample, all negated if necessary so that they point outwards: files orient their faces either way. The sign
+/// of the volume decides, which for an open surface still shows the direction that most of it faces.
 pub(crate) fn outwards(mesh: &Mesh, normals: &[Vec3]) -> Vec<Vec3> {
     let (low, high) = mesh.bounding_box();
     let centre = (low + high) * 0.5;

@@ -1,5 +1,5 @@
-//! New views from refined photographs: the sources that show most of what the view shows, weighed per pixel, and an honest
-//! account of what none of them shows.
+//! New views from refined photographs: combines the sources that show most of the view's surface, weighted per pixel, and marks the
+//! pixels that none of them shows.
 
 use rayon::prelude::*;
 use sixfold_geometry::{Camera, Mask, Pose, Vec3};
@@ -15,12 +15,12 @@ use crate::select::{choose_by_surface, shown_points, unseen_fraction};
 use crate::source::SourceView;
 use crate::surface::outwards;
 
-/// How the colours that several photographs show at one place become one.
+/// How the colours of several photographs at one point are combined.
 #[derive(Debug, Clone, Copy)]
 pub enum Weighting<'a> {
-    /// The photograph that looks at the place most directly: plain multi-view texturing.
+    /// The photograph with the most frontal view of the point: plain multi-view texturing.
     Best,
-    /// All alike.
+    /// All photographs with equal weights.
     Average,
     /// The network of NOL.
     Network(&'a NolModel),
@@ -29,11 +29,11 @@ pub enum Weighting<'a> {
 /// A new view.
 #[derive(Debug, Clone)]
 pub struct NewView {
-    /// Colours; 0 beside the object.
+    /// Colours; 0 outside the object.
     pub patch: Patch,
     /// Where the object is.
     pub mask: Mask,
-    /// Where the object is but no source shows it: filled from what is near.
+    /// Where the object is not shown by any source: filled from nearby pixels.
     pub unseen: Mask,
     /// Numbers of the sources that were used.
     pub sources: Vec<usize>,
@@ -49,7 +49,7 @@ impl NewView {
 
 /// Points of the surface by which sources are chosen.
 const POINTS: usize = 3000;
-/// A source that adds fewer points to a view is left out of it.
+/// A source that adds fewer points to a view is not used for it.
 const MIN_GAIN: f64 = 1.0;
 
 /// Makes views of one object.
@@ -68,10 +68,10 @@ pub struct ViewMaker<'a> {
 }
 
 impl<'a> ViewMaker<'a> {
-    /// `per_view` is the number of sources for a view (dissertation: 6).
+    /// `per_view` is the number of sources per view (dissertation: 6).
     ///
     /// # Errors
-    /// [`NolError::Option`] without sources, or when none shows the object.
+    /// [`NolError::Option`] without sources, or if none shows the object.
     pub fn new(
         mesh: &'a Mesh,
         sources: Vec<SourceView>,
@@ -114,7 +114,7 @@ impl<'a> ViewMaker<'a> {
         Ok(maker)
     }
 
-    /// The object's colour as a whole, for views of which nothing is seen.
+    /// The object's mean colour, for views of which no source shows anything.
     fn mean_color(&self) -> [f32; 3] {
         let (mut sum, mut weight) = ([0.0f32; 3], 0.0f32);
         let mut color = [0.0; 3];
@@ -177,7 +177,7 @@ impl<'a> ViewMaker<'a> {
         view
     }
 
-    /// The sources that together show most of what the view shows.
+    /// The sources that together show most of the view's surface.
     fn choose(&self, camera: &Camera, pose: &Pose) -> Vec<usize> {
         let black = Patch::filled(camera.width, camera.height, [0.0; 3]);
         let whole = sixfold_synth::augment::Coverage::filled(camera.width, camera.height, 1.0);
@@ -191,7 +191,7 @@ impl<'a> ViewMaker<'a> {
         choose_by_surface(&self.shown, Some(&only), self.per_view, MIN_GAIN)
     }
 
-    /// Colours without a network: of the most direct source, or of all in equal parts.
+    /// Colours without a network: of the most frontal source, or the mean of all.
     fn plain(&self, target: &TargetSurface, chosen: &[usize], best: bool) -> (Vec<[f32; 3]>, Vec<bool>) {
         let mut colors = vec![[0.0f32; 3]; target.pixels.len()];
         let mut weights = vec![0.0f32; target.pixels.len()];
@@ -223,16 +223,17 @@ impl<'a> ViewMaker<'a> {
     }
 }
 
-/// Rounds in which filled pixels become the mean of themselves and their neighbours.
+/// Iterations in which filled pixels are replaced by the mean of themselves and their neighbours.
 const SMOOTHINGS: usize = 40;
 
-/// Gives unseen pixels of the object the colours of seen ones nearby: means over ever larger neighbourhoods, from halved images.
+/// Fills unseen pixels of the object with the colours of visible ones nearby: means over increasingly large neighbourhoods, from
+/// repeatedly halved images.
 fn fill(view: &mut NewView, mean: [f32; 3]) {
     let (width, height) = view.mask.size();
     if !view.unseen.as_slice().contains(&true) {
         return;
     }
-    // Sums of colours and weights at full resolution, then halved again and again.
+    // Sums of colours and weights at full resolution, then repeatedly halved.
     let area = width * height;
     let known = |at: usize| view.mask.as_slice()[at] && !view.unseen.as_slice()[at];
     let mut levels: Vec<(usize, usize, Vec<[f32; 4]>)> = vec![(
@@ -268,7 +269,7 @@ fn fill(view: &mut NewView, mean: [f32; 3]) {
             .map_or(mean, |sum| [sum[0] / sum[3], sum[1] / sum[3], sum[2] / sum[3]]);
         (0..3).for_each(|c| view.patch.data[c * area + at] = color[c]);
     }
-    // The blocks of the halved images melt into each other and into what is seen.
+    // Smooths the blocks of the halved images and their transition to visible pixels.
     for _ in 0..SMOOTHINGS {
         let before = view.patch.data.clone();
         for &at in &unseen {

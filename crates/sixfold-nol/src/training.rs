@@ -19,7 +19,7 @@ use crate::network::{Blend, COLOURS, Network, Parts};
 use crate::preview::Preview;
 use crate::samples::{Batch, ViewBatchOptions, ViewSampleOptions};
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NolTrainingOptions {
     /// Steps, learning rate, seed.
@@ -27,12 +27,12 @@ pub struct NolTrainingOptions {
     pub common: TrainingOptions,
     /// Weights of colours, features and smoothness.
     pub weights: [f64; 3],
-    /// Weight of the adversarial loss against a discriminator, which trains beside the network; 0 for none.
+    /// Weight of the adversarial loss against a discriminator, which is trained together with the network; 0 for none.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub adversarial: f64,
     /// How samples are made.
     pub samples: ViewSampleOptions,
-    /// How many in a step.
+    /// Samples per step.
     pub batch: ViewBatchOptions,
 }
 
@@ -62,8 +62,8 @@ impl Default for NolTrainingOptions {
 }
 
 impl NolTrainingOptions {
-    /// The dissertation's (section 4.3.3): one target with eight sources of 256x256 pixels in a step, all of them with rough poses;
-    /// 35 epochs of 10,000 images.
+    /// The dissertation's options (section 4.3.3): one target with eight sources of 256x256 pixels in a step, all of them with
+    /// rough poses; 35 epochs of 10,000 images.
     pub fn published() -> Self {
         let default = Self::default();
         NolTrainingOptions {
@@ -117,7 +117,7 @@ fn is_zero(weight: &f64) -> bool {
     *weight == 0.0
 }
 
-/// Which losses a training sums up: the columns of table 4.6, each with one more.
+/// Which losses a training sums: the columns of table 4.6, each with one more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NolLosses {
     /// Colours alone.
@@ -126,7 +126,7 @@ pub enum NolLosses {
     Image,
     /// Equations 4.1 and 4.2: with smoothness.
     Smooth,
-    /// With an adversarial loss. The dissertation does not say its weight; it is 1 here.
+    /// With an adversarial loss. The dissertation does not state its weight; it is 1 here.
     Gan,
 }
 
@@ -152,7 +152,7 @@ impl Choice for NolLosses {
     }
 }
 
-/// A batch that went through the network.
+/// The result of a forward pass of a batch.
 pub(crate) struct Passed {
     /// X^S and the weights.
     pub blend: Blend,
@@ -164,7 +164,7 @@ pub(crate) struct Passed {
     pub mask: Tensor<4>,
 }
 
-/// Takes a batch through the network, on `device`.
+/// Forward pass of a batch, on `device`.
 pub(crate) fn pass(network: &Network, batch: Batch, device: &Device) -> Passed {
     let (side, sources, samples) = (batch.side, batch.sources, batch.samples);
     let all = sources * samples;
@@ -197,13 +197,14 @@ pub struct NolTraining {
     perceptual: Perceptual,
     preview: Option<Preview>,
     options: NolTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl NolTraining {
-    /// Of a network of these `parts` whose tensors are on the autodiff `device`; `perceptual` is the loss on features.
+    /// Starts the training of a network with these `parts` whose tensors are on the autodiff `device`; `perceptual` is the loss on
+    /// features.
     pub fn new(
         network: Network,
         parts: Parts,
@@ -218,8 +219,8 @@ impl NolTraining {
         NolTraining { learner, critic, parts, perceptual, preview: None, options, pace, device }
     }
 
-    /// Draws `preview.png` beside every checkpoint: a row a synthetic object with textures from `textures`: sources, the true
-    /// target, the sources' average, X^D, X^phi.
+    /// Writes `preview.png` next to every checkpoint. It has one row per synthetic object with textures from `textures`: sources,
+    /// the true target, the sources' average, X^D, X^phi.
     pub(crate) fn with_preview(mut self, textures: &Backgrounds) -> Self {
         self.preview = Some(Preview::new(textures, &self.options.samples, self.options.common.seed));
         self
@@ -232,7 +233,7 @@ impl NolTraining {
 }
 
 impl Training for NolTraining {
-    /// What objects, backgrounds and clutter look like.
+    /// Textures of objects, backgrounds and clutter.
     type Samples = Backgrounds;
     type Batch = Batch;
 
@@ -277,7 +278,7 @@ impl Training for NolTraining {
         let [of_colours, of_features, of_smoothness] = self.options.weights;
         let mut sum = colours * of_colours + features * of_features + smoothness * of_smoothness;
         if let Some(critic) = &mut self.critic {
-            // What no source sees is left out of both.
+            // Pixels that no source shows are left out of both.
             let (image, target) = (out.image * out.mask.clone(), out.target * out.mask);
             let told = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
             let adversarial = critic.generator_loss(image);
@@ -301,7 +302,7 @@ impl Training for NolTraining {
     }
 }
 
-/// All that decides about the result.
+/// Everything that affects the result.
 #[derive(Serialize)]
 struct Settings<'a> {
     #[serde(flatten)]
@@ -344,7 +345,7 @@ mod tests {
     fn on_one_batch_the_loss_falls() {
         let textures = Backgrounds::procedural();
         let mut options = options(1);
-        // As AdamW comes without options.
+        // As in AdamW with its default options.
         options.common.max_grad_norm = None;
         let mut training = training(&options);
         let batch = Batch::of_step(&textures, &options.samples, &options.batch, 0, 4);

@@ -1,5 +1,4 @@
-//! Which views of an object make up a training set, and how a view is laid over a background (K. Park, dissertation, section
-//! 4.3).
+//! The views of an object in a training set, and the composition of a view with a background (K. Park, dissertation, section 4.3).
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
@@ -13,17 +12,17 @@ use sixfold_synth::augment::{Coverage, Patch};
 use crate::synthesis::NewView;
 use crate::window::object_window;
 
-/// Side of an image in units of the object's box.
+/// Side of an image in units of the object's box in the image.
 const ROOM: f64 = 1.6;
 
-/// Views from everywhere on a part of the sphere about an object.
+/// A grid of views over a part of the sphere around an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewGrid {
-    /// Between views, in azimuth and elevation, degrees.
+    /// Step between views in azimuth and elevation, degrees.
     pub step: f64,
-    /// Lowest and highest elevation over the object's xy plane, degrees.
+    /// Lowest and highest elevation above the object's xy plane, degrees.
     pub elevation: [f64; 2],
-    /// Images of each view, each with a turn of its own in the image plane (up to 45 degrees).
+    /// Images of each view, each with its own in-plane rotation (up to 45 degrees).
     pub turns: usize,
     /// Side of the images, pixels.
     pub size: usize,
@@ -31,7 +30,7 @@ pub struct ViewGrid {
     pub seed: u64,
 }
 
-/// Where a view is taken from, radians, and which of its turns it is.
+/// Direction of a view, radians, and the number of its in-plane rotation.
 struct Aim {
     azimuth: f64,
     elevation: f64,
@@ -39,8 +38,8 @@ struct Aim {
 }
 
 impl ViewGrid {
-    /// Camera and camera_from_object of every image of object number `object`, as far away as its photographs were taken; none
-    /// for an image that would not show it.
+    /// Camera and camera_from_object of every image of object number `object`, at distances of its photographs; `None` for an image
+    /// that would not show it.
     pub fn placed(
         &self,
         mesh: &Mesh,
@@ -51,7 +50,7 @@ impl ViewGrid {
         (0..).zip(&aims).map(|(number, aim)| self.place(mesh, photographs, object, aim, number)).collect()
     }
 
-    /// Images of an object.
+    /// Number of images of an object.
     pub fn count(&self) -> usize {
         self.aims().len()
     }
@@ -88,7 +87,7 @@ impl ViewGrid {
         let distances = photographs.iter().map(|p| p.camera_from_object().translation().norm());
         let range = distances.fold([f64::INFINITY, 0.0f64], |[low, high], d| [low.min(d), high.max(d)]);
         let distance = f64::from(uniform(&mut random, [range[0] as f32, range[1] as f32]));
-        // Turns of one view lie evenly between -45 and 45 degrees; a single one anywhere there.
+        // The in-plane rotations of one view are spread evenly between -45 and 45 degrees; a single one is random in this range.
         let roll = if self.turns == 1 {
             f64::from(uniform(&mut random, [-1.0, 1.0])) * FRAC_PI_4
         } else {
@@ -100,13 +99,13 @@ impl ViewGrid {
     }
 }
 
-/// A camera that looks at `centre` from a direction given in the object's frame, upright but for a turn of the image.
+/// The pose for a camera aimed at `centre` from a direction in the object's frame, upright except for the roll.
 fn looking_at(centre: &Vec3, aim: &Aim, distance: f64, roll: f64) -> Pose {
     let (sa, ca) = aim.azimuth.sin_cos();
     let (se, ce) = aim.elevation.sin_cos();
     let back = Vec3::new(ce * ca, ce * sa, se);
     let z = -back;
-    // Straight from above, up is where the azimuth points.
+    // For a view straight from above, the azimuth defines the up direction.
     let up = if se.abs() > 0.999 { Vec3::new(-ca, -sa, 0.0) * se.signum() } else { Vec3::z() };
     let x = z.cross(&up).normalize();
     let rotation = Mat3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
@@ -114,7 +113,7 @@ fn looking_at(centre: &Vec3, aim: &Aim, distance: f64, roll: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), roll), Vec3::zeros()) * upright
 }
 
-/// A view with a soft border over a background of its size.
+/// A view with a soft border composed with a background of its size.
 pub(crate) fn over_background(view: &NewView, mut background: Patch) -> RgbImage {
     let (width, height) = view.mask.size();
     let mut soft = Coverage::from_fn(width, height, |x, y| f32::from(u8::from(view.mask[(x, y)])));
@@ -123,7 +122,7 @@ pub(crate) fn over_background(view: &NewView, mut background: Patch) -> RgbImage
     background.to_rgb()
 }
 
-/// Colours of the object carried a few pixels beyond its border, so that a soft border mixes no black.
+/// Colours of the object extended a few pixels beyond its border, so that a soft border does not mix with black.
 fn spread(patch: &Patch, mask: &Mask) -> Patch {
     let (width, height) = mask.size();
     let area = width * height;
@@ -175,7 +174,7 @@ mod tests {
                 );
             }
         }
-        // Upright: the object's z axis points up in the image, rotated by the roll.
+        // Upright: the object's z axis points up in the image (before the roll).
         let pose = looking_at(&centre, &Aim { azimuth: 0.4, elevation: 0.6, turn: 0 }, 0.7, 0.0);
         let up = pose.transform_direction(&Vec3::z());
         assert!(up.x.abs() < 1e-9 && up.y < 0.0);

@@ -1,4 +1,4 @@
-//! New views of an object as the images of a training set in the form of BOP (K. Park, dissertation, section 4.3).
+//! New views of an object as a training set in BOP format (K. Park, dissertation, section 4.3).
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -17,14 +17,14 @@ use crate::source::SourceView;
 use crate::synthesis::ViewMaker;
 use crate::view_grid::{ViewGrid, over_background};
 
-/// Images of an object that are shown to people.
+/// Number of images of an object in the preview.
 const PREVIEWED: usize = 10;
 
 /// Why views cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ViewSplitError {
-    /// A photograph does not fit.
+    /// A photograph cannot be used.
     #[error(transparent)]
     Image(#[from] NolError),
     /// The dataset cannot be written.
@@ -33,9 +33,9 @@ pub enum ViewSplitError {
     /// Object coordinates cannot be written.
     #[error("{}", path.display())]
     Coordinates {
-        /// Where to.
+        /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -46,23 +46,23 @@ pub struct ViewSplit<'a> {
     pub dataset: &'a Path,
     /// Name of the split.
     pub split: &'a str,
-    /// Where views are taken from.
+    /// Viewpoints.
     pub grid: ViewGrid,
-    /// What is behind the objects.
+    /// Backgrounds of the views.
     pub backgrounds: &'a Backgrounds,
-    /// Put the photographs themselves, cut to the object, behind the views.
+    /// Add the photographs themselves, cropped to the object, after the views.
     pub with_photographs: bool,
 }
 
-/// What was written of one object.
+/// Summary of the written views of one object.
 pub struct WrittenViews {
-    /// Images.
+    /// Number of images.
     pub images: usize,
     /// Fraction of the object's pixels in all views that no photograph shows.
     pub unseen: f64,
-    /// Some of the images with a text each.
+    /// Some of the images, each with a text.
     pub preview: Vec<(RgbImage, String)>,
-    /// Of the first image.
+    /// Camera of the first image.
     pub camera: Option<Camera>,
 }
 
@@ -72,11 +72,11 @@ impl ViewSplit<'_> {
         self.dataset.join(self.split).join(format!("{id:06}"))
     }
 
-    /// Renders all views of one object. Images that are there already are not rendered again. `None` when `progress`, which
-    /// receives every image, stopped it.
+    /// Renders all views of one object. Existing images are not rendered again. `progress` is called for every image; `None` if it
+    /// stopped the run.
     ///
     /// # Errors
-    /// When an image cannot be written, or a photograph that is put into the dataset does not fit.
+    /// When an image cannot be written, or a photograph to be added cannot be used.
     pub fn write(
         &self,
         object: &RoughObject,
@@ -94,7 +94,7 @@ impl ViewSplit<'_> {
             let Some((camera, pose)) = *place else { continue };
             let image_file = self.folder(object.id).join("rgb").join(format!("{im_id:06}.png"));
             let coordinates = self.folder(object.id).join("coordinates").join(format!("{im_id:06}.png"));
-            // The coordinates are written last: where they are, all is.
+            // The coordinates are written last: if they exist, so do the other files.
             let there = coordinates.exists() && image_file.exists();
             let previewed = number % every == every / 2;
             let (mask, image) = if there && !previewed {
@@ -135,7 +135,7 @@ impl ViewSplit<'_> {
     }
 }
 
-/// A photograph cut to the object, as an image of the dataset.
+/// Adds a photograph, cropped to the object, to the dataset.
 fn add_photograph(
     size: usize,
     writer: &mut SceneWriter,

@@ -1,11 +1,11 @@
-//! The part of an image that an object fills.
+//! The part of an image that shows an object.
 
 use sixfold_geometry::{Camera, Pose, Vec2};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::Window;
 
-/// A square about the mesh at a pose, `room` times as wide as the longer side of its box in the image; `None` where a vertex
-/// lies behind the camera.
+/// A square around the mesh at a pose, `room` times as wide as the longer side of its bounding box in the image; `None` if a vertex
+/// is behind the camera.
 pub(crate) fn object_window(camera: &Camera, mesh: &Mesh, pose: &Pose, room: f64) -> Option<Window> {
     let mut low = Vec2::repeat(f64::INFINITY);
     let mut high = Vec2::repeat(f64::NEG_INFINITY);
@@ -14,6 +14,6 @@ pub(crate) fn object_window(camera: &Camera, mesh: &Mesh, pose: &Pose, room: f64
         low = low.inf(&p);
         high = high.sup(&p);
     }
-    // Far away, something of a few pixels still has a crop.
+    // A distant object of a few pixels still gets a crop.
     Some(Window { centre: (low + high) * 0.5, side: (high - low).amax().max(4.0) * room })
 }

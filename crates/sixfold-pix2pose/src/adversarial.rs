@@ -24,7 +24,7 @@ use sixfold_nn::training::{Batches, Losses, Plan, Training};
 /// Side of images and targets, pixels.
 const SIDE: usize = 128;
 
-/// How to train. The defaults are the dissertation's (section 3.4.1).
+/// Options of the training. The defaults are the dissertation's (section 3.4.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AdversarialOptions {
     /// Iterations (dissertation: 25,000).
@@ -33,17 +33,17 @@ pub struct AdversarialOptions {
     pub batch: usize,
     /// Learning rate of generator and discriminator, divided by ten every `decay_every` iterations.
     pub learning_rate: f64,
-    /// Iterations between divisions of the rate (dissertation: 12,000).
+    /// Iterations between reductions of the rate (dissertation: 12,000).
     pub decay_every: u64,
     /// Weight of the reconstruction, lambda_1.
     pub reconstruction: f32,
     /// Weight of the error prediction, lambda_2.
     pub error: f32,
-    /// Train a discriminator; without, the generator learns from its targets alone.
+    /// Train a discriminator; otherwise the generator learns from its targets only.
     pub adversarial: bool,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
-    /// Equation 3.1 with its beta on hidden pixels of the object too; otherwise on visible ones alone, as in the author's code.
+    /// Equation 3.1 with its beta on hidden pixels of the object too; otherwise on visible ones only, as in the author's code.
     pub whole_mask: bool,
     /// Seed of samples and labels.
     pub seed: u64,
@@ -91,11 +91,11 @@ impl AdversarialOptions {
     }
 }
 
-/// A generator that can be trained: it makes coordinates and error of `batch x 3 x 128 x 128` images.
+/// A trainable generator: computes coordinates and expected error of `batch x 3 x 128 x 128` images.
 pub trait Generator: Module {
     /// Coordinates and expected error.
     fn generate(&self, x: Tensor<4>) -> GeneratorOutput;
-    /// Pixel values in 0..1 as the network takes them.
+    /// Scales pixel values in 0..1 for the network.
     fn input(rgb: &[f32]) -> Vec<f32>;
 }
 
@@ -123,13 +123,14 @@ pub struct AdversarialTraining<G> {
     critic: Critic,
     pool: Vec<SymmetryMap>,
     options: AdversarialOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl<G: Generator> AdversarialTraining<G> {
-    /// Of a generator on the autodiff `device` for one object; `pool` holds the object's symmetries, the identity first.
+    /// Starts the training of a generator on the autodiff `device` for one object; `pool` has the object's symmetries, the identity
+    /// first.
     pub fn new(
         generator: G,
         mut pool: Vec<SymmetryMap>,
@@ -155,7 +156,7 @@ impl<G: Generator> AdversarialTraining<G> {
     }
 }
 
-/// The samples of an iteration, and which it is.
+/// The samples of an iteration, and its number.
 pub struct AdversarialBatch {
     samples: Vec<Sample>,
     step: u64,

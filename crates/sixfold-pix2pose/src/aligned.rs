@@ -1,9 +1,8 @@
-//! The whole way from a box to a pose: both passes and PnP, alignment of the outline, less what the model is known to be
-//! off by.
+//! From a box to a pose: both passes and PnP, alignment of the outline, and correction of the model's systematic error.
 //!
-//! A box says where the object is seen; how large it appears, parts behind other things included, only its pose says. A
-//! further look into the box of the aligned pose can be asked for. Where boxes are poor it helps (LM-O, boxes moved and scaled by
-//! up to 20 %: recall of ADD(-S) 0.48 against 0.44); in good ones it takes twice the time for no better poses.
+//! A box shows where the object is visible, but only its pose gives its full size, including occluded parts. Further iterations in
+//! the box of the aligned pose are optional. They help with inaccurate boxes (LM-O, boxes moved and scaled by up to 20 %: recall of
+//! ADD(-S) 0.48 against 0.44); with accurate ones they take twice the time without improving poses.
 
 use crate::estimate::{EstimateError, Found, Pix2PoseOptions, estimate};
 use crate::model::Pix2PoseModel;
@@ -16,16 +15,17 @@ use sixfold_geometry::{Camera, OptionError, Pose, Progress, Rect, RgbImage, Vec2
 use sixfold_mesh::{Mesh, ModelInfo};
 use std::collections::BTreeMap;
 
-/// How aligned poses are estimated.
+/// Options of the estimation with alignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AlignOptions {
     /// Both passes and PnP.
     pub estimate: Pix2PoseOptions,
     /// The alignment.
     pub refine: OutlineRefinementOptions,
-    /// Most looks: each but the first is into the box of the pose before, and none follows one that found the same box.
+    /// Maximum number of iterations: each after the first uses the box of the previous pose; they stop when the box does not
+    /// change.
     pub looks: usize,
-    /// Take out what the model's object is known to be off by.
+    /// Correct the model's systematic error for the object.
     pub correct: bool,
 }
 
@@ -41,7 +41,7 @@ impl Default for AlignOptions {
 }
 
 impl AlignOptions {
-    /// Checks every field, also those of both passes and of the alignment.
+    /// Checks every field, including those of both passes and of the alignment.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
@@ -57,16 +57,16 @@ impl AlignOptions {
 pub struct Aligned {
     /// The pose.
     pub camera_from_object: Pose,
-    /// Score of the last look, 0 to 1.
+    /// Score of the last iteration, 0 to 1.
     pub score: f64,
     /// Whether enough of the outline was found to align it.
     pub improved: bool,
-    /// What the last look found.
+    /// Result of the last iteration.
     pub found: Found,
 }
 
-/// Looks for one object in a box of a pinhole image and aligns it; `mesh` as [`sixfold_align::outline::outline_mesh`] makes it. `None`
-/// if its pixels are not in the box.
+/// Estimates the pose of one object in a box of a pinhole image and aligns it; `mesh` comes from
+/// [`sixfold_align::outline::outline_mesh`]. `None` if the object's pixels are not in the box.
 ///
 /// # Errors
 /// As [`estimate`].
@@ -108,14 +108,14 @@ pub fn estimate_aligned(
     Ok(Some(best))
 }
 
-/// Whether the box of a pose can be that of an object seen in `region`: it covers most of it, and is not many times larger.
+/// Whether the box of a pose can be that of an object visible in `region`: it covers most of it, and is not many times larger.
 fn alike(whole: &Rect, region: &Rect) -> bool {
     let common = whole.intersect(region).map_or(0.0, |r| r.width * r.height);
     common > 0.5 * region.width * region.height
         && whole.width.max(whole.height) < 4.0 * region.width.max(region.height)
 }
 
-/// Whether looking there would show the same.
+/// Whether two boxes are almost equal, so that another iteration would change nothing.
 fn same(a: &Rect, b: &Rect) -> bool {
     let near = |a: f64, b: f64| (a - b).abs() < 0.02 * b.abs().max(10.0);
     let apart = (a.x + 0.5 * a.width - b.x - 0.5 * b.width).abs()
@@ -123,20 +123,20 @@ fn same(a: &Rect, b: &Rect) -> bool {
     near(a.width, b.width) && near(a.height, b.height) && apart < 0.02 * b.width.max(b.height).max(10.0)
 }
 
-/// Fewer photographs say nothing of the shift, and fewer of an object nothing of its distance.
+/// Fewest photographs to measure the shift, and fewest of an object to measure the error of its distance.
 const MIN_PHOTOGRAPHS: usize = 5;
-/// Poses turned further from the truth than this are wrong, not off.
+/// Poses with a larger rotation error than this are wrong and not used, radians.
 const SAME_ROTATION: f64 = 0.26;
 /// Steps of a continuous symmetry, as a fraction of the diameter.
 const SYMMETRY_STEP: f64 = 0.1;
 
-/// What aligned poses are off by on posed images, object by object. The shift is one for all, for it lies in camera and
-/// annotations; distances are shrunk towards zero as far as their scatter does not tell them from it (empirical Bayes, James
-/// and Stein 1961). `objects` are meshes as [`sixfold_align::outline::outline_mesh`] makes them, with their symmetries.
-/// `progress` receives the images; `None` when it was stopped.
+/// Measures the systematic error of aligned poses on posed images, per object. The shift is common to all objects, because it comes
+/// from camera and annotations; errors of the distance are shrunk towards zero according to their scatter (empirical Bayes, James
+/// and Stein 1961). `objects` are meshes from [`sixfold_align::outline::outline_mesh`], with their symmetries. `progress` is called
+/// for every image; `None` if it stopped the run.
 ///
 /// # Errors
-/// As [`estimate`], for objects that the model does not know.
+/// As [`estimate`], for objects that are not in the model.
 pub(crate) fn measure_corrections(
     model: &Pix2PoseModel,
     photographs: &[PosedImage],
@@ -159,7 +159,7 @@ pub(crate) fn measure_corrections(
             continue;
         };
         let found = aligned.camera_from_object;
-        // Of the poses that look alike the nearest.
+        // The nearest of the symmetric poses.
         let away = |pose: &Pose| found.rotation().angle_to(&pose.rotation());
         let alike = info.symmetry_poses(SYMMETRY_STEP).into_iter();
         let truth = alike.map(|symmetry| *photograph.camera_from_object() * symmetry);
@@ -176,7 +176,7 @@ pub(crate) fn measure_corrections(
     Ok(Some(corrections(&shifts, depths)))
 }
 
-/// What is known from the `shifts` of all photographs (pixels) and the relative errors of every object's distance.
+/// Corrections from the `shifts` of all photographs (pixels) and the relative errors of every object's distance.
 fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32, Correction> {
     let shift = if shifts.len() < MIN_PHOTOGRAPHS {
         [0.0; 2]
@@ -209,7 +209,7 @@ fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32
     ids.into_iter().map(|id| (id, correction(id))).collect()
 }
 
-/// The middle value, 0 of none.
+/// The median, 0 if there are no values.
 fn median(values: &mut [f64]) -> f64 {
     upper_median(values).unwrap_or(0.0)
 }
@@ -230,13 +230,13 @@ mod tests {
             (3, vec![0.5; MIN_PHOTOGRAPHS - 1]),
         ]);
         let found = corrections(&shifts, known.clone());
-        // The outlier is outvoted, and the shift is the same for all.
+        // The outlier has no influence, and the shift is the same for all.
         assert!(found.values().all(|c| c.shift == [1.1, -1.1]), "{found:?}");
-        // A sure error is taken out whole, an unsure one in part, one seen on too few photographs not at all.
+        // A certain error is corrected completely, an uncertain one in part, one measured on too few photographs not at all.
         assert!((0.0199..0.02).contains(&found[&1].depth), "{found:?}");
         assert!((0.001..0.015).contains(&found[&2].depth), "{found:?}");
         assert_eq!(found[&3].depth, 0.0);
-        // Too few photographs say nothing of the shift either.
+        // With too few photographs the shift is not corrected either.
         let few = corrections(&shifts[..MIN_PHOTOGRAPHS - 1], known);
         assert!(few.values().all(|c| c.shift == [0.0; 2]), "{few:?}");
         assert_eq!(few[&1].depth, found[&1].depth);

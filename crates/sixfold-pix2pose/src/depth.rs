@@ -1,5 +1,5 @@
-//! Poses from colour brought to a depth image, where there is one: [`sixfold_align::align_to_depth`] on the pixels that the
-//! network takes for the object's.
+//! Aligns poses from colour with a depth image, if there is one: [`sixfold_align::align_to_depth`] on the pixels that the network
+//! predicts for the object.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use sixfold_mesh::Mesh;
 /// A visible pixel has at least this probability.
 const VISIBLE: f32 = 0.5;
 
-/// Prepares a pinhole depth image (metres, 0 where nothing was measured) for [`align`]: normals alone, no plane.
+/// Prepares a pinhole depth image (metres, 0 where nothing was measured) for [`align`]: normals only, no plane.
 ///
 /// # Errors
 /// [`PreparedDepthError`].
@@ -21,14 +21,14 @@ pub fn prepare(depth: &DepthImage, camera: &Camera) -> Result<Arc<PreparedDepth>
     PreparedDepth::new(depth, camera, &options)
 }
 
-/// Aligns a pose of the object that `found` saw; `diameter` in metres. `mask`, of the image's size, holds the pixels
-/// that may be the object's; without one the network's word is taken.
+/// Aligns a pose of the object in `found`; `diameter` in metres. `mask`, of the image's size, marks the pixels that may belong to
+/// the object; without one the network's prediction is used.
 ///
 /// # Panics
-/// If the mask is of another size.
+/// If the mask has another size.
 ///
 /// # Errors
-/// [`IcpError`] where too little depth is measured on the object or its surface can slide.
+/// [`IcpError`] if too little depth is measured on the object, or its surface does not constrain the pose.
 pub fn align(
     image: &PreparedDepth,
     mesh: &Mesh,
@@ -42,7 +42,7 @@ pub fn align(
     align_to_depth(image, mesh, diameter, start, &visible)
 }
 
-/// Whether the network saw the object at a pixel of the image.
+/// Whether the network predicts the object at a pixel of the image.
 fn visible(found: &Found, x: usize, y: usize) -> bool {
     let (window, prediction) = (&found.view.window, &found.view.prediction);
     let at = |value: usize, start: f64, size: f64| (value as f64 - start) / size * prediction.side as f64;
@@ -122,7 +122,7 @@ mod tests {
         let corner = DepthImage::from_fn(320, 240, |x, y| if x < 4 && y < 4 { 0.7 } else { 0.0 });
         let empty = prepare(&corner, &camera).unwrap();
         assert!(align(&empty, &mesh, mesh.diameter(), &start, &found, None).is_err());
-        // Something stands before most of the object, which the network did not notice and a mask knows of.
+        // An occluder in front of most of the object, which the network did not detect but the mask excludes.
         let mut half = render_depth(&mesh, &truth, &camera);
         let at = |i: usize| (i % 320, i / 320);
         let covered = half.as_slice().iter().enumerate().filter(|(_, z)| **z > 0.0);

@@ -1,8 +1,8 @@
 //! Poses from an image and boxes: two passes of the network, PnP with RANSAC, a score (section 3.3).
 //!
-//! The first pass sees the box with its surroundings, finds the object's pixels and centres the crop on them. The second
-//! sees the crop without background, once for every outlier threshold, all in one batch. The candidate with most inliers
-//! wins; the others stay as hypotheses. [`Pix2PoseOptions::published`] is the dissertation's form.
+//! The input of the first pass is the box with its surroundings; it finds the object's pixels, on which the crop is then centred.
+//! The input of the second is the crop without background, once for every outlier threshold, all in one batch. The candidate with
+//! the most inliers is chosen; the others are kept as hypotheses. [`Pix2PoseOptions::published`] is the dissertation's form.
 
 use crate::model::{ModelError, Pix2PoseModel, Prediction};
 use crate::object::ObjectEntry;
@@ -13,25 +13,25 @@ use sixfold_geometry::{
 };
 use sixfold_synth::augment::{Patch, Window};
 
-/// How poses are estimated. Deviations that the author's code makes from its text can be switched on for comparison.
+/// Options of the pose estimation. Deviations of the author's code from the dissertation can be enabled for comparisons.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pix2PoseOptions {
-    /// Outlier thresholds on the expected error; empty for those of the model's object.
+    /// Outlier thresholds on the expected error; if empty, those of the model's object are used.
     pub thresholds: Vec<f32>,
-    /// Two passes; otherwise poses come from the first.
+    /// Whether there are two passes; otherwise poses come from the first.
     pub two_stages: bool,
-    /// Side of the crop over the longer side of the box.
+    /// Ratio of the crop's side to the longer side of the box.
     pub crop_factor: f64,
     /// Expected error below which a pixel of the second pass is a correspondence, the dissertation's theta_i; `None`: the
     /// outlier threshold of the pass, at least 0.3.
     pub inlier_threshold: Option<f32>,
-    /// Reprojection error below which PnP takes a correspondence for an inlier, the dissertation's theta_re.
+    /// Reprojection error below which a correspondence is an inlier of PnP, the dissertation's theta_re.
     pub reprojection: Reprojection,
-    /// What turns a sample of correspondences into poses.
+    /// The minimal solver of PnP.
     pub solver: PnpSolver,
     /// What the second crop is centred on.
     pub recentring: Recentring,
-    /// Whether the second crop with its background is a candidate beside those without.
+    /// Whether the second crop with its background is a candidate in addition to those without.
     pub open_candidate: bool,
     /// Seed of RANSAC.
     pub seed: u64,
@@ -70,7 +70,7 @@ pub enum Reprojection {
 pub enum Recentring {
     /// The box of the object's pixels, uncertain ones included; the crop shrinks with it.
     Box,
-    /// The centroid of the mask of the pass' own outlier threshold; the crop keeps its size.
+    /// The centroid of the mask for each outlier threshold; the crop keeps its size.
     Centroid,
 }
 
@@ -109,14 +109,14 @@ impl Pix2PoseOptions {
     }
 }
 
-/// What the author's code does differently from the dissertation, to measure what each costs.
+/// What the author's code does differently from the dissertation, to measure the effect of each.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Quirks {
     /// The second crop's shift is measured in network pixels and added to image pixels.
     pub unscaled_recentring: bool,
-    /// Coordinates pass through 8 bits.
+    /// Coordinates are quantised to 8 bits.
     pub eight_bits: bool,
-    /// The candidate with the least (projected centre - mask centroid)^2 / inliers wins instead of the one with most
+    /// The candidate with the smallest (projected centre - mask centroid)^2 / inliers is chosen, instead of the one with the most
     /// inliers.
     pub centre_choice: bool,
     /// EPnP with 5 px, 100 iterations and no final refinement.
@@ -124,22 +124,22 @@ pub struct Quirks {
 }
 
 impl Quirks {
-    /// All of them.
+    /// All deviations.
     pub fn all() -> Self {
         Self { unscaled_recentring: true, eight_bits: true, centre_choice: true, plain_pnp: true }
     }
 }
 
-/// Why no estimate could be tried. Finding nothing is no error.
+/// Why the estimation could not run. Finding no object is not an error.
 #[derive(Debug, thiserror::Error)]
 pub enum EstimateError {
-    /// The model does not know the object.
+    /// The model was not trained on the object.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A box without area or numbers.
+    /// A box without area, or with numbers that are not finite.
     #[error("box: found x {x}, y {y}, width {width}, height {height}; expected finite numbers and at least 2 pixels a side", x = .0.x, y = .0.y, width = .0.width, height = .0.height)]
     Box(Rect),
-    /// The box shows nothing of the image.
+    /// The box is outside the image.
     #[error("box: {box_:?} lies outside the {width}x{height} image")]
     Outside {
         /// The box.
@@ -161,35 +161,35 @@ pub enum EstimateError {
         /// The camera's height.
         camera_height: usize,
     },
-    /// The image is distorted.
+    /// The image has lens distortion.
     #[error("the camera has lens distortion: undistort image and camera first")]
     Distorted,
 }
 
-/// A pose with what speaks for it.
+/// A pose with its inliers and score.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ThresholdHypothesis {
     /// The pose, metres.
     pub camera_from_object: Pose,
     /// The outlier threshold of its second pass.
     pub threshold: f32,
-    /// Correspondences that fit the pose.
+    /// Number of correspondences that agree with the pose.
     pub inliers: usize,
-    /// Inliers over the object's pixels of the first pass, 0 to 1: the score of the dissertation.
+    /// Ratio of inliers to the object's pixels of the first pass, 0 to 1: the dissertation's score.
     pub score: f64,
 }
 
-/// What was found in one box.
+/// The result for one box.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
     /// Best first, never empty.
     pub hypotheses: Vec<ThresholdHypothesis>,
-    /// What the network saw and said last, for the best hypothesis.
+    /// Input and output of the last pass, for the best hypothesis.
     pub view: View,
-    /// The same with the background left in: where the object's border is, a crop without background cannot tell. Without
-    /// [`Pix2PoseOptions::open_candidate`] that of the last outlier threshold.
+    /// The same with the background: a crop without background does not show the object's border. Without
+    /// [`Pix2PoseOptions::open_candidate`] it is that of the last outlier threshold.
     pub open_view: View,
-    /// The first pass: the box as it was given.
+    /// Input and output of the first pass: the box as given.
     pub first_view: View,
     /// Object and image points of the best hypothesis' correspondences, metres and pixels.
     pub object_points: Vec<Vec3>,
@@ -208,16 +208,16 @@ pub struct View {
     pub prediction: Prediction,
 }
 
-/// Least pixels of an object after the first pass.
+/// Fewest pixels of an object after the first pass.
 const MIN_PIXELS: usize = 10;
 /// A visible pixel has at least this probability.
 const VISIBLE: f32 = 0.5;
 
-/// Looks for one object in a box of a pinhole image; `None` if its pixels are not in it.
+/// Estimates the pose of one object in a box of a pinhole image; `None` if its pixels are not in it.
 ///
 /// # Errors
-/// [`EstimateError`] for an object the model does not know, a box without area or outside the image, and an image that
-/// does not fit its camera.
+/// [`EstimateError`] for an object that is not in the model, a box without area or outside the image, and an image of another size
+/// than its camera's.
 pub fn estimate(
     model: &Pix2PoseModel,
     image: &RgbImage,
@@ -245,7 +245,7 @@ pub fn estimate(
     }
     let first_view = view(&crop, &first);
     let cut = |window: Window| Crop::cut(image, camera, window, model.sizes().input);
-    // The crop follows the object's pixels; it does not grow.
+    // The crop follows the object's pixels; it is not enlarged.
     let scaled = cut(recentred(&window, &mask, first.side, options));
     let mut candidates: Vec<(f32, Crop)> = Vec::new();
     for &threshold in thresholds {
@@ -300,12 +300,12 @@ fn check(image: &RgbImage, camera: &Camera, region: &Rect) -> Result<(), Estimat
     Ok(())
 }
 
-/// Where the first pass sees the object, less certain pixels left out.
+/// The object's pixels in the first pass, without uncertain ones.
 fn object_mask(prediction: &Prediction, threshold: f32) -> Vec<bool> {
     prediction.visible.iter().zip(&prediction.error).map(|(v, e)| *v > VISIBLE && *e < threshold).collect()
 }
 
-/// The mask with its direct neighbours: thresholds take the least certain pixels away, and those lie on the border.
+/// The mask dilated by its direct neighbours: thresholds remove the least certain pixels, which are at the border.
 fn grown(mask: &[bool], side: usize) -> Vec<bool> {
     (0..mask.len())
         .map(|i| {
@@ -319,7 +319,7 @@ fn grown(mask: &[bool], side: usize) -> Vec<bool> {
         .collect()
 }
 
-/// A crop and its prediction as the caller sees them.
+/// A crop and its prediction for the caller.
 fn view(crop: &Crop, prediction: &Prediction) -> View {
     let side = crop.window.side;
     let corner = crop.window.centre - Vec2::repeat(0.5 * side);
@@ -327,7 +327,7 @@ fn view(crop: &Crop, prediction: &Prediction) -> View {
     View { window, input: crop.picture(), prediction: prediction.clone() }
 }
 
-/// The window about the object's pixels: their box and the crop factor, no larger than before.
+/// The window around the object's pixels: their bounding box times the crop factor, not larger than before.
 fn recentred(window: &Window, mask: &[bool], side: usize, options: &Pix2PoseOptions) -> Window {
     let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
     for index in (0..mask.len()).filter(|i| mask[*i]) {
@@ -345,7 +345,7 @@ fn recentred(window: &Window, mask: &[bool], side: usize, options: &Pix2PoseOpti
     Window { centre: window.centre + shift * step, side: new_side }
 }
 
-/// The window moved to the centroid of the object's pixels (section 3.3.1); its size stays.
+/// The window moved to the centroid of the object's pixels (section 3.3.1); its size is unchanged.
 fn on_centroid(window: &Window, mask: &[bool], side: usize) -> Window {
     let (mut sum, mut count) = (Vec2::zeros(), 0usize);
     for index in (0..mask.len()).filter(|i| mask[*i]) {
@@ -356,7 +356,7 @@ fn on_centroid(window: &Window, mask: &[bool], side: usize) -> Window {
     Window { centre: window.centre + shift * (window.side / side as f64), side: window.side }
 }
 
-/// A square crop at the network's size.
+/// A square crop with the network's input size.
 #[derive(Debug, Clone)]
 struct Crop {
     window: Window,
@@ -370,7 +370,7 @@ impl Crop {
         Self { window, side, pixels: patch.data }
     }
 
-    /// The crop with everything grey that a mask (`side x side` over the square `of`) leaves out.
+    /// The crop with all pixels outside a mask (`side x side` over the square `of`) grey.
     fn without_background(&self, of: &Window, mask: &[bool], side: usize) -> Self {
         let mut pixels = self.pixels.clone();
         let corner = |window: &Window| window.centre - Vec2::repeat(0.5 * window.side);
@@ -379,7 +379,7 @@ impl Crop {
             let image =
                 here + Vec2::new(x as f64 + 0.5, y as f64 + 0.5) * (self.window.side / self.side as f64);
             let at = (image - there) * (side as f64 / of.side);
-            // Bilinear between the mask's pixels, as far as half.
+            // Bilinear between the mask's pixels, with a threshold slightly below one half.
             let at = at - Vec2::repeat(0.5);
             let (x, y) = (at.x.floor(), at.y.floor());
             let (fx, fy) = (at.x - x, at.y - y);
@@ -418,11 +418,11 @@ struct Context<'a> {
     camera: &'a Camera,
     object: &'a ObjectEntry,
     options: &'a Pix2PoseOptions,
-    /// Pixels of the object in the first pass.
+    /// Number of the object's pixels in the first pass.
     visible: usize,
 }
 
-/// A hypothesis with its correspondences and how far its centre lies from the mask's, image pixels.
+/// A hypothesis with its correspondences and the distance of its centre from the mask's, image pixels.
 struct Candidate {
     hypothesis: ThresholdHypothesis,
     object_points: Vec<Vec3>,
@@ -432,7 +432,7 @@ struct Candidate {
 
 impl Context<'_> {
     fn best(&self, views: Vec<(f32, Crop, Prediction)>, first_view: View, open_view: View) -> Option<Found> {
-        // In the order of the views, however many threads there are.
+        // In the order of the views, independent of the number of threads.
         let candidates: Vec<Option<Candidate>> = views
             .par_iter()
             .map(|(threshold, crop, prediction)| self.pose(*threshold, crop, prediction))

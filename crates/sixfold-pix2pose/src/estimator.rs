@@ -28,11 +28,11 @@ pub struct Pix2PoseEstimator {
     pub model: Pix2PoseModel,
     /// Both passes, PnP and the alignment of the outline.
     pub options: AlignOptions,
-    /// Align the rendered outline with the image where there is a mesh.
+    /// Align the rendered outline with the image if there is a mesh.
     pub refine: bool,
     /// Align poses with the depth image.
     pub icp: bool,
-    /// Which of the model's objects is meant where the object itself does not say; `None` is its only one.
+    /// Id of the model's object, for objects that do not give one; `None`: its only object.
     pub object_id: Option<u32>,
 }
 
@@ -67,10 +67,10 @@ impl Pix2PoseEstimator {
         Pix2PoseEstimator { options, refine: false, ..self }
     }
 
-    /// What the model knows of an object; without an id, of its only one.
+    /// The model's entry of an object; without an id, of its only one.
     ///
     /// # Errors
-    /// [`EstimatorError::Method`] for an object that it does not know, or several and no id.
+    /// [`EstimatorError::Method`] for an object that is not in the model, or if it has several and no id is given.
     pub fn entry(&self, id: Option<u32>) -> Result<&ObjectEntry, EstimatorError> {
         match (id, self.model.objects()) {
             (Some(id), _) => Ok(self.model.object(id).map_err(EstimatorError::method)?.1),
@@ -84,10 +84,10 @@ impl Pix2PoseEstimator {
         }
     }
 
-    /// An object as the model knows it, with its mesh where it has one.
+    /// An object prepared for the model, with its mesh if it has one.
     ///
     /// # Errors
-    /// [`EstimatorError`] where the model does not know it, or its mesh is another's.
+    /// [`EstimatorError`] if it is not in the model, or its mesh is that of another object.
     pub fn object(&self, object: &Object) -> Result<Pix2PoseObject, EstimatorError> {
         let entry = self.entry(object.id.or(self.object_id))?;
         let mut notes = vec![];
@@ -112,7 +112,7 @@ impl Pix2PoseEstimator {
         })
     }
 
-    /// The best pose of an object in a box of a pinhole image, before ICP; `None` if it is not seen there. Without a mesh the
+    /// The best pose of an object in a box of a pinhole image, before ICP; `None` if it is not visible there. Without a mesh the
     /// outline is not aligned.
     ///
     /// # Errors
@@ -150,21 +150,21 @@ impl Pix2PoseEstimator {
 pub struct Pix2PosePose {
     /// The pose.
     pub camera_from_object: Pose,
-    /// Correspondences that fit over the object's pixels, 0 to 1.
+    /// Ratio of inlier correspondences to the object's pixels, 0 to 1.
     pub score: f64,
     /// Whether the outline was aligned with the image.
     pub refined: bool,
-    /// What both passes found.
+    /// The result of both passes.
     pub found: Found,
 }
 
-/// An object as a trained network knows it.
+/// An object prepared for a trained network.
 pub struct Pix2PoseObject {
     name: String,
     id: u32,
     diameter: f64,
     mesh: Option<Arc<Mesh>>,
-    /// The box of the model's coordinates, for overlays without a mesh.
+    /// The bounding box of the model's coordinates, for overlays without a mesh.
     solid: Option<Mesh>,
     outline: OnceLock<Mesh>,
     notes: Vec<String>,
@@ -219,7 +219,7 @@ impl PoseEstimator for Pix2PoseEstimator {
         let posed = match self.pose_in_box(image, query.camera, object, &region.bbox) {
             Ok(Some(posed)) => posed,
             Ok(None) => return Ok(vec![]),
-            // Only the box is to blame.
+            // Only the box is invalid.
             Err(error @ (EstimateError::Box(_) | EstimateError::Outside { .. })) => {
                 return Err(EstimatorError::Region { source: Box::new(error) });
             }
@@ -259,8 +259,8 @@ impl PoseEstimator for Pix2PoseEstimator {
     }
 }
 
-/// What is said of an estimate besides: whether the outline was aligned, ICP, the square of the image that the last pass saw (x, y,
-/// side), and all hypotheses as PnP left them, best first.
+/// Details of an estimate: whether the outline was aligned, ICP, the square of the image in the last pass (x, y, side), and all
+/// hypotheses from PnP, best first.
 fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
     let rows = |pose: &Pose| -> [[f64; 4]; 4] {
         let m = pose.to_matrix();
@@ -272,7 +272,7 @@ fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
             "camera_from_object": rows(&h.camera_from_object),
             "confidence": h.score,
             "inliers": h.inliers,
-            // As a decimal: 0.15, not the single-precision number next to it.
+            // Rounded to a decimal: 0.15, not the single-precision number closest to it.
             "threshold": (f64::from(h.threshold) * 1e6).round() / 1e6,
         })
     };
@@ -286,7 +286,7 @@ fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
     ])
 }
 
-/// The box of the model's coordinates.
+/// The bounding box of the model's coordinates.
 fn box_of(entry: &ObjectEntry) -> Option<Mesh> {
     let scale = entry.scale();
     let corner =
@@ -298,13 +298,13 @@ fn box_of(entry: &ObjectEntry) -> Option<Mesh> {
 
 /// Side of each of the four tiles of [`view_image`], pixels.
 const TILE: usize = 256;
-/// Pixels between tiles.
+/// Gap between tiles, pixels.
 const GAP: usize = 4;
-/// From this probability on a pixel counts as visible.
+/// Smallest probability of a visible pixel.
 const VISIBLE: f32 = 0.5;
 
-/// What the network saw and returned: input, coordinates (black where the object is not seen), expected error and visibility
-/// (black 0, white 1), side by side.
+/// Input and output of the network side by side: input, coordinates (black where the object is not visible), expected error and
+/// visibility (black 0, white 1).
 pub(crate) fn view_image(view: &View) -> RgbImage {
     let (input, p) = (&view.input, &view.prediction);
     Image::from_fn(4 * TILE + 3 * GAP, TILE, |x, y| {

@@ -1,20 +1,20 @@
 //! Losses on the networks' outputs, with their gradients (equations 3.1 to 3.3).
 //!
-//! They are computed in one pass over the pixels. A training step hands the gradient on to the network as the sum of
-//! output times gradient, whose derivative it is.
+//! They are computed in one pass over the pixels. A training step passes the gradient to the network through the sum of output
+//! times gradient, whose derivative it is.
 
 use crate::object::SymmetryMap;
 use rayon::prelude::*;
 use sixfold_geometry::stats::sigmoid;
 
-/// What a network's channels mean, and how its pixels are weighed.
+/// The meaning of a network's channels, and the weights of its pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum OutputKind {
-    /// The dissertation's: three coordinates in -1..1 and the error in 0..1, after their activations. Background pixels
+    /// The dissertation's network: three coordinates in -1..1 and the error in 0..1, after their activations. Background pixels
     /// have the target 0 and count; sums are divided by all pixels.
     Paper,
-    /// Three linear coordinates, the error and the visibility through sigmoids. Coordinates count on the object only;
-    /// sums are divided by the sum of the weights.
+    /// Three linear coordinates, the error and the visibility through sigmoids. Coordinates count only on the object; sums are
+    /// divided by the sum of the weights.
     Compact,
 }
 
@@ -33,7 +33,8 @@ impl OutputKind {
 pub(crate) struct LossOptions {
     /// Weight of object pixels, beta of equation 3.1.
     pub beta: f32,
-    /// Whether hidden pixels of the object weigh beta too, as in equation 3.1; otherwise visible ones alone, as in the author's code.
+    /// Whether hidden pixels of the object have the weight beta too, as in equation 3.1; otherwise only visible ones, as in the
+    /// author's code.
     pub whole_mask: bool,
     /// Weight of the error prediction relative to the reconstruction, `lambda_2 / lambda_1` of equation 3.5.
     pub error: f32,
@@ -42,7 +43,7 @@ pub(crate) struct LossOptions {
 }
 
 impl LossOptions {
-    /// The dissertation's weights; for the compact network a larger one for the error, which counts on the object only.
+    /// The dissertation's weights; for the compact network a larger one for the error, which counts only on the object.
     pub(crate) fn of(kind: OutputKind) -> Self {
         match kind {
             OutputKind::Paper => Self { beta: 3.0, whole_mask: false, error: 0.5, visibility: 0.0 },
@@ -56,7 +57,7 @@ impl LossOptions {
 pub(crate) struct Targets<'a> {
     /// `batch x 3 x side x side`, normalised coordinates of the whole object.
     pub coordinates: &'a [f32],
-    /// `batch x side x side`, 1 where the object is, hidden parts included.
+    /// `batch x side x side`, 1 where the object is, including hidden parts.
     pub object: &'a [f32],
     /// `batch x side x side`, 1 where it is visible.
     pub visible: &'a [f32],
@@ -71,15 +72,15 @@ pub(crate) struct LossValue {
     pub error: f64,
     /// Visibility (before its weight).
     pub visibility: f64,
-    /// In the shape of the output, multiplied by the scale that was asked for.
+    /// Gradient in the shape of the output, multiplied by the requested scale.
     pub gradient: Vec<f32>,
 }
 
-/// Loss and gradient of one object's images. `raw`, the network's output, is `batch x channels x pixels`; the gradient belongs to
-/// `scale *` the sum over the images (equation 3.2: of each image the least loss over the pool of symmetries).
+/// Loss and gradient of one object's images. `raw`, the network's output, is `batch x channels x pixels`; the gradient is that of
+/// `scale *` the sum over the images (equation 3.2: for each image the minimum of the loss over the pool of symmetries).
 ///
 /// # Panics
-/// If the lengths do not fit each other or the pool is empty.
+/// If the lengths are inconsistent or the pool is empty.
 pub(crate) fn loss(
     raw: &[f32],
     targets: &Targets<'_>,
@@ -264,8 +265,8 @@ mod tests {
             let case = case(kind, 12, 7);
             let pool = [IDENTITY, HALF_TURN];
             let (_, gradient) = total(&case, &case.raw, kind, &pool);
-            // The error's target moves with the coordinates, but no gradient is to flow through it: leave that term out
-            // of coordinate channels by comparing only the error and visibility channels there.
+            // The error's target depends on the coordinates, but no gradient flows through it: that term is excluded from the
+            // coordinate channels by comparing only the error and visibility channels there.
             for index in 0..case.raw.len() {
                 let step = 1e-3;
                 let shifted = |by: f32| {
@@ -312,7 +313,8 @@ mod tests {
 
     #[test]
     fn hidden_pixels_weigh_beta_in_equation_3_1() {
-        // Four pixels: visible, hidden, hidden, background; each with an error of its own, of which the hidden weigh 3 times.
+        // Four pixels: visible, hidden, hidden, background; each with a different error, of which the hidden ones have the weight
+        // 3.
         let errors = [0.1, 0.2, 0.4, 0.8f32];
         let raw: Vec<f32> = (0..16).map(|i| if i < 12 { errors[i % 4] } else { 0.0 }).collect();
         let object = [1.0, 1.0, 1.0, 0.0];

@@ -1,4 +1,4 @@
-//! A trained model: the network with the objects it knows, as one file.
+//! A trained model: the network and the entries of its objects in one file.
 
 use crate::loss::OutputKind;
 use crate::networks::{Compact, CompactConfig};
@@ -21,14 +21,14 @@ pub const PAPER: &str = "pix2pose-paper";
 /// Name of the generator with a ResNet-50 encoder in weight files.
 pub(crate) const RESNET50: &str = "pix2pose-resnet50";
 
-/// A network of one of the three kinds. Those of the dissertation know one object.
+/// A network of one of the three kinds. Those of the dissertation are for one object.
 #[derive(Debug, Clone)]
 pub enum Network {
-    /// Shared encoder, one decoder an object.
+    /// Shared encoder, one decoder per object.
     Compact(Box<Compact>),
     /// The dissertation's generator.
     Paper(Box<PaperGenerator>),
-    /// The one with a ResNet-50 encoder.
+    /// The dissertation's generator with a ResNet-50 encoder.
     ResNet50(Box<ResNet50Generator>),
 }
 
@@ -74,16 +74,17 @@ pub enum ModelError {
         "the model knows the objects {known}, not object {id}; train it (`sixfold train pix2pose`) or give other weights"
     )]
     UnknownObject {
-        /// The object that was asked for.
+        /// The requested object.
         id: u32,
-        /// Those it knows.
+        /// The objects of the model.
         known: String,
     },
 }
 
-/// Objects of a compact network, most.
+/// Maximum number of objects of a compact network.
 const MOST_OBJECTS: usize = 1000;
-/// Bytes of a decoder in a file, at least: 291,000 numbers of two bytes or more. A file cannot name more objects than it holds.
+/// Minimum size of a decoder in a file, bytes: 291,000 numbers of two bytes or more. A file cannot name more objects than it has
+/// decoders.
 const DECODER_BYTES: u64 = 500_000;
 
 /// Sizes of a network's images, part of the card.
@@ -101,7 +102,7 @@ impl Default for ImageSizes {
     }
 }
 
-/// A network and what it was trained on.
+/// A network and the objects it was trained on.
 #[derive(Debug, Clone)]
 pub struct Pix2PoseModel {
     network: Network,
@@ -111,7 +112,7 @@ pub struct Pix2PoseModel {
     device: Device,
 }
 
-/// What the network predicts for one crop, `side x side` pixels each.
+/// Prediction of the network for one crop, `side x side` pixels each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prediction {
     /// Pixels along a side.
@@ -120,12 +121,12 @@ pub struct Prediction {
     pub coordinates: Vec<[f32; 3]>,
     /// Expected error of the coordinates, 0 to 1 in normalised units.
     pub error: Vec<f32>,
-    /// Probability that the object is visible there.
+    /// Probability that the object is visible at the pixel.
     pub visible: Vec<f32>,
 }
 
 impl Pix2PoseModel {
-    /// A model of a trained network. `card` gets architecture, objects and sizes filled in.
+    /// A model of a trained network. Its architecture, objects and sizes are written into `card`.
     pub fn new(network: Network, objects: Vec<ObjectEntry>, sizes: ImageSizes, card: ModelCard) -> Self {
         let objects_json = objects.iter().map(|o| serde_json::to_value(o).unwrap_or_default()).collect();
         let mut extra = card.extra.clone();
@@ -142,7 +143,7 @@ impl Pix2PoseModel {
         Self { network: network.for_inference(), objects, sizes, card, device: Device::flex() }
     }
 
-    /// The same with another card; what it says of objects and sizes has to be this model's.
+    /// The same with another card; its objects and sizes must be those of this model.
     pub(crate) fn with_card(self, card: ModelCard) -> Self {
         Self { card, ..self }
     }
@@ -172,7 +173,7 @@ impl Pix2PoseModel {
         Ok(Self { network, objects, sizes, card, device })
     }
 
-    /// The network of a weight file, to be trained further on `device` for the objects `ids` in this order.
+    /// The network of a weight file, for further training on `device` with the objects `ids` in this order.
     pub fn network_for_training(path: &Path, ids: &[u32], device: &Device) -> Result<Compact, ModelError> {
         let model = Self::load(path)?;
         let places = ids.iter().map(|id| Ok(model.object(*id)?.0)).collect::<Result<Vec<_>, ModelError>>()?;
@@ -182,7 +183,7 @@ impl Pix2PoseModel {
         Ok(Compact { decoders, ..network })
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
         match &self.network {
             Network::Compact(network) => save_weights(network.as_ref(), &self.card, path)?,
@@ -197,7 +198,7 @@ impl Pix2PoseModel {
         &self.objects
     }
 
-    /// Place and entry of an object.
+    /// Index and entry of an object.
     pub fn object(&self, id: u32) -> Result<(usize, &ObjectEntry), ModelError> {
         self.objects.iter().enumerate().find(|(_, o)| o.id == id).ok_or_else(|| ModelError::UnknownObject {
             id,
@@ -205,7 +206,7 @@ impl Pix2PoseModel {
         })
     }
 
-    /// Sets what aligned poses of its objects are off by; other objects stay as they are.
+    /// Sets the systematic errors of aligned poses of its objects; other objects are unchanged.
     pub(crate) fn set_corrections(&mut self, corrections: &BTreeMap<u32, Correction>) {
         for object in &mut self.objects {
             if let Some(correction) = corrections.get(&object.id) {
@@ -244,7 +245,7 @@ impl Pix2PoseModel {
     /// Runs the network on crops of one object: `count` images of `3 x side x side` values in 0..1, one after another.
     ///
     /// # Panics
-    /// If the length does not fit or there is no such object.
+    /// If the length is wrong or there is no such object.
     pub fn predict(&self, object_index: usize, crops: &[f32]) -> Vec<Prediction> {
         let side = self.sizes.input;
         let count = crops.len() / (3 * side * side);
@@ -280,8 +281,8 @@ impl Pix2PoseModel {
             .collect()
     }
 
-    /// The dissertation's networks have no channel of visibility: a pixel is the object's where its coordinates are
-    /// longer than 0.3, and the surer the smaller its expected error.
+    /// The dissertation's networks have no channel of visibility: a pixel belongs to the object if the norm of its coordinates
+    /// exceeds 0.3, and its probability is higher for a smaller expected error.
     fn paper_predictions(&self, output: GeneratorOutput) -> Vec<Prediction> {
         let side = self.sizes.output;
         let pixels = side * side;
@@ -303,7 +304,7 @@ impl Pix2PoseModel {
     }
 }
 
-/// What a card says of objects and sizes, checked before a network of that size is made.
+/// Objects and sizes of a card, checked before a network of that size is created.
 fn described(path: &Path, card: &ModelCard) -> Result<(Vec<ObjectEntry>, ImageSizes), ModelError> {
     let file = || path.to_path_buf();
     let wrong = |field, expected, found: String| ModelError::Card { file: file(), field, expected, found };
@@ -361,12 +362,12 @@ fn numbers(output: Tensor<4>) -> Vec<f32> {
     output.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
 
-/// Values in 0..1 as the dissertation's generator takes them: `(255 v - 128) / 128`.
+/// Scales values in 0..1 for the dissertation's generator: `(255 v - 128) / 128`.
 pub fn paper_input(rgb: &[f32]) -> Vec<f32> {
     rgb.iter().map(|v| (v * 255.0 - 128.0) / 128.0).collect()
 }
 
-/// Images of `3 x side x side` values in 0..1 as torchvision's ResNet-50 takes them.
+/// Scales images of `3 x side x side` values in 0..1 for torchvision's ResNet-50.
 pub(crate) fn resnet_input(rgb: &[f32]) -> Vec<f32> {
     const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
     const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
@@ -374,7 +375,7 @@ pub(crate) fn resnet_input(rgb: &[f32]) -> Vec<f32> {
     rgb.iter().enumerate().map(|(i, v)| (v - MEAN[i / plane % 3]) / DEVIATION[i / plane % 3]).collect()
 }
 
-/// Values in 0..1 as EfficientNet-Lite0 takes them: `(255 v - 127) / 128`.
+/// Scales values in 0..1 for EfficientNet-Lite0: `(255 v - 127) / 128`.
 pub(crate) fn network_input(rgb: &[f32]) -> Vec<f32> {
     rgb.iter().map(|v| (v * 255.0 - 127.0) / 128.0).collect()
 }

@@ -1,11 +1,11 @@
-//! What a network has to know of an object: how its coordinates are normalised and under which rotations it looks the same.
+//! Data of an object for a network: the normalisation of its coordinates and its symmetries.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Camera, KdTree, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::BoundingBoxScale;
 
-/// One object of a model, as it stands in the weight file.
+/// One object of a model, as stored in the weight file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObjectEntry {
     /// Id in the dataset.
@@ -14,22 +14,22 @@ pub struct ObjectEntry {
     pub diameter: f64,
     /// Centre of the coordinates, metres.
     pub centre: [f64; 3],
-    /// What coordinates are divided by, metres per axis.
+    /// Divisor of the coordinates, metres per axis.
     pub half_size: [f64; 3],
     /// Outlier thresholds on the expected error that are tried, the dissertation's theta_o.
     pub thresholds: Vec<f32>,
-    /// What aligned poses are off by.
+    /// Systematic error of aligned poses.
     #[serde(default)]
     pub correction: Correction,
 }
 
-/// Diameters and sides, smallest and largest, metres.
+/// Smallest and largest diameters and sides, metres.
 const SMALLEST: f64 = 0.001;
 const LARGEST: f64 = 10.0;
-/// Outlier thresholds of an object, most: each of them is tried.
+/// Maximum number of outlier thresholds of an object: each of them is tried.
 const MOST_THRESHOLDS: usize = 16;
 
-/// Corners of mesh and model may differ by this fraction of the diameter: BOP's meshes for evaluation are simplified.
+/// The bounding boxes of mesh and model may differ by this fraction of the diameter: BOP's meshes for evaluation are simplified.
 const SAME_BOX: f64 = 0.05;
 
 /// A mesh that is not the one of the training.
@@ -42,11 +42,11 @@ const SAME_BOX: f64 = 0.05;
     1000.0 * off
 )]
 pub struct OtherMesh {
-    /// The object it was to be.
+    /// The object that the mesh should show.
     pub object_id: u32,
-    /// Sides of the box in the training, metres.
+    /// Sides of the bounding box in the training, metres.
     pub expected: [f64; 3],
-    /// Sides of the mesh's box, metres.
+    /// Sides of the mesh's bounding box, metres.
     pub found: [f64; 3],
     /// Largest difference of a corner's coordinate, metres.
     pub off: f64,
@@ -69,7 +69,8 @@ impl ObjectEntry {
         }
     }
 
-    /// Whether its numbers can be an object's; otherwise which field cannot, what it should hold, and what it holds.
+    /// Tests that its numbers are valid for an object; otherwise returns the invalid field, the expected values and the value
+    /// found.
     ///
     /// # Errors
     /// Field, expected, found.
@@ -103,7 +104,7 @@ impl ObjectEntry {
         Ok(())
     }
 
-    /// An error unless the mesh is the object's: of the same size and place in its frame.
+    /// Returns an error unless the mesh is that of the object: with the same size and position in its frame.
     ///
     /// # Errors
     /// [`OtherMesh`].
@@ -126,18 +127,18 @@ impl ObjectEntry {
     }
 }
 
-/// By how much aligned poses were off on the photographs of the training, on average: annotations made in another sensor's
-/// image, a principal point a pixel away, a mesh a little larger than its object.
+/// Mean error of aligned poses on the photographs of the training. Causes are annotations made in another sensor's image, an error
+/// of the principal point, or a mesh that is slightly too large.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Correction {
-    /// Of the object's place in the image, pixels.
+    /// Error of the object's position in the image, pixels.
     pub shift: [f64; 2],
-    /// Of its distance, as a fraction of it.
+    /// Error of its distance, as a fraction of the distance.
     pub depth: f64,
 }
 
 impl Correction {
-    /// The pose without the error; rotation as it is.
+    /// The corrected pose; the rotation is unchanged.
     pub fn apply(&self, camera: &Camera, camera_from_object: &Pose) -> Pose {
         let t = camera_from_object.translation();
         let Some(pixel) = camera.project(&t) else { return *camera_from_object };
@@ -183,15 +184,15 @@ impl SymmetryMap {
         })
     }
 
-    /// The identity and all discrete symmetries of an object. Continuous ones are taken out of the targets instead.
+    /// The identity and all discrete symmetries of an object. Continuous ones are removed from the targets instead.
     pub fn pool(info: &ModelInfo, scale: &BoundingBoxScale) -> Vec<Self> {
         let discrete = ModelInfo { symmetries_continuous: Vec::new(), ..info.clone() };
         discrete.symmetry_poses(0.01).iter().map(|pose| Self::new(pose, scale)).collect()
     }
 }
 
-/// Mean distance in metres from the moved surface to the surface itself, over 500 of its points: near zero where the
-/// object has the symmetry.
+/// Mean distance in metres from the moved surface to the surface itself, over 500 of its points: near zero if the object has the
+/// symmetry.
 pub fn symmetry_deviation(mesh: &Mesh, object_from_object: &Pose) -> f64 {
     let surface = mesh.sample_surface(5000, 0).points;
     let tree = KdTree::new(&surface);
@@ -219,7 +220,7 @@ mod tests {
         assert_eq!(moved.rotation(), pose.rotation());
         let none = Correction::default().apply(&camera, &pose);
         assert!((none.translation() - pose.translation()).norm() < 1e-12);
-        // Behind the camera nothing can be said.
+        // Behind the camera there is no correction.
         let behind = Pose::from_translation(Vec3::new(0.0, 0.0, -1.0));
         assert_eq!(correction.apply(&camera, &behind), behind);
     }

@@ -1,22 +1,22 @@
 //! The outlier threshold theta_o of an object, chosen on training images with artificial occlusion (dissertation, section 3.4.1).
 //!
-//! The text chooses among three values "to include more numbers of visible pixels while excluding noisy pixels" and gives no
-//! formula. Here it is the intersection over union of what a threshold keeps and what is visible, over all samples: a visible pixel
-//! left out lowers it as much as a pixel kept that shows something else.
+//! The dissertation chooses among three values "to include more numbers of visible pixels while excluding noisy pixels" and gives
+//! no formula. Here the criterion is the intersection over union of the pixels kept by a threshold and the visible pixels, over all
+//! samples: a missing visible pixel lowers it as much as a wrong pixel that is kept.
 
 use crate::model::{Pix2PoseModel, Prediction};
 use crate::samples::SampleSource;
 
-/// The values that are tried (section 3.4.1).
+/// The candidate values (section 3.4.1).
 pub(crate) const CANDIDATES: [f32; 3] = [0.1, 0.2, 0.3];
-/// Samples that decide.
+/// Number of samples for the choice.
 const SAMPLES: u64 = 64;
 /// Samples in a batch.
 const BATCH: u64 = 8;
-/// From this probability on a pixel counts as the object's, as in the first stage.
+/// Smallest probability of an object pixel, as in the first stage.
 const VISIBLE: f32 = 0.5;
 
-/// For each candidate the pixels that are kept and visible, and those that are either.
+/// For each candidate the number of pixels that are kept and visible, and that are kept or visible.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(crate) struct Overlap {
     both: [u64; CANDIDATES.len()],
@@ -24,7 +24,7 @@ pub(crate) struct Overlap {
 }
 
 impl Overlap {
-    /// Adds a prediction of the first stage and where the object is visible (1 there, else 0), pixel by pixel.
+    /// Adds a prediction of the first stage and the object's visibility (1 or 0), pixel by pixel.
     pub(crate) fn add(&mut self, prediction: &Prediction, visible: &[f32]) {
         for (candidate, threshold) in CANDIDATES.iter().enumerate() {
             for ((seen, error), truth) in prediction.visible.iter().zip(&prediction.error).zip(visible) {
@@ -35,7 +35,7 @@ impl Overlap {
         }
     }
 
-    /// The candidate with the largest intersection over union; of equal ones the smallest.
+    /// The candidate with the largest intersection over union; ties go to the smallest.
     pub(crate) fn best(&self) -> f32 {
         let ratio = |i: usize| self.both[i] as f64 / self.either[i].max(1) as f64;
         let best = (0..CANDIDATES.len()).rev().max_by(|a, b| ratio(*a).total_cmp(&ratio(*b)));
@@ -43,7 +43,7 @@ impl Overlap {
     }
 }
 
-/// The threshold of one object of a model, on samples of the first stage. The same source and seed choose the same.
+/// The threshold of one object of a model, on samples of the first stage. The same source and seed give the same choice.
 pub(crate) fn choose(model: &Pix2PoseModel, object_index: usize, source: &SampleSource, seed: u64) -> f32 {
     let mut overlap = Overlap::default();
     for batch in 0..SAMPLES / BATCH {
@@ -79,7 +79,7 @@ mod tests {
         assert_eq!(chosen([0.05, 0.05, 0.05, 0.15, 0.25, 0.4], 3), 0.1);
         assert_eq!(chosen([0.05, 0.05, 0.15, 0.15, 0.25, 0.25], 4), 0.2);
         assert_eq!(chosen([0.05, 0.15, 0.15, 0.25, 0.25, 0.4], 5), 0.3);
-        // Where they keep the same, the smallest.
+        // If all keep the same pixels, the smallest is chosen.
         assert_eq!(chosen([0.05; 6], 6), 0.1);
     }
 

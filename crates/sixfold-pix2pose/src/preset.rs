@@ -1,5 +1,5 @@
-//! Parameters of the dissertation's experiments: pools of symmetric poses (appendix A.1), outlier thresholds (A.2) and how
-//! much of an object is hidden in training (table 3.3).
+//! Parameters of the dissertation's experiments: pools of symmetric poses (appendix A.1), outlier thresholds (A.2) and occluded
+//! fractions in training (table 3.3).
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -9,11 +9,11 @@ use sixfold_nn::choice::Choice;
 
 use crate::object::BOP_THRESHOLDS;
 
-/// One experiment of the dissertation. Objects go by the ids that BOP gives them.
+/// One experiment of the dissertation. Objects have their BOP ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Preset {
-    /// The entries to the BOP challenges of 2019 and 2020 (section 3.4.5): three thresholds for every object, symmetries
-    /// as the dataset states them.
+    /// The entries to the BOP challenges of 2019 and 2020 (section 3.4.5): three thresholds for every object, symmetries as stated
+    /// by the dataset.
     Bop,
     /// LineMOD (section 3.4.2), 13 objects.
     Linemod,
@@ -23,7 +23,7 @@ pub enum Preset {
     Tless,
 }
 
-/// Under which rotations an object looks the same.
+/// Rotations under which an object looks the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turns {
     None,
@@ -31,7 +31,7 @@ enum Turns {
     HalfY,
     /// Half a turn about z.
     HalfZ,
-    /// Quarters of a turn about z.
+    /// Quarter turns about z.
     QuarterZ,
     /// Any rotation about z.
     AnyZ,
@@ -94,8 +94,8 @@ impl Preset {
         Some(vec![one])
     }
 
-    /// Smallest and largest fraction of an object that occluders hide in training (table 3.3). The entries to BOP have no range
-    /// of their own; theirs is that of the datasets with occlusion.
+    /// Smallest and largest fraction of an object that occluders hide in training (table 3.3). The dissertation gives no range for
+    /// the entries to BOP; that of the datasets with occlusion is used.
     pub fn occlusion(self) -> [f32; 2] {
         match self {
             Preset::Linemod => [0.0, 0.1],
@@ -103,8 +103,8 @@ impl Preset {
         }
     }
 
-    /// What is known of an object, with the pool of symmetric poses of appendix A.1 in place of the stated ones. The pool's
-    /// turns are about axes through the centre of the object's box. [`Preset::Bop`] leaves the stated ones.
+    /// The object's information with the pool of symmetric poses of appendix A.1 instead of the stated symmetries. The pool's
+    /// rotations are about axes through the centre of the object's bounding box. [`Preset::Bop`] keeps the stated symmetries.
     pub(crate) fn with_pool(self, id: u32, info: &ModelInfo) -> ModelInfo {
         let turns = match (self, id) {
             (Preset::Bop, _) => return info.clone(),
@@ -146,8 +146,8 @@ mod tests {
         }
     }
 
-    /// Appendix A.1 and tables A.2.1 to A.2.3, typed once more: id, fold of the symmetry (0: any rotation, -2: half a turn about
-    /// y), threshold in tenths.
+    /// Appendix A.1 and tables A.2.1 to A.2.3, typed independently: id, fold of the symmetry (0: any rotation, -2: half a turn
+    /// about y), threshold in tenths.
     const LINEMOD: &str =
         "1 1 1, 2 1 2, 4 1 2, 5 1 2, 6 1 2, 8 1 2, 9 1 1, 10 2 2, 11 2 2, 12 1 2, 13 1 2, 14 1 2, 15 1 2";
     const LMO: &str = "1 1 2, 5 1 3, 6 1 3, 8 1 3, 9 1 2, 10 2 2, 11 2 3, 12 1 3";
@@ -197,7 +197,7 @@ mod tests {
         assert!((moved(Preset::Tless, 27, 2) - Vec3::new(0.01, -0.03, 0.02)).norm() < 1e-12);
         let any = Preset::Tless.with_pool(30, &info).symmetries_continuous[0];
         assert_eq!((any.axis, any.offset), (Vec3::z(), centre));
-        // What a dataset states stays with the preset of the challenge alone.
+        // Only the preset of the challenge keeps the stated symmetries.
         let stated = ModelInfo { symmetries_discrete: vec![Pose::identity()], ..info.clone() };
         assert_eq!(Preset::Bop.with_pool(1, &stated), stated);
         assert_eq!(Preset::Lmo.with_pool(1, &stated), info);

@@ -1,4 +1,4 @@
-//! A whole training: objects and their photographs in, a model file out. Interrupted at any time, it is resumed.
+//! A complete training: from objects and their photographs to a model file. It can be interrupted at any time and resumed.
 
 use std::collections::BTreeMap;
 use std::f32::consts::PI;
@@ -32,7 +32,7 @@ use sixfold_data::{
     FrameId, PosedImage, TrainingObject, TrainingSet, background_files, backgrounds_with_images,
 };
 
-/// Which network learns.
+/// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum NetworkKind {
     /// ImageNet encoder shared by all objects, a small decoder for each; trains on two cores.
@@ -40,7 +40,7 @@ pub enum NetworkKind {
     Compact,
     /// The dissertation's generator with its discriminator, one object.
     Paper,
-    /// The same with a ResNet-50 encoder, as in the entry to BOP 2020.
+    /// The same generator with a ResNet-50 encoder, as in the entry to BOP 2020.
     ResNet50,
 }
 
@@ -68,28 +68,27 @@ impl Choice for NetworkKind {
     }
 }
 
-/// How a model is trained.
+/// Options of the training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pix2PoseRecipe {
-    /// Which network learns.
+    /// Which network is trained.
     pub network: NetworkKind,
-    /// Steps in all; `None`: those of [`Pix2PoseTrainingOptions`], the dissertation's networks those of
-    /// [`AdversarialOptions`], as for the next two. 0: the weights of `init` as they are, with their alignment's systematic error
-    /// measured again.
+    /// Number of steps; `None`: that of [`Pix2PoseTrainingOptions`], or of [`AdversarialOptions`] for the dissertation's networks,
+    /// as for the next two fields. 0: keeps the weights of `init` and only measures the systematic error of their alignment again.
     pub steps: Option<u64>,
     /// Images of every object in a step.
     pub per_object: Option<usize>,
     /// Highest learning rate.
     pub learning_rate: Option<f64>,
-    /// Train against a discriminator; `None`: the dissertation's networks with one, the compact one without.
+    /// Train against a discriminator; `None`: with one for the dissertation's networks, without one for the compact network.
     pub adversarial: Option<bool>,
-    /// torchvision's ResNet-50 weights for [`NetworkKind::ResNet50`]; random ones without.
+    /// torchvision's ResNet-50 weights for [`NetworkKind::ResNet50`]; random ones if `None`.
     pub encoder: Option<PathBuf>,
-    /// Stages of the ImageNet encoder that stay as they are, of five.
+    /// Number of frozen stages of the ImageNet encoder, of five.
     pub frozen_stages: usize,
     /// Fraction of renders among the images, 0 to 1.
     pub render_share: f32,
-    /// Fraction of renders whose pose lies near one of a photograph, 0 to 1.
+    /// Fraction of renders whose pose is near that of a photograph, 0 to 1.
     pub near_photographs: f32,
     /// Largest rotation of photographs in the image plane, radians.
     pub rotation: f32,
@@ -97,24 +96,24 @@ pub struct Pix2PoseRecipe {
     pub size: usize,
     /// Continue from the weights of another training instead of ImageNet's.
     pub init: Option<PathBuf>,
-    /// Draw the meshes in their own colours; otherwise in random ones.
+    /// Render the meshes in their own colours; otherwise in random ones.
     pub mesh_colors: bool,
     /// Learn the coordinates of the meshes' convex hulls.
     pub convex_hull: bool,
     /// The transformer loss for symmetric objects (equation 3.2); otherwise plain L1.
     pub transformer_loss: bool,
-    /// Plain L1 with one side of a symmetric object standing for all.
+    /// Plain L1, with one side of a symmetric object representing all equivalent ones.
     pub view_limits: bool,
-    /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as they
-    /// are stated, the thresholds of its BOP entries.
+    /// Symmetries, outlier thresholds and occlusion of one of the dissertation's experiments; `None`: symmetries as stated by the
+    /// dataset, and the thresholds of the BOP entries.
     pub preset: Option<Preset>,
     /// Samples, loss and choice of the outlier threshold as in the dissertation ([`Pix2PoseRecipe::published`]).
     pub published: bool,
-    /// Folder of photographs for backgrounds; procedural textures without.
+    /// Folder of photographs for backgrounds; procedural textures if `None`.
     pub backgrounds: Option<PathBuf>,
     /// Seed of weights and samples.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -147,13 +146,13 @@ impl Default for Pix2PoseRecipe {
     }
 }
 
-/// Instances below this visibility add label noise.
+/// Smallest visibility of instances: those below it add label noise.
 pub const MIN_VISIBILITY: f64 = 0.25;
 
 /// Weight of the compact network's adversarial loss: the dissertation's lambda_1 is 100.
 const ADVERSARIAL: f32 = 0.01;
 
-/// What is known beside the network before the first step.
+/// Data prepared before the first step, in addition to the network.
 pub struct Context {
     objects: Vec<TrainingObject>,
     real: Vec<PosedImage>,
@@ -163,10 +162,10 @@ pub struct Context {
 }
 
 impl Pix2PoseRecipe {
-    /// The dissertation's training (section 3.4.1): its generator and discriminator, 25,000 batches of 50 that imitate the first
-    /// and the second stage in turns, colours of table 3.2, photographs on random backgrounds partly hidden by them (table 3.3),
-    /// beta on the whole mask (equation 3.1), and an outlier threshold that is chosen on training images with artificial
-    /// occlusion, unless `preset` names it.
+    /// The dissertation's training (section 3.4.1): its generator and discriminator, 25,000 batches of 50 that alternately imitate
+    /// the first and the second stage, colours of table 3.2, photographs on random backgrounds and partly hidden by parts of them
+    /// (table 3.3), beta on the whole mask (equation 3.1), and an outlier threshold that is chosen on training images with
+    /// artificial occlusion, unless `preset` gives it.
     pub fn published() -> Self {
         let samples = SampleOptions::published(1);
         Pix2PoseRecipe {
@@ -178,7 +177,7 @@ impl Pix2PoseRecipe {
         }
     }
 
-    /// How the compact network is trained.
+    /// Training options of the compact network.
     pub fn compact_options(&self) -> Pix2PoseTrainingOptions {
         let default = Pix2PoseTrainingOptions::default();
         Pix2PoseTrainingOptions {
@@ -191,7 +190,7 @@ impl Pix2PoseRecipe {
         }
     }
 
-    /// How the dissertation's networks are trained.
+    /// Training options of the dissertation's networks.
     pub fn dissertation_options(&self) -> AdversarialOptions {
         let default = AdversarialOptions::default();
         AdversarialOptions {
@@ -206,7 +205,7 @@ impl Pix2PoseRecipe {
         }
     }
 
-    /// How samples are made.
+    /// Options of the samples.
     fn sample_options(&self, sizes: ImageSizes) -> SampleOptions {
         let default = match self.published {
             true => SampleOptions::published(self.dissertation_options().batch as u64),
@@ -227,7 +226,7 @@ impl Pix2PoseRecipe {
         }
     }
 
-    /// Objects as the preset and `convex_hull` want them, and what they are in words.
+    /// Objects according to the preset and `convex_hull`, and a description of them.
     fn objects(
         &self,
         mut objects: Vec<TrainingObject>,
@@ -262,7 +261,7 @@ impl Pix2PoseRecipe {
     }
 
     fn card(&self, description: String, frames: &[FrameId]) -> Result<ModelCard, TrainError> {
-        // With weights to begin with, their frames count too; so do those that corrections are measured on.
+        // Training frames also include those of the initial weights and those on which corrections are measured.
         let frames = training_frames(self.init.as_deref(), frames).map_err(TrainError::method)?;
         if let (Some(file), Some(0)) = (&self.init, self.steps) {
             let mut card = Pix2PoseModel::load(file).map_err(TrainError::method)?.card().clone();
@@ -371,14 +370,14 @@ impl Recipe for Pix2PoseRecipe {
     }
 
     fn inputs(&self, material: &TrainingSet) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place.
+        // Every field by its name, so that the compiler reports a new one.
         #[rustfmt::skip]
         let Pix2PoseRecipe {
             network, encoder, render_share, near_photographs, rotation, size, init, mesh_colors, convex_hull, view_limits, preset,
             published, backgrounds,
-            // In the training's options.
+            // These are in the training's options.
             steps: _, per_object: _, learning_rate: _, adversarial: _, frozen_stages: _, transformer_loss: _, seed: _,
-            // Changes nothing.
+            // This does not affect the training.
             command: _,
         } = self;
         let training = match network {
@@ -438,14 +437,14 @@ impl Recipe for Pix2PoseRecipe {
             objects.len(),
             real.len()
         ));
-        // The published form makes further samples at the end.
+        // The published form generates further samples at the end.
         let objects = if self.published { objects.clone() } else { std::mem::take(objects) };
         SampleSource::new(objects, real.clone(), backgrounds, self.sample_options(*sizes))
             .map(Some)
             .map_err(TrainError::method)
     }
 
-    /// Measures the systematic error of the model's aligned poses on the photographs that it learnt from.
+    /// Measures the systematic error of the model's aligned poses on the photographs of the training.
     fn finish(
         &self,
         Prepared { training, card, context }: Prepared<Pix2PoseTraining, Context>,
@@ -481,7 +480,7 @@ impl Recipe for Pix2PoseRecipe {
 }
 
 impl Pix2PoseRecipe {
-    /// The outlier threshold of the one object, on images of the first stage that are all partly hidden.
+    /// The outlier threshold of the object, chosen on images of the first stage in which it is always partly hidden.
     fn outlier_threshold(
         &self,
         model: &Pix2PoseModel,
@@ -497,7 +496,7 @@ impl Pix2PoseRecipe {
     }
 }
 
-/// What the dissertation's networks can be trained with.
+/// The options that the dissertation's networks support.
 const DISSERTATION: &str =
     "the compact network, or one object, images of 128 pixels and no weights to begin with";
 
@@ -518,7 +517,7 @@ pub enum Pix2PoseTraining {
     ResNet50(AdversarialTraining<ResNet50Generator>),
 }
 
-/// What a step of one of the networks learns from.
+/// The batch of a step of one of the networks.
 pub enum Pix2PoseBatch {
     /// Images of all objects.
     Compact(CompactBatch),
@@ -585,7 +584,7 @@ impl Training for Pix2PoseTraining {
     }
 }
 
-/// What the alignment is measured with, where there are photographs to measure it on.
+/// Outline meshes for measuring the alignment, for objects with photographs.
 fn outlines(objects: &[TrainingObject], photographs: &[PosedImage]) -> BTreeMap<u32, (Mesh, ModelInfo)> {
     if photographs.is_empty() {
         return BTreeMap::new();
@@ -593,7 +592,7 @@ fn outlines(objects: &[TrainingObject], photographs: &[PosedImage]) -> BTreeMap<
     objects.iter().map(|o| (o.id, (outline_mesh(&o.mesh), o.info.clone()))).collect()
 }
 
-/// Gives an object the symmetries of a preset, which must have the object.
+/// Sets the symmetries of an object to those of a preset, which must include the object.
 fn apply(preset: Preset, object: &mut TrainingObject, session: &mut Session<'_>) -> Result<(), OptionError> {
     if preset.thresholds(object.id).is_none() {
         let found = format!("{} with object {}", preset.name(), object.id);
@@ -615,7 +614,8 @@ fn apply(preset: Preset, object: &mut TrainingObject, session: &mut Session<'_>)
     Ok(())
 }
 
-/// A symmetry that the mesh does not have misleads the training: says how far the surface moves under it.
+/// Warns of a symmetry that the mesh does not have, which would mislead the training, with the distance by which it moves the
+/// surface.
 fn warn_of_symmetry(object: &TrainingObject, session: &mut Session<'_>) {
     for pose in object.info.symmetry_poses(0.1).iter().skip(1) {
         let deviation = symmetry_deviation(&object.mesh, pose);

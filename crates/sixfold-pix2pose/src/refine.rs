@@ -1,13 +1,14 @@
 //! Aligns the mesh's outline with the object's border in the image.
 //!
-//! Coordinates fix a pose well across the image and badly along the view axis: one per cent of scale is ten millimetres
-//! at a metre. The outline knows better, at the image's full resolution. The network says where the object is visible;
-//! colour histograms of that part and of its surroundings, learnt from this one crop, sharpen it. Along the normals of
-//! the rendered outline the most likely border is found, rather where the image has an edge, and Gauss-Newton moves the
-//! pose there (region-based tracking: Prisacariu and Reid 2012, with the sparse lines of Stoiber et al. 2020), with the
-//! network's correspondences as a second term. Lines whose inner side is not the object's are left out: something covers it there.
+//! Coordinates determine a pose accurately across the image but poorly along the view axis: one per cent of scale is ten
+//! millimetres at a metre. The outline determines it better, at the image's full resolution. The network predicts where the object
+//! is visible; colour histograms of that part and of its surroundings, computed from this crop alone, refine this. Along the
+//! normals of the rendered outline the most likely border is found, with a preference for edges of the image, and Gauss-Newton
+//! moves the pose there (region-based tracking: Prisacariu and Reid 2012, with the sparse lines of Stoiber et al. 2020), with the
+//! network's correspondences as a second term. Lines whose inner side does not show the object are left out, because it is occluded
+//! there.
 //!
-//! It goes beyond the dissertation, whose poses from colour end with PnP, and needs no colours of the mesh.
+//! This goes beyond the dissertation, in which poses from colour end with PnP, and needs no colours of the mesh.
 
 use crate::estimate::{Found, ThresholdHypothesis, View};
 use crate::samples::second_stage::GREY;
@@ -16,12 +17,12 @@ use sixfold_geometry::{Camera, OptionError, Pose, RgbImage, Vec2};
 use sixfold_mesh::Mesh;
 use sixfold_synth::augment::{Patch, Window};
 
-/// How poses are aligned.
+/// Options of the alignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutlineRefinementOptions {
-    /// How far from the outline the border is looked for, crop pixels, from coarse to fine.
+    /// Search distances for the border from the outline, crop pixels, from coarse to fine.
     pub reaches: Vec<f64>,
-    /// Most steps at each reach.
+    /// Maximum number of steps at each reach.
     pub iterations: usize,
     /// Shortest side of the crop in pixels; smaller ones are enlarged.
     pub smallest: usize,
@@ -29,19 +30,19 @@ pub struct OutlineRefinementOptions {
     pub largest: usize,
     /// Weight of the correspondences as a whole, in independent measurements.
     pub correspondences: f64,
-    /// Weight of the correspondences' shape: what is left of them once a shift and a scale common to all are taken out.
-    /// They know the rotation, the outline knows the place.
+    /// Weight of the correspondences' shape: the part that remains after removing a common shift and scale. The correspondences
+    /// determine the rotation, the outline the position.
     pub shape: f64,
     /// Weight of a line, in independent measurements.
     pub line: f64,
-    /// Lines count less the further their border is from the outline, in units of this many deviations of all lines
-    /// (Tukey's biweight); 0 for all lines alike.
+    /// The weight of a line decreases with the distance of its border from the outline, in units of this many standard deviations
+    /// of all lines (Tukey's biweight); 0 for equal weights.
     pub robust: f64,
-    /// Fraction of the first pass in where the object is seen; the rest is the second's. They err apart.
+    /// Weight of the first pass in the object's visibility; the rest is that of the second. Their errors are largely independent.
     pub first_pass: f32,
-    /// Weight of colour against the network in telling object from background.
+    /// Weight of colour relative to the network in the object probability.
     pub color: f32,
-    /// What the log likelihood of a border gains where colours change sharply; 0 for odds alone.
+    /// Bonus to the log likelihood of a border where colours change sharply; 0 uses only the odds.
     pub edges: f64,
 }
 
@@ -63,11 +64,11 @@ impl Default for OutlineRefinementOptions {
     }
 }
 
-/// Shortest crop in which an outline can be looked for at all, pixels.
+/// Smallest side of a crop in which an outline can be searched, pixels.
 const MIN_CROP: usize = 16;
 
 impl OutlineRefinementOptions {
-    /// The part that [`Alignment`] takes.
+    /// The options of [`Alignment`].
     fn alignment(&self) -> AlignmentOptions {
         AlignmentOptions {
             reaches: self.reaches.clone(),
@@ -107,17 +108,17 @@ impl OutlineRefinementOptions {
 /// A pose after alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refined {
-    /// The pose; that from before where too little of the outline was found.
+    /// The pose; the initial one if too little of the outline was found.
     pub camera_from_object: Pose,
-    /// Lines on which the border was found at the end.
+    /// Number of lines on which the border was found at the end.
     pub lines: usize,
-    /// Mean distance from outline to border on them, crop pixels.
+    /// Mean distance from outline to border on these lines, crop pixels.
     pub distance: f64,
     /// Whether the pose was changed.
     pub improved: bool,
 }
 
-/// Aligns the best hypothesis of what [`crate::estimate::estimate`] found in the same image.
+/// Aligns the best hypothesis of a result of [`crate::estimate::estimate`] in the same image.
 pub fn refine(
     image: &RgbImage,
     camera: &Camera,
@@ -182,7 +183,7 @@ pub fn refine(
     })
 }
 
-/// How probably the object is visible at a position in 0..1 of a view's sides.
+/// Probability that the object is visible at a position, given as fractions in 0..1 of a view's sides.
 fn seen(view: &View, u: f64, v: f64) -> f32 {
     let side = view.prediction.side;
     sample(&view.prediction.visible, side, u * side as f64 - 0.5, v * side as f64 - 0.5)
@@ -217,7 +218,7 @@ mod tests {
         Mesh::new(vertices, faces).unwrap()
     }
 
-    /// Errors in metres before and after alignment of a part at 0.8 m, a fraction of whose columns is covered.
+    /// Errors in metres before and after alignment of a part at 0.8 m, with a fraction of its columns covered.
     fn errors(covered: f64) -> [f64; 2] {
         let mesh = part();
         let camera = Camera::new(570.0, 570.0, 159.5, 119.5, 320, 240).unwrap();
@@ -228,7 +229,7 @@ mod tests {
         let columns: Vec<usize> = (0..320).filter(|x| (0..240).any(|y| silhouette[(*x, y)])).collect();
         let edge = columns[(covered * (columns.len() - 1) as f64) as usize];
         let seen = |x: usize, y: usize| silhouette[(x, y)] && (covered == 0.0 || x > edge);
-        // A red part on a grey table, something blue in front of its left side.
+        // A red part on a grey table, with a blue occluder in front of its left side.
         let image = RgbImage::from_fn(320, 240, |x, y| {
             let noise = ((x * 7 + y * 13) % 17) as u8;
             if seen(x, y) {

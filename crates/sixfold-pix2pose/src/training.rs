@@ -1,4 +1,4 @@
-//! The training of the compact network: what a step is, and the samples that it learns from.
+//! The training of the compact network: its steps and batches.
 
 use crate::loss::{LossOptions, OutputKind, Targets, loss};
 use crate::model::network_input;
@@ -14,7 +14,7 @@ use sixfold_nn::parameters::{GradientSum, gradients_of};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
-/// How to train.
+/// Options of the training.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pix2PoseTrainingOptions {
     /// Steps, learning rate of the decoders, seed.
@@ -22,19 +22,20 @@ pub struct Pix2PoseTrainingOptions {
     pub common: TrainingOptions,
     /// Images of every object in a step, 1 or more.
     pub per_object: usize,
-    /// The encoder's fraction of the learning rate, 0 to 1: it is pretrained.
+    /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
     pub encoder_share: f64,
-    /// Stages of the encoder that stay as they are, 0 to 5.
+    /// Number of frozen stages of the encoder, 0 to 5.
     pub frozen_stages: usize,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
     pub transformer_loss: bool,
     /// Weight of the adversarial loss (equation 3.4) against that of the coordinates; 0 trains without discriminators. The
-    /// dissertation's is 0.01. A discriminator, one an object, sees coordinates within the object's whole silhouette.
+    /// dissertation's is 0.01. There is one discriminator per object; its input are the coordinates within the object's whole
+    /// silhouette.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub adversarial: f32,
 }
 
-/// Cards and checkpoints do not mention what is not used.
+/// Cards and checkpoints omit unused options.
 fn is_zero(weight: &f32) -> bool {
     *weight == 0.0
 }
@@ -97,22 +98,22 @@ fn make_batch(source: &SampleSource, options: &Pix2PoseTrainingOptions, step: u6
     batch
 }
 
-/// The compact network in training, with a discriminator an object or none.
+/// The compact network in training, with one discriminator per object or none.
 pub struct CompactTraining {
     learner: Learner<Compact>,
     critics: Vec<Critic>,
     pools: Vec<Vec<SymmetryMap>>,
-    /// Of the input, pixels.
+    /// Side of the input, pixels.
     side: usize,
     options: Pix2PoseTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl CompactTraining {
-    /// Of a network on the autodiff `device` with an input of `side` pixels; `pools` holds every object's symmetries, the
-    /// identity first.
+    /// Starts the training of a network on the autodiff `device` with an input of `side` pixels; `pools` has every object's
+    /// symmetries, the identity first.
     pub fn new(
         network: Compact,
         pools: Vec<Vec<SymmetryMap>>,
@@ -171,8 +172,8 @@ impl Training for CompactTraining {
         let loss_options = LossOptions::of(kind);
         let mut sums = [0.0; 3];
         let mut adversarial = [0.0; 2];
-        // One object after another: their images together would not fit the processor's caches, and memory is what this
-        // network waits for.
+        // One object at a time: their images together would not fit into the processor's caches, and this network is bound by
+        // memory bandwidth.
         let mut encoder_gradients = GradientSum::new();
         let mut decoder_gradients = GradientSum::new();
         let mut rgb = batch.rgb.as_slice();

@@ -1,4 +1,4 @@
-//! GPD as a planner: its candidates, each with the success probability that the network gives it.
+//! GPD as a planner: its candidates, each with the success probability from the network.
 
 use rayon::prelude::*;
 use sixfold_grasp::learned::{ClosingRegion, LocalFrameOptions, ScoredGrasp, local_frame_grasps};
@@ -6,8 +6,8 @@ use sixfold_grasp::{GraspView, Gripper};
 
 use crate::GpdModel;
 
-/// Candidates on the object of a view with their success probability, the best first. The same seed gives the same at any number
-/// of threads.
+/// Candidates on the object of a view with their success probability, the best first. The same seed gives the same result at any
+/// number of threads.
 pub fn gpd_grasps(
     view: &GraspView,
     gripper: &Gripper,
@@ -20,7 +20,7 @@ pub fn gpd_grasps(
     let scores = model.scores(&regions);
     let mut scored: Vec<ScoredGrasp> =
         grasps.into_iter().zip(scores).map(|(grasp, score)| ScoredGrasp { grasp, score }).collect();
-    // Stable: equal ones stay in the order of their samples.
+    // A stable sort: ties keep the order of their samples.
     scored.sort_by(|a, b| b.score.total_cmp(&a.score));
     scored
 }

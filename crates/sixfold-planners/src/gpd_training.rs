@@ -26,7 +26,7 @@ pub struct GpdTraining {
 }
 
 impl GpdTraining {
-    /// Of a network whose tensors are on the autodiff `device`.
+    /// Starts the training of a network whose tensors are on the autodiff `device`.
     pub(crate) fn new(network: Gpd, options: TrainingOptions, device: Device) -> Self {
         GpdTraining { learner: Learner::adam_w("network", network, &options), options, device }
     }
@@ -79,7 +79,7 @@ impl Training for GpdTraining {
             .unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
         let right = values.iter().zip(&held).filter(|(v, h)| (**v > 0.0) == (**h > 0.5)).count();
         let target = Tensor::<1>::from_data(TensorData::new(held, [batch.len()]), &self.device);
-        // Stable for large logits of either sign.
+        // Numerically stable for large logits of either sign.
         let loss = relu(logits.clone()) - logits.clone() * target + (logits.abs().neg().exp() + 1.0).log();
         let loss = loss.mean();
         let value = loss.clone().inner().into_scalar::<f32>();
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
     use crate::network::GpdConfig;
 
-    /// A wall across the closing direction: held when it is near the centre between the pads.
+    /// A wall across the closing direction: held if it is near the centre between the pads.
     fn sample(number: u64) -> Sample<ClosingRegion> {
         let gripper = Gripper::built_in("jaws-140").unwrap();
         let x = stream(1, number).random_range(-0.06..0.06);

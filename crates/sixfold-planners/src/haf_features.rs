@@ -1,7 +1,8 @@
-//! Which height features HAF uses: many at random, of which those are kept that tell good grasps from bad ones best alone.
+//! Selection of HAF's height features: of many random ones, those are kept that individually best separate good grasps from bad
+//! ones.
 //!
-//! As the original (Fischinger, Weiss and Vincze 2015): two to four rectangles with weights that cancel, beside one alone; a third of
-//! them symmetric about the closing direction's centre. The choice is by F-score (Chen and Lin 2006).
+//! As in the original (Fischinger, Weiss and Vincze 2015), features have one rectangle, or two to four with weights that sum to
+//! zero; a third of them are symmetric about the centre of the closing direction. The selection is by F-score (Chen and Lin 2006).
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, stream};
@@ -9,12 +10,12 @@ use sixfold_grasp::learned::{CELLS, HeightFeature, HeightGrid, Region};
 
 use crate::samples::Sample;
 
-/// Features at random, of which the best are kept. The original has about 70,000; chosen by hand, not swept.
+/// Number of random features, of which the best are kept. The original has about 70,000; chosen by hand, not swept.
 const CANDIDATES: u64 = 6000;
-/// Features that are kept, as in the original.
+/// Number of features that are kept, as in the original.
 pub(crate) const KEPT: usize = 300;
 
-/// The features to learn with, the one with the highest F-score first.
+/// The features for the training, the one with the highest F-score first.
 pub(crate) fn chosen(samples: &[Sample<HeightGrid>], seed: u64) -> Vec<HeightFeature> {
     use rayon::prelude::*;
     let mut rated: Vec<(f64, HeightFeature)> = (0..CANDIDATES)
@@ -24,7 +25,7 @@ pub(crate) fn chosen(samples: &[Sample<HeightGrid>], seed: u64) -> Vec<HeightFea
             (f_score(&feature, samples), feature)
         })
         .collect();
-    // Stable: equal ones in the order of their numbers.
+    // A stable sort: ties keep the order of their numbers.
     rated.sort_by(|a, b| b.0.total_cmp(&a.0));
     rated.into_iter().take(KEPT).map(|(_, feature)| feature).collect()
 }

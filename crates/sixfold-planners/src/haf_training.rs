@@ -1,6 +1,6 @@
 //! The training of HAF's linear classifier: a support vector machine with hinge loss by dual coordinate descent (Hsieh et al. 2008,
-//! "A dual coordinate descent method for large-scale linear SVM"), a pass over all candidates a step. Then the logistic curve over its
-//! margin (Platt 1999).
+//! "A dual coordinate descent method for large-scale linear SVM"), with one pass over all candidates per step. Then the logistic
+//! curve over its margin (Platt 1999).
 
 use rand::RngExt;
 use rayon::prelude::*;
@@ -16,10 +16,10 @@ use sixfold_nn::{Checkpoint, CheckpointError, CheckpointWriter};
 use crate::haf_features::chosen;
 use crate::samples::Sample;
 
-/// What a candidate on the wrong side of the margin counts: C of the support vector machine. Chosen by hand; not swept.
+/// Cost of a candidate on the wrong side of the margin: C of the support vector machine. Chosen by hand; not swept.
 const COST: f64 = 1e-3;
 
-/// Height grids as numbers, with mean 0 and variance 1.
+/// Features of height grids, with mean 0 and variance 1.
 #[derive(Debug)]
 pub struct HafSamples {
     features: Vec<HeightFeature>,
@@ -31,7 +31,7 @@ pub struct HafSamples {
 }
 
 impl HafSamples {
-    /// Chooses features and computes them.
+    /// Selects features and computes them.
     pub(crate) fn new(samples: &[Sample<HeightGrid>], seed: u64) -> HafSamples {
         let features = chosen(samples, seed);
         let rows: Vec<(Vec<f64>, f64)> = samples
@@ -61,7 +61,7 @@ impl HafSamples {
         HafSamples { features, means, deviations, rows, signs }
     }
 
-    /// The planner of trained weights.
+    /// The planner with trained weights.
     pub(crate) fn model(&self, weights: &[f64], card: serde_json::Value) -> HafModel {
         let count = self.features.len();
         let weight = |k: usize| weights[k] / self.deviations[k];
@@ -105,7 +105,7 @@ pub struct HafTraining {
     seed: u64,
     /// Weights of the scaled features, then the bias.
     pub(crate) weights: Vec<f64>,
-    /// Of each candidate, 0 to [`COST`]; empty before the first pass.
+    /// Dual variable of each candidate, 0 to [`COST`]; empty before the first pass.
     duals: Vec<f64>,
 }
 
@@ -202,7 +202,7 @@ mod tests {
 
     use super::*;
 
-    /// Ridges across the hand that are held when they are near its centre and high, and noise.
+    /// Ridges across the hand that are held if they are near its centre and high, with noise.
     fn samples() -> Vec<Sample<HeightGrid>> {
         (0..300)
             .map(|number| {
@@ -244,7 +244,7 @@ mod tests {
         // The model's own features give the margins of the training.
         let margin = dot(&straight.weights, &samples.rows[0]);
         assert!((f64::from(model.margin(&seen[0].seen)) - margin).abs() < 1e-2, "{margin}");
-        // Higher margins are likelier, and on average as likely as they held.
+        // Higher margins have a higher probability, and the mean probability equals the success rate.
         let scores: Vec<f64> = seen.iter().map(|s| model.score(&s.seen)).collect();
         let held = seen.iter().filter(|s| s.held).count() as f64 / 300.0;
         assert!((scores.iter().sum::<f64>() / 300.0 - held).abs() < 0.03);

@@ -1,8 +1,8 @@
-//! Grasp planners that learn: GPD's network, and the trainings of GPD and HAF.
+//! Learned grasp planners: GPD's network, and the trainings of GPD and HAF.
 //!
-//! Candidates and what describes them are in `sixfold_grasp::learned`, HAF's classifier as well: it needs no network. Here a
-//! network judges GPD's candidates ([`GpdModel`], [`gpd_grasps`]). With the feature `recipe` both are trained (`recipe`) on the same
-//! trials: grasps on synthetic objects, tried in a physics engine (`trials`).
+//! Candidates and their descriptions are in `sixfold_grasp::learned`, and so is HAF's classifier, which needs no network. Here a
+//! network scores GPD's candidates ([`GpdModel`], [`gpd_grasps`]). With the feature `recipe` both are trained (`recipe`) on the
+//! same trials: grasps on synthetic objects, tried in a physics engine (`trials`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

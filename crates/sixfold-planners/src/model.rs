@@ -1,4 +1,4 @@
-//! A trained GPD network as one file, and the success probabilities that it gives.
+//! A trained GPD network as one file, and its success probabilities.
 
 use std::path::Path;
 
@@ -12,10 +12,10 @@ use sixfold_nn::weights::{
 
 use crate::network::{ARCHITECTURE, Gpd, GpdConfig};
 
-/// The weights that come with Sixfold; see the card beside the file.
+/// The shipped weights; see the card next to the file.
 static SHIPPED: &[u8] = include_bytes!("../weights/gpd-compact.safetensors");
 
-/// Candidates that go through the network at a time.
+/// Candidates per forward pass.
 const AT_A_TIME: usize = 64;
 
 /// A network and its card.
@@ -32,7 +32,7 @@ impl GpdModel {
         GpdModel { network: network.valid(), card }
     }
 
-    /// The model that comes with Sixfold.
+    /// The shipped model.
     ///
     /// # Panics
     /// Never: a test reads it.
@@ -44,7 +44,7 @@ impl GpdModel {
         GpdModel { network: network.valid(), card }
     }
 
-    /// Reads a weight file that `sixfold train planner --planner gpd` wrote.
+    /// Reads a weight file written by `sixfold train planner --planner gpd`.
     ///
     /// # Errors
     /// [`WeightsError`].
@@ -53,7 +53,7 @@ impl GpdModel {
         Ok(GpdModel { network: network.valid(), card })
     }
 
-    /// Writes the weight file and, beside it, the card as text.
+    /// Writes the weight file and, next to it, the card as text.
     ///
     /// # Errors
     /// [`WeightsError`].
@@ -82,7 +82,7 @@ impl GpdModel {
     }
 }
 
-/// Images as the network takes them: `count x 15 x 32 x 32`, 0 to 1.
+/// Images as the network's input: `count x 15 x 32 x 32`, 0 to 1.
 pub(crate) fn tensor<'a>(
     regions: impl Iterator<Item = &'a ClosingRegion>,
     count: usize,

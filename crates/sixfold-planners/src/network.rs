@@ -1,5 +1,5 @@
-//! GPD's network (Ten Pas et al. 2017, section 5): LeNet, two convolutions with pooling and two dense layers. For 32x32 pixels
-//! where the paper has 60x60, and with 96 hidden numbers for 500: a quarter of the work, 0.6 MB.
+//! GPD's network (Ten Pas et al. 2017, section 5): LeNet, two convolutions with pooling and two dense layers. It has 32x32 pixels
+//! instead of 60x60, and 96 hidden units instead of 500: a quarter of the computation, 0.6 MB.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -18,7 +18,7 @@ use sixfold_nn::layers::{Conv, ConvConfig};
 pub(crate) const ARCHITECTURE: &str = "gpd-compact";
 /// Maps of both convolutions, as in the paper.
 const MAPS: [usize; 2] = [20, 50];
-/// Numbers of the hidden dense layer.
+/// Units of the hidden dense layer.
 const HIDDEN: usize = 96;
 
 /// Sizes of the network.
@@ -41,7 +41,7 @@ impl GpdConfig {
     }
 }
 
-/// The network, made by `GpdConfig`.
+/// The network, created by `GpdConfig`.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub(crate) struct Gpd {
@@ -54,7 +54,7 @@ pub(crate) struct Gpd {
 sixfold_nn::displayed_by_name!(Gpd);
 
 impl Gpd {
-    /// Images `batch x 15 x 32 x 32`, 0 to 1, to logits of the success probability, `batch`.
+    /// From images, `batch x 15 x 32 x 32`, 0 to 1, to logits of the success probability, `batch`.
     pub(crate) fn forward(&self, images: Tensor<4>) -> Tensor<1> {
         let pool = |x: Tensor<4>| max_pool2d(x, MaxPoolOptions::new([2, 2]));
         let x = pool(self.second.forward(pool(self.first.forward(images))));

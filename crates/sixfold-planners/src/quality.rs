@@ -1,24 +1,24 @@
-//! How well a planner tells grasps that hold from others, on trials that it did not learn from.
+//! How well a planner distinguishes grasps that hold from others, on trials that were not used in its training.
 
 use serde::{Deserialize, Serialize};
 
-/// On one group of trials.
+/// Quality on one group of trials.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GroupQuality {
-    /// Candidates.
+    /// Number of candidates.
     pub candidates: usize,
     /// Fraction of them that held.
     pub held: f64,
     /// The probability that a candidate that held has a higher score than one that did not (area under the ROC curve; Hanley and
     /// McNeil 1982).
     pub auc: f64,
-    /// Fraction of the best quarter by score that held.
+    /// Fraction that held among the best quarter by score.
     pub precision: f64,
     /// Fraction of the scenes whose best candidate by score held.
     pub first: f64,
 }
 
-/// On objects of the families of the training, and on shapes of no family.
+/// Quality on objects of the training's families, and on shapes of no family.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PlannerQuality {
     /// New members of the families.
@@ -28,7 +28,7 @@ pub struct PlannerQuality {
 }
 
 impl PlannerQuality {
-    /// Names and numbers, for people.
+    /// Names and values, for display.
     pub fn scores(&self) -> Vec<(String, f64)> {
         let of = |name: &str, q: &GroupQuality| {
             [
@@ -44,7 +44,7 @@ impl PlannerQuality {
     }
 }
 
-/// Of candidates with their score, whether they held, and their scene (those of one scene in a row).
+/// Quality of candidates, given as score, whether it held, and scene (those of one scene are consecutive).
 pub(crate) fn group_quality(scored: &[(f64, bool, u64)]) -> GroupQuality {
     let mut order: Vec<&(f64, bool, u64)> = scored.iter().collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -52,7 +52,7 @@ pub(crate) fn group_quality(scored: &[(f64, bool, u64)]) -> GroupQuality {
         |of: &[&(f64, bool, u64)]| of.iter().filter(|s| s.1).count() as f64 / of.len().max(1) as f64;
     let best: Vec<&(f64, bool, u64)> = scored
         .chunk_by(|a, b| a.2 == b.2)
-        // Of equal ones the first.
+        // Ties go to the first.
         .filter_map(|scene| scene.iter().reduce(|a, b| if b.0 > a.0 { b } else { a }))
         .collect();
     GroupQuality {
@@ -64,7 +64,7 @@ pub(crate) fn group_quality(scored: &[(f64, bool, u64)]) -> GroupQuality {
     }
 }
 
-/// By ranks; equal scores count half. One half where all held or none.
+/// By ranks; equal scores count half. One half if all held or none.
 fn auc(order: &[&(f64, bool, u64)]) -> f64 {
     let (mut good, mut bad, mut area) = (0.0, 0.0, 0.0);
     for equal in order.chunk_by(|a, b| a.0 == b.0) {

@@ -1,5 +1,4 @@
-//! Whole trainings of both planners on the same trials: nothing but a seed in, a planner out. Interrupted at any time, they are
-//! resumed.
+//! Complete trainings of both planners on the same trials, from a seed alone. They can be interrupted at any time and resumed.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -23,18 +22,18 @@ use crate::quality::{PlannerQuality, group_quality};
 use crate::samples::{Sample, Samples, samples};
 use crate::trials::{TrialSetOptions, complete};
 
-/// What both trainings take.
+/// Options of both trainings.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PlannerOptions {
-    /// The trials to learn from.
+    /// The trials.
     pub trials: TrialSetOptions,
-    /// The file that holds them, or gets them: `trials.jsonl` beside the model where none is named.
+    /// The file from which they are read or to which they are written; `None`: `trials.jsonl` next to the model.
     pub file: Option<PathBuf>,
-    /// Steps in all; `None`: those of the planner.
+    /// Number of steps; `None`: the planner's default.
     pub steps: Option<u64>,
-    /// Seed of weights and order.
+    /// Seed of weights and of the order of samples.
     pub seed: u64,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -66,7 +65,7 @@ impl PlannerOptions {
         card
     }
 
-    /// The trials, made where they are missing, and what a planner sees of them.
+    /// The trials, run if they are missing, as samples for a planner.
     fn samples<T: Send>(
         &self,
         see: impl Fn(&GraspView, &Gripper, &Grasp) -> T + Sync,
@@ -82,14 +81,14 @@ impl PlannerOptions {
     }
 }
 
-/// Trials that are not learned from, for the measurement at the end.
+/// Trials that are not used in the training, for the measurement at the end.
 struct HeldOut<T> {
     new_members: Vec<Sample<T>>,
     new_shapes: Vec<Sample<T>>,
 }
 
 impl<T> HeldOut<T> {
-    /// With the scores that a planner gives.
+    /// The quality of a planner with these scores.
     fn quality(&self, scores: impl Fn(&[Sample<T>]) -> Vec<f64>) -> PlannerQuality {
         let of = |samples: &[Sample<T>]| {
             let scored: Vec<(f64, bool, u64)> =
@@ -104,22 +103,22 @@ fn with_quality(card: &mut ModelCard, quality: &PlannerQuality) {
     card.scores = quality.scores().into_iter().collect();
 }
 
-/// How GPD's network is trained.
+/// Options of the training of GPD's network.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GpdRecipe {
-    /// What both planners take.
+    /// Options of both planners.
     pub common: PlannerOptions,
     /// Highest learning rate; `None`: 0.001.
     pub learning_rate: Option<f64>,
 }
 
-/// What GPD's training knows before its samples, and behind them.
+/// Context of GPD's training: the held-out trials, once there are samples.
 pub struct GpdContext {
     held_out: Option<HeldOut<ClosingRegion>>,
 }
 
 impl GpdRecipe {
-    /// How the network is trained. Chosen by hand; not swept.
+    /// Training options of the network. Chosen by hand; not swept.
     pub fn options(&self) -> TrainingOptions {
         TrainingOptions {
             steps: 3000,
@@ -190,7 +189,7 @@ impl Recipe for GpdRecipe {
         let network = training.into_network();
         let model = GpdModel::new(network.clone(), card.clone());
         model.save(&session.model())?;
-        // Only exported: there were no samples yet.
+        // In an export there are no samples yet.
         if context.held_out.is_none() && self.samples(&mut context, session)?.is_none() {
             return Ok(None);
         }
@@ -205,21 +204,21 @@ impl Recipe for GpdRecipe {
     }
 }
 
-/// How HAF's classifier is trained: a step is a pass over all grasps.
+/// Options of the training of HAF's classifier: a step is a pass over all grasps.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct HafRecipe {
-    /// What both planners take.
+    /// Options of both planners.
     pub common: PlannerOptions,
 }
 
-/// What HAF's training knows before its samples, and behind them.
+/// Context of HAF's training: the samples and the held-out trials, once there are any.
 #[derive(Default)]
 pub struct HafContext {
     samples: Option<(Arc<HafSamples>, HeldOut<HeightGrid>)>,
 }
 
 impl HafRecipe {
-    /// Passes where nothing else is asked for: the loss no longer changes in its third digit.
+    /// Default number of passes: after it the loss no longer changes in its third digit.
     pub const PASSES: u64 = 100;
     /// The model's file in the training's folder.
     pub const FILE: &str = "model.json";
@@ -281,7 +280,7 @@ impl Recipe for HafRecipe {
         Prepared { training, mut card, mut context }: Prepared<HafTraining, HafContext>,
         session: &mut Session<'_>,
     ) -> Result<Option<PlannerQuality>, TrainError> {
-        // The classifier stands on features that are chosen from the trials: without them there is no model yet.
+        // The classifier's features are selected from the trials: without them there is no model yet.
         if context.samples.is_none() && self.samples(&mut context, session)?.is_none() {
             return Ok(None);
         }

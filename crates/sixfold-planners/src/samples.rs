@@ -1,4 +1,4 @@
-//! What trials show and how they ended: every scene rendered again, as it was.
+//! Samples from trials: every scene is rendered again exactly as in its trials, and each candidate has its outcome.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -13,7 +13,7 @@ use crate::trials::{Part, TrialSetOptions, TrialsError, object, object_of, setti
 /// A candidate that was tried.
 #[derive(Debug, Clone)]
 pub struct Sample<T> {
-    /// What a planner sees of it.
+    /// The planner's input for it.
     pub seen: T,
     /// Whether it held.
     pub held: bool,
@@ -21,18 +21,18 @@ pub struct Sample<T> {
     pub scene: u64,
 }
 
-/// Trials to learn from and to measure on.
+/// Samples for the training and for the evaluation.
 #[derive(Debug, Clone)]
 pub struct Samples<T> {
-    /// To learn from.
+    /// For the training.
     pub training: Vec<Sample<T>>,
-    /// To measure on: new members of the families.
+    /// For the evaluation: new members of the families.
     pub new_members: Vec<Sample<T>>,
-    /// To measure on: new shapes.
+    /// For the evaluation: new shapes.
     pub new_shapes: Vec<Sample<T>>,
 }
 
-/// What a planner sees of all trials, in their order; `None` when it was stopped.
+/// The planner's inputs for all trials, in their order; `None` when it was stopped.
 pub(crate) fn samples<T: Send>(
     rows: &[SceneRow],
     options: &TrialSetOptions,

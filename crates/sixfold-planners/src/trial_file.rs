@@ -1,5 +1,5 @@
-//! The file of trials: the seed in the first line, then a scene a line, so that a stopped run continues and both planners learn
-//! from the same trials.
+//! The file of trials: the seed in the first line, then one scene per line, so that a stopped run resumes and both planners are
+//! trained on the same trials.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Seek, SeekFrom, Write};
@@ -22,9 +22,9 @@ pub(crate) type PoseRow = [f64; 7];
 pub(crate) struct SceneRow {
     /// Its number.
     pub scene: u64,
-    /// Where the object lies.
+    /// Pose of the object.
     pub world_from_object: PoseRow,
-    /// What was tried; none where the object did not come to rest or was not found.
+    /// The candidates tried; empty if the object did not come to rest or was not found.
     pub candidates: Vec<Candidate>,
 }
 
@@ -32,9 +32,9 @@ pub(crate) struct SceneRow {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Candidate {
-    /// Who proposed it.
+    /// The planner that proposed it.
     pub source: Source,
-    /// Where the hand was sent.
+    /// The commanded pose of the hand.
     pub camera_from_gripper: PoseRow,
     /// Distance of the pads before closing, metres.
     pub opening: f64,
@@ -68,7 +68,7 @@ impl Candidate {
         Candidate { source, camera_from_gripper, opening: grasp.opening, held }
     }
 
-    /// The grasp, without what it was proposed for.
+    /// The grasp, without width and quality.
     pub(crate) fn grasp(&self) -> Grasp {
         let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.5, observed: 1.0 };
         let (camera_from_gripper, opening) = (pose_of(&self.camera_from_gripper), self.opening);
@@ -76,7 +76,7 @@ impl Candidate {
     }
 }
 
-/// The file, open for more scenes.
+/// The file, opened to append scenes.
 pub(crate) struct TrialFile {
     file: File,
     path: PathBuf,
@@ -85,8 +85,8 @@ pub(crate) struct TrialFile {
 }
 
 impl TrialFile {
-    /// Opens a file, or begins one. A line without an end, written when a run was stopped, is removed. A file of fewer scenes is
-    /// continued, one of more serves as well.
+    /// Opens or creates a file. An incomplete last line from a stopped run is removed. A file with fewer scenes is continued; one
+    /// with more can be used as well.
     pub(crate) fn open(path: &Path, options: &TrialSetOptions) -> Result<TrialFile, TrialsError> {
         let io = |source| TrialsError::Io { file: path.display().to_string(), source };
         sixfold_io::make_folder_of(path).map_err(io)?;
@@ -114,7 +114,7 @@ impl TrialFile {
         Ok(opened)
     }
 
-    /// Scenes in it.
+    /// Number of scenes in the file.
     pub(crate) fn len(&self) -> usize {
         self.rows
     }
@@ -127,7 +127,7 @@ impl TrialFile {
     }
 
     fn line(&mut self, line: &str) -> Result<(), TrialsError> {
-        // One write, so that little else than a whole line is ever there.
+        // A single write, so that the file almost always ends with a complete line.
         let written = self.file.write_all(format!("{line}\n").as_bytes());
         written.map_err(|e| self.io(e))
     }

@@ -1,7 +1,8 @@
-//! What planners learn from: candidates on synthetic objects, seen in one simulated depth view and tried in a physics engine.
+//! Training data of planners: candidates on synthetic objects, proposed from one simulated depth view and tried in a physics
+//! engine.
 //!
-//! GPD learned from scanned objects and a geometric test of force closure, HAF from labelled heights. Here a candidate counts as good
-//! when it held in one trial of the hard setting, in which the hand errs and the friction is low.
+//! GPD was trained on scanned objects with a geometric test of force closure, HAF on labelled heights. Here a candidate counts as
+//! good if it held in one trial of the hard setting, with pose errors of the gripper and low friction.
 
 use std::path::Path;
 
@@ -25,17 +26,17 @@ use thiserror::Error;
 
 use crate::trial_file::{Candidate, SceneRow, TrialFile};
 
-/// Scenes of each object.
+/// Scenes per object.
 const SCENES_PER_OBJECT: u64 = 4;
-/// Candidates of a scene that are tried, of each source: GPD's, HAF's, the antipodal planner's.
+/// Number of candidates per scene that are tried, for each source: GPD, HAF, the antipodal planner.
 const TRIED: [(Source, usize); 3] =
     [(Source::LocalFrame, 6), (Source::ApproachGrid, 5), (Source::Antipodal, 5)];
-/// HAF's candidates are sampled from a coarser grid than it plans on.
+/// HAF's candidates are sampled from a coarser grid than that used for planning.
 const GRID: ApproachGridOptions = ApproachGridOptions { rolls: 6, step: 0.02 };
-/// The gripper that is tried.
+/// The gripper of the trials.
 const GRIPPER: &str = "jaws-140";
 
-/// Why there are no trials.
+/// Errors of trials.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum TrialsError {
@@ -44,38 +45,38 @@ pub enum TrialsError {
     Io {
         /// The file.
         file: String,
-        /// What went wrong.
+        /// The cause.
         source: std::io::Error,
     },
-    /// Another training makes trials in the file.
+    /// Another training is writing trials to the file.
     #[error(transparent)]
     Lock(#[from] LockError),
-    /// The file holds something else.
+    /// The file has other contents.
     #[error("trials {file}, line {line}: found {found}, expected {expected}")]
     Content {
         /// The file.
         file: String,
         /// Number of the line.
         line: usize,
-        /// What is there.
+        /// The content found.
         found: String,
-        /// What should be there.
+        /// The content expected.
         expected: String,
     },
-    /// A synthetic object could not be made or tried: never with these numbers.
+    /// A synthetic object could not be generated or tried: never with these values.
     #[error("object {number}: {reason}")]
     Object {
         /// Its number.
         number: u64,
-        /// What went wrong.
+        /// The cause.
         reason: String,
     },
 }
 
-/// Which trials are made.
+/// Options of the trials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TrialSetOptions {
-    /// Scenes in all, four of each object; eight objects of ten are trained on.
+    /// Number of scenes, four per object; eight of ten objects are for the training.
     pub scenes: u64,
     /// Seed of objects, scenes, candidates and trials.
     pub seed: u64,
@@ -94,27 +95,27 @@ impl TrialSetOptions {
     }
 }
 
-/// Where a candidate came from.
+/// The source of a candidate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
     /// GPD's sampling.
     LocalFrame,
-    /// HAF's.
+    /// HAF's sampling.
     ApproachGrid,
     /// The antipodal planner.
     Antipodal,
 }
 
-/// What a scene is for.
+/// The purpose of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
-    /// To learn from.
+    /// For the training.
     Training,
-    /// To measure on: objects of the same families that were not learned from.
+    /// For the evaluation: objects of the same families that are not in the training.
     NewMembers,
-    /// To measure on: objects of no family.
+    /// For the evaluation: objects of no family.
     NewShapes,
 }
 
@@ -135,8 +136,8 @@ pub(crate) fn setting() -> Hardness {
     Hardness::hard(gripper, TrialOptions::default())
 }
 
-/// Makes the trials that `file` lacks; all its scenes, in order, as the file has them. `None` when it was stopped: what was made
-/// stays. The same options give the same bytes, in however many runs and by however many threads.
+/// Runs the trials that are missing in `file`; returns all its scenes, in order, as read from the file. `None` when it was stopped;
+/// finished trials are kept. The same options give the same bytes, independent of the number of runs and threads.
 pub(crate) fn complete(
     file: &Path,
     options: &TrialSetOptions,
@@ -148,7 +149,8 @@ pub(crate) fn complete(
         if !progress.report(rows.len(), total) {
             return Ok(None);
         }
-        // Whole objects, a few at a time: cutting one into convex parts takes longer than its scenes.
+        // All scenes of an object together, a few objects at a time: the convex decomposition of an object takes longer than its
+        // scenes.
         let first = rows.len() as u64 / SCENES_PER_OBJECT;
         let last = options.scenes.div_ceil(SCENES_PER_OBJECT).min(first + 4);
         let made: Result<Vec<Vec<SceneRow>>, TrialsError> =
@@ -164,7 +166,7 @@ pub(crate) fn complete(
     rows.read(options.scenes).map(Some)
 }
 
-/// An object of the trials, as it lies before it comes to rest.
+/// An object of the trials, in the orientation before it comes to rest.
 pub(crate) fn object(number: u64, options: &TrialSetOptions) -> Result<Mesh, TrialsError> {
     let mut random = stream(options.seed, number);
     let made = if Part::of_scene(number * SCENES_PER_OBJECT) == Part::NewShapes {
@@ -196,14 +198,14 @@ fn scenes_of_object(number: u64, options: &TrialSetOptions) -> Result<Vec<SceneR
         .collect()
 }
 
-/// The setting of a scene: of each object's, one lies in any orientation.
+/// The setting of a scene: in one scene of each object, the object is in any orientation.
 pub(crate) fn setting_of_scene(number: u64) -> Hardness {
     let mut setting = setting();
     setting.options.any_orientation = number % SCENES_PER_OBJECT == SCENES_PER_OBJECT - 1;
     setting
 }
 
-/// Some candidates of a scene, tried.
+/// Tries some candidates of a scene.
 fn tried(
     scene: &Scene,
     parts: &ConvexParts,
@@ -242,7 +244,7 @@ fn candidates(view: &GraspView, gripper: &Gripper, source: Source, seed: u64) ->
     }
 }
 
-/// So many of them, or all.
+/// `count` random ones of them, or all if there are fewer.
 fn some(mut grasps: Vec<Grasp>, count: usize, random: &mut Random) -> Vec<Grasp> {
     for k in 0..count.min(grasps.len()) {
         let other = random.random_range(k..grasps.len());
@@ -266,14 +268,14 @@ mod tests {
         let count: usize = rows.iter().map(|r| r.candidates.len()).sum();
         let held = rows.iter().flat_map(|r| &r.candidates).filter(|c| c.held).count();
         assert!(count > 20 && held > 0 && held < count, "{held} of {count}");
-        // Stopped within a line.
+        // A run that was stopped within a line.
         let bytes = std::fs::read(&whole).unwrap();
         let cut = folder.path().join("cut.jsonl");
         std::fs::write(&cut, &bytes[..bytes.len() * 6 / 10]).unwrap();
         let threads = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         assert_eq!(threads.install(|| complete(&cut, &options, &())).unwrap().unwrap(), rows);
         assert_eq!(std::fs::read(&cut).unwrap(), bytes);
-        // Of more scenes than are asked for the first serve.
+        // From a file with more scenes than requested the first are used.
         let fewer = TrialSetOptions { scenes: 3, ..options };
         assert_eq!(complete(&cut, &fewer, &()).unwrap().unwrap(), rows[..3]);
         let other = TrialSetOptions { seed: 6, ..options };

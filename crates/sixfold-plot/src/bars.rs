@@ -1,17 +1,17 @@
-//! Horizontal bars, in groups, with their values written at the ends.
+//! Horizontal bars in groups, with their values printed at the ends.
 
 use sixfold_geometry::RgbImage;
 
 use crate::{COLORS, Canvas, FAINT, INK, text_width, ticks, ticks_logarithmic};
 
 const WIDTH: usize = 760;
-/// Height of a bar, between groups, of the title, the legend and the axis, pixels.
+/// Heights of a bar, of the gap between groups, and of title, legend and axis, pixels.
 const BAR: f64 = 15.0;
 const GAP: f64 = 12.0;
 const TITLE: f64 = 30.0;
 const LEGEND: f64 = 22.0;
 const AXIS: f64 = 40.0;
-/// Between the longest label and the bars, and right of the bars for their values, pixels.
+/// Margin between the longest label and the bars, and space right of the bars for their values, pixels.
 const MARGIN: f64 = 10.0;
 const VALUES: f64 = 64.0;
 /// Side of a font's dot, pixels: text, title.
@@ -21,24 +21,24 @@ const LARGE: f64 = 2.0;
 /// A chart of horizontal bars.
 #[derive(Debug, Clone, Default)]
 pub struct BarChart {
-    /// Stands above it.
+    /// Text above the chart.
     pub title: String,
-    /// What the axis measures, with its unit.
+    /// Quantity of the axis, with its unit.
     pub axis: String,
-    /// Names of the bars of each group, for the legend; fewer than two need none.
+    /// Names of the bars of each group, for the legend; with fewer than two there is no legend.
     pub series: Vec<String>,
-    /// From top to bottom.
+    /// Groups of bars, from top to bottom.
     pub groups: Vec<BarGroup>,
-    /// The axis has powers of ten.
+    /// Whether the axis is logarithmic (powers of ten).
     pub logarithmic: bool,
-    /// Where a linear axis ends; `None` for the largest value.
+    /// End of a linear axis; `None`: the largest value.
     pub end: Option<f64>,
 }
 
 /// Bars with a common label.
 #[derive(Debug, Clone, Default)]
 pub struct BarGroup {
-    /// Stands left of them.
+    /// Text left of the bars.
     pub label: String,
     /// One value for each series.
     pub values: Vec<f64>,
@@ -83,7 +83,7 @@ impl BarChart {
         }
     }
 
-    /// Grid lines with numbers; where a value lies.
+    /// Draws grid lines with numbers; returns the map from a value to its position.
     fn axis(
         &self,
         canvas: &mut Canvas,
@@ -117,7 +117,7 @@ impl BarChart {
     }
 }
 
-/// Three digits that count.
+/// A value with three significant digits.
 fn written(value: f64) -> String {
     let digits = if value == 0.0 { 0.0 } else { value.abs().log10().floor() };
     let decimals = (2.0 - digits).clamp(0.0, 3.0) as usize;

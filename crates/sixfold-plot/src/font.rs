@@ -1,6 +1,6 @@
 //! A font of 5 x 7 pixels.
 
-/// Glyphs of 5 x 7 pixels for the characters from space to `~`, a byte a column, lowest bit on top.
+/// Glyphs of 5 x 7 pixels for the characters from space to `~`, one byte per column, the lowest bit on top.
 pub(crate) const FONT: [[u8; 5]; 95] = [
     [0, 0, 0, 0, 0],
     [0, 0, 95, 0, 0],

@@ -1,4 +1,4 @@
-//! Lines, text and axes drawn with nothing but pixels: no font file, no system library.
+//! Lines, text and axes drawn directly as pixels, without font files or system libraries.
 //!
 //! [`Canvas`] draws at three times the size and averages down, so lines are smooth. Coordinates are image pixels, x to
 //! the right and y down from the top left corner.
@@ -16,7 +16,7 @@ pub use bars::{BarChart, BarGroup};
 use font::FONT;
 pub use ticks::{Ticks, ticks, ticks_logarithmic};
 
-/// Drawn this many times larger and averaged down: smooth lines.
+/// Images are drawn this many times larger and averaged down, for smooth lines.
 const OVERSAMPLING: usize = 3;
 
 /// Colour of text and axes.
@@ -25,7 +25,7 @@ pub const INK: [u8; 3] = [40, 44, 52];
 pub const FAINT: [u8; 3] = [226, 229, 234];
 /// Colour of the background.
 pub const PAPER: [u8; 3] = [255, 255, 255];
-/// Colours that stay apart for colour-blind eyes (Tol's bright and muted schemes).
+/// Colours that colour-blind readers can distinguish (Tol's bright and muted schemes).
 pub const COLORS: [[u8; 3]; 12] = [
     [68, 119, 170],
     [238, 102, 119],
@@ -105,7 +105,7 @@ impl Canvas {
         }
     }
 
-    /// Text that runs upwards, its left side at `x` and its middle at `y`.
+    /// Text that runs upwards, with its left side at `x` and its centre at `y`.
     pub fn text_upwards(&mut self, x: f64, y: f64, size: f64, text: &str, color: [u8; 3]) {
         let bottom = y + 0.5 * text_width(text, size);
         for (i, c) in text.chars().enumerate() {
@@ -147,7 +147,7 @@ pub fn text_width(text: &str, size: f64) -> f64 {
     size * (6.0 * text.chars().count() as f64 - 1.0).max(0.0)
 }
 
-/// The dots of a text, column and row from its top left corner; six columns a character, eight rows.
+/// The dots of a text, column and row from its top left corner; six columns per character, eight rows.
 pub fn text_dots(text: &str) -> Vec<(usize, usize)> {
     let mut dots = vec![];
     for (i, c) in text.chars().enumerate() {

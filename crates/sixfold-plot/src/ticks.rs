@@ -1,11 +1,11 @@
 //! Round numbers for an axis.
 
-/// Where the marks of an axis stand and what they say.
+/// Positions and labels of the marks of an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ticks {
-    /// Value at the axis' start.
+    /// Value at the start of the axis.
     pub low: f64,
-    /// Value at the axis' end.
+    /// Value at the end of the axis.
     pub high: f64,
     /// Value and label of every mark, in rising order.
     pub marks: Vec<(f64, String)>,
@@ -29,7 +29,7 @@ pub fn ticks(low: f64, high: f64) -> Ticks {
     Ticks { low: first * step, high: last * step, marks }
 }
 
-/// Marks at the powers of ten that enclose `low` to `high`, both above zero.
+/// Marks at the powers of ten that enclose `low` to `high`, both positive.
 pub fn ticks_logarithmic(low: f64, high: f64) -> Ticks {
     let (low, high) = if low > 0.0 && high >= low && high.is_finite() { (low, high) } else { (0.1, 1.0) };
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);

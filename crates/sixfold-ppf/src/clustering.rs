@@ -1,32 +1,32 @@
-//! Joining similar pose hypotheses: the votes of a cluster are the sum of its members' (Drost et al. 2010,
-//! section 3.5).
+//! Clustering of similar pose hypotheses: the votes of a cluster are the sum of its members' votes (Drost et al. 2010, section
+//! 3.5).
 
 use nalgebra::UnitQuaternion;
 use sixfold_geometry::{OptionError, Pose, Vec3};
 
 use crate::voting::Hypothesis;
 
-/// When two poses are one.
+/// When two poses belong to one cluster.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClusterOptions {
     /// Largest distance of the object's centres, as a fraction of its diameter.
     pub distance: f64,
     /// Largest rotation between them, radians.
     pub angle: f64,
-    /// Most clusters returned.
+    /// Maximum number of clusters returned.
     pub max_clusters: usize,
 }
 
-/// Largest distance of the centres of poses that are joined, as a fraction of the diameter; chosen by hand, not swept.
+/// Largest distance of the centres of poses in a cluster, as a fraction of the diameter; chosen by hand, not swept.
 const DISTANCE: f64 = 0.08;
-/// Largest rotation between poses that are joined, degrees; chosen by hand, not swept.
+/// Largest rotation between poses in a cluster, degrees; chosen by hand, not swept.
 const ANGLE: f64 = 15.0;
-/// Most clusters; chosen by hand, not swept.
+/// Maximum number of clusters; chosen by hand, not swept.
 const MAX_CLUSTERS: usize = 400;
-/// At most about this many symmetries are tried when poses are joined: those of a continuous one are 10 degrees apart then.
+/// Approximate maximum number of symmetries tried in the clustering: those of a continuous symmetry are then 10 degrees apart.
 const MAX_SYMMETRIES: usize = 36;
-/// Clusters that may be founded, as a multiple of those returned: weak hypotheses may support a cluster, but found none once there
-/// are plenty. Chosen by hand; not swept.
+/// Maximum number of clusters during the clustering, as a multiple of those returned: when it is reached, further (weak) hypotheses
+/// can join a cluster but not start a new one. Chosen by hand; not swept.
 const FOUNDED: usize = 4;
 
 impl Default for ClusterOptions {
@@ -49,8 +49,8 @@ impl ClusterOptions {
     }
 }
 
-/// Clusters the hypotheses, most votes first. `centre` is the object's centre in its frame and `diameter`
-/// its size, metres; poses that differ by one of `symmetries` are the same.
+/// Clusters the hypotheses, most votes first. `centre` is the object's centre in its frame and `diameter` its size, metres; poses
+/// that differ by one of `symmetries` count as equal.
 pub fn cluster(
     hypotheses: &[Hypothesis],
     centre: &Vec3,
@@ -68,7 +68,7 @@ pub fn cluster(
     let mut order: Vec<usize> = (0..hypotheses.len()).collect();
     order.sort_by(|&a, &b| hypotheses[b].votes.total_cmp(&hypotheses[a].votes).then(a.cmp(&b)));
     let reach = options.distance * diameter;
-    // With a continuous symmetry there are hundreds: a coarse subset is enough to join.
+    // With a continuous symmetry there are hundreds: a coarse subset suffices for the clustering.
     let stride = symmetries.len().div_ceil(MAX_SYMMETRIES).max(1);
     let symmetries: Vec<&Pose> = symmetries.iter().step_by(stride).collect();
     let cosine = (0.5 * options.angle).cos();

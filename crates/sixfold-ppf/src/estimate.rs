@@ -1,8 +1,8 @@
-//! From a prepared scene and a described object to poses: vote, join, screen, refine, verify.
+//! From a prepared scene and an object's model to poses: vote, cluster, screen, refine, verify.
 //!
-//! Screening compares the object's samples with the depth image at the hypothesis as the view-dependent
-//! re-scoring of Vidal et al. (2018), section 3.4: only samples seen from that side count. It is cheap enough for
-//! hundreds of hypotheses, so the number of votes decides little.
+//! Screening compares the object's samples with the depth image at the hypothesis as in the view-dependent re-scoring of Vidal et
+//! al. (2018), section 3.4: only samples visible from that side count. It is cheap enough for hundreds of hypotheses, so the number
+//! of votes has little influence.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -14,12 +14,12 @@ use crate::clustering::{ClusterOptions, cluster};
 use crate::model::ObjectModel;
 use crate::voting::{Hypothesis, VotingOptions, vote};
 
-/// How poses are estimated.
+/// Options of the pose estimation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PpfOptions {
     /// Voting.
     pub voting: VotingOptions,
-    /// Joining.
+    /// Clustering.
     pub clustering: ClusterOptions,
     /// Final scores.
     pub verification: VerificationOptions,
@@ -27,7 +27,7 @@ pub struct PpfOptions {
     pub refined: usize,
     /// Hypotheses that get a full ICP and are verified by rendering.
     pub verified: usize,
-    /// How much the votes say beside the verification, as an exponent from 0 (nothing) to 1.
+    /// Exponent of the votes in the confidence, next to the verification, from 0 (no influence) to 1.
     pub vote_power: f64,
     /// Maximum number of instances of the object returned, 1 or more.
     pub max_instances: usize,
@@ -35,58 +35,58 @@ pub struct PpfOptions {
     pub min_score: f64,
 }
 
-/// [`PpfOptions::refined`]; chosen by hand for the time that it takes, not swept.
+/// [`PpfOptions::refined`]; chosen by hand for run time, not swept.
 const REFINED: usize = 100;
-/// [`PpfOptions::verified`]; chosen by hand for the time that it takes, not swept.
+/// [`PpfOptions::verified`]; chosen by hand for run time, not swept.
 const VERIFIED: usize = 40;
 /// [`PpfOptions::vote_power`]; chosen by hand, not swept.
 const VOTE_POWER: f64 = 0.3;
-/// [`PpfOptions::min_score`]: lower ones are guesses. Chosen by hand; not swept.
+/// [`PpfOptions::min_score`]: estimates below it are guesses. Chosen by hand; not swept.
 const MIN_SCORE: f64 = 0.05;
 
-/// Scene points nearer than this to the surface of an instance that was found belong to it and do not vote for the next, metres:
-/// the points are thinned to 2 mm. Chosen by hand; not swept.
+/// Scene points closer than this to the surface of a found instance belong to it and do not vote for the next one, metres: the
+/// points are downsampled to 2 mm. Chosen by hand; not swept.
 const EXPLAINED: f64 = 0.003;
-/// Fraction of its pixels, as a numerator and a denominator, that an instance may share with those found before; chosen by hand,
-/// not swept.
+/// Largest fraction (numerator, denominator) of its pixels that an instance may share with those found before; chosen by hand, not
+/// swept.
 const MAX_SHARED: (usize, usize) = (3, 10);
-/// Samples nearer to the camera than this are not screened, metres: depth cameras measure nothing there.
+/// Samples closer to the camera than this are not used in the screening, metres: depth cameras do not measure there.
 const NEAREST: f32 = 0.05;
-/// Least cosine between ray and normal by which a difference of depth counts as one along the normal: surface seen at a grazing
-/// angle may be off by more in depth. Chosen by hand; not swept.
+/// Lower bound of the cosine between ray and normal with which a difference in depth is converted to one along the normal: at
+/// grazing angles the depth may differ by more. Chosen by hand; not swept.
 const MIN_SLOPE: f32 = 0.3;
-/// What a sample counts in screening whose depth agrees and whose normal does not, 0 to 1; chosen by hand, not swept.
+/// Weight in the screening of a sample whose depth agrees but whose normal does not, 0 to 1; chosen by hand, not swept.
 const DEPTH_ALONE: f32 = 0.2;
-/// Weight of all samples in the denominator of the screening score, where occluded ones do not count: the fewer samples are seen, the
-/// lower the score. Chosen by hand; not swept.
+/// Weight of all samples in the denominator of the screening score, where occluded ones do not count: the fewer samples are
+/// visible, the lower the score. Chosen by hand; not swept.
 const HIDDEN_WEIGHT: f32 = 0.15;
-/// Tolerance of depth in the first screening, in sampling steps: poses of votes are off by about so much. Chosen by hand; not swept.
+/// Depth tolerance in the first screening, in sampling steps: about the error of the voted poses. Chosen by hand; not swept.
 const COARSE_TOLERANCE: f64 = 1.5;
-/// Lower bound, metres; chosen by hand, not swept.
+/// Lower bound of this tolerance, metres; chosen by hand, not swept.
 const MIN_COARSE_TOLERANCE: f64 = 0.006;
 /// Cosine above which normals agree in the first screening, about 45 degrees; chosen by hand, not swept.
 const COARSE_COSINE: f32 = 0.7;
-/// Tolerance of depth in the screening after the short ICP, in sampling steps; at least the inlier threshold of the verification.
+/// Depth tolerance in the screening after the short ICP, in sampling steps; at least the inlier threshold of the verification.
 /// Chosen by hand; not swept.
 const FINE_TOLERANCE: f64 = 0.7;
 /// Cosine above which normals agree in that screening, about 37 degrees; chosen by hand, not swept.
 const FINE_COSINE: f32 = 0.8;
-/// One of so many of the hypotheses that are refined is chosen by votes whatever its screening score; chosen by hand, not swept.
+/// One in this many of the refined hypotheses is selected by votes, regardless of its screening score; chosen by hand, not swept.
 const BY_VOTES: usize = 3;
 /// Levels of the short ICP: rejection distance in sampling steps, and iterations. Chosen by hand; not swept.
 const SHORT_LEVELS: [(f64, usize); 2] = [(2.5, 4), (1.2, 4)];
-/// Normals of a correspondence agree within this angle, degrees; chosen by hand, not swept.
+/// Largest angle between the normals of a correspondence, degrees; chosen by hand, not swept.
 const SHORT_ANGLE: f64 = 50.0;
-/// A level of the short ICP ends at steps smaller than this, metres and radians; chosen by hand, well below the noise of depth.
+/// A level of the short ICP stops when a step is smaller than this, metres and radians; chosen by hand, well below the depth noise.
 const SHORT_CONVERGENCE: f64 = 1e-4;
-/// Fewest correspondences of the short ICP, two more than fix a pose; chosen by hand, not swept.
+/// Fewest correspondences of the short ICP, two more than a pose needs; chosen by hand, not swept.
 const SHORT_CORRESPONDENCES: usize = 8;
-/// Poses whose centres are nearer than this fraction of the diameter, and whose rotations differ by less than [`SAME_ANGLE`], are
-/// one after the short ICP. Chosen by hand; not swept.
+/// After the short ICP, poses are merged if their centres are closer than this fraction of the diameter and their rotations differ
+/// by less than [`SAME_ANGLE`]. Chosen by hand; not swept.
 const SAME_PLACE: f64 = 0.03;
 /// See [`SAME_PLACE`]; radians.
 const SAME_ANGLE: f64 = 0.1;
-/// Factor by which more hypotheses are verified where there may be several instances; chosen by hand, not swept.
+/// Factor on the number of verified hypotheses if there may be several instances; chosen by hand, not swept.
 const SEVERAL: usize = 2;
 
 impl Default for PpfOptions {
@@ -105,7 +105,7 @@ impl Default for PpfOptions {
 }
 
 impl PpfOptions {
-    /// Checks every field, also those of voting, joining and verification.
+    /// Checks every field, including those of voting, clustering and verification.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
@@ -126,21 +126,21 @@ impl PpfOptions {
 pub struct PpfEstimate {
     /// The pose.
     pub camera_from_object: Pose,
-    /// What the verification says.
+    /// The scores of the verification.
     pub score: VerificationScore,
     /// Votes of the hypothesis it came from.
     pub votes: f32,
-    /// What decides between estimates, in `0..=1`: [`VerificationScore::ranking`] times the fraction of the most votes, to the
-    /// power [`PpfOptions::vote_power`].
+    /// Confidence in `0..=1`, by which estimates are ranked: [`VerificationScore::ranking`] times the votes as a fraction of the
+    /// maximum, to the power [`PpfOptions::vote_power`].
     pub confidence: f64,
 }
 
-/// Where an estimate's time went, in seconds.
+/// Run time of each stage of an estimate, in seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Timing {
     /// Voting.
     pub voting: f64,
-    /// Joining.
+    /// Clustering.
     pub clustering: f64,
     /// Screening and short ICP.
     pub screening: f64,
@@ -154,7 +154,7 @@ pub fn estimate(scene: &DepthRegion, model: &ObjectModel, options: &PpfOptions) 
     estimate_timed(scene, model, options).0
 }
 
-/// As [`estimate`], and where the time went.
+/// As [`estimate`], with the run time of each stage.
 pub fn estimate_timed(
     scene: &DepthRegion,
     model: &ObjectModel,
@@ -165,7 +165,7 @@ pub fn estimate_timed(
     let Some(target) = scene.indexed_cloud() else { return (vec![], timing) };
     let mut found: Vec<PpfEstimate> = vec![];
     let mut taken: Vec<u32> = vec![];
-    // Several instances hide each other's votes: after each round the explained points are taken out.
+    // Instances mask each other's votes, so the explained points are removed after each round.
     for round in 0..options.max_instances.max(1) {
         let start = std::time::Instant::now();
         let cloud;
@@ -219,7 +219,7 @@ pub fn estimate_timed(
     (found, timing)
 }
 
-/// The samples of the model that are seen at a pose, in the object's frame.
+/// Indices of the model's samples that are visible at a pose.
 fn visible_samples(model: &ObjectModel, pose: &Pose) -> impl Iterator<Item = usize> {
     let centre = pose.transform_point(&model.centre);
     let towards = pose.inverse().transform_direction(&-centre.normalize()).cast::<f32>();
@@ -260,7 +260,7 @@ pub(crate) fn screening_score(
         if z <= 0.0 {
             continue;
         }
-        // Distance to the tangent plane along the ray: grazing surface may miss by more in depth.
+        // Distance to the tangent plane along the ray: at grazing angles the depth may differ by more.
         let slope = (-n.dot(&p) / p.norm()).clamp(MIN_SLOPE, 1.0);
         let difference = (z - p.z) * slope;
         if difference > tolerance {
@@ -280,8 +280,8 @@ pub(crate) fn screening_score(
     good / (seen + HIDDEN_WEIGHT * total) * (1.0 - out / total)
 }
 
-/// The first sieve: the samples of every hypothesis against the depth image, a short ICP for the best
-/// [`PpfOptions::refined`], and what is left without repetitions, best first.
+/// The first selection: compares the samples of every hypothesis with the depth image, runs a short ICP for the best
+/// [`PpfOptions::refined`], and removes duplicates; best first.
 pub fn screen(
     scene: &DepthRegion,
     model: &ObjectModel,
@@ -297,8 +297,8 @@ pub fn screen(
         .map(|(i, h)| (screening_score(scene, model, &h.camera_from_object, coarse, COARSE_COSINE), i))
         .collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    // The best by agreement, and those with the most votes whatever they score: a coarse pose of a thin or curved
-    // object agrees badly before it is refined.
+    // The best by agreement, and those with the most votes regardless of their score: the coarse pose of a thin or curved object
+    // agrees poorly before the refinement.
     let by_votes = options.refined / BY_VOTES;
     let mut rank = 0;
     scored.retain(|&(_, i)| {
@@ -327,12 +327,12 @@ pub fn screen(
         })
         .collect();
     refined.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    // Votes and agreement are two witnesses; half of the places go to each one's favourites.
+    // Half of the hypotheses are selected by votes, half by agreement.
     let limit = options.verified * if options.max_instances > 1 { SEVERAL } else { 1 };
     let mut by_votes: Vec<_> = refined.clone();
     by_votes.sort_by_key(|&(_, i, _)| i);
     let mixed = refined.into_iter().zip(by_votes).flat_map(|(a, b)| [a, b]);
-    // Those that fell into the same place are one.
+    // Hypotheses that converged to the same pose are merged.
     let mut kept: Vec<Hypothesis> = vec![];
     for (_, i, pose) in mixed {
         let votes = clusters[i].votes;
@@ -350,7 +350,7 @@ pub fn screen(
     kept
 }
 
-/// The second sieve: refined and verified with the mesh, the most confident first.
+/// The second selection: hypotheses refined and verified with the mesh, sorted by confidence.
 fn verified(
     scene: &DepthRegion,
     model: &ObjectModel,
@@ -374,7 +374,7 @@ fn verified(
             }
         })
         .collect();
-    // A stable sort: equal scores stay in the order of the screening.
+    // A stable sort: ties keep the order of the screening.
     verified.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
     verified
 }

@@ -11,9 +11,9 @@ use std::sync::Arc;
 use crate::estimate::{PpfOptions, estimate};
 use crate::model::{ModelOptions, ObjectModel};
 
-/// Step at which a continuous symmetry is sampled when hypotheses are joined, as a fraction of the diameter.
+/// Step at which a continuous symmetry is sampled for the clustering, as a fraction of the diameter.
 const SYMMETRY_STEP: f64 = 0.05;
-/// Where an object's description is kept in its folder.
+/// File of an object's description in its folder.
 const FILE: &str = "ppf.bin";
 const METHOD: &str = "ppf";
 
@@ -22,13 +22,13 @@ const METHOD: &str = "ppf";
 pub struct PpfEstimator {
     /// How depth images are prepared.
     pub depth: DepthOptions,
-    /// How objects are described.
+    /// How objects are sampled.
     pub model: ModelOptions,
-    /// How poses are estimated; instances and the minimum confidence are the query's.
+    /// How poses are estimated; the query sets the number of instances and the minimum confidence.
     pub options: PpfOptions,
 }
 
-/// An object as point pair features know it.
+/// An object prepared for point pair features.
 pub struct PpfObject {
     name: String,
     mesh: Arc<Mesh>,
@@ -70,7 +70,7 @@ impl PoseEstimator for PpfEstimator {
         self.depth
     }
 
-    /// On real frames most wrong poses lie below 0.25, most right ones above (LM-O frame 3 and two YCB-V frames, by
+    /// On real frames most wrong poses have a confidence below 0.25, most right ones above (LM-O frame 3 and two YCB-V frames, by
     /// `cargo test --release -p sixfold-ppf --test real_frames -- --nocapture`).
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: 0.25, dataset: PpfOptions::default().min_score }

@@ -1,9 +1,9 @@
 //! Depth-only pose of known objects without training: point pair features, pose hypotheses and their
 //! verification.
 //!
-//! The way of one image: a [`DepthRegion`](sixfold_align::DepthRegion) is prepared once; for every object its [`ObjectModel`] votes for poses
-//! ([`voting`]), similar poses are joined ([`clustering`]), the best are refined by ICP and
-//! judged by rendering ([`sixfold_align::verify()`]); [`estimate()`] puts it together.
+//! The steps for one image: a [`DepthRegion`](sixfold_align::DepthRegion) is prepared once; for every object its [`ObjectModel`]
+//! votes for poses ([`voting`]), similar poses are clustered ([`clustering`]), and the best are refined by ICP and verified by
+//! rendering ([`sixfold_align::verify()`]); [`estimate()`] runs all steps.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

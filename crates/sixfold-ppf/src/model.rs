@@ -1,11 +1,10 @@
-//! The description of an object: what its surface looks like from outside, sampled, and the table of its
-//! point pair features (Drost et al. 2010, section 3).
+//! The model of an object: samples of its outer surface, and the table of its point pair features (Drost et al. 2010, section 3).
 //!
 //! Differences to the paper, and why:
-//! * The surface is sampled from renderings around the object, not from the mesh: inner walls vanish and normals
-//!   point outwards whatever the winding (Hinterstoisser et al. 2016, section 3.1, ask for the same).
-//! * Every sample knows from which of the views it is seen. Pairs that no view sees together are not in the table:
-//!   one depth image cannot show them.
+//! * The surface is sampled from renderings around the object, not from the mesh: inner walls are excluded and normals point
+//!   outwards independent of the winding (as proposed by Hinterstoisser et al. 2016, section 3.1).
+//! * Every sample stores the views in which it is visible. Pairs that are not visible in a common view are not in the table: one
+//!   depth image cannot show them.
 
 use rayon::prelude::*;
 use sixfold_align::verification_mesh;
@@ -17,11 +16,11 @@ use thiserror::Error;
 use crate::V3;
 use crate::voting::THINNING_ANGLE;
 
-/// Why a mesh cannot be described.
+/// Why no model can be made from a mesh.
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// There is nothing to render.
+    /// The mesh has no faces to render.
     #[error(
         "the mesh has {faces} faces, a model to be matched needs a surface: give a mesh, not a point cloud"
     )]
@@ -29,7 +28,7 @@ pub enum ModelError {
         /// Faces found.
         faces: usize,
     },
-    /// Too few samples were seen from outside.
+    /// Too few samples are visible from outside.
     #[error(
         "only {found} surface samples are seen from outside, at least {needed} are needed: lower the sampling step or check the mesh"
     )]
@@ -46,7 +45,7 @@ pub enum ModelError {
     TooManySamples {
         /// Samples found.
         found: usize,
-        /// Samples taken.
+        /// Maximum number of samples.
         most: usize,
     },
     /// An option is out of range.
@@ -54,7 +53,7 @@ pub enum ModelError {
     Option(#[from] OptionError),
 }
 
-/// How an object is described.
+/// Options of the model.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ModelOptions {
     /// Distance between samples as a fraction of the diameter; also the step of the feature's distance
@@ -88,35 +87,36 @@ impl ModelOptions {
 
 /// Views around the object from which its surface is sampled (a Fibonacci sphere), one bit each of a word.
 pub(crate) const VIEWS: usize = 64;
-/// Side of a view, pixels: several in the width of a sampling step. Chosen by hand; not swept.
+/// Side of a view, pixels: several per sampling step. Chosen by hand; not swept.
 const VIEW_PIXELS: usize = 160;
 /// Distance of the views, in diameters; chosen by hand, not swept.
 const VIEW_DISTANCE: f64 = 4.0;
 /// Fraction of a view that a sphere of [`VIEW_SPAN`] diameters would fill, seen from its distance; chosen by hand, so that every
-/// object lies inside.
+/// object is inside.
 const VIEW_FILL: f64 = 0.9;
 /// See [`VIEW_FILL`].
 const VIEW_SPAN: f64 = 1.15;
-/// Pixels whose normals have a z (camera frame) above this are seen at a grazing angle: they say little about the surface and much
-/// about the silhouette. Chosen by hand; not swept.
+/// Pixels whose normals have a z (camera frame) above this are seen at a grazing angle: their depth and normals are unreliable
+/// there. Chosen by hand; not swept.
 const GRAZING: f32 = -0.3;
-/// A sample is seen by a view where the cosine between its normal and the ray is below this; chosen by hand, not swept.
+/// A sample is visible in a view only if the cosine between its normal and the ray is below this; chosen by hand, not swept.
 const SEEN_COSINE: f64 = -0.1;
-/// A sample is seen by a view where it lies behind its depth image by less than this fraction of a sampling step: the samples are
-/// means over cells of that size.
+/// A sample is visible in a view only if it is behind the view's depth image by less than this fraction of a sampling step: samples
+/// are means over cells of that size.
 const SEEN_TOLERANCE: f64 = 0.5;
-/// Fewest samples that make a model; chosen by hand, not swept.
+/// Minimum number of samples of a model; chosen by hand, not swept.
 pub(crate) const MIN_SAMPLES: usize = 20;
-/// Most samples: a sphere has 12,000 at the finest sampling step. The table grows with their square, to about 2 GB here.
+/// Maximum number of samples: a sphere has 12,000 at the finest sampling step. The table grows with their square, to about 2 GB
+/// here.
 pub(crate) const MAX_SAMPLES: usize = 16_000;
-/// Points nearer than this have no direction between them, metres.
+/// Points closer than this have no direction between them, metres.
 const SAME_POINT: f32 = 1e-6;
 /// Logarithm (metres, radians) of a transformation below which it is the identity.
 const IDENTITY: f64 = 1e-9;
 /// The camera's up direction is the object's z unless the ray has a z above this, where it is the object's y.
 const UPRIGHT: f64 = 0.9;
 
-/// An object ready to be matched.
+/// An object prepared for matching.
 #[derive(Debug, Clone)]
 pub struct ObjectModel {
     pub(crate) mesh: Mesh,
@@ -126,16 +126,16 @@ pub struct ObjectModel {
     pub(crate) centre: Vec3,
     /// Samples for the feature table, in the object's frame.
     pub(crate) samples: PointCloud,
-    /// Per sample, the views that see it, one bit each.
+    /// Per sample, the views in which it is visible, one bit each.
     pub(crate) visible_from: Vec<u64>,
     /// Directions from the object to the views.
     pub(crate) view_directions: Vec<V3>,
-    /// Symmetry transformations of the object, the identity among them.
+    /// Symmetry transformations of the object, including the identity.
     pub(crate) symmetries: Vec<Pose>,
     pub(crate) table: FeatureTable,
 }
 
-/// The part of an [`ObjectModel`] that takes long to compute and little room to keep.
+/// The part of an [`ObjectModel`] that is slow to compute and small to store.
 #[derive(Debug, Clone)]
 pub(crate) struct Description {
     pub mesh: Mesh,
@@ -202,7 +202,7 @@ pub(crate) fn fast_acos(x: f32) -> f32 {
     if x < 0.0 { std::f32::consts::PI - r } else { r }
 }
 
-/// A frame at a point: rows of a rotation that turns the normal onto x.
+/// A frame at a point: rows of a rotation that takes the normal to the x axis.
 #[inline]
 pub(crate) fn local_frame(n: &V3) -> [V3; 3] {
     // Duff et al. (2017), Building an orthonormal basis, revisited.
@@ -219,7 +219,7 @@ pub(crate) fn turn_about_normal(frame: &[V3; 3], d: &V3) -> u8 {
     (z.atan2(y) * (128.0 / std::f32::consts::PI)).round() as i32 as u8
 }
 
-/// A camera pose that looks at `centre` from `direction`, `distance` metres away.
+/// The pose for a camera aimed at `centre` from `direction`, `distance` metres away.
 pub(crate) fn look_at(centre: &Vec3, direction: &Vec3, distance: f64) -> Pose {
     let z = -direction;
     let up = if z.z.abs() < UPRIGHT { Vec3::z() } else { Vec3::y() };
@@ -233,7 +233,7 @@ pub(crate) fn look_at(centre: &Vec3, direction: &Vec3, distance: f64) -> Pose {
 }
 
 impl ObjectModel {
-    /// Describes a mesh. `symmetries` are the transformations that leave it as it is; the identity is added.
+    /// Makes the model of a mesh. `symmetries` are the transformations that map the object onto itself; the identity is added.
     ///
     /// # Errors
     /// [`ModelError`].
@@ -311,7 +311,7 @@ impl ObjectModel {
         ))
     }
 
-    /// Adds what follows from the description: symmetries and the feature table.
+    /// Computes the rest of the model from the description: symmetries and the feature table.
     pub(crate) fn assemble(description: Description, symmetries: &[Pose]) -> ObjectModel {
         let Description { mesh, options, diameter, centre, samples, visible_from } = description;
         let step = diameter * options.sampling_step;
@@ -337,7 +337,7 @@ impl ObjectModel {
         self.diameter
     }
 
-    /// The surface samples the features are made of, in the object's frame.
+    /// The surface samples from which the features are computed, in the object's frame.
     pub fn samples(&self) -> &PointCloud {
         &self.samples
     }
@@ -347,18 +347,18 @@ impl ObjectModel {
         self.table.entries.len()
     }
 
-    /// The mesh that is rendered for verification (simplified where it was very fine), in the object's frame.
+    /// The mesh that is rendered for verification (simplified if it was very fine), in the object's frame.
     pub fn mesh(&self) -> &Mesh {
         &self.mesh
     }
 
-    /// The transformations that leave the object as it is, the identity first.
+    /// The transformations that map the object onto itself, the identity first.
     pub fn symmetries(&self) -> &[Pose] {
         &self.symmetries
     }
 
-    /// The samples seen when the camera looks along `-direction` (a unit vector from the object to the camera, in
-    /// the object's frame): those of the nearest sampled view.
+    /// The number of the sampled view nearest to a camera that looks along `-direction` (a unit vector from the object to the
+    /// camera, in the object's frame).
     pub(crate) fn view_of(&self, direction: &V3) -> usize {
         let mut best = (0, f32::NEG_INFINITY);
         for (i, d) in self.view_directions.iter().enumerate() {

@@ -1,8 +1,8 @@
-//! The description of an object on disk, beside the object: what [`ObjectModel::new`] renders is computed once.
+//! The description of an object on disk, in the object's folder, so that the renderings of [`ObjectModel::new`] are computed once.
 //!
-//! Little-endian: magic, format version, a hash of the mesh and options it was made from, the simplified mesh, the
-//! samples with the views that see them, and a checksum. The feature table is not stored: it is twenty times as
-//! large and is built from the samples in a tenth of a second.
+//! Little-endian: magic, format version, a hash of mesh and options, the simplified mesh, the samples with the views in which they
+//! are visible, and a checksum. The feature table is not stored: it is twenty times as large and is built from the samples in a
+//! tenth of a second.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,15 +15,15 @@ use thiserror::Error;
 
 use crate::model::{Description, MAX_SAMPLES, MIN_SAMPLES, ModelError, ModelOptions, ObjectModel};
 
-/// How far a length in the file may be off that of the mesh, as a fraction of the diameter: rounding.
+/// Largest difference between a length in the file and that of the mesh, as a fraction of the diameter: rounding errors.
 const SAME_LENGTH: f64 = 1e-9;
-/// How far a normal's length may be off 1.
+/// Largest deviation of a normal's length from 1.
 const SAME_NORMAL: f64 = 1e-6;
 
 const MAGIC: &[u8; 8] = b"SIXFPPF\0";
 const VERSION: u32 = 1;
 
-/// Why a stored description was not taken; it is then recomputed.
+/// Why a stored description was not used; it is then recomputed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ModelFileError {
@@ -32,10 +32,10 @@ pub enum ModelFileError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file is no description, another version, or damaged.
+    /// The file is not a description, has another version, or is damaged.
     #[error("{path}: {what}")]
     Damaged {
         /// The file.
@@ -49,15 +49,14 @@ pub enum ModelFileError {
         /// The file.
         path: PathBuf,
     },
-    /// The mesh itself cannot be described.
+    /// No model can be made from the mesh itself.
     #[error(transparent)]
     Model(#[from] ModelError),
 }
 
 impl ObjectModel {
-    /// The description of `mesh`, read from `path` when it is there and belongs to this mesh and these options,
-    /// otherwise computed and written there. The second value tells why a file that was there was not taken, or that
-    /// the new one could not be written.
+    /// The model of `mesh`: its description is read from `path` if the file belongs to this mesh and these options, otherwise
+    /// computed and written there. The second value says why an existing file was not used or the new one could not be written.
     ///
     /// # Errors
     /// [`ModelError`] as [`ObjectModel::new`].
@@ -83,7 +82,7 @@ impl ObjectModel {
     }
 }
 
-/// FNV-1a over what the description depends on.
+/// FNV-1a over everything on which the description depends.
 fn fingerprint(mesh: &Mesh, options: &ModelOptions) -> u64 {
     let mut hash = Fnv1a::default();
     hash.write(&options.sampling_step.to_le_bytes());
@@ -150,7 +149,7 @@ fn read(path: &Path, key: u64, mesh: &Mesh, options: &ModelOptions) -> Result<De
         let centre = reader.vector()?;
         let (vertices, faces, samples) =
             (reader.u32()? as usize, reader.u32()? as usize, reader.u32()? as usize);
-        // The sizes must be exactly what is left before anything is allocated.
+        // The sizes must match the remaining bytes exactly; checked before anything is allocated.
         let needed = vertices.checked_mul(24)?.checked_add(faces.checked_mul(12)?)?;
         if reader.bytes.len() != needed.checked_add(samples.checked_mul(56)?)? {
             return None;
@@ -177,8 +176,8 @@ fn read(path: &Path, key: u64, mesh: &Mesh, options: &ModelOptions) -> Result<De
     Ok(description)
 }
 
-/// Holds every field against the mesh: a checksum keeps accidents out, not forgery, and what is wrong here would be a wrong pose, a
-/// panic or all memory later.
+/// Checks every field against the mesh: a checksum detects accidental damage, not forgery, and an invalid value would later cause a
+/// wrong pose, a panic or the use of all memory.
 fn check(found: &Description, mesh: &Mesh) -> Result<(), &'static str> {
     let (low, high) = mesh.bounding_box();
     let (diameter, centre) = (mesh.diameter(), (low + high) * 0.5);
@@ -242,8 +241,8 @@ mod tests {
         Mesh::new(corners, vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).unwrap()
     }
 
-    /// Descriptions that are whole, of this version and of this mesh, as they say: they made an index panic, asked for 97 GB or
-    /// never ended.
+    /// Descriptions that claim to be intact, of this version and of this mesh: earlier they caused an index panic, an allocation of
+    /// 97 GB or an endless loop.
     #[test]
     fn a_forged_description_is_made_again_with_a_note_that_names_the_field() {
         let folder = tempfile::tempdir().unwrap();
@@ -284,7 +283,7 @@ mod tests {
             let note = note.unwrap().to_string();
             assert!(note.contains(field) && note.contains("ppf.bin"), "{field}: {note}");
             assert!(model.table == honest.table && model.diameter == honest.diameter, "{field}");
-            // It is whole again.
+            // The file is intact again.
             assert!(ObjectModel::cached(&path, &mesh, &[], &options).unwrap().1.is_none(), "{field}");
         }
     }

@@ -1,9 +1,9 @@
-//! Voting for poses: every scene reference point asks which model point it is and how the model is rotated
-//! about its normal (Drost et al. 2010, section 3.4).
+//! Voting for poses: for every scene reference point the votes determine the corresponding model point and the rotation about its
+//! normal (Drost et al. 2010, section 3.4).
 //!
-//! With the improvements of Hinterstoisser et al. (2016) and Vidal et al. (2018): a feature near the border of its
-//! bin also votes from the neighbouring bins, and a feature votes only once per reference point and rotation, so
-//! that large flat regions do not shout down the rest.
+//! With the improvements of Hinterstoisser et al. (2016) and Vidal et al. (2018): a feature near the border of its bin also votes
+//! from the neighbouring bins, and a feature votes only once per reference point and rotation, so that large flat regions do not
+//! dominate.
 
 use std::f32::consts::PI;
 
@@ -14,7 +14,7 @@ use sixfold_geometry::{OptionError, PointCloud, Pose};
 use crate::V3;
 use crate::model::{BLOCK, FeatureTable, ObjectModel, fast_acos, local_frame, turn_about_normal};
 
-/// A pose with the votes it got.
+/// A pose with its votes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hypothesis {
     /// The pose.
@@ -28,33 +28,33 @@ pub struct Hypothesis {
 pub struct VotingOptions {
     /// Every n-th scene point is a reference point (Drost et al. 2010: 5).
     pub reference_stride: usize,
-    /// At most this many reference points; the stride grows to keep it.
+    /// Maximum number of reference points; the stride grows to respect it.
     pub max_references: usize,
     /// Fraction of a bin at each border from which the neighbouring bin votes too; 0 for none.
     pub bin_margin: f32,
-    /// Most peaks taken from one reference point.
+    /// Maximum number of peaks per reference point.
     pub peaks_per_reference: usize,
-    /// A peak needs this fraction of the reference point's best.
+    /// Minimum votes of a peak, as a fraction of the reference point's best.
     pub peak_fraction: f32,
 }
 
-/// Every so many-th scene point is a reference point (Drost et al. 2010: every fifth).
+/// Every n-th scene point is a reference point (Drost et al. 2010: every fifth).
 const REFERENCE_STRIDE: usize = 5;
-/// Most reference points; chosen by hand for the time that voting takes, not swept.
+/// Maximum number of reference points; chosen by hand for the run time of the voting, not swept.
 const MAX_REFERENCES: usize = 2500;
 /// Fraction of a bin at each border from which the neighbouring bin votes too. The idea is that of Hinterstoisser et al. (2016) and
 /// Vidal et al. (2018); the number was chosen by hand, not swept.
 const BIN_MARGIN: f32 = 0.25;
-/// Most peaks of a reference point; chosen by hand, not swept.
+/// Maximum number of peaks per reference point; chosen by hand, not swept.
 const PEAKS_PER_REFERENCE: usize = 4;
-/// Votes that a peak needs, as a fraction of the reference point's best; chosen by hand, not swept.
+/// Minimum votes of a peak, as a fraction of the reference point's best; chosen by hand, not swept.
 const PEAK_SHARE: f32 = 0.7;
-/// Neighbouring scene points whose normals enclose more than this stay apart when the scene is thinned, degrees (as in the model:
-/// [`crate::model`]). Chosen by hand; not swept.
+/// Neighbouring scene points whose normals differ by more than this angle are not merged when the scene is downsampled, degrees (as
+/// in the model: [`crate::model`]). Chosen by hand; not swept.
 pub(crate) const THINNING_ANGLE: f64 = 30.0;
-/// Squared distance below which two points are one and have no feature, square metres: a hundredth of a millimetre.
+/// Squared distance below which two points count as equal and have no feature, square metres: a hundredth of a millimetre.
 const SAME_POINT: f32 = 1e-10;
-/// Reference points that a thread takes at a time; of no influence on the result.
+/// Reference points per parallel task; does not affect the result.
 const CHUNK: usize = 32;
 
 impl Default for VotingOptions {
@@ -83,15 +83,15 @@ impl VotingOptions {
     }
 }
 
-/// Steps of the rotation about the normal, 11.25 degrees each: Hinterstoisser et al. (2016) and Vidal et al. (2018) keep the votes that
-/// were cast in the 32 bits of a word, one for each step, and so does this.
+/// Steps of the rotation about the normal, 11.25 degrees each: Hinterstoisser et al. (2016) and Vidal et al. (2018) record the
+/// votes already cast in the 32 bits of a word, one for each step, and so does this implementation.
 const TURNS: usize = 32;
 
-/// The scene cloud at the model's sampling step, sorted into cells of the model's diameter so that all partners
-/// of a point lie in 27 cells.
+/// The scene cloud at the model's sampling step, sorted into cells of the model's diameter so that all partners of a point are in
+/// 27 cells.
 ///
-/// Cells grow where there would be more than [`MAX_CELLS`], as with points that a camera of a wrong unit puts kilometres apart: the
-/// partners are the same.
+/// Cells grow if there would be more than [`MAX_CELLS`], as with points that a wrong unit puts kilometres apart; the partners found
+/// are the same.
 struct Grid {
     points: Vec<V3>,
     normals: Vec<V3>,
@@ -102,7 +102,7 @@ struct Grid {
     order: Vec<u32>,
 }
 
-/// Most cells of a [`Grid`]: 32 MB. A room seen with an object of 4 cm takes half of them.
+/// Maximum number of cells of a [`Grid`]: 32 MB. A room with an object of 4 cm needs half of them.
 const MAX_CELLS: f64 = (1u64 << 22) as f64;
 
 impl Grid {
@@ -119,7 +119,7 @@ impl Grid {
         while cells(cell) > MAX_CELLS {
             cell *= 2.0;
         }
-        // Points that are not finite, or a cell without a size.
+        // For points that are not finite, or a cell without a size.
         if !cells(cell).is_finite() {
             return None;
         }
@@ -165,8 +165,8 @@ impl Grid {
     }
 }
 
-/// Poses the model's features vote for in a scene cloud (points and normals in the camera frame), in the order
-/// of the reference points; the same at any number of threads.
+/// Poses for which the model's features vote in a scene cloud (points and normals in the camera frame), in the order of the
+/// reference points; the result does not depend on the number of threads.
 pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) -> Vec<Hypothesis> {
     let step = model.diameter * model.options.sampling_step;
     let thinned = cloud.voxel_downsample(step, THINNING_ANGLE.to_radians());
@@ -358,8 +358,8 @@ impl Counter {
     }
 }
 
-/// The pose that lays the model's point and frame onto the scene's, rotated about the common normal
-/// (Drost et al. 2010, equation 3).
+/// The pose that aligns the model's point and frame with the scene's, rotated about the common normal (Drost et al. 2010, equation
+/// 3).
 fn pose_of(p: &V3, scene: &[V3; 3], q: &V3, model: &[V3; 3], turn: f32) -> Pose {
     let rows = |f: &[V3; 3]| Matrix3::from_rows(&[f[0].transpose(), f[1].transpose(), f[2].transpose()]);
     let about_x = Rotation3::from_axis_angle(&nalgebra::Vector3::x_axis(), turn);
@@ -379,7 +379,7 @@ mod tests {
     use sixfold_geometry::Vec3;
     use sixfold_mesh::Mesh;
 
-    /// Scattered points with random normals: every feature is rare, no reflection and no rotation looks alike.
+    /// Scattered points with random normals: every feature is rare, and no reflection or rotation looks the same.
     fn scattered() -> ObjectModel {
         let mut random = ChaCha8Rng::seed_from_u64(4);
         let mut draw = || Vec3::from_fn(|_, _| random.random_range(-1.0..1.0));
@@ -397,7 +397,7 @@ mod tests {
         ObjectModel::assemble(description, &[])
     }
 
-    /// A focal length of half a pixel put the points 12 km apart, and the cells of 10 cm between them took 7.5 GB.
+    /// Regression test: with a focal length of half a pixel the points are 12 km apart, and a grid of cells of 10 cm took 7.5 GB.
     #[test]
     fn points_kilometres_apart_take_a_bounded_grid_with_the_same_partners() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
@@ -440,7 +440,7 @@ mod tests {
             let cloud = model.samples.transformed(&truth);
             let options = VotingOptions { reference_stride: 1, ..VotingOptions::default() };
             let votes = vote(&model, &cloud, &options);
-            // Every point is a reference point here, and the best vote of most of them is the truth.
+            // Every point is a reference point here, and the best vote of most of them is the true pose.
             let best = votes.iter().map(|h| h.votes).fold(0.0, f32::max);
             let strong: Vec<_> = votes.iter().filter(|h| h.votes > 0.5 * best).collect();
             let right = strong

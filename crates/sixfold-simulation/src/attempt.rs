@@ -1,4 +1,5 @@
-//! One whole attempt: an object comes to rest, a depth camera looks, the planner proposes, the hand tries.
+//! One complete attempt: an object comes to rest, a depth camera records it, the planner proposes grasps, and the gripper tries the
+//! best one.
 
 use rand::RngExt;
 use serde::Serialize;
@@ -17,14 +18,14 @@ use crate::{
     settle_at_centre, simulate_view, try_grasp,
 };
 
-/// What is sampled again in every attempt, and with what it is tried.
+/// What is sampled in every attempt, and the options of camera, planner and trial.
 #[derive(Debug, Clone, Copy)]
 pub struct AttemptOptions {
-    /// Let the object fall in any orientation; otherwise it stands with its own z axis up, rotated about it.
+    /// Let the object fall in any orientation; otherwise its own z axis is up and it is rotated about that axis.
     pub any_orientation: bool,
-    /// The camera's elevation above the table, smallest and largest, radians.
+    /// Smallest and largest elevation of the camera above the table, radians.
     pub elevation: (f64, f64),
-    /// The camera's distance, smallest and largest, metres.
+    /// Smallest and largest distance of the camera, metres.
     pub distance: (f64, f64),
     /// The depth camera's noise.
     pub sensor: Option<DepthSensor>,
@@ -32,7 +33,7 @@ pub struct AttemptOptions {
     pub view: ViewOptions,
     /// How grasps are proposed.
     pub planner: AntipodalOptions,
-    /// How proposals are joined.
+    /// How proposals are clustered.
     pub clusters: ClusterOptions,
     /// How they are tried.
     pub trial: TrialOptions,
@@ -57,7 +58,7 @@ impl Default for AttemptOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AttemptOutcome {
-    /// The object did not come to rest on the table: not an attempt of the planner.
+    /// The object did not come to rest on the table; does not count as an attempt of the planner.
     NoRest,
     /// Nothing was found on the table.
     NotSeen,
@@ -79,13 +80,13 @@ impl AttemptOutcome {
 pub struct Attempt {
     /// How it ended.
     pub ending: AttemptOutcome,
-    /// Where the object lay.
+    /// The object's pose at rest.
     pub world_from_object: Pose,
-    /// What was seen.
+    /// The recorded view.
     pub view: Option<SimulatedView>,
-    /// The grasps that were proposed, clusters' best members in the order of their rank.
+    /// The proposed grasps: the best member of each cluster, by rank.
     pub proposals: Vec<Grasp>,
-    /// What happened to the first of them.
+    /// Report of the trial of the first one.
     pub report: Option<TrialReport>,
     /// Time from the depth image to the ranked proposals, seconds.
     pub planning_seconds: f64,
@@ -93,15 +94,15 @@ pub struct Attempt {
     pub trial_seconds: f64,
 }
 
-/// An object at rest on the table, and what a depth camera sees of it: where an attempt starts.
+/// An object at rest on the table and its depth image: the start of an attempt.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// [`AttemptOutcome::NoRest`] or [`AttemptOutcome::NotSeen`] when there is nothing to grasp; [`AttemptOutcome::NoProposal`] as long as nothing was
-    /// proposed.
+    /// [`AttemptOutcome::NoRest`] or [`AttemptOutcome::NotSeen`] when there is nothing to grasp; otherwise
+    /// [`AttemptOutcome::NoProposal`], because nothing was proposed yet.
     pub ending: AttemptOutcome,
-    /// Where the object lies.
+    /// The object's pose.
     pub world_from_object: Pose,
-    /// What the camera sees.
+    /// The recorded view.
     pub seen: Option<SimulatedView>,
     /// The same, prepared for grasping.
     pub view: Option<GraspView>,
@@ -116,8 +117,8 @@ pub fn scene(mesh: &Mesh, parts: &ConvexParts, options: &AttemptOptions, seed: u
     scene_at(mesh, |start| settle_at_centre(mesh, parts, start), options, seed, number)
 }
 
-/// [`scene`] where `rest` says how the object comes to rest that was let go at a pose, if it does: with what was kept of a scene
-/// that is a view of it without physics.
+/// As [`scene`], with a function `rest` from the pose at which the object is released to its pose at rest (`None` if it does not
+/// rest). With a stored pose at rest this renders the scene without physics.
 pub fn scene_at(
     mesh: &Mesh,
     rest: impl FnOnce(&Pose) -> Option<Pose>,
@@ -171,7 +172,7 @@ pub fn scene_at(
     result
 }
 
-/// Makes attempt `number` with the geometric planner: pose, view point and noise are sampled from `seed` and `number` alone.
+/// Runs attempt `number` with the geometric planner: pose, view point and noise are sampled from `seed` and `number` alone.
 ///
 /// # Errors
 /// [`SimulationError`] for options out of range.

@@ -1,4 +1,4 @@
-//! Why something cannot be simulated.
+//! Errors of the simulation.
 
 use thiserror::Error;
 
@@ -6,12 +6,12 @@ use thiserror::Error;
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum SimulationError {
-    /// The mesh has no faces, or nothing with a volume came out of it.
+    /// The mesh has no faces, or its decomposition has no part with a volume.
     #[error("the mesh has {faces} faces and gives no solid part, expected a surface with a volume: {advice}")]
     NoSolid {
         /// Faces of the mesh.
         faces: usize,
-        /// What to do.
+        /// Advice for the user.
         advice: &'static str,
     },
     /// An option is out of range.
@@ -19,14 +19,14 @@ pub enum SimulationError {
     Option {
         /// Name of the field.
         field: &'static str,
-        /// What it holds.
+        /// Its value.
         found: f64,
-        /// What it may hold.
+        /// The values allowed.
         expected: &'static str,
     },
 }
 
-/// Tests that options lie within their ranges: name, value, lowest, highest, what is expected.
+/// Tests that options are within their ranges, each given as name, value, lowest, highest, expected values.
 pub(crate) fn check_ranges(
     ranges: &[(&'static str, f64, f64, f64, &'static str)],
 ) -> Result<(), SimulationError> {

@@ -1,11 +1,11 @@
 //! A simulated robot: a parallel-jaw gripper that tries grasps in a physics engine.
 //!
-//! The gripper comes along its approach direction, closes with a limited force, lifts, and shakes. What holds the object is
-//! Coulomb friction and nothing else: no finger is glued to anything, and none is driven with unlimited force. A trial is a
-//! function of its arguments: the same numbers in, the same numbers out, on every machine.
+//! The gripper moves along its approach direction, closes with a limited force, lifts, and shakes. Only Coulomb friction holds the
+//! object: it is never attached to a finger, and no finger is driven with unlimited force. A trial is a deterministic function of
+//! its arguments, with the same result on every machine.
 //!
-//! The world's frame: `z` up, the table's top at `z = 0`. Metres, kilograms, newtons, seconds. The engine (Rapier) counts
-//! in `f32`; what goes in and comes out is `f64`.
+//! The world's frame: `z` up, the table's top at `z = 0`. Metres, kilograms, newtons, seconds. The engine (Rapier) computes in
+//! `f32`; inputs and results are `f64`.
 //!
 //! ```
 //! use sixfold_geometry::{Pose, Vec3};

@@ -1,5 +1,5 @@
-//! An object as convex parts, which is what physics engines collide: approximate convex decomposition by V-HACD (Mamou 2016,
-//! "Volumetric hierarchical approximate convex decomposition", in Game Engine Gems 3), as the crate parry has it.
+//! An object as convex parts, which physics engines need for collisions: approximate convex decomposition by V-HACD (Mamou 2016,
+//! "Volumetric hierarchical approximate convex decomposition", in Game Engine Gems 3), as implemented in the crate parry.
 
 use rapier3d::math::Vector;
 use rapier3d::parry::transformation::vhacd::{VHACD, VHACDParameters};
@@ -11,16 +11,17 @@ use sixfold_mesh::{Mesh, simplify};
 use crate::SimulationError;
 use crate::error::check_ranges;
 
-/// How an object is cut into convex parts.
+/// Options of the convex decomposition.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartsOptions {
     /// Size of a voxel, metres; walls thinner than this are thickened to it.
     pub voxel: f64,
-    /// Most parts.
+    /// Maximum number of parts.
     pub max_parts: usize,
-    /// A part is cut further when its hull holds this much more volume than it, as a fraction of the whole object's hull.
+    /// A part is split further when the volume of its hull exceeds its own by more than this fraction of the volume of the whole
+    /// object's hull.
     pub concavity: f64,
-    /// Faces are reduced to this number first.
+    /// The mesh is first simplified to this number of faces.
     pub max_faces: usize,
 }
 
@@ -48,7 +49,7 @@ impl PartsOptions {
 /// Convex parts of an object, in its own frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ConvexParts {
-    /// The corners of each part's hull, metres.
+    /// The vertices of each part's hull, metres.
     parts: Vec<Vec<Vec3>>,
 }
 
@@ -56,12 +57,12 @@ impl ConvexParts {
     /// The object as one convex part: its hull.
     ///
     /// # Errors
-    /// [`SimulationError::NoSolid`] when all vertices lie in a plane.
+    /// [`SimulationError::NoSolid`] when all vertices are in a plane.
     pub fn of_convex(mesh: &Mesh) -> Result<ConvexParts, SimulationError> {
         Self::from_points(vec![mesh.vertices().to_vec()], mesh)
     }
 
-    /// The object cut into convex parts, so that what is hollow stays hollow. Takes seconds: keep the result.
+    /// The object decomposed into convex parts, so that hollows stay hollow. Takes seconds: keep the result.
     ///
     /// # Errors
     /// [`SimulationError::Option`], and [`SimulationError::NoSolid`] for a mesh without faces.
@@ -101,7 +102,7 @@ impl ConvexParts {
         )
     }
 
-    /// Keeps the hulls' corners of all groups of points that have a volume.
+    /// The hull vertices of all groups of points that have a volume.
     fn from_points(groups: Vec<Vec<Vec3>>, mesh: &Mesh) -> Result<ConvexParts, SimulationError> {
         let parts: Vec<Vec<Vec3>> = groups
             .into_iter()
@@ -122,12 +123,12 @@ impl ConvexParts {
         Ok(ConvexParts { parts })
     }
 
-    /// The corners of each part, metres, in the object's frame.
+    /// The hull vertices of each part, metres, in the object's frame.
     pub fn parts(&self) -> &[Vec<Vec3>] {
         &self.parts
     }
 
-    /// The same with at most so many corners a part: those that stand out most in directions spread evenly over the sphere.
+    /// The same with at most `most` vertices per part: the extreme ones in directions spread evenly over the sphere.
     pub(crate) fn thinned(&self, most: usize) -> ConvexParts {
         let thin = |part: &Vec<Vec3>| -> Vec<Vec3> {
             if part.len() <= most {
@@ -169,12 +170,12 @@ fn is_convex(mesh: &Mesh) -> bool {
     mesh.convex_hull().is_ok_and(|hull| (0.97..=1.03).contains(&(volume(mesh).abs() / volume(&hull))))
 }
 
-/// To the engine's numbers.
+/// To the engine's vector type.
 pub(crate) fn vector(v: &Vec3) -> Vector {
     Vector::new(v.x as f32, v.y as f32, v.z as f32)
 }
 
-/// From the engine's numbers.
+/// From the engine's vector type.
 pub(crate) fn vec3(v: &Vector) -> Vec3 {
     Vec3::new(f64::from(v.x), f64::from(v.y), f64::from(v.z))
 }
@@ -189,7 +190,7 @@ mod tests {
         let bowl = shapes::bowl(0.07, 0.05, 0.004).unwrap();
         let parts = ConvexParts::of_mesh(&bowl, &PartsOptions::default()).unwrap();
         assert!(parts.parts().len() > 6, "{}", parts.parts().len());
-        // No part's hull reaches the middle of the hollow.
+        // No part's hull contains the centre of the hollow.
         let inside = Vec3::new(0.0, 0.0, 0.04);
         for (_, shape) in parts.shapes() {
             let reach = shape.as_convex_polyhedron().unwrap().aabb(&RapierPose::IDENTITY);

@@ -1,4 +1,4 @@
-//! Several objects dropped on the table: scenes to look at, with objects that touch, lean on and lie over one another.
+//! Several objects dropped on the table: cluttered scenes, in which objects touch, lean on and lie on one another.
 
 use std::f64::consts::TAU;
 
@@ -12,31 +12,31 @@ use crate::error::check_ranges;
 use crate::world::{body_pose, insert_object, world};
 use crate::{ConvexParts, SimulationError};
 
-/// Time step, seconds; twice that of grasps, as nothing is held here.
+/// Time step, seconds; longer than that of grasps, because nothing is held here.
 const STEP: f64 = 0.004;
-/// Steps between two passes at what still moves: 0.1 s.
+/// Steps between two checks of which objects still move: 0.1 s.
 const STEPS: usize = 25;
-/// What moves less than this between two passes rests: metres and radians.
+/// An object that moves less than this between two checks is at rest: metres and radians.
 const REST: (f64, f64) = (0.0005, 0.005);
-/// Looks after which what still moves is taken away, and after which all is over.
+/// Number of checks after which objects that still move are removed, and after which the simulation ends.
 const PATIENCE: (usize, usize) = (30, 40);
-/// Corners of a part that are enough: the others stand out by less than half a millimetre.
+/// Largest number of hull vertices per part: the others protrude by less than half a millimetre.
 const CORNERS: usize = 400;
-/// Height at which objects are let go over the table, metres.
+/// Height above the table at which objects are released, metres.
 const HEIGHT: f64 = 0.002;
-/// Of each object; two of them rub with the product.
+/// Friction coefficient of each object; between two objects it is the product.
 const FRICTION: f64 = 0.75;
 
 /// How objects are dropped.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PileOptions {
-    /// Radius of the disc about the origin that the objects' middles are dropped over, metres.
+    /// Radius of the disc around the origin over which the objects' centres are dropped, metres.
     pub radius: f64,
-    /// Objects whose middle comes further than this from the origin are taken away, metres.
+    /// Objects whose centre gets further than this from the origin are removed, metres.
     pub reach: f64,
-    /// Fraction of the objects that start upright (their z axis up) and rotated about it; the others start in any orientation.
+    /// Fraction of the objects that start upright (their z axis up, rotated about it); the others start in any orientation.
     pub upright: f64,
-    /// Fraction of the objects that fall wherever they fall; the others look for a free place (and may find none).
+    /// Fraction of the objects that are dropped at any place; the others are put at a free place (if one is found).
     pub stacked: f64,
 }
 
@@ -61,18 +61,18 @@ impl PileOptions {
     }
 }
 
-/// An object with what is known of it before it falls.
+/// An object with its precomputed sizes before it is dropped.
 struct Dropped {
     number: usize,
     upright: bool,
     parts: ConvexParts,
     rotation: UnitQuaternion<f64>,
-    /// Centre of its box in its own frame, and the distance of its farthest corner from there.
+    /// Centre of its bounding box in its own frame, and the largest distance of a vertex from there.
     middle: Vec3,
     radius: f64,
-    /// Distance of the farthest corner from the upright axis through the middle, as it is rotated.
+    /// Largest distance of a vertex from the vertical axis through the centre, in its initial rotation.
     width: f64,
-    /// How far the lowest corner lies below the middle, as it is rotated.
+    /// Depth of the lowest vertex below the centre, in its initial rotation.
     below: f64,
 }
 
@@ -90,17 +90,17 @@ impl Dropped {
         Dropped { number, upright, parts, rotation, middle, radius, width, below }
     }
 
-    /// Its pose when its middle is at a place of the world.
+    /// Its pose when its centre is at `place` in the world.
     fn at(&self, place: &Vec3) -> Pose {
         Pose::new(self.rotation, place - self.rotation * self.middle)
     }
 }
 
-/// Drops objects on the plane z = 0 and lets them come to rest: world_from_object for each, metres; `None` for what rolled
-/// or fell out of reach, or does not rest within four seconds (all, where `options` do not pass their check).
+/// Drops objects on the plane z = 0 and lets them come to rest: world_from_object for each, metres; `None` for objects that rolled
+/// or fell out of reach, or do not rest within four seconds (for all, if `options` are invalid).
 ///
-/// Objects are let go where they touch nothing, the upright ones 2 mm over the table, others over those below them. The
-/// result is a function of the arguments: the same numbers in, the same numbers out.
+/// Objects are released where they touch nothing, upright ones 2 mm above the table, others above those below them. The result is a
+/// deterministic function of the arguments.
 pub fn drop_objects(
     parts: &[&ConvexParts],
     options: &PileOptions,
@@ -118,7 +118,7 @@ pub fn drop_objects(
         let turn = if upright { yaw(&mut random) } else { any_turn(&mut random) };
         objects.push(Dropped::new(number, parts, upright, turn));
     }
-    // What is to stand needs its place before others take it.
+    // Upright objects are placed first, before others take their space.
     objects.sort_by_key(|o| !o.upright);
     let mut world = world(STEP, 60.0, 0.8);
     let mut placed: Vec<(Vec3, f64, f64)> = vec![];
@@ -145,7 +145,7 @@ pub fn drop_objects(
             let rests = last[object.number]
                 .is_some_and(|l| l.distance_to(&pose) < REST.0 && l.rotation_angle_to(&pose) < REST.1);
             last[object.number] = Some(pose);
-            // `!(a < b)` also takes away what is not a number any more.
+            // `!(a < b)` also removes objects whose position is NaN.
             let away = !(middle.xy().norm() < options.reach) || middle.z < 0.0;
             if away || (!rests && look == PATIENCE.0) {
                 world.remove_body(body);
@@ -169,7 +169,8 @@ pub fn drop_objects(
     poses
 }
 
-/// Where an object's centre starts: a free place on the table if it wants one and finds it, otherwise over what is there.
+/// Where an object's centre starts: a free place on the table if it needs one and one is found, otherwise above the objects already
+/// there.
 fn choose_place(
     object: &Dropped,
     placed: &[(Vec3, f64, f64)],
@@ -186,7 +187,7 @@ fn choose_place(
         for (other, radius, width) in placed {
             let apart = (other.xy() - spot.xy()).norm();
             let (reach, near) = (object.radius + radius + HEIGHT, object.width + width + HEIGHT);
-            // Side by side as they are rotated, or one above the other as balls.
+            // Side by side: with their widths as rotated; one above the other: with their bounding spheres.
             if apart < near {
                 height = height.max(other.z + (reach * reach - apart * apart).max(0.0).sqrt());
             }
@@ -205,7 +206,7 @@ fn yaw(random: &mut impl Rng) -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vec3::z_axis(), TAU * random.random::<f64>())
 }
 
-/// A rotation, each as likely as any other (Shoemake 1992, "Uniform random rotations").
+/// A uniformly random rotation (Shoemake 1992, "Uniform random rotations").
 fn any_turn(random: &mut impl Rng) -> UnitQuaternion<f64> {
     let [u, v, w] = [random.random::<f64>(), random.random(), random.random()];
     let (a, b) = ((1.0 - u).sqrt(), u.sqrt());
@@ -238,7 +239,7 @@ mod tests {
         let mut worst: Option<f64> = None;
         for (_, x) in a.0.shapes() {
             for (_, y) in b.0.shapes() {
-                // Once in some hundred pairs the engine's query is far off in one order of the two and right in the other.
+                // About once in a few hundred pairs the engine's query is wrong for one order of the two and right for the other.
                 let there = contact(&pa, &*x, &pb, &*y, 0.003);
                 let back = contact(&pb, &*y, &pa, &*x, 0.003);
                 if let (Ok(Some(there)), Ok(Some(back))) = (there, back) {
@@ -312,7 +313,7 @@ mod tests {
         assert!(drop_objects(&[], &PileOptions::default(), 0, 0).is_empty());
     }
 
-    /// `cargo test --release -- --ignored --nocapture time_of_a_pile` says how long eight detailed objects take.
+    /// `cargo test --release -- --ignored --nocapture time_of_a_pile` prints the time for eight detailed objects.
     #[test]
     #[ignore = "a measurement"]
     fn time_of_a_pile() {

@@ -1,4 +1,4 @@
-//! Where an object comes to rest on the table.
+//! The pose at which an object comes to rest on the table.
 
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
@@ -6,9 +6,9 @@ use sixfold_mesh::Mesh;
 use crate::ConvexParts;
 use crate::world::{body_pose, insert_object, world};
 
-/// Lets an object fall onto the table from a pose above it (the lowest point is put 2 mm over the table) and gives the
-/// pose in which it rests; `None` when it still moves after four seconds or rolled off further than half a metre.
-/// Its turning is damped, so that round things do not roll for ever.
+/// Lets an object fall onto the table from a pose above it (its lowest point starts 2 mm above the table) and returns its pose at
+/// rest; `None` when it still moves after four seconds or rolled further than half a metre. Its rotation is damped, so that round
+/// objects do not roll forever.
 pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     const STEP: f64 = 0.002;
     let lowest = parts
@@ -21,8 +21,7 @@ pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Po
         world_from_object.with_translation(world_from_object.translation() + Vec3::z() * (0.002 - lowest));
     let mut world = world(STEP, 60.0, 0.8);
     let (object, _) = insert_object(&mut world, parts, &start, 0.2, 4.0);
-    // A body on many contacts trembles and creeps by micrometres a step for ever: what counts is whether it gets anywhere
-    // in 0.2 s.
+    // A body with many contacts jitters and creeps by micrometres per step forever: the test is its motion over 0.2 s.
     let mut last = start;
     for _ in 0..20 {
         for _ in 0..100 {
@@ -38,8 +37,7 @@ pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Po
     None
 }
 
-/// As `settle`, with the mesh that the parts were made of; the object is put back over the middle of the table, wherever
-/// it rolled.
+/// As `settle`, with the mesh from which the parts were made; the object is then moved back to the centre of the table.
 pub fn settle_at_centre(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     let rest = settle(parts, world_from_object)?;
     let (low, high) = mesh.transformed(&rest).bounding_box();

@@ -1,13 +1,13 @@
-//! How sure a fraction of successes is.
+//! Confidence intervals of success rates.
 
-/// The interval that holds the true fraction with 95 % confidence (Wilson 1927, "Probable inference, the law of succession,
-/// and statistical inference"); 0 to 1 without trials.
+/// The 95 % confidence interval of a success rate (Wilson 1927, "Probable inference, the law of succession, and statistical
+/// inference"); 0 to 1 without trials.
 pub fn wilson_interval(successes: usize, trials: usize) -> (f64, f64) {
     wilson_interval_of_fraction(successes as f64 / trials.max(1) as f64, trials)
 }
 
-/// The same for a mean of fractions, each measured by several tries of one trial: as wide as if each trial had been tried once,
-/// which is never too narrow.
+/// The same for a mean success rate in which each trial was repeated several times: as wide as if each trial had run once, which is
+/// never too narrow.
 pub fn wilson_interval_of_fraction(share: f64, trials: usize) -> (f64, f64) {
     const Z: f64 = 1.959_963_984_540_054;
     if trials == 0 {
@@ -32,7 +32,7 @@ mod tests {
         let (low, high) = wilson_interval(0, 20);
         assert!(low == 0.0 && (high - 0.1611).abs() < 1e-4, "{low} {high}");
         assert_eq!(wilson_interval(0, 0), (0.0, 1.0));
-        // Five trials of which one held in half of its tries.
+        // Five trials, one of which held in half of its repetitions.
         let (low, high) = wilson_interval_of_fraction(0.9, 5);
         assert!(low > wilson_interval(4, 5).0 && high < wilson_interval(5, 5).1, "{low} {high}");
     }

@@ -1,6 +1,6 @@
-//! Objects at rest on a table under lamps, and what a colour and depth camera sees of them: scenes for datasets.
+//! Objects at rest on a table under lamps, and images of them from a colour and depth camera: scenes for datasets.
 //!
-//! A scene is a function of its options and its number: the same numbers in, the same pixels out.
+//! A scene is a deterministic function of its options and its number, to the pixel.
 
 use std::f64::consts::TAU;
 
@@ -18,13 +18,13 @@ use crate::parts::ConvexParts;
 use crate::pile::{PileOptions, drop_objects};
 use crate::view::ViewPoint;
 
-/// Drops of a scene in which nothing at all came to rest, before it stays empty.
+/// Attempts to drop the objects of a scene if none comes to rest; after that it stays empty.
 const TRIES: u64 = 5;
-/// Cameras look past the middle by up to so much, metres, and are turned in the image by up to so much, radians.
+/// Largest offset of the point at which cameras are aimed, metres, and largest roll ([`ROLL`]), radians.
 const AIM: f64 = 0.1;
 const ROLL: f64 = 0.12;
 
-/// What scenes are like.
+/// Options of the scenes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TabletopOptions {
     /// Fewest and most objects.
@@ -33,7 +33,7 @@ pub struct TabletopOptions {
     pub pile: PileOptions,
     /// Smallest and largest distance of the camera, metres.
     pub distance: [f64; 2],
-    /// Lowest and highest elevation of the camera over the table, degrees.
+    /// Lowest and highest elevation of the camera above the table, degrees.
     pub elevation_degrees: [f64; 2],
     /// Seed of everything random.
     pub seed: u64,
@@ -41,7 +41,7 @@ pub struct TabletopOptions {
 
 /// Objects at rest on a table.
 pub struct Tabletop {
-    /// Which of the objects, and world_from_object, metres; the table is z = 0.
+    /// Index of each object at rest and its world_from_object, metres; the table is z = 0.
     pub resting: Vec<(usize, Pose)>,
     /// Objects that were dropped; some may not have come to rest within reach.
     pub dropped: usize,
@@ -51,21 +51,21 @@ pub struct Tabletop {
     random: Random,
 }
 
-/// What a camera saw.
+/// Images of one camera.
 pub struct TabletopImage {
-    /// Metres, as the sensor measures it.
+    /// Depth as measured by the sensor, metres.
     pub depth: DepthImage,
-    /// Under the scene's lamps; none unless it was asked for.
+    /// Colour under the scene's lamps; `None` unless it was requested.
     pub rgb: Option<RgbImage>,
     /// The poses of [`Tabletop::resting`] in the camera's frame.
     pub camera_from_object: Vec<Pose>,
 }
 
 impl Tabletop {
-    /// Chooses among objects, each known by its convex parts, and lets them fall until at least one of them rests.
+    /// Selects some of the objects, given as convex parts, and drops them until at least one of them rests.
     ///
     /// # Errors
-    /// When no table can be made.
+    /// If the table's mesh cannot be made.
     pub fn new(
         objects: &[&ConvexParts],
         options: &TabletopOptions,
@@ -77,7 +77,7 @@ impl Tabletop {
         Ok(Tabletop { resting, dropped, options: *options, table, lights, random })
     }
 
-    /// The next camera's camera_from_world: it looks near the middle.
+    /// The next camera's camera_from_world: it is aimed near the centre of the table.
     pub fn next_camera(&mut self) -> Pose {
         let (options, random) = (&self.options, &mut self.random);
         let target = Vec3::from_fn(|axis, _| match axis {
@@ -95,8 +95,8 @@ impl Tabletop {
         (view.world_from_camera() * Pose::new(roll, Vec3::zeros())).inverse()
     }
 
-    /// What a camera sees. `meshes` are those of all objects that the scene was made of; `noise` is the seed of the sensor's
-    /// noise, which an ideal sensor has not.
+    /// The images of a camera. `meshes` are those of all objects from which the scene was made; `noise` is the seed of the sensor's
+    /// noise (an ideal sensor has none).
     pub fn image(
         &self,
         meshes: &[&Mesh],
@@ -131,7 +131,7 @@ impl Tabletop {
     }
 }
 
-/// Chooses objects and lets them fall until at least one of them rests: which, where, and how many fell.
+/// Selects objects and drops them until at least one of them rests: their indices and poses, and the number dropped.
 fn settle(
     objects: &[&ConvexParts],
     options: &TabletopOptions,
@@ -146,7 +146,7 @@ fn settle(
         chosen.extend(round.into_iter().take(count - chosen.len()));
     }
     let parts: Vec<&ConvexParts> = chosen.iter().map(|&object| objects[object]).collect();
-    // The same numbers as the objects' own shapes would be no harm, but no chance either.
+    // Another random stream than that of the objects' shapes, so that the two are independent.
     let seed = options.seed ^ 0x7069_6c65;
     let mut resting: Vec<(usize, Pose)> = vec![];
     for attempt in 0..TRIES {
@@ -159,7 +159,7 @@ fn settle(
     (resting, count)
 }
 
-/// A square table top at z = 0 of 1 to 3 m in a dull colour.
+/// A square table top at z = 0 with sides of 1 to 3 m in a dull colour.
 fn table(random: &mut impl Rng) -> Result<Mesh, MeshError> {
     let half = between(random, 0.5, 1.5);
     let corners = [(-half, -half), (half, -half), (half, half), (-half, half)];
@@ -169,7 +169,7 @@ fn table(random: &mut impl Rng) -> Result<Mesh, MeshError> {
     mesh.with_colors(vec![color; 4])
 }
 
-/// Where light comes from in a scene, world frame.
+/// Directions of the lights in a scene, world frame.
 struct Lights {
     direction: Vec3,
     ambient: f32,

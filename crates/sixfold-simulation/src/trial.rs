@@ -1,8 +1,8 @@
-//! One grasp, tried: come, close, lift 10 cm, shake; held or not.
+//! The trial of one grasp: approach, close, lift by 10 cm, shake; then test whether the object is held.
 //!
-//! The fingers slide on the palm, each driven by a motor with a limited force, and are coupled as the two jaws of a real
-//! hand are: what pushes one moves the other. The palm follows its path whatever it meets. The speed ramps up and down,
-//! so that no jerk adds to the weight.
+//! The fingers slide on the palm, each driven by a motor with a limited force, and are coupled like the two jaws of a real gripper:
+//! a force on one moves the other. The palm follows its path regardless of contacts. The speed ramps up and down, so that no jerk
+//! adds to the weight.
 
 use rapier3d::prelude::*;
 use serde::Serialize;
@@ -21,15 +21,15 @@ pub struct TrialOptions {
     pub mass: f64,
     /// Coulomb friction coefficient of the table.
     pub table_friction: f64,
-    /// How far before the grasp the approach begins, metres.
+    /// Distance from the grasp at which the approach begins, metres.
     pub stand_off: f64,
     /// How far the object is lifted, metres.
     pub lift: f64,
-    /// Speed of approach and lift, metres a second.
+    /// Speed of approach and lift, m/s.
     pub speed: f64,
-    /// The hand is shaken up and down and to the side by this, metres.
+    /// Amplitude of the shake, vertical and then to the side, metres.
     pub shake: f64,
-    /// Shakes a second.
+    /// Frequency of the shake, hertz.
     pub shake_frequency: f64,
     /// Time step, seconds.
     pub time_step: f64,
@@ -77,15 +77,15 @@ impl TrialOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// After lift and shake the object is in the air, between both fingers.
+    /// After lift and shake the object is off the table, between both fingers.
     Held,
-    /// Before it moved, the gripper overlapped the table at the grasp, or the object at the stand-off.
+    /// Before any motion, the gripper overlaps the table at the grasp pose, or the object at the stand-off.
     Blocked,
-    /// The fingers closed on nothing.
+    /// The fingers closed without the object.
     Missed,
-    /// The fingers had the object and lost it in the lift.
+    /// The object was between the fingers and lost in the lift.
     LostInLift,
-    /// It was lifted and lost in the shake.
+    /// The object was lifted and lost in the shake.
     LostInShake,
 }
 
@@ -110,9 +110,9 @@ pub struct TrialReport {
     pub gap: f64,
     /// How much the object's own origin rose, metres.
     pub raised: f64,
-    /// How far the object slid between the fingers from the end of closing to the end, metres.
+    /// How far the object slid between the fingers from the end of closing to the end of the trial, metres.
     pub slip: f64,
-    /// How far it turned between the fingers in that time, radians.
+    /// Angle by which it rotated between the fingers in that time, radians.
     pub turn: f64,
     /// How far the object was moved before the lift, metres.
     pub pushed: f64,
@@ -120,20 +120,20 @@ pub struct TrialReport {
     pub time: f64,
 }
 
-/// Mass of a finger, kg. Lighter ones are shaken about by the contact solver.
+/// Mass of a finger, kg. With lighter ones the contact solver is unstable.
 const FINGER_MASS: f64 = 0.3;
-/// Speed at which a free finger closes, metres a second.
+/// Speed at which a free finger closes, m/s.
 const CLOSING_SPEED: f64 = 0.1;
-/// Time for closing beyond the way, seconds: the contact settles.
+/// Extra time for closing, seconds, so that the contact settles.
 const SQUEEZE: f64 = 0.3;
 /// Stiffness of the coupling of the two fingers, N/m.
 const COUPLING: f64 = 2e4;
 
-/// Tries a grasp on an object on the table. `world_from_gripper` is the gripper when it closes (its frame: the first page
-/// of `sixfold-grasp`), `opening` the distance of its pads until then, metres.
+/// Tries a grasp on an object on the table. `world_from_gripper` is the gripper's pose when it closes (its frame is defined in the
+/// crate documentation of `sixfold-grasp`), `opening` the distance of its pads before that, metres.
 ///
 /// # Errors
-/// [`SimulationError::Option`] for options out of range, or an opening that the gripper does not have.
+/// [`SimulationError::Option`] for options out of range, or an opening that the gripper cannot reach.
 pub fn try_grasp(
     parts: &ConvexParts,
     world_from_object: &Pose,
@@ -154,7 +154,7 @@ pub fn try_grasp(
     if run.blocked(gripper, world_from_gripper, opening) {
         return Ok(run.report(Outcome::Blocked));
     }
-    // Come.
+    // Approach.
     let approach = world_from_gripper.transform_direction(&Vec3::z());
     run.travel(approach * options.stand_off, options.speed);
     // Close.
@@ -172,7 +172,7 @@ pub fn try_grasp(
     if !run.holds() {
         return Ok(run.report(Outcome::LostInLift));
     }
-    // Shake: two seconds' worth of a full swing up and down, then to the side along the closing direction's horizontal.
+    // Shake, one second up and down and one second to the side, along the horizontal part of the closing direction.
     let side = world_from_gripper.transform_direction(&Vec3::x());
     let side = (side - Vec3::z() * side.z).try_normalize(0.1).unwrap_or_else(Vec3::x);
     for direction in [Vec3::z(), side] {
@@ -183,7 +183,7 @@ pub fn try_grasp(
     Ok(run.report(outcome))
 }
 
-/// Pads nearer than this have closed on nothing, metres.
+/// If the gap between the pads is smaller than this, they hold nothing, metres.
 const MIN_GAP: f64 = 0.0005;
 
 struct Run {
@@ -207,7 +207,7 @@ struct Finger {
     body: RigidBodyHandle,
     collider: ColliderHandle,
     joint: ImpulseJointHandle,
-    /// Where it is in the palm's frame when open.
+    /// Its position in the palm's frame when open.
     open_at: Vec3,
     /// The direction in which it closes, in the palm's frame.
     inwards: Vec3,
@@ -293,7 +293,7 @@ impl Run {
         body_pose(&self.world, self.palm)
     }
 
-    /// How far a finger has closed, metres, and how fast, metres a second.
+    /// How far a finger has closed, metres, and its speed, m/s.
     fn travelled(&self, finger: &Finger) -> (f64, f64) {
         let palm = self.palm();
         let at = palm.inverse().transform_point(&body_pose(&self.world, finger.body).translation());
@@ -316,13 +316,13 @@ impl Run {
         })
     }
 
-    /// In the air and between both fingers.
+    /// Whether the object is off the table and between both fingers.
     fn holds(&self) -> bool {
         let raised = self.object().translation().z - self.start.translation().z;
         self.gap() > MIN_GAP && self.touches() && raised > 0.5 * self.lift
     }
 
-    /// Whether the gripper cannot even begin: a part of it is under the table at the grasp, or inside the object at the
+    /// Whether the trial cannot begin: a part of the gripper is below the table at the grasp pose, or inside the object at the
     /// stand-off.
     fn blocked(&self, gripper: &Gripper, world_from_gripper: &Pose, opening: f64) -> bool {
         let boxes = gripper.boxes(opening);
@@ -348,7 +348,7 @@ impl Run {
         if let Some(palm) = self.world.bodies.get_mut(self.palm) {
             palm.set_next_kinematic_position(to_engine(&palm_at));
         }
-        // The jaws are geared: a spring, stiff against what they carry, keeps them equally far closed.
+        // The jaws are coupled: a spring, stiff compared with their load, keeps them closed by equal amounts.
         let [(left, left_speed), (right, right_speed)] =
             [self.travelled(&self.fingers[0]), self.travelled(&self.fingers[1])];
         let damping = 2.0 * (COUPLING * 0.5 * FINGER_MASS).sqrt();
@@ -376,13 +376,13 @@ impl Run {
         }
     }
 
-    /// Moves the palm by `way`, speeding up and slowing down over the first and last third.
+    /// Moves the palm by `way`, speeding up and slowing down smoothly.
     fn travel(&mut self, way: Vec3, speed: f64) {
         let length = way.norm();
         if length < 1e-9 {
             return;
         }
-        // A smooth step of the cubic kind: its largest speed is 1.5 times the mean one.
+        // A cubic smoothstep: its maximum speed is 1.5 times the mean.
         let seconds = 1.5 * length / speed;
         let steps = (seconds / self.dt()).ceil().max(1.0) as usize;
         let start = self.palm_at;
@@ -393,7 +393,7 @@ impl Run {
         }
     }
 
-    /// Swings the palm about where it is, with an amplitude that comes and goes smoothly.
+    /// Oscillates the palm around its position, with an amplitude that rises and falls smoothly.
     fn shake(&mut self, amplitude: Vec3, frequency: f64, seconds: f64) {
         let steps = (seconds / self.dt()).ceil() as usize;
         let start = self.palm_at;

@@ -1,10 +1,10 @@
-//! What a depth camera would see of an object on the table.
+//! Simulated depth images of an object on the table.
 
 use sixfold_geometry::{Camera, CameraError, DepthImage, Mat3, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
-/// Where a camera stands that looks at the table's origin.
+/// The viewpoint of a camera that is aimed at a target on the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewPoint {
     /// Angle about the world's z axis, radians.
@@ -13,12 +13,13 @@ pub struct ViewPoint {
     pub elevation: f64,
     /// Distance from the target, metres.
     pub distance: f64,
-    /// The point that the camera looks at, in the world's frame, metres.
+    /// The point at which the camera is aimed, world frame, metres.
     pub target: Vec3,
 }
 
 impl ViewPoint {
-    /// The camera's pose: x to the right and level, y down, z to the target. Straight from above, x is level all the same.
+    /// The camera's pose: x to the right and horizontal, y down, z to the target. x is horizontal also when the camera looks
+    /// straight down.
     pub fn world_from_camera(&self) -> Pose {
         let (azimuth, elevation) = (self.azimuth, self.elevation);
         let back =
@@ -40,7 +41,7 @@ pub struct SimulatedView {
     pub camera: Camera,
     /// Measured depth, metres.
     pub depth: DepthImage,
-    /// Where the camera stands.
+    /// The camera's pose.
     pub world_from_camera: Pose,
 }
 
@@ -48,7 +49,7 @@ pub struct SimulatedView {
 /// `sensor`, or none.
 ///
 /// # Errors
-/// [`CameraError`]: never with these numbers.
+/// [`CameraError`]: never with these values.
 pub fn simulate_view(
     mesh: &Mesh,
     world_from_object: &Pose,

@@ -1,8 +1,8 @@
-//! The engine with the settings that make grasping honest.
+//! The physics engine with settings that make grasping realistic.
 //!
-//! Found by trying: Rapier's default softness of contacts (30 Hz) lets a light finger sink millimetres into what it holds, its
-//! default friction model solves one constraint for four contacts, and recycled contacts creep. Here contacts are stiff,
-//! friction is Coulomb's at every contact, and none is recycled.
+//! Found by experiments: with Rapier's default softness of contacts (30 Hz) a light finger sinks millimetres into the object, its
+//! default friction model solves one constraint for four contacts, and recycled contacts creep. Here contacts are stiff, friction
+//! is Coulomb's at every contact, and none is recycled.
 
 use nalgebra::{Quaternion, UnitQuaternion};
 use rapier3d::dynamics::FrictionModel;
@@ -15,7 +15,7 @@ use sixfold_geometry::nalgebra;
 use crate::ConvexParts;
 use crate::parts::{vec3, vector};
 
-/// What collides with what: the object with all, gripper and table not with each other (that is tested before).
+/// Collision groups: the object collides with everything; gripper and table do not collide with each other (this is tested before).
 pub(crate) const OBJECT: InteractionGroups =
     InteractionGroups::new(Group::GROUP_1, Group::ALL, InteractionTestMode::And);
 pub(crate) const GRIPPER: InteractionGroups =
@@ -42,7 +42,8 @@ pub(crate) fn world(time_step: f64, contact_frequency: f64, table_friction: f64)
     world
 }
 
-/// Puts the object into the world. Its friction is 1: the other side's coefficient is the pair's.
+/// Puts the object into the world. Its friction coefficient is 1, so the product for a contact pair is the other body's
+/// coefficient.
 pub(crate) fn insert_object(
     world: &mut PhysicsWorld,
     parts: &ConvexParts,
@@ -82,7 +83,7 @@ pub(crate) fn body_pose(world: &PhysicsWorld, body: RigidBodyHandle) -> Pose {
     world.bodies.get(body).map_or_else(Pose::identity, |b| from_engine(b.position()))
 }
 
-/// A body's velocity, metres a second.
+/// A body's velocity, m/s.
 pub(crate) fn velocity(world: &PhysicsWorld, body: RigidBodyHandle) -> Vec3 {
     world.bodies.get(body).map_or_else(Vec3::zeros, |b| vec3(&b.linvel()))
 }

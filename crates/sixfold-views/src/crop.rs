@@ -1,25 +1,25 @@
-//! Square views of a region: a camera in the same place that looks at the centre of a box, rotated so that the box is in the centre
-//! of its image. What a crop shows then depends on the object alone, not on where in the image it is seen.
+//! Square views of a region: a camera at the same position, rotated so that the centre of a box is at the centre of its image. The
+//! content of a crop then does not depend on the object's position in the image.
 
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2, Vec3};
 use sixfold_synth::augment::Patch;
 
-/// Most samples along each axis that a pixel of a crop averages where the image is reduced.
+/// Maximum number of samples along each axis that a pixel of a crop averages if the image is reduced.
 const MAX_TAPS: usize = 6;
 
-/// A pinhole camera that looks at a box.
+/// A pinhole camera aimed at a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Crop {
     /// The square camera.
     pub camera: Camera,
-    /// From the frame of the image's camera to that of the crop's; both stand in the same place.
+    /// From the frame of the image's camera to that of the crop's; both have the same position.
     pub crop_from_camera: UnitQuaternion<f64>,
 }
 
 impl Crop {
-    /// A crop of `side` pixels that shows a box and around it as much as makes it `factor` times as large; `None` where the box has no
-    /// size or lies beside every image.
+    /// A crop of `side` pixels that shows a box enlarged `factor` times about its centre; `None` if the box has no area or is
+    /// outside any image.
     pub(crate) fn of_box(camera: &Camera, bbox: &Rect, factor: f64, side: usize) -> Option<Crop> {
         if !(bbox.width > 0.0 && bbox.height > 0.0) {
             return None;
@@ -47,18 +47,18 @@ impl Crop {
         Some(Crop { camera, crop_from_camera })
     }
 
-    /// A pose in the crop's frame from one in the image's.
+    /// Converts a pose from the image's frame to the crop's.
     pub(crate) fn to_crop(self, camera_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera, Vec3::zeros()) * *camera_from_object
     }
 
-    /// A pose in the image's frame from one in the crop's.
+    /// Converts a pose from the crop's frame to the image's.
     pub(crate) fn to_camera(self, crop_from_object: &Pose) -> Pose {
         Pose::new(self.crop_from_camera.inverse(), Vec3::zeros()) * *crop_from_object
     }
 
-    /// The crop's pixels of an image of `camera` (without lens distortion): bilinear, an average over several samples where the image
-    /// is reduced; `outside` beside it.
+    /// The crop's pixels of an image of `camera` (without lens distortion): bilinear, an average over several samples if the image
+    /// is reduced; `outside` beyond its border.
     pub(crate) fn cut(&self, image: &RgbImage, camera: &Camera, outside: [f32; 3]) -> Patch {
         let side = self.camera.width;
         let mut patch = Patch::filled(side, side, outside);
@@ -150,7 +150,7 @@ mod tests {
         let pose = Pose::exp(&[0.2, -0.1, 0.9, 0.4, -0.3, 0.8].into());
         let back = crop.to_camera(&crop.to_crop(&pose));
         assert!(back.distance_to(&pose) < 1e-12 && back.rotation_angle_to(&pose) < 1e-6);
-        // An image whose red says the column and whose green says the row.
+        // An image whose red encodes the column and whose green encodes the row.
         let image = RgbImage::from_fn(640, 480, |x, y| [(x / 4) as u8, (y / 4) as u8, 0]);
         let patch = crop.cut(&image, &camera, [0.0; 3]);
         let area = 160 * 160;

@@ -1,4 +1,4 @@
-//! What can go wrong.
+//! Errors of this crate.
 
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use thiserror::Error;
 /// Why poses could not be estimated from views.
 #[derive(Debug, Error)]
 pub enum ViewsError {
-    /// The program's weights are not its own.
+    /// The shipped weights cannot be used.
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// A file could not be read.
@@ -16,19 +16,19 @@ pub enum ViewsError {
     Read {
         /// The file.
         file: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The network's output could not be read.
     #[error("features: expected numbers, found {reason}")]
     Network {
-        /// What the framework said.
+        /// The framework's error.
         reason: String,
     },
-    /// The object cannot be seen from any side.
+    /// The object is not visible from any side.
     #[error("object {object}: expected a mesh with faces that a camera sees, found none; give another mesh")]
     Invisible {
-        /// What people call it.
+        /// Name of the object.
         object: String,
     },
 }

@@ -1,5 +1,5 @@
-//! Poses from a crop: templates that look alike, correspondences with the best of them, PnP, then render, compare and move (the structure
-//! of FoundPose: Örnek et al. 2024; of its parts only the order is theirs).
+//! Poses from a crop: similar templates, correspondences with the best of them, PnP, then repeatedly render, compare and update
+//! (the order of the steps is that of FoundPose, Örnek et al. 2024; the steps themselves are ours).
 
 use rayon::prelude::*;
 use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds, projected_box};
@@ -19,43 +19,43 @@ use crate::network::input;
 use crate::refiner::{Refiner, Target};
 use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
 
-/// How poses are estimated.
+/// Options of the pose estimation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewsOptions {
     /// Side of a crop, pixels; that of the templates.
     pub side: usize,
-    /// How far a feature may lie from where the template has it while templates are compared, cells.
+    /// Largest distance of a feature from its position in the template when templates are compared, cells.
     pub reach: usize,
-    /// Templates that correspondences are looked for with.
+    /// Number of templates for which correspondences are computed.
     pub candidates: usize,
-    /// How far correspondences may lie apart, cells.
+    /// Largest distance of correspondences, cells.
     pub match_reach: usize,
     /// Inlier threshold of PnP, crop pixels.
     pub reprojection: f64,
-    /// Poses that are rendered and compared.
+    /// Number of poses that are rendered and compared.
     pub hypotheses: usize,
-    /// How often each is rendered, compared and moved.
+    /// Iterations of rendering, comparing and updating each pose.
     pub refinements: usize,
-    /// How far a rendered feature is looked for then, cells.
+    /// Search distance of a rendered feature in these iterations, cells.
     pub refine_reach: usize,
-    /// Poses that are refined once more in a crop about the whole object.
+    /// Number of poses that are refined once more in a crop around the whole object.
     pub close: usize,
     /// Side of that crop, pixels.
     pub close_side: usize,
-    /// Align the outline there.
+    /// Align the outline in that crop.
     pub outline: bool,
-    /// Where no region is given: proposals of an image that templates are compared with, the surest ones.
+    /// If no region is given: number of proposals of an image that are compared with templates, those with the highest scores.
     pub proposals: usize,
-    /// Of those, the ones most alike the object in which poses are looked for, beside one for each further instance.
+    /// Of these, the number most similar to the object in which poses are estimated, plus one for each further instance.
     pub places: usize,
     /// Seed of RANSAC.
     pub seed: u64,
 }
 
-/// Chosen by AR_MSSD on 86 targets of every ninth LM-O development frame: `reprojection` among 3, 4, 6, 9 pixels, `refine_reach` among
-/// 2, 3 cells; with the refiner AR_MSSD / AR_MSPD / ADD(-S) recall with 8 hypotheses were .436 / .650 / .326, with 12
-/// .462 / .659 / .326, with 12 and `close` 4 instead of 2 .470 / .669 / .349 (without the refiner .431 / .643 / .302), with
-/// `close_side` 192 and `close` 2 .444 / .636 / .279. The others were chosen by hand.
+/// Chosen by AR_MSSD on 86 targets of every ninth LM-O development frame: `reprojection` from 3, 4, 6, 9 pixels, `refine_reach`
+/// from 2, 3 cells; with the refiner AR_MSSD / AR_MSPD / ADD(-S) recall with 8 hypotheses were .436 / .650 / .326, with 12 .462 /
+/// .659 / .326, with 12 and `close` 4 instead of 2 .470 / .669 / .349 (without the refiner .431 / .643 / .302), with `close_side`
+/// 192 and `close` 2 .444 / .636 / .279. The others were chosen by hand.
 impl Default for ViewsOptions {
     fn default() -> Self {
         ViewsOptions {
@@ -96,51 +96,52 @@ impl ViewsOptions {
     }
 }
 
-/// A pose with what speaks for it.
+/// A pose with its similarity and inliers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Hypothesis {
-    /// From the object's frame to the camera's; to the crop's while it is refined there.
+    /// From the object's frame to the camera's; to the crop's during the refinement in it.
     pub camera_from_object: Pose,
-    /// How well the crop agrees with the object rendered there, 0 to 1: the part of it that the crop shows where the render does, as the
-    /// refiner has it; without a refiner the mean of the squared products of features, 0 for negative ones.
+    /// Agreement of the crop with the object rendered at the pose, 0 to 1: the fraction of the object that the crop shows at the
+    /// same position as the render, as predicted by the refiner; without a refiner the mean of the squared products of features,
+    /// with 0 for negative ones.
     pub similarity: f64,
-    /// Correspondences that agreed with it.
+    /// Number of correspondences that agree with it.
     pub inliers: usize,
 }
 
 /// Everything that estimating one object's poses needs.
 pub(crate) struct Views<'a> {
-    /// Makes features.
+    /// Computes features.
     pub extractor: &'a Extractor,
     /// The object's surface.
     pub mesh: &'a Mesh,
-    /// The same for its outline ([`sixfold_align::outline::outline_mesh`]).
+    /// A mesh for its outline ([`sixfold_align::outline::outline_mesh`]).
     pub outline: &'a Mesh,
     /// Its templates.
     pub templates: &'a [Template],
-    /// Moves poses; without one the features' products do.
+    /// Refines poses; without one the products of features are used.
     pub refiner: Option<&'a Refiner>,
-    /// How.
+    /// Options.
     pub options: &'a ViewsOptions,
 }
 
-/// Weight of colour against the pose that an alignment begins with in telling object from background.
+/// Weight of colour relative to the initial pose in the object probability of the outline alignment.
 const COLOUR: f32 = 2.0;
-/// What the log likelihood of a border gains where colours change sharply.
+/// Bonus to the log likelihood of a border where colours change sharply.
 const EDGES: f64 = 8.0;
-/// Standard deviation of the band about the outline in which the pose does not decide what is object, crop pixels.
+/// Standard deviation of the band around the outline in which the pose does not determine the object's pixels, crop pixels.
 const UNDECIDED: f32 = 5.0;
-/// How sure the pose makes the pixels within and without.
+/// Probability that the pose gives to pixels inside, and its complement to those outside.
 const DECIDED: f32 = 0.9;
-/// The box of a whole object is at most this many times as large as what is seen of it.
+/// Largest ratio of the bounding box of a whole object to that of its visible part.
 const MAX_GROWTH: f64 = 4.0;
-/// An aligned outline is kept unless the features agree less by more than this; chosen by hand, not swept.
+/// An aligned outline is kept unless the agreement of features drops by more than this; chosen by hand, not swept.
 const TOLERANCE: f64 = 0.02;
-/// Objects that are rendered this near are inside the camera, diameters.
+/// Objects rendered closer than this would be inside the camera, diameters.
 const MIN_DISTANCE: f64 = 0.3;
 
 impl Views<'_> {
-    /// Looks for the object in a box of a pinhole image; `None` for a box that shows nothing.
+    /// Searches the object in a box of a pinhole image; `None` if the box does not overlap the image.
     ///
     /// # Errors
     /// [`ViewsError`].
@@ -162,7 +163,7 @@ impl Views<'_> {
         Ok(Some(hypotheses))
     }
 
-    /// The templates most alike a crop, best first: number and similarity.
+    /// The templates most similar to a crop, best first: number and similarity.
     pub(crate) fn ranked(&self, part: &Part) -> Vec<(usize, f32)> {
         let reach = self.options.reach;
         let mut ranked: Vec<(usize, f32)> =
@@ -172,7 +173,7 @@ impl Views<'_> {
         ranked
     }
 
-    /// The poses, best first, that a crop and the templates most alike it give.
+    /// Poses from a crop and the templates most similar to it, best first.
     pub(crate) fn coarse(&self, part: &Part, ranked: &[(usize, f32)]) -> Result<Vec<Hypothesis>, ViewsError> {
         let options = self.options;
         let mut first: Vec<Hypothesis> =
@@ -192,7 +193,7 @@ impl Views<'_> {
         Ok(hypotheses)
     }
 
-    /// Poses with the boxes they were found in, each refined once more ([`Views::closer`]), best first.
+    /// Poses with the boxes in which they were found, each refined once more ([`Views::closer`]), best first.
     pub(crate) fn closer_all(
         &self,
         poses: Vec<(Hypothesis, Rect)>,
@@ -206,7 +207,7 @@ impl Views<'_> {
         Ok(closer)
     }
 
-    /// A pose refined in a crop about the whole object as the pose has it, of more pixels, and its outline aligned there.
+    /// A pose refined in a crop of higher resolution around the whole object at this pose, with its outline aligned there.
     fn closer(
         &self,
         hypothesis: Hypothesis,
@@ -235,13 +236,13 @@ impl Views<'_> {
         Ok(Hypothesis { camera_from_object: part.crop.to_camera(&best.camera_from_object), ..*best })
     }
 
-    /// Whether two poses are so near that refining both is no use.
+    /// Whether two poses are so close that refining both is useless.
     pub(crate) fn same(&self, a: &Hypothesis, b: &Hypothesis) -> bool {
         let (a, b) = (&a.camera_from_object, &b.camera_from_object);
         a.rotation_angle_to(b) < 0.17 && a.distance_to(b) < 0.05 * a.translation().norm()
     }
 
-    /// The pose that correspondences with a template give.
+    /// The pose from correspondences with a template.
     fn pose_by(&self, template: &Template, Part { crop, map, .. }: &Part) -> Option<Hypothesis> {
         let matches = mutual_matches(template, map, self.options.match_reach);
         let (points, pixels): (Vec<Vec3>, Vec<Vec2>) = matches
@@ -272,7 +273,7 @@ impl Views<'_> {
         })
     }
 
-    /// Refines poses in a crop by what there is to do it.
+    /// Refines poses in a crop with the refiner, or with the products of features if there is none.
     fn moved(&self, hypotheses: Vec<Hypothesis>, part: &Part) -> Result<Vec<Hypothesis>, ViewsError> {
         let Some(refiner) = self.refiner else { return self.refined(hypotheses, part) };
         let poses: Vec<Pose> = hypotheses.iter().map(|h| h.camera_from_object).collect();
@@ -292,7 +293,7 @@ impl Views<'_> {
         Ok(out)
     }
 
-    /// Renders the object at each pose, compares and moves, several times.
+    /// Several iterations of rendering the object at each pose, comparing and updating.
     fn refined(&self, mut hypotheses: Vec<Hypothesis>, part: &Part) -> Result<Vec<Hypothesis>, ViewsError> {
         let mut best = hypotheses.clone();
         for pass in 0..=self.options.refinements {
@@ -319,7 +320,7 @@ impl Views<'_> {
         Ok(best)
     }
 
-    /// The object rendered at each pose against the crop; `None` where it cannot be seen.
+    /// Compares the object rendered at each pose with the crop; `None` if it is not visible.
     fn compared(
         &self,
         hypotheses: &[Hypothesis],
@@ -361,12 +362,13 @@ impl Views<'_> {
         (high - low).norm()
     }
 
-    /// Aligns the outline of a pose; keeps it where the features agree less afterwards.
+    /// Aligns the outline of a pose; keeps the old pose if the features agree less afterwards.
     fn align(&self, best: &mut Hypothesis, part: &Part) -> Result<(), ViewsError> {
         let Part { crop, patch, .. } = part;
         let Some((compared, _)) = self.seen_at(best, part)? else { return Ok(()) };
         let prior = self.prior(&best.camera_from_object, crop);
-        // As for Pix2Pose, whose crops are as large; weights from a fifth to five times of these change AR_MSSD by less than 0.01.
+        // As for Pix2Pose, whose crops have the same size; weights from a fifth to five times of these change AR_MSSD by less than
+        // 0.01.
         let options = AlignmentOptions {
             reaches: vec![8.0, 5.0, 3.0],
             iterations: 5,
@@ -396,7 +398,7 @@ impl Views<'_> {
         Ok(())
     }
 
-    /// Correspondences at a pose, and how alike the object there and the crop are.
+    /// Correspondences at a pose, and the similarity of the rendered object and the crop.
     fn seen_at(
         &self,
         hypothesis: &Hypothesis,
@@ -415,7 +417,7 @@ impl Views<'_> {
         }))
     }
 
-    /// How probably each pixel of the crop shows the object at a pose: not decided near its outline.
+    /// Probability that each pixel of the crop shows the object at a pose: uncertain near its outline.
     fn prior(&self, pose: &Pose, crop: &Crop) -> Vec<f32> {
         let mut frame = VisibilityBuffer::new(&crop.camera);
         let objects = [sixfold_render::SceneObject { mesh: self.outline, camera_from_object: *pose }];
@@ -430,7 +432,7 @@ impl Views<'_> {
     }
 }
 
-/// A crop with what the networks see of it.
+/// A crop with the networks' inputs and features.
 pub(crate) struct Part {
     crop: Crop,
     patch: Patch,
@@ -439,7 +441,7 @@ pub(crate) struct Part {
 }
 
 impl Part {
-    /// The part of an image about a box in a crop of `side` pixels; `None` for a box that shows nothing.
+    /// The part of an image around a box in a crop of `side` pixels; `None` if the box does not overlap the image.
     pub(crate) fn new(
         extractor: &Extractor,
         image: &RgbImage,
@@ -462,7 +464,7 @@ impl Part {
 /// Points of the object, and the pixels that show them.
 type Correspondences = Vec<(Vec3, Vec2)>;
 
-/// A render against a crop.
+/// Comparison of a render with a crop.
 struct Compared {
     similarity: f64,
     points: Vec<Vec3>,
@@ -483,7 +485,7 @@ fn compare(cells: &[u16], features: &[f32], points: &[[f32; 3]], map: &FeatureMa
     out
 }
 
-/// Where about a cell the product with a feature is largest, crop pixels: the top of a parabola along each axis.
+/// Position near a cell at which the product with a feature is largest, crop pixels: the vertex of a parabola along each axis.
 fn peak(feature: &[f32], map: &FeatureMap, cell: usize) -> Vec2 {
     let n = map.cells;
     let (x, y) = (cell % n, cell / n);
@@ -523,7 +525,7 @@ pub(crate) mod tests {
         .unwrap()
     }
 
-    /// [`part`] in an image of 640x480 pixels, where it is, and its box.
+    /// [`part`] in an image of 640x480 pixels, its pose, and its box.
     pub(crate) fn photographed(camera: &Camera) -> (RgbImage, Pose, Rect) {
         let mesh = part();
         let truth = Pose::new(UnitQuaternion::from_euler_angles(2.1, 0.5, 0.7), Vec3::new(0.15, -0.1, 0.9));
@@ -570,7 +572,7 @@ pub(crate) mod tests {
             let bound = if outline { 0.05 } else { 0.1 };
             assert!(add < bound * mesh.diameter(), "outline {outline}: {add} m off");
         }
-        // The same where nothing of it is: less alike.
+        // The same in a box without the object: less similar.
         let beside = Rect { x: 40.0, y: 300.0, ..bbox };
         let nothing = find(true, &beside).first().map_or(0.0, |h| h.similarity);
         assert!(nothing < 0.6 * find(true, &bbox)[0].similarity, "{nothing}");

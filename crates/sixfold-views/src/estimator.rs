@@ -24,16 +24,17 @@ use crate::search::Places;
 use crate::templates::{Template, TemplateOptions, make_templates, view_mesh};
 
 const METHOD: &str = "views";
-/// Where an object's templates are kept in its folder.
+/// File of an object's templates in its folder.
 const FILE: &str = "views.bin";
 
-/// Poses of known objects from colour, without training for the object, in given regions or where a detector of any object sees one.
+/// Poses of known objects from colour, without training for the object, in given regions or in the proposals of a detector of any
+/// object.
 #[derive(Clone)]
 pub struct ViewsEstimator {
     extractor: Arc<Extractor>,
-    /// For the features of the network within the program alone.
+    /// Trained only for the features of the shipped network.
     refiner: Option<Arc<Refiner>>,
-    /// Says where any object could be, for queries without a region.
+    /// Proposes regions of any object, for queries without a region.
     proposals: Option<Arc<dyn ObjectDetector>>,
     /// The hash of the network's weights, for templates that are kept.
     network: u64,
@@ -44,7 +45,7 @@ pub struct ViewsEstimator {
 }
 
 impl ViewsEstimator {
-    /// With the network within the program.
+    /// With the shipped network.
     ///
     /// # Errors
     /// [`ViewsError::Weights`].
@@ -55,8 +56,8 @@ impl ViewsEstimator {
         Ok(ViewsEstimator { refiner: Some(Arc::new(refiner)), ..estimator })
     }
 
-    /// With a network that `sixfold train views` wrote. The refiner within the program does not know its features: poses are refined
-    /// by their products alone.
+    /// With a network written by `sixfold train views`. The shipped refiner was not trained on its features, so poses are refined
+    /// by their products only.
     ///
     /// # Errors
     /// [`ViewsError::Weights`].
@@ -79,23 +80,23 @@ impl ViewsEstimator {
         }
     }
 
-    /// Looks for objects where `detector` sees any, if a query has no region. Which object it says is not asked.
+    /// Searches in the detections of `detector` if a query has no region. The class of the detections is not used.
     #[must_use]
     pub fn with_proposals(self, detector: Arc<dyn ObjectDetector>) -> ViewsEstimator {
         ViewsEstimator { proposals: Some(detector), ..self }
     }
 
-    /// What decides about the templates of a mesh.
+    /// A hash of everything that affects the templates of a mesh.
     fn key(&self, mesh: &Mesh, diameter: f64) -> u64 {
         let mut hash = Fnv1a::default();
         hash.write(&mesh.contents_hash().to_le_bytes());
         hash.write(&self.network.to_le_bytes());
-        // Numbers print with all their digits.
+        // Numbers are printed with all their digits.
         hash.write(format!("{diameter:?} {:?}", self.templates).as_bytes());
         hash.value()
     }
 
-    /// The templates kept in the object's folder, or new ones.
+    /// The templates kept in the object's folder, or newly rendered ones.
     fn templates_of(
         &self,
         object: &Object,
@@ -122,7 +123,7 @@ impl ViewsEstimator {
     }
 }
 
-/// An object as this method knows it.
+/// An object prepared for this method.
 pub struct ViewsObject {
     name: String,
     mesh: Arc<Mesh>,
@@ -156,8 +157,9 @@ impl PoseEstimator for ViewsEstimator {
         Needs { depth: Need::Unused, rgb: Need::Required, region, object: Need::Required }
     }
 
-    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 69 % lie above 0.4, 90 % of those within a fifth of the
-    /// diameter among them; 94 % of them are within half of it, of all 74 % (`benches/views_confidence.py`).
+    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 69 % have a confidence above 0.4, including 90 % of
+    /// those with an MSSD below a fifth of the diameter; 94 % of the poses above have an MSSD below half the diameter, of all poses
+    /// 74 % (`benches/views_confidence.py`).
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: 0.4, dataset: 0.0 }
     }
@@ -242,7 +244,7 @@ mod tests {
     use sixfold_geometry::{Camera, Rect, RgbImage};
     use sixfold_mesh::ModelInfo;
 
-    /// Sees something in these boxes, and counts how often it is asked.
+    /// Detects an object in each of these boxes, and counts its calls.
     struct Somewhere(Vec<Rect>, std::sync::atomic::AtomicUsize);
 
     impl ObjectDetector for Somewhere {
@@ -266,7 +268,7 @@ mod tests {
         let detector = Arc::new(Somewhere(vec![beside, above, bbox], 0.into()));
         let mut estimator = ViewsEstimator::shipped().unwrap();
         estimator.templates = TemplateOptions { directions: 60, rotations: 12, ..TemplateOptions::default() };
-        // One place alone is looked at: the templates have to choose the right one.
+        // Only one place is searched: the templates must choose the right one.
         estimator.options = ViewsOptions { places: 1, close: 1, ..ViewsOptions::default() };
         assert_eq!(estimator.needs().region, Need::Required);
         let mesh = part();
@@ -286,7 +288,7 @@ mod tests {
             assert!(pose.distance_to(&truth) < 0.05, "{pose:?} instead of {truth:?}");
         }
         assert_eq!(detector.1.load(std::sync::atomic::Ordering::Relaxed), 1);
-        // As many instances as are asked for, each a place of its own.
+        // As many instances as requested, each at a place of its own.
         let query = Query { rgb: Some(&image), max_instances: 3, ..Query::new(&camera) };
         let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
         assert!(!found.is_empty() && found.len() <= 3);

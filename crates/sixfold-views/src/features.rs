@@ -1,4 +1,4 @@
-//! Features of crops: one of length 1 for every 8x8 pixels.
+//! Features of crops: one unit vector for every 8x8 pixels.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_nn::xfeat::{CELL, CHANNELS};
@@ -6,7 +6,7 @@ use sixfold_nn::xfeat::{CELL, CHANNELS};
 use crate::error::ViewsError;
 use crate::network::{INPUTS, ViewNetwork};
 
-/// Crops that go through the network together.
+/// Crops per forward pass.
 const BATCH: usize = 16;
 
 /// The network, ready to run.
@@ -33,7 +33,7 @@ impl FeatureMap {
 }
 
 impl Extractor {
-    /// The network within the program.
+    /// The shipped network.
     ///
     /// # Errors
     /// [`ViewsError::Weights`].
@@ -47,10 +47,10 @@ impl Extractor {
         Extractor { network, device }
     }
 
-    /// Features of crops of `side` x `side` pixels as `crate::network::input` makes them.
+    /// Features of crops of `side` x `side` pixels as returned by `crate::network::input`.
     ///
     /// # Errors
-    /// [`ViewsError::Network`] where the network's output cannot be read.
+    /// [`ViewsError::Network`] if the network's output cannot be read.
     pub fn features(&self, inputs: &[Vec<f32>], side: usize) -> Result<Vec<FeatureMap>, ViewsError> {
         let cells = side / CELL;
         let count = cells * cells;

@@ -1,4 +1,4 @@
-//! Templates in a file: with the hash of what they were made from in front and a checksum behind.
+//! Templates in a file: with the hash of their inputs at the beginning and a checksum at the end.
 
 use std::io;
 use std::path::Path;
@@ -11,14 +11,14 @@ use sixfold_nn::xfeat::CHANNELS;
 
 use crate::templates::Template;
 
-/// What such a file begins with; the digit is the format's version.
+/// Magic bytes of such a file; the digit is the format's version.
 const MAGIC: &[u8; 8] = b"sfviews1";
 /// Bytes of a template without its cells: pose, focal length, side, number of cells.
 const HEAD: usize = 8 * 8 + 2 * 4;
 /// Bytes of a cell: number, feature, point.
 const PER_CELL: usize = 2 + 2 * CHANNELS + 3 * 4;
 
-/// Writes templates that were made from what `key` is the hash of.
+/// Writes templates; `key` is the hash of their inputs.
 pub(crate) fn write(path: &Path, key: u64, templates: &[Template]) -> io::Result<()> {
     let mut out = Vec::new();
     out.extend_from_slice(MAGIC);
@@ -40,10 +40,10 @@ pub(crate) fn write(path: &Path, key: u64, templates: &[Template]) -> io::Result
     write_atomically(path, &out)
 }
 
-/// Templates of a file, `None` where it holds others than `key` says, or is damaged.
+/// Templates of a file, `None` if it has another `key` or is damaged.
 ///
 /// # Errors
-/// Where it cannot be read for another reason than that it is not there.
+/// If it exists but cannot be read.
 pub(crate) fn read(path: &Path, key: u64) -> io::Result<Option<Vec<Template>>> {
     match read_regular(path, limits::DERIVED) {
         Ok(bytes) => Ok(decode(&bytes, key)),
@@ -126,7 +126,7 @@ impl Reader<'_> {
     }
 }
 
-/// Longest side of a crop, pixels: with more, cells have no 16-bit numbers.
+/// Longest side of a crop, pixels: beyond it, numbers of cells do not fit into 16 bits.
 const MAX_SIDE: usize = 2048;
 
 #[cfg(test)]
@@ -163,7 +163,7 @@ mod tests {
         for length in 0..whole.len() {
             assert!(decode(&whole[..length], 7).is_none(), "{length} bytes");
         }
-        // A forged count behind a right checksum asks for no memory.
+        // A forged count with a valid checksum does not allocate memory.
         let mut forged = whole[..whole.len() - 8].to_vec();
         forged[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
         let sum = fnv1a(&forged);

@@ -1,11 +1,12 @@
-//! Poses of known objects from one colour image, without training for the object: the mesh is rendered from all around, and local features
-//! of these views are matched with those of a region of the image.
+//! Poses of known objects from one colour image, without training for the object: the mesh is rendered from all sides, and local
+//! features of these views are matched with those of a region of the image.
 //!
 //! Without a region, a detector of any object proposes some, and the templates choose among them (`search`).
 //!
-//! A region is cut out as a camera sees it that looks at its middle (`crop`). Its features (`features`) are compared with those of all
-//! `templates`; the best of these give correspondences, these poses by PnP, and each pose is rendered, compared and moved
-//! (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects (`training`).
+//! A region is resampled as seen by a camera aimed at its centre (`crop`). Its features (`features`) are compared with those of all
+//! `templates`; the best of these give correspondences, the correspondences give poses by PnP, and each pose is rendered, compared
+//! and moved (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
+//! (`training`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

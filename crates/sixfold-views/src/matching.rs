@@ -1,4 +1,4 @@
-//! Templates against a crop, feature by feature.
+//! Compares templates with a crop, feature by feature.
 
 use sixfold_nn::xfeat::CHANNELS;
 
@@ -21,7 +21,7 @@ pub(crate) fn dot(a: &[f32], b: &[f32]) -> f32 {
     sums.iter().sum()
 }
 
-/// How alike a template and a crop are: the mean over the template's features of the best product with one of the crop's within
+/// Similarity of a template and a crop: the mean over the template's features of the best product with a feature of the crop within
 /// `reach` cells.
 pub(crate) fn similarity(template: &Template, map: &FeatureMap, reach: usize) -> f32 {
     if template.cells.is_empty() {
@@ -34,7 +34,7 @@ pub(crate) fn similarity(template: &Template, map: &FeatureMap, reach: usize) ->
     sum / template.cells.len() as f32
 }
 
-/// The same by every [`QUICK_STEP`]th feature, looked for in the neighbouring cells alone: about twelve times as fast.
+/// The same with every [`QUICK_STEP`]th feature, searched only in the neighbouring cells: about twelve times as fast.
 pub(crate) fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
     let (mut sum, mut count) = (0.0, 0.0);
     for (i, cell) in template.cells.iter().enumerate().step_by(QUICK_STEP) {
@@ -44,7 +44,7 @@ pub(crate) fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
     if count > 0.0 { sum / count } else { 0.0 }
 }
 
-/// The cell within `reach` of `cell` whose feature is nearest, and the product.
+/// The cell within `reach` of `cell` whose feature is most similar, and the product.
 pub(crate) fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
     let mut best = (cell, f32::NEG_INFINITY);
     for at in near(map.cells, cell, reach) {
@@ -63,10 +63,10 @@ fn near(n: usize, cell: usize, reach: usize) -> impl Iterator<Item = usize> {
     range(y).flat_map(move |v| range(x).map(move |u| v * n + u))
 }
 
-/// A feature of the template and one of the crop that choose each other.
+/// A feature of the template and one of the crop that are mutual nearest neighbours.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Match {
-    /// Which of the template's features.
+    /// Index of the template's feature.
     pub index: usize,
     /// The cell of the crop.
     pub cell: usize,
@@ -74,7 +74,7 @@ pub(crate) struct Match {
     pub similarity: f32,
 }
 
-/// Features that choose each other within `reach` cells.
+/// Mutual nearest neighbours within `reach` cells.
 pub(crate) fn mutual_matches(template: &Template, map: &FeatureMap, reach: usize) -> Vec<Match> {
     let n = map.cells;
     let mut back: Vec<(f32, u32)> = vec![(f32::NEG_INFINITY, u32::MAX); n * n];
@@ -105,14 +105,14 @@ mod tests {
     use super::*;
     use sixfold_geometry::{Camera, Pose};
 
-    /// A map of 4 x 4 cells in which every cell has a feature of its own.
+    /// A map of 4 x 4 cells in which every cell has a different feature.
     fn map() -> FeatureMap {
         let mut features = vec![0.0; 16 * CHANNELS];
         (0..16).for_each(|cell| features[cell * CHANNELS + 3 * cell] = 1.0);
         FeatureMap { cells: 4, features }
     }
 
-    /// A template whose `i`-th feature is that of the map's cell `of[i]` and lies at `at[i]`.
+    /// A template whose `i`-th feature is that of the map's cell `of[i]` and is at `at[i]`.
     fn template(at: &[u16], of: &[usize]) -> Template {
         Template {
             crop_from_object: Pose::identity(),
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn only_features_that_choose_each_other_match() {
-        // Two features of the template want the same cell: the first of equals gets it.
+        // Two features of the template match the same cell: ties go to the first.
         let found = mutual_matches(&template(&[5, 9, 10], &[6, 6, 11]), &map(), 2);
         let pairs: Vec<(usize, usize)> = found.iter().map(|m| (m.index, m.cell)).collect();
         assert_eq!(pairs, [(0, 6), (2, 11)]);

@@ -1,5 +1,5 @@
-//! The network: XFeat's backbone, which also sees colour, trained further so that renders and photographs of the same point of an
-//! object get the same feature.
+//! The network: XFeat's backbone, extended to colour input and trained further so that the same point of an object has the same
+//! feature in renders and photographs.
 
 use std::path::Path;
 
@@ -15,13 +15,13 @@ pub(crate) const ARCHITECTURE: &str = "views-xfeat-colour";
 
 /// Channels of the input: grey, and two of colour.
 pub(crate) const INPUTS: usize = 3;
-/// Pixels along each side of the stem's cells.
+/// Side of the stem's cells, pixels.
 const STEM_CELL: usize = 4;
 
-/// The weights within the program; their card lies beside them.
+/// The shipped weights; their card is next to them.
 const WEIGHTS: &[u8] = include_bytes!("../weights/views.safetensors");
 
-/// The hash of the weights within the program.
+/// The hash of the shipped weights.
 pub(crate) fn shipped_hash() -> u64 {
     sixfold_io::fnv1a(WEIGHTS)
 }
@@ -37,10 +37,10 @@ pub struct ViewNetwork {
 sixfold_nn::displayed_by_name!(ViewNetwork);
 
 impl ViewNetwork {
-    /// XFeat with its authors' weights; colour makes no difference yet.
+    /// XFeat with its authors' weights; the colour channels have no influence yet.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn untrained(device: &Device) -> Result<ViewNetwork, WeightsError> {
         let config = ConvConfig {
             padding: Padding::Zeros(0),
@@ -52,16 +52,16 @@ impl ViewNetwork {
         Ok(ViewNetwork { backbone: XFeat::shipped(device)?.into_backbone(), colour })
     }
 
-    /// The network within the program.
+    /// The shipped network.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped(device: &Device) -> Result<ViewNetwork, WeightsError> {
         let name = Path::new("views.safetensors");
         Ok(load_weights_from_bytes(ViewNetwork::untrained(device)?, name, WEIGHTS, ARCHITECTURE)?.0)
     }
 
-    /// A network that `sixfold train views` wrote, with its card.
+    /// A network written by `sixfold train views`, with its card.
     ///
     /// # Errors
     /// [`WeightsError`].
@@ -69,8 +69,8 @@ impl ViewNetwork {
         load_weights(ViewNetwork::untrained(device)?, path, ARCHITECTURE)
     }
 
-    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs that `input` makes, `batch x 3 x side
-    /// x side`; sides are multiples of 32 pixels.
+    /// Features before normalisation to length 1, `batch x 64 x side / 8 x side / 8`, of inputs from `input`, `batch x 3 x side x
+    /// side`; sides are multiples of 32 pixels.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let grey = x.clone().narrow(1, 0, 1);
         let colour = x.narrow(1, 1, INPUTS - 1);
@@ -78,8 +78,8 @@ impl ViewNetwork {
     }
 }
 
-/// What the network sees of a planar colour crop (0 to 1): grey values with mean 0 and variance 1, and the differences of red from green
-/// and of blue from both on the same scale, for exposure changes neither.
+/// The network's input for a planar colour crop (0 to 1): grey values with mean 0 and variance 1, and the differences of red from
+/// green and of blue from both, on the same scale; all of these are invariant to exposure.
 pub(crate) fn input(planes: &[f32]) -> Vec<f32> {
     let area = planes.len() / 3;
     let (red, rest) = planes.split_at(area);

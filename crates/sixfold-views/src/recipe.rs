@@ -1,5 +1,5 @@
-//! A whole training: nothing but a seed in (better: photographs for textures and backgrounds too), a network for views out.
-//! Interrupted at any time, it is resumed.
+//! A complete training of the network for views, from a seed alone (better: with photographs for textures and backgrounds). It can
+//! be interrupted at any time and resumed.
 
 use std::path::{Path, PathBuf};
 
@@ -15,7 +15,7 @@ use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 use crate::network::{ARCHITECTURE, ViewNetwork};
 use crate::training::{ViewsTraining, ViewsTrainingOptions};
 
-/// Fraction of procedural textures between the photographs.
+/// Fraction of procedural textures among the photographs.
 const PROCEDURAL_FRACTION: f32 = 0.2;
 
 /// Textures, backgrounds and occluders of the training objects.
@@ -25,7 +25,7 @@ pub(crate) fn textures(backgrounds: Option<&Path>) -> Result<Backgrounds, TrainE
     Ok(photographs.map_err(TrainError::about("backgrounds"))?.with_procedural_fraction(PROCEDURAL_FRACTION))
 }
 
-/// What a model's card says of the training objects.
+/// Description of the training objects for a model's card.
 pub(crate) fn described(textures: &Backgrounds) -> String {
     let images = match textures.images() {
         0 => "noise".to_owned(),
@@ -36,14 +36,14 @@ pub(crate) fn described(textures: &Backgrounds) -> String {
     )
 }
 
-/// How the network is trained.
+/// Options of the training.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ViewsRecipe {
-    /// Folder of photographs for textures, backgrounds and occluders; procedural textures only without.
+    /// Folder of photographs for textures, backgrounds and occluders; procedural textures only if `None`.
     pub backgrounds: Option<PathBuf>,
     /// Steps, learning rate, seed, crops.
     pub options: ViewsTrainingOptions,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -71,7 +71,7 @@ impl Recipe for ViewsRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         let ViewsRecipe { backgrounds, options, command: _ } = self;
         let backgrounds =
             background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;

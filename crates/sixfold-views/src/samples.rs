@@ -1,5 +1,5 @@
-//! What the network learns from: synthetic objects, each seen once as a photograph might show it (any light, clutter behind it, something
-//! in front of it) and twice as a template shows it, from about the same side and from another one.
+//! Training samples: synthetic objects, each rendered once like a photograph (any light, with clutter behind it and occluders in
+//! front) and twice like a template, from about the same side and from another one.
 //!
 //! A sample is a function of seed and number alone.
 
@@ -19,23 +19,23 @@ use crate::crop::Crop;
 use crate::network::input;
 use crate::templates::{CROP_FACTOR, cells_on_object, input_over_grey, render, wide_camera};
 
-/// Correspondences that are taken from a sample.
+/// Correspondences per sample.
 pub(crate) const POINTS: usize = 96;
-/// Points of an object that are nearer to each other than this part of its diameter are not held apart.
+/// Points of an object that are closer to each other than this fraction of its diameter are not used as negatives.
 const SAME_POINT: f32 = 0.05;
-/// A point is seen where the surface in the photograph is at most this part of the diameter away from it.
+/// A point is visible if the surface in the photograph is within this fraction of the diameter from it.
 pub(crate) const SEEN: f32 = 0.02;
-/// Fewer correspondences are no sample.
+/// Fewest correspondences of a sample.
 const MIN_POINTS: usize = 12;
 
-/// A photograph, two templates, and which of their cells show the same.
+/// A photograph, two templates, and their corresponding cells.
 #[derive(Debug, Clone)]
 pub(crate) struct Sample {
     /// Inputs of the network: the photograph, the template from about the same side, and one from another side.
     pub inputs: [Vec<f32>; 3],
     /// [`POINTS`] cells of the first template.
     pub cells: Vec<usize>,
-    /// Where the photograph shows each of them: four cells with their weights.
+    /// Position of each of them in the photograph: four cells with their weights.
     pub places: Vec<[(usize, f32); 4]>,
     /// For each of them and every cell of both templates, whether that cell shows another point.
     pub others: Vec<Vec<bool>>,
@@ -45,7 +45,7 @@ pub(crate) fn between(random: &mut Random, low: f64, high: f64) -> f64 {
     low + (high - low) * random.random::<f64>()
 }
 
-/// An object about the origin, in colours or without.
+/// An object centred on the origin, with or without colours.
 pub(crate) fn object(textures: &Backgrounds, random: &mut Random) -> Option<Mesh> {
     let mesh = if random.random::<f32>() < 0.6 {
         randomly_colored(&toy(random).ok()?, random)
@@ -69,7 +69,7 @@ fn nearby(
     UnitQuaternion::from_axis_angle(&Vec3::z_axis(), between(random, -roll, roll)) * tilt * rotation
 }
 
-/// The object as a template shows it.
+/// The object rendered like a template.
 struct Side {
     input: Vec<f32>,
     cells: Vec<u16>,
@@ -88,7 +88,7 @@ fn template(mesh: &Mesh, rotation: &UnitQuaternion<f64>, distance: f64, side: us
     Some(Side { input: input_over_grey(&rendered), cells, points })
 }
 
-/// Light as in rooms: from everywhere, and one or two lamps in front of the object.
+/// Indoor light: ambient light, and one or two lamps in front of the object.
 fn lights(random: &mut Random) -> (Vec<Light>, Material) {
     let ambient = uniform(random, [0.15, 0.6]);
     let mut lights = vec![Light::Ambient { color: [ambient; 3] }];
@@ -105,7 +105,7 @@ fn lights(random: &mut Random) -> (Vec<Light>, Material) {
     (lights, Material { specular, shininess: uniform(random, [5.0, 60.0]), plain })
 }
 
-/// The object as a photograph shows it.
+/// The object rendered like a photograph.
 pub(crate) struct Photograph {
     pub(crate) patch: Patch,
     pub(crate) crop: Crop,
@@ -115,11 +115,11 @@ pub(crate) struct Photograph {
     pub(crate) hidden: Coverage,
 }
 
-/// Which box a photograph is cropped about.
+/// The box around which a photograph is cropped.
 pub(crate) struct Framing {
-    /// The whole object's, not that of the part that is seen.
+    /// Whether it is the box of the whole object; otherwise that of the visible part.
     pub(crate) whole: bool,
-    /// How much smaller or larger than that box.
+    /// Range of the scale factor of that box.
     pub(crate) scale: [f64; 2],
 }
 
@@ -189,7 +189,7 @@ pub(crate) fn photograph(
     Some(Photograph { patch, crop, pose, coordinates: frame.object_coordinates(&objects), hidden })
 }
 
-/// What covers pixels of the wide image, in the crop.
+/// A coverage of the wide image, resampled to the crop.
 fn in_crop(cover: &Coverage, wide: &Camera, crop: &Crop) -> Coverage {
     let back = crop.crop_from_camera.inverse();
     Coverage::from_fn(crop.camera.width, crop.camera.height, |x, y| {
@@ -202,7 +202,7 @@ pub(crate) fn distance(a: &[f32; 3], b: &[f32; 3]) -> f32 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f32>().sqrt()
 }
 
-/// Draws a sample of crops of `side` pixels; `None` where the object can hardly be seen.
+/// Generates a sample of crops of `side` pixels; `None` if the object is hardly visible.
 fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<Sample> {
     let mesh = object(textures, random)?;
     let diameter = mesh.diameter();
@@ -211,7 +211,7 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<S
     let shift = Vec3::new(between(random, -0.05, 0.05), between(random, -0.05, 0.05), 1.0) * range;
     let framing = Framing { whole: false, scale: [0.9, 1.15] };
     let photograph = photograph(&mesh, &Pose::new(rotation, shift), textures, side, &framing, random)?;
-    // Most meshes of users have colours, some have not.
+    // Most meshes of users have colours, some do not.
     let bare = (random.random::<f32>() < 0.15)
         .then(|| Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec()).ok())
         .flatten();
@@ -261,7 +261,7 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<S
     Some(sample)
 }
 
-/// The four cells about a place, and their weights.
+/// The four cells around a position, and their weights.
 fn bilinear(x: f64, y: f64, cells: usize) -> [(usize, f32); 4] {
     let last = (cells - 1) as f64;
     let (x, y) = (x.clamp(0.0, last), y.clamp(0.0, last));
@@ -276,7 +276,7 @@ fn bilinear(x: f64, y: f64, cells: usize) -> [(usize, f32); 4] {
     ]
 }
 
-/// The sample of a number.
+/// The sample with a number.
 pub(crate) fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> Sample {
     let mut random = stream(seed, number);
     loop {

@@ -1,7 +1,7 @@
-//! Where no region is given: a detector of any object proposes boxes, the object's templates say which of them look like it, and
-//! poses are looked for there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features are a foundation model's).
+//! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
+//! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models).
 //!
-//! Proposals and their features belong to the image: they are computed once, however many objects are searched in it.
+//! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -15,21 +15,21 @@ use crate::estimate::{Hypothesis, Part, Views};
 use crate::features::Extractor;
 use crate::matching::quick_similarity;
 
-/// Boxes of two poses that overlap more than this (intersection over union) are of one instance.
+/// Boxes of two poses that overlap more than this (intersection over union) belong to one instance.
 const ONE_INSTANCE: f64 = 0.5;
 
-/// A box that could show an object, with what the networks see there.
+/// A box that may show an object, with the networks' features there.
 pub(crate) struct Place {
     bbox: Rect,
     part: Part,
 }
 
-/// The places of an image, once they are known.
+/// The places of an image, computed once.
 #[derive(Default)]
 pub(crate) struct Places(Mutex<Option<Arc<Vec<Place>>>>);
 
 impl Places {
-    /// Where a detector of any object sees one, the surest first, at most `most`; asked for once.
+    /// The proposals of a detector of any object, by decreasing score, at most `most`; computed once.
     pub(crate) fn of_image(
         &self,
         detector: &dyn ObjectDetector,
@@ -58,7 +58,7 @@ impl Places {
 }
 
 impl Views<'_> {
-    /// The object's poses in the places that look like it, best first, at most `instances`, no two alike.
+    /// The object's poses in the places similar to it, best first, at most `instances`, no two of the same instance.
     pub(crate) fn search(
         &self,
         image: &RgbImage,
@@ -76,7 +76,7 @@ impl Views<'_> {
             pool.extend(poses.into_iter().map(|pose| (number, pose)));
         }
         pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));
-        // The best of all, and where several instances are asked for, the best of each place.
+        // The best of all and, if several instances are requested, the best of each place.
         let mut seen = vec![false; alike.len()];
         let mut chosen = Vec::new();
         for (number, pose) in pool {
@@ -95,13 +95,13 @@ impl Views<'_> {
         Ok(kept)
     }
 
-    /// How alike a crop and the most similar template are, by some of its features: to choose the places that are worth more.
+    /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
     fn likeness(&self, part: &Part) -> f32 {
         let of = |template| quick_similarity(template, &part.map);
         self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 
-    /// Whether two poses are of one instance: their boxes in the image overlap more than those of two can.
+    /// Whether two poses belong to one instance: their boxes in the image overlap more than [`ONE_INSTANCE`].
     fn one(&self, camera: &Camera, a: &Hypothesis, b: &Hypothesis) -> bool {
         let boxed = |h: &Hypothesis| projected_box(self.outline, camera, &h.camera_from_object);
         match (boxed(a), boxed(b)) {

@@ -1,4 +1,4 @@
-//! Templates: an object rendered from all around, each view as features and the points of the object that they lie on.
+//! Templates: an object rendered from all sides, each view as features and their points on the object.
 
 use std::f64::consts::TAU;
 
@@ -23,7 +23,7 @@ pub(crate) struct Template {
     pub crop_from_object: Pose,
     /// The crop's camera.
     pub camera: Camera,
-    /// Cells whose feature lies on the object.
+    /// Cells whose feature is on the object.
     pub cells: Vec<u16>,
     /// Their features.
     pub features: Vec<f32>,
@@ -40,13 +40,13 @@ impl Template {
 
 /// An object rendered in one crop.
 pub(crate) struct Rendered {
-    /// Its colours, before `background`.
+    /// Its colours, in front of `background`.
     pub image: RgbImage,
-    /// The points seen in the object's frame; NaN where nothing is seen.
+    /// The visible points in the object's frame; NaN where there are none.
     pub coordinates: sixfold_geometry::PointImage,
 }
 
-/// The lamp that templates are lit with: at the camera.
+/// The lamp for templates: at the camera.
 pub(crate) fn head_light() -> Vec<Light> {
     vec![
         Light::Ambient { color: [0.35; 3] },
@@ -54,7 +54,7 @@ pub(crate) fn head_light() -> Vec<Light> {
     ]
 }
 
-/// Renders an object into a frame of its camera.
+/// Renders an object into an image of its camera.
 pub(crate) fn render(
     frame: &mut VisibilityBuffer,
     mesh: &Mesh,
@@ -67,11 +67,11 @@ pub(crate) fn render(
     Rendered { image, coordinates: frame.object_coordinates(&objects) }
 }
 
-/// More faces than this do not show in a crop; chosen by hand, not swept.
+/// More faces than this are not visible in a crop; chosen by hand, not swept.
 const MAX_FACES: usize = 12_000;
 
-/// The mesh with no more faces than its views need, in the same colours: scans have tens of thousands, and rendering them takes longer
-/// than all the rest. A mesh with a texture stays as it is.
+/// The mesh simplified to the faces that its views need, in the same colours: scans have tens of thousands, and rendering them
+/// takes longer than everything else. A mesh with a texture is not simplified.
 pub(crate) fn view_mesh(mesh: &Mesh) -> Mesh {
     if mesh.faces().len() <= MAX_FACES || mesh.texture().is_some() {
         return mesh.clone();
@@ -88,10 +88,10 @@ pub(crate) fn view_mesh(mesh: &Mesh) -> Mesh {
     coloured.unwrap_or_else(|_| mesh.clone())
 }
 
-/// How much darker or lighter than the object a template's background is.
+/// Difference in brightness of a template's background and the object.
 const CONTRAST: f32 = 0.4;
 
-/// The network's input of a render over plain grey that stands out from the object.
+/// The network's input for a render in front of plain grey that contrasts with the object.
 pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
     let mut planes = Patch::from_rgb(&rendered.image).data;
     let area = planes.len() / 3;
@@ -111,10 +111,10 @@ pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
     input(&planes)
 }
 
-/// Side of a crop over the longer side of the object's box; the network was trained with it.
+/// Ratio of a crop's side to the longer side of the object's box; the network was trained with it.
 pub(crate) const CROP_FACTOR: f64 = 1.2;
 
-/// A camera in whose image an object of any side is seen as a whole; only its box is taken from it.
+/// A camera whose image shows the whole object from any side; only the object's box is taken from it.
 pub(crate) fn wide_camera() -> Camera {
     Camera {
         fx: 600.0,
@@ -127,18 +127,18 @@ pub(crate) fn wide_camera() -> Camera {
     }
 }
 
-/// How templates are made.
+/// Options of the templates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TemplateOptions {
-    /// Directions from which the object is seen, spread evenly over the sphere.
+    /// Number of viewing directions, spread evenly over the sphere.
     pub directions: usize,
-    /// Rotations in the image plane for each.
+    /// Number of in-plane rotations for each.
     pub rotations: usize,
     /// Side of a crop, pixels; a multiple of 32.
     pub side: usize,
-    /// Side of a crop over the longer side of the object's box.
+    /// Ratio of a crop's side to the longer side of the object's box.
     pub crop_factor: f64,
-    /// Distance of the camera over the object's diameter.
+    /// Distance of the camera as a multiple of the object's diameter.
     pub distance: f64,
 }
 
@@ -181,7 +181,8 @@ pub(crate) fn directions(count: usize) -> Vec<Vec3> {
         .collect()
 }
 
-/// The rotation of a camera that sees an object from a direction, with the object's z axis up as far as there is one, rotated in the image plane.
+/// The rotation of a camera that views an object from a direction, with the object's z axis up (if it is not along the view),
+/// followed by an in-plane rotation.
 fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
     let up = if direction.z.abs() > 0.999 { Vec3::y() } else { Vec3::z() };
     let z = -direction;
@@ -192,7 +193,7 @@ fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vec3::z_axis(), roll) * camera_from_object
 }
 
-/// The cells of a render whose feature lies on the object, with their points.
+/// The cells of a render whose feature is on the object, with their points.
 pub(crate) fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, Vec<[f32; 3]>) {
     let mut on = Vec::new();
     let mut points = Vec::new();
@@ -207,7 +208,7 @@ pub(crate) fn cells_on_object(rendered: &Rendered, cells: usize) -> (Vec<u16>, V
     (on, points)
 }
 
-/// Renders an object from all around; `mesh` is best one of [`view_mesh`].
+/// Renders an object from all sides; `mesh` should come from [`view_mesh`].
 ///
 /// # Errors
 /// [`ViewsError`].
@@ -225,7 +226,7 @@ pub(crate) fn make_templates(
         .collect();
     let wide = wide_camera();
     let mut templates = Vec::with_capacity(sides.len());
-    // Inputs are large: not all at once.
+    // Inputs are large, so they are processed in chunks.
     for chunk in sides.chunks(CHUNK) {
         let rendered: Vec<(Template, Vec<f32>)> = chunk
             .par_iter()
@@ -239,7 +240,7 @@ pub(crate) fn make_templates(
         let maps = extractor.features(&inputs, options.side)?;
         for (template, map) in made.iter_mut().zip(maps) {
             template.features = gathered(&map, &template.cells);
-            // As the file has them: kept templates and new ones give the same poses.
+            // Rounded as in the file, so that stored and new templates give the same poses.
             template.features.iter_mut().for_each(|v| *v = f16::from_f32(*v).to_f32());
         }
         templates.append(&mut made);
@@ -250,10 +251,10 @@ pub(crate) fn make_templates(
     Ok(templates)
 }
 
-/// Templates that are rendered before their features are computed.
+/// Number of templates rendered at a time, before their features are computed.
 const CHUNK: usize = 64;
 
-/// A template without features, and the network's input for these; `None` for a side from which nothing is seen.
+/// A template without features, and the network's input for these; `None` for a side from which nothing is visible.
 fn render_side(
     (wide, close): &mut (VisibilityBuffer, VisibilityBuffer),
     mesh: &Mesh,

@@ -1,5 +1,5 @@
-//! The training: a point of a template has to find itself in the photograph, and a point of the photograph itself among those of
-//! both templates (InfoNCE: Van den Oord, Li and Vinyals 2018).
+//! The training: a point of a template must be matched to itself in the photograph, and a point of the photograph to itself among
+//! those of both templates (InfoNCE: Van den Oord, Li and Vinyals 2018).
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
@@ -13,10 +13,10 @@ use sixfold_synth::augment::Backgrounds;
 use crate::network::{INPUTS, ViewNetwork};
 use crate::samples::{POINTS, Sample, make_sample};
 
-/// What excludes a cell from the choice.
+/// Added to a logit to exclude a cell.
 const EXCLUDED: f32 = -1e4;
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ViewsTrainingOptions {
     /// Steps, learning rate, seed.
@@ -24,9 +24,9 @@ pub struct ViewsTrainingOptions {
     pub common: TrainingOptions,
     /// Side of the crops, pixels; a multiple of 32.
     pub side: usize,
-    /// Samples in a step: of each a photograph and two templates.
+    /// Samples per step, each with a photograph and two templates.
     pub batch: usize,
-    /// What products of features are divided by before they compete.
+    /// Temperature by which products of features are divided before the softmax.
     pub temperature: f32,
 }
 
@@ -68,7 +68,7 @@ impl ViewsTrainingOptions {
     }
 }
 
-/// A step's samples as the numbers of tensors; `B` samples, `K` points, `N` cells in a crop.
+/// A batch as tensor data; `B` samples, `K` points, `N` cells in a crop.
 #[derive(Debug, Clone)]
 pub struct Batch {
     count: usize,
@@ -78,7 +78,7 @@ pub struct Batch {
     cells: Vec<f32>,
     /// `B x K x N`, weights of the photograph's cells.
     places: Vec<f32>,
-    /// `B x K x 2 N`, what is added to the logits of the templates' cells.
+    /// `B x K x 2 N`, added to the logits of the templates' cells.
     excluded: Vec<f32>,
 }
 
@@ -118,13 +118,13 @@ impl Batch {
 pub struct ViewsTraining {
     learner: Learner<ViewNetwork>,
     options: ViewsTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl ViewsTraining {
-    /// Of a network whose tensors are on the autodiff `device`.
+    /// Starts the training of a network whose tensors are on the autodiff `device`.
     pub fn new(network: ViewNetwork, options: ViewsTrainingOptions, device: Device) -> Self {
         let learner = Learner::adam_w("network", network, &options.common);
         let pace = Pace { checkpoint_every: 200, ..Pace::default() };
@@ -140,7 +140,7 @@ impl ViewsTraining {
         (self.options.side / CELL).pow(2)
     }
 
-    /// Both losses of a batch, and how often the best cell is at most one from the right one.
+    /// Both losses of a batch, and the fraction of points whose best cell is at most one cell from the right one.
     fn losses(&self, batch: Batch) -> (Tensor<1>, Tensor<1>, f64) {
         let (count, cells, side) = (batch.count, self.cells(), self.options.side);
         let tensor = |values: Vec<f32>, shape: [usize; 3]| {
@@ -176,7 +176,7 @@ impl ViewsTraining {
     }
 }
 
-/// The part of the choices that are among the cells of the true place.
+/// The fraction of the best cells that are among the cells of the true position.
 fn hits(best: Vec<i32>, places: &Tensor<3>) -> f64 {
     let [_, _, cells] = places.dims();
     let Ok(weights) = places.clone().inner().try_into_vec_as::<f32>() else { return 0.0 };
@@ -186,7 +186,7 @@ fn hits(best: Vec<i32>, places: &Tensor<3>) -> f64 {
 }
 
 impl Training for ViewsTraining {
-    /// What textures, backgrounds and occluders look like.
+    /// Textures, backgrounds and occluders.
     type Samples = Backgrounds;
     type Batch = Batch;
 

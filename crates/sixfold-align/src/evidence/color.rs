@@ -1,4 +1,4 @@
-//! A rendering held against a colour image: its outline against edges, its colours against the colours there.
+//! Compares a rendering with a colour image: its outline with edges, its colours with the colours there.
 
 use sixfold_geometry::{Camera, Image, Pose, Rect, RgbImage};
 use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
@@ -8,40 +8,41 @@ use super::Shape;
 use crate::outline::projected_box;
 use crate::prepared::PreparedDepth;
 
-/// What a colour image says of a pose.
+/// Agreement of a pose with a colour image.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct ColorEvidence {
-    /// How much of the outline lies on edges that run along it, 0 to 1.
+    /// Fraction of the outline on edges with the same direction, 0 to 1.
     pub edges: f64,
-    /// The same beside the outline, inside and outside the object: what clutter and texture give without an outline.
+    /// The same at a distance from the outline, inside and outside the object: the level that clutter and texture reach without an
+    /// outline.
     pub background_edges: f64,
-    /// Correlation of the rendered colours with those of the image over all channels, -1 to 1; 0 where either hardly varies.
+    /// Correlation of the rendered colours with those of the image over all channels, -1 to 1; 0 if either hardly varies.
     pub correlation: f64,
-    /// How far the mean colours lie apart, brightness aside (chromaticity, 0 to about 1); `None` for a mesh without colours.
+    /// Distance of the mean colours without brightness (chromaticity, 0 to about 1); `None` for a mesh without colours.
     pub tint: Option<f64>,
 }
 
-/// How the colours of an image change, computed once for all poses.
+/// Colour gradients of an image, computed once for all poses.
 #[derive(Debug)]
 pub struct ColorGradients(Image<[f32; 2]>);
 
-/// Standard deviation of the blur before colours are compared, pixels: noise is no edge. Chosen by hand; not swept.
+/// Standard deviation of the blur before colours are compared, pixels: suppresses edges from noise. Chosen by hand; not swept.
 const BLUR: f32 = 1.0;
-/// A change from pixel to pixel (0 to 1) that is half an edge; chosen by hand, not swept.
+/// Change from pixel to pixel (0 to 1) that counts as half an edge; chosen by hand, not swept.
 const EDGE: f32 = 0.03;
-/// How far off the outline its edge may lie, pixels; chosen by hand, not swept.
+/// Largest distance of an edge from the outline, pixels; chosen by hand, not swept.
 const REACH: i32 = 2;
-/// Where edges are looked for that are none of the outline's, pixels from it; chosen by hand, not swept.
+/// Distances from the outline at which background edges are measured, pixels; chosen by hand, not swept.
 const BESIDE: [i32; 4] = [-11, -7, 7, 11];
-/// Least standard deviation of colours (0 to 1) that says something of their pattern; chosen by hand, not swept.
+/// Smallest standard deviation of colours (0 to 1) for which their correlation is computed; chosen by hand, not swept.
 const MIN_VARIATION: f64 = 0.02;
-/// Fewer pixels say nothing; chosen by hand, not swept.
+/// Fewest pixels that are compared; chosen by hand, not swept.
 const MIN_PIXELS: usize = 30;
-/// Pixels beside the projected box that are rendered.
+/// Margin of the rendering around the projected bounding box, pixels.
 const MARGIN: f64 = 2.0;
 
 impl ColorGradients {
-    /// Of an image.
+    /// The gradients of an image.
     pub fn new(image: &RgbImage) -> ColorGradients {
         let mut patch = Patch::from_rgb(image);
         patch.blur(BLUR);
@@ -61,7 +62,7 @@ impl ColorGradients {
         }))
     }
 
-    /// How much of an edge across `normal` is within reach of a place, 0 to 1; `None` beside the image.
+    /// Strength of the edge perpendicular to `normal` within `reach` of a position, 0 to 1; `None` outside the image.
     fn edge(&self, x: f64, y: f64, normal: [f64; 2], reach: i32) -> Option<f64> {
         let at = |step: i32| {
             let (x, y) = (x + f64::from(step) * normal[0], y + f64::from(step) * normal[1]);
@@ -77,7 +78,7 @@ impl ColorGradients {
     }
 }
 
-/// The image that a pose is held against.
+/// The image with which a pose is compared.
 pub(super) struct ColorImage<'a> {
     pub camera: &'a Camera,
     pub image: &'a RgbImage,
@@ -85,7 +86,7 @@ pub(super) struct ColorImage<'a> {
     pub depth: Option<&'a PreparedDepth>,
 }
 
-/// What the image says, and the pixels that the object covers; `None` where it covers too few.
+/// Agreement with the image, and the pixels that the object covers; `None` if it covers too few.
 pub(super) fn evidence_of(
     seen: &ColorImage<'_>,
     shape: &Shape<'_>,
@@ -104,7 +105,7 @@ pub(super) fn evidence_of(
     let (x0, y0) = (part.x as usize, part.y as usize);
     let (width, height) = (frame.width(), frame.height());
     let inverse = frame.inverse_depth();
-    // What lies before the object hides it, where depth says so.
+    // Pixels where the depth image shows an occluder are hidden.
     let hidden = |x: usize, y: usize| {
         let Some(depth) = seen.depth else { return false };
         let measured = f64::from(depth.depth()[(x + x0, y + y0)]);
@@ -161,7 +162,8 @@ pub(super) fn evidence_of(
     Some((evidence, covered))
 }
 
-/// The direction out of the object at a pixel whose neighbours `empty` tells; `None` within.
+/// The outward direction at a border pixel of the object; `empty` returns whether a neighbour is background. `None` inside the
+/// object.
 fn outward(empty: &dyn Fn(isize, isize) -> bool) -> Option<[f64; 2]> {
     if !(empty(-1, 0) || empty(1, 0) || empty(0, -1) || empty(0, 1)) {
         return None;
@@ -185,7 +187,7 @@ fn mean(colors: &[[f64; 3]]) -> [f64; 3] {
     std::array::from_fn(|c| colors.iter().map(|color| color[c]).sum::<f64>() / count)
 }
 
-/// Pearson's correlation over pixels and channels, each channel about its own mean.
+/// Pearson's correlation over pixels and channels, each channel relative to its own mean.
 fn correlation(a: &[[f64; 3]], b: &[[f64; 3]]) -> f64 {
     let (mean_a, mean_b) = (mean(a), mean(b));
     let (mut product, mut square_a, mut square_b) = (0.0, 0.0, 0.0);

@@ -1,5 +1,5 @@
-//! What an image says for and against a pose, as numbers: depth, normals and outline of one rendering held against the depth image,
-//! outline and colours against the colour image. Who weighs these numbers is not known here.
+//! Evidence for and against a pose, as numbers: depth, normals and outline of one rendering compared with the depth image, outline
+//! and colours with the colour image. Combining these numbers is up to the caller.
 
 mod color;
 
@@ -11,56 +11,56 @@ pub use color::{ColorEvidence, ColorGradients};
 use crate::prepared::PreparedDepth;
 use crate::verification::{VerificationOptions, VerificationScore, Verifier};
 
-/// What the depth image says of a pose.
+/// Agreement of a pose with the depth image.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct DepthEvidence {
     /// Verification by rendering.
     pub score: VerificationScore,
-    /// How much the normals of the pixels that agree differ, 0 to 1: 0 for a plane, which agrees with every other plane.
+    /// Variation of the normals over the pixels that agree, 0 to 1: 0 for a plane, which fits any other plane.
     pub relief: f64,
-    /// Fraction of the pixels that agree which lie on the table plane: the table explains them as well.
+    /// Fraction of the agreeing pixels that are on the table plane, which explains them as well.
     pub on_plane: f64,
 }
 
-/// What an image says of a pose.
+/// Agreement of a pose with an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Evidence {
-    /// Of the depth image, where there is one.
+    /// Agreement with the depth image, if there is one.
     pub depth: Option<DepthEvidence>,
-    /// Of the colour image, where there is one.
+    /// Agreement with the colour image, if there is one.
     pub color: Option<ColorEvidence>,
     /// The pixels (numbers `y * width + x`) that agree in depth; without depth those that the object covers.
     pub pixels: Vec<u32>,
 }
 
-/// An image that poses are held against.
+/// The images with which poses are compared.
 pub struct Scene<'a> {
     /// Its camera, without lens distortion.
     pub camera: &'a Camera,
     /// The depth image.
     pub depth: Option<&'a PreparedDepth>,
-    /// The colour image and how its colours change.
+    /// The colour image and its gradients.
     pub color: Option<(&'a RgbImage, &'a ColorGradients)>,
 }
 
-/// An object whose poses are held against images.
+/// An object whose poses are compared with images.
 pub struct Shape<'a> {
-    /// Its mesh, best one of [`crate::verification_mesh`].
+    /// Its mesh; it should come from [`crate::verification_mesh`].
     pub mesh: &'a Mesh,
-    /// The same with its colours.
+    /// The mesh with its colours.
     pub colored: &'a Mesh,
     /// Depth inlier threshold, metres.
     pub threshold: f64,
 }
 
-/// Holds poses of objects against images; keeps its buffers.
+/// Compares poses of objects with images; reuses its buffers.
 #[derive(Debug, Default)]
 pub struct EvidenceCollector {
     verifier: Verifier,
 }
 
 impl EvidenceCollector {
-    /// What an image says of an object's pose.
+    /// Compares an object's pose with an image.
     pub fn collect(
         &mut self,
         scene: &Scene<'_>,
@@ -86,8 +86,8 @@ impl EvidenceCollector {
     }
 }
 
-/// One minus the largest eigenvalue of the normals' second moments, in thirds of its range: 0 where all are parallel, 1 where they
-/// point everywhere alike.
+/// One minus the largest eigenvalue of the normals' second moments, scaled to its range: 0 if all are parallel, 1 if they are
+/// uniformly distributed.
 fn relief(image: &PreparedDepth, pixels: &[u32]) -> f64 {
     let normals = image.normals().as_slice();
     let mut moments = Mat3::zeros();
@@ -107,7 +107,7 @@ fn relief(image: &PreparedDepth, pixels: &[u32]) -> f64 {
     (1.5 * (1.0 - largest)).clamp(0.0, 1.0)
 }
 
-/// Fraction of the pixels nearer to the table plane than its points are.
+/// Fraction of the pixels within the table plane's margin.
 fn on_plane(image: &PreparedDepth, pixels: &[u32]) -> f64 {
     let Some(plane) = image.plane().filter(|_| !pixels.is_empty()) else { return 0.0 };
     let camera = image.camera();
@@ -156,7 +156,7 @@ mod tests {
         sixfold_geometry::nalgebra::Vector6::new(0.0, 0.0, 0.0, x, y, z)
     }
 
-    /// The box before a wall 0.9 m away, and its colours on grey.
+    /// The box in front of a wall 0.9 m away, and its colours on grey.
     fn images() -> (DepthImage, RgbImage) {
         let (mesh, camera) = (cuboid(), camera());
         let depth = render_depth(&mesh, &pose(), &camera).map(|z| if *z > 0.0 { *z } else { 0.9 });
@@ -199,7 +199,7 @@ mod tests {
 
     #[test]
     fn a_side_that_is_seen_alone_has_no_relief() {
-        // Three sides of the box are seen; turned to the camera, one.
+        // Three sides of the box are visible; one if it faces the camera.
         let turned = asked(&pose()).depth.unwrap().relief;
         assert!(turned > 0.2, "{turned}");
         let (camera, mesh) = (camera(), cuboid());

@@ -1,30 +1,30 @@
-//! Gauss-Newton over the lines across an outline and, as a second term, correspondences: these fix a rotation well and a distance badly,
-//! the outline the other way round.
+//! Gauss-Newton over the lines across an outline and, as a second term, correspondences: the latter determine the rotation well and
+//! the distance poorly, the outline vice versa.
 
 use sixfold_geometry::{Camera, Mat3, NormalEquations, Pose, Vec2, Vec3};
 
 use super::lines::{MIN_LINES, Outline, add_lines, motion, tukey};
 
-/// Steps that move the outline by less than this, crop pixels, end the search at a reach: a fortieth of a pixel.
+/// The iterations at a reach stop when a step moves the outline by less than this, crop pixels: a fortieth of a pixel.
 const CONVERGED: f64 = 0.025;
-/// Where the border is looked for at the end when no reach is given, crop pixels.
+/// Search distance for the border at the end if no reach is given, crop pixels.
 const LAST_REACH: f64 = 3.0;
 
-/// How an outline is aligned.
+/// Options of the alignment of an outline.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AlignmentOptions {
-    /// How far from the outline the border is looked for, crop pixels, from coarse to fine.
+    /// Search distances for the border from the outline, crop pixels, from coarse to fine.
     pub reaches: Vec<f64>,
-    /// Most steps at each reach.
+    /// Maximum number of steps at each reach.
     pub iterations: usize,
     /// Weight of the correspondences as a whole, in independent measurements.
     pub correspondences: f64,
-    /// Weight of the correspondences' shape: what is left of them once a shift and a scale common to all are taken out.
+    /// Weight of the correspondences' shape: the part that remains after removing a common shift and scale.
     pub shape: f64,
     /// Weight of a line, in independent measurements.
     pub line: f64,
-    /// Lines count less the further their border is from the outline, in units of this many deviations of all lines (Tukey's
-    /// biweight); 0 for all lines alike.
+    /// The weight of a line decreases with the distance of its border from the outline, in units of this many standard deviations
+    /// of all lines (Tukey's biweight); 0 for equal weights.
     pub robust: f64,
 }
 
@@ -33,9 +33,9 @@ pub struct AlignmentOptions {
 pub struct AlignedOutline {
     /// The pose.
     pub camera_from_object: Pose,
-    /// Lines on which the border was found at the end.
+    /// Number of lines on which the border was found at the end.
     pub lines: usize,
-    /// Mean distance from outline to border on them, crop pixels.
+    /// Mean distance from outline to border on these lines, crop pixels.
     pub distance: f64,
 }
 
@@ -45,18 +45,18 @@ pub struct Alignment<'a> {
     pub camera: &'a Camera,
     /// The outline.
     pub outline: Outline<'a>,
-    /// The crop's camera; it stands where [`camera`](Self::camera) stands and looks the same way.
+    /// The crop's camera; it has the position and orientation of [`camera`](Self::camera).
     pub crop: Camera,
     /// The object's centre, about which it is rotated.
     pub centre: Vec3,
-    /// Points of the object and where they are seen, pixels of [`camera`](Self::camera).
+    /// Points of the object and their pixels in [`camera`](Self::camera).
     pub correspondences: Vec<(Vec3, Vec2)>,
-    /// How it is aligned.
+    /// Options.
     pub options: &'a AlignmentOptions,
 }
 
 impl Alignment<'_> {
-    /// Moves a pose until outline and border agree; `None` where too little of the outline is found.
+    /// Moves a pose until outline and border agree; `None` if too little of the border is found.
     pub fn run(&mut self, start: &Pose) -> Option<AlignedOutline> {
         let mut pose = *start;
         for reach in &self.options.reaches {
@@ -77,7 +77,7 @@ impl Alignment<'_> {
         Some(AlignedOutline { camera_from_object: pose, lines: lines.len(), distance })
     }
 
-    /// The next pose, and how far the outline moved in crop pixels.
+    /// The next pose, and the distance by which the outline moved, crop pixels.
     fn step(&mut self, reach: f64, pose: &Pose) -> Option<(Pose, f64)> {
         let lines = self.outline.lines(reach, pose);
         if lines.len() < MIN_LINES {
@@ -120,7 +120,7 @@ impl Alignment<'_> {
         let noise = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.3);
         let full = self.options.correspondences / errors.len() as f64 / (noise * noise);
         let shape = self.options.shape / errors.len() as f64 / (noise * noise);
-        // Rows of every pair: x and y, each with its Jacobian, error, weight and its part in the common shift and scale.
+        // Rows of every pair: x and y, each with its Jacobian, error, weight and its derivative by the common shift and scale.
         let mut rows: Vec<([f64; 6], f64, f64, [f64; 3])> = Vec::with_capacity(2 * errors.len());
         let middle =
             errors.iter().filter_map(|(p, _)| self.camera.project(p)).sum::<Vec2>() / errors.len() as f64;
@@ -132,7 +132,7 @@ impl Alignment<'_> {
             rows.push((first, error.x, weight, [1.0, 0.0, arm.x]));
             rows.push((second, error.y, weight, [0.0, 1.0, arm.y]));
         }
-        // Least squares of Jacobians and errors on shift and scale, to be taken out of them.
+        // Least-squares fit of Jacobians and errors by shift and scale, which is then subtracted.
         let mut gram = Mat3::zeros();
         let mut sums = [Vec3::zeros(); 7];
         for (jacobian, error, weight, common) in &rows {

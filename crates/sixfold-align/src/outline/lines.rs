@@ -1,53 +1,53 @@
-//! Lines across the rendered outline, and the border of the object found on each (Stoiber et al. 2020). Beside the odds of the
-//! pixels on either side, which are theirs, an edge of the image speaks for a border (ours): `w g^2 / (g^2 + EDGE^2)` is added to
-//! its log likelihood, where `g` is the change of colour across it and `w` the weight of [`Outline::with_edges`].
+//! Lines across the rendered outline, and the border of the object found on each (Stoiber et al. 2020). In addition to their term,
+//! the odds of the pixels on either side, edges of the image support a border (ours): `w g^2 / (g^2 + EDGE^2)` is added to its log
+//! likelihood, where `g` is the change of colour across it and `w` the weight of [`Outline::with_edges`].
 
 use sixfold_geometry::{Camera, NormalEquations, Pose, Rect, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 use sixfold_synth::augment::Patch;
 
-/// Fewer lines do not hold a pose: twice its six degrees of freedom.
+/// Fewest lines that determine a pose: twice its six degrees of freedom.
 pub const MIN_LINES: usize = 12;
 
-/// Faces of a mesh that is drawn for its outline alone; chosen by hand, not swept.
+/// Maximum number of faces of a mesh that is rendered only for its outline; chosen by hand, not swept.
 const OUTLINE_FACES: usize = 4000;
 
 /// Standard deviation of the blur of the silhouette whose gradient is the outline's normal, pixels; chosen by hand, not swept.
 const SILHOUETTE_BLUR: f32 = 1.5;
-/// Pixels at the crop's border on which no outline is looked for: its normal would need what lies outside.
+/// Pixels at the crop's border that are not searched for the outline: its normal would depend on pixels outside.
 const CROP_MARGIN: usize = 2;
-/// A blurred silhouette that changes less than this a pixel has no normal (thin parts); chosen by hand, not swept.
+/// Where the blurred silhouette changes by less than this per pixel there is no normal (thin parts); chosen by hand, not swept.
 const MIN_STEEPNESS: f64 = 0.05;
-/// How far the outline may lie from the middle of its pixel along the normal, pixels, inwards and outwards; chosen by hand, not
-/// swept.
+/// Range of the outline's position relative to the centre of its pixel along the normal, pixels, inwards and outwards; chosen by
+/// hand, not swept.
 const SUBPIXEL: (f64, f64) = (-1.0, 1.5);
-/// Pixels between samples on a line; chosen by hand, not swept.
+/// Distance of samples on a line, pixels; chosen by hand, not swept.
 const STEP: f64 = 0.5;
-/// Mean log odds that the inner third of a line has at least, and the outer third at most with the other sign, for a border to be
-/// between them: a probability of 0.62. Chosen by hand; not swept.
+/// There is a border on a line only if the mean log odds of its inner third are at least this and those of its outer third at most
+/// the negative of this: a probability of 0.62. Chosen by hand; not swept.
 const MIN_ODDS: f32 = 0.5;
-/// Least variance of a border's place, squared pixels, so that no line outweighs all others; chosen by hand, not swept.
+/// Smallest variance of a border's position, squared pixels, so that no line outweighs all others; chosen by hand, not swept.
 const MIN_VARIANCE: f64 = 0.1;
 /// From the median of absolute deviations to the standard deviation of a normal distribution.
 const DEVIATION_FROM_MEDIAN: f64 = 1.4826;
-/// Least deviation of all lines that robust weights are taken in, pixels; chosen by hand, not swept.
+/// Smallest standard deviation of all lines for the robust weights, pixels; chosen by hand, not swept.
 const MIN_DEVIATION: f64 = 0.5;
-/// Variance that every line has beside its border's, squared pixels: that of the rendered outline. Chosen by hand; not swept.
+/// Variance added to that of every line's border, squared pixels: that of the rendered outline. Chosen by hand; not swept.
 const LINE_VARIANCE: f64 = 0.5;
-/// A border at `reach` counts as a residual of this many deviations: those at the end of a line weigh about two thirds. Chosen by
-/// hand; not swept.
+/// A border at `reach` counts as a residual of this many standard deviations: those at the end of a line have a weight of about two
+/// thirds. Chosen by hand; not swept.
 const REACH_DEVIATIONS: f64 = 2.0;
-/// Tuning of Tukey's biweight, in deviations: 95 % efficiency for normal noise (Holland and Welsch 1977).
+/// Tuning constant of Tukey's biweight, in standard deviations: 95 % efficiency for normal noise (Holland and Welsch 1977).
 const TUKEY: f64 = 4.685;
 
-/// The mesh with no more faces than its outline needs: scans have tens of thousands, and drawing them takes
-/// longer than all the rest.
+/// The mesh simplified to the faces that its outline needs: scans have tens of thousands, and rendering them takes longer than
+/// everything else.
 pub fn outline_mesh(mesh: &Mesh) -> Mesh {
     if mesh.faces().len() > OUTLINE_FACES { simplify(mesh, OUTLINE_FACES) } else { mesh.clone() }
 }
 
-/// The box of a posed mesh in the image; `None` if a part of it is behind the camera.
+/// The bounding box of a posed mesh in the image; `None` if a part of it is behind the camera.
 pub fn projected_box(mesh: &Mesh, camera: &Camera, pose: &Pose) -> Option<Rect> {
     let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
     for vertex in mesh.vertices() {
@@ -66,7 +66,7 @@ pub fn sample(map: &[f32], side: usize, x: f64, y: f64) -> f32 {
     (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
 }
 
-/// The first of the four pixels about a place in a square map, and how far the place is from it along both axes, 0 to 1.
+/// The first of the four pixels around a position in a square map, and the offset of the position from it along both axes, 0 to 1.
 fn cell(side: usize, x: f64, y: f64) -> (usize, f64, f64) {
     let last = (side - 1) as f64;
     let (x, y) = (x.clamp(0.0, last), y.clamp(0.0, last));
@@ -81,37 +81,37 @@ pub struct Line {
     pub point: Vec3,
     /// Outward normal in the crop.
     pub normal: Vec2,
-    /// From the outline to the border along the normal, crop pixels.
+    /// Distance from the outline to the border along the normal, crop pixels.
     pub offset: f64,
     /// Variance of the offset.
     pub variance: f64,
 }
 
-/// A mesh whose outline is looked for in one crop.
+/// A mesh whose outline is searched in one crop.
 #[derive(Debug)]
 pub struct Outline<'a> {
     mesh: &'a Mesh,
     frame: VisibilityBuffer,
     crop: Camera,
     odds: Vec<f32>,
-    /// Change of colour along x and y at every pixel, and its weight.
+    /// Colour gradient along x and y at every pixel, and its weight.
     edges: Option<(Vec<[f32; 2]>, f64)>,
     side: usize,
 }
 
 impl<'a> Outline<'a> {
-    /// `odds` are the log odds of the object at every pixel of a square crop, row by row ([`log_odds`](super::log_odds)); `mesh` is
-    /// best one of [`outline_mesh`].
+    /// `odds` are the log odds of the object at every pixel of a square crop, row by row ([`log_odds`](super::log_odds)); `mesh`
+    /// should come from [`outline_mesh`].
     ///
     /// # Panics
-    /// When `odds` has not as many numbers as the crop has pixels.
+    /// If `odds` does not have one number per pixel of the crop.
     pub fn new(mesh: &'a Mesh, crop: &Camera, odds: Vec<f32>) -> Self {
         assert_eq!(odds.len(), crop.width * crop.height, "one number per pixel of a square crop");
         Outline { mesh, frame: VisibilityBuffer::new(crop), crop: *crop, odds, edges: None, side: crop.width }
     }
 
-    /// The same where borders are rather there where colours change: `weight` is what the log likelihood of a border gains at a
-    /// sharp edge of the image, whose pixels are those of the odds.
+    /// The same, but borders are more likely where colours change: `weight` is added to the log likelihood of a border at a sharp
+    /// edge of the image, which has the pixels of the odds.
     pub fn with_edges(mut self, patch: &Patch, weight: f64) -> Self {
         if weight > 0.0 {
             self.edges = Some((gradients(patch), weight));
@@ -150,7 +150,7 @@ impl<'a> Outline<'a> {
                     continue;
                 }
                 let normal = -gradient / steep;
-                // The outline lies where the blurred silhouette is one half.
+                // The outline is where the blurred silhouette is one half.
                 let start = Vec2::new(x as f64, y as f64)
                     + normal * ((f64::from(soft[i]) - 0.5) / steep).clamp(SUBPIXEL.0, SUBPIXEL.1);
                 if let Some((offset, variance)) = self.border(&start, &normal, reach) {
@@ -162,7 +162,7 @@ impl<'a> Outline<'a> {
         lines
     }
 
-    /// Mean and variance of the border's place on a line through `start` along the outward normal.
+    /// Mean and variance of the border's position on a line through `start` along the outward normal.
     fn border(&self, start: &Vec2, normal: &Vec2, reach: f64) -> Option<(f64, f64)> {
         let count = (2.0 * reach / STEP) as usize + 1;
         let at = |k: usize| k as f64 * STEP - reach;
@@ -172,13 +172,13 @@ impl<'a> Outline<'a> {
                 sample(&self.odds, self.side, p.x, p.y)
             })
             .collect();
-        // Something covers the object here, or there is no border within reach.
+        // The object is occluded here, or there is no border within reach.
         let third = count / 3;
         let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
         if mean(&odds[..third]) < MIN_ODDS || mean(&odds[count - third..]) > -MIN_ODDS {
             return None;
         }
-        // Log likelihood of a border before sample k: object up to there, background behind.
+        // Log likelihood of a border before sample k: object before it, background after it.
         let mut likelihood = Vec::with_capacity(count + 1);
         let mut sum = 0.0;
         likelihood.push(0.0);
@@ -207,7 +207,8 @@ impl<'a> Outline<'a> {
     }
 }
 
-/// Change of the channel that changes most from one pixel to the next (0 to 1) that is half an edge; chosen by hand, not swept.
+/// Change from one pixel to the next, in the channel that changes most (0 to 1), that counts as half an edge; chosen by hand, not
+/// swept.
 const EDGE: f64 = 0.06;
 
 /// The change along x and y of the channel that changes most, at every pixel.
@@ -231,7 +232,7 @@ fn gradients(patch: &Patch) -> Vec<[f32; 2]> {
         .collect()
 }
 
-/// Change along a direction at a place between pixels.
+/// Gradient along a direction at a position between pixels.
 fn change_along(gradients: &[[f32; 2]], side: usize, p: &Vec2, normal: &Vec2) -> f64 {
     let (first, fx, fy) = cell(side, p.x, p.y);
     let at = |dx: usize, dy: usize| {
@@ -241,9 +242,9 @@ fn change_along(gradients: &[[f32; 2]], side: usize, p: &Vec2, normal: &Vec2) ->
     (1.0 - fy) * ((1.0 - fx) * at(0, 0) + fx * at(1, 0)) + fy * ((1.0 - fx) * at(0, 1) + fx * at(1, 1))
 }
 
-/// Adds the distances of lines to the normal equations of a twist about `centre` (camera frame). `line` is the weight of a line
-/// in independent measurements; lines count less the further their border is, in units of `robust` deviations of all lines
-/// (Tukey's biweight; 0 for all alike).
+/// Adds the distances of lines to the normal equations of a twist about `centre` (camera frame). `line` is the weight of a line in
+/// independent measurements; the weight of a line decreases with the distance of its border, in units of `robust` standard
+/// deviations of all lines (Tukey's biweight; 0 for equal weights).
 pub fn add_lines(
     equations: &mut NormalEquations,
     lines: &[Line],
@@ -273,7 +274,7 @@ pub fn add_lines(
     }
 }
 
-/// Derivative of a point's pixel by a twist `(v, w)` about `centre`, pixels per metre and radian.
+/// Derivative of a point's pixel with respect to a twist `(v, w)` about `centre`, pixels per metre and radian.
 pub fn motion(camera: &Camera, point: &Vec3, centre: &Vec3) -> [[f64; 6]; 2] {
     let (x, y, z) = (point.x, point.y, point.z);
     let rows = [
@@ -306,15 +307,15 @@ mod tests {
         (Mesh::new(vertices, vec![[0, 2, 1], [0, 3, 2], [0, 1, 2], [0, 2, 3]]).unwrap(), camera)
     }
 
-    /// Mean distance outwards of the borders that are found, where odds change at `odds` pixels outside the outline and colours
-    /// at `colors` pixels.
+    /// Mean outward distance of the borders found, if odds change `odds` pixels outside the outline and colours `colors` pixels
+    /// outside.
     fn found(odds: f64, colors: f64, weight: f64) -> f64 {
         let (mesh, camera) = plate();
         let outside = |i: usize, by: f64| {
             let (x, y) = ((i % 80) as f64 - 39.5, (i / 80) as f64 - 39.5);
             x.abs().max(y.abs()) > 20.0 + by
         };
-        // Odds as a network's and a histogram's are: unsure about the border.
+        // Odds like those of a network or a histogram: uncertain near the border.
         let map: Vec<f32> = (0..80 * 80)
             .map(|i| {
                 let (x, y) = ((i % 80) as f64 - 39.5, (i / 80) as f64 - 39.5);
@@ -333,13 +334,13 @@ mod tests {
 
     #[test]
     fn an_edge_near_the_border_of_the_odds_says_where_it_is() {
-        // By odds alone the border is where they change their sign.
+        // With odds alone the border is where they change their sign.
         let alone = found(2.0, 0.0, 0.0);
         assert!((alone - 2.0).abs() < 0.3, "{alone}");
-        // The edge two pixels further in draws it there, and the stronger the heavier it weighs.
+        // The edge two pixels further inside shifts it there, and more with a larger weight.
         let (little, much) = (found(2.0, 0.0, 2.0), found(2.0, 0.0, 8.0));
         assert!(much < little && little < alone && much.abs() < 0.4, "{alone} {little} {much}");
-        // One far away does not.
+        // An edge far away does not.
         let far = found(0.0, 15.0, 8.0);
         assert!(far.abs() < 0.3, "{far}");
     }

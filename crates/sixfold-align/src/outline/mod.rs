@@ -1,8 +1,8 @@
 //! Aligns a mesh's outline with the object's border in a colour image: region-based tracking (Prisacariu and Reid 2012) with
 //! the sparse lines of Stoiber et al. 2020. Needs no colours of the mesh.
 //!
-//! [`log_odds`] says where the object is, [`Outline::lines`] where its border lies across the rendered outline,
-//! [`add_lines`] what that says about the pose.
+//! [`log_odds`] estimates the object's pixels, [`Outline::lines`] finds its border on lines across the rendered outline, and
+//! [`add_lines`] adds these to the normal equations of the pose.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 

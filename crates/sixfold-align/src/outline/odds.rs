@@ -1,20 +1,21 @@
-//! Where colour says that a pixel shows the object: histograms of what lies inside and around it in this one image.
+//! Probability from colour that a pixel shows the object: histograms of the pixels inside and around it in this one image.
 
 use sixfold_synth::augment::Patch;
 
 /// Bins of the colour histograms along each channel; chosen by hand, not swept.
 const BINS: usize = 16;
-/// Log odds are at most this, either way: neither source is ever certain. Chosen by hand; not swept.
+/// Largest absolute value of log odds: neither source is ever certain. Chosen by hand; not swept.
 const MAX_ODDS: f32 = 3.0;
-/// Probabilities are kept off 0 and 1 by this, so that their log odds are finite.
+/// Probabilities are kept away from 0 and 1 by this, so that their log odds are finite.
 const CERTAIN: f32 = 0.01;
-/// The prior takes a pixel above the first for the object and below the second for the background; chosen by hand, not swept.
+/// Pixels whose prior is above the first count as object, those below the second ([`BACKGROUND`]) as background; chosen by hand,
+/// not swept.
 const OBJECT: f32 = 0.75;
 /// See [`OBJECT`].
 const BACKGROUND: f32 = 0.25;
-/// What every bin holds before any pixel is counted, in pixels; chosen by hand, not swept.
+/// Initial count of every bin, in pixels; chosen by hand, not swept.
 const EMPTY_BIN: f32 = 0.5;
-/// How much of a bin stays in it, and goes to each of its neighbours, along each channel: a binomial filter.
+/// Fraction of a bin that stays in it, and that goes to each of its neighbours, along each channel: a binomial filter.
 const SMOOTHING: (f32, f32) = (0.5, 0.25);
 
 /// Log odds of object against background at every pixel: from the prior's probability, and, times `color`, from
@@ -29,8 +30,8 @@ pub fn log_odds(patch: &Patch, prior: &[f32], color: f32) -> Vec<f32> {
         .collect()
 }
 
-/// Log odds of object against background at every pixel from its colour alone: histograms of what the prior (a probability per
-/// pixel, row by row) takes for the one (above 3/4) and the other (below 1/4).
+/// Log odds of object against background at every pixel from its colour alone: histograms of the pixels whose prior (a probability
+/// per pixel, row by row) is above 3/4 (object) and below 1/4 (background).
 pub fn color_odds(patch: &Patch, prior: &[f32]) -> Vec<f32> {
     let area = prior.len();
     let bins = BINS * BINS * BINS;
@@ -40,14 +41,14 @@ pub fn color_odds(patch: &Patch, prior: &[f32]) -> Vec<f32> {
             .fold(0, |bin, c| bin * BINS + ((patch.data[c * area + i] * BINS as f32) as usize).min(BINS - 1))
     };
     for (i, p) in prior.iter().enumerate() {
-        // What is uncertain says nothing.
+        // Uncertain pixels are not counted.
         if *p > OBJECT {
             counts[0][bin(i)] += *p;
         } else if *p < BACKGROUND {
             counts[1][bin(i)] += 1.0 - *p;
         }
     }
-    // A little of each bin goes to its neighbours.
+    // A fraction of each bin goes to its neighbours.
     for count in &mut counts {
         for stride in [1, BINS, BINS * BINS] {
             let before = count.clone();

@@ -1,8 +1,9 @@
 //! The compact network: the dissertation's structure with plain convolutions, for input of 96x96 pixels.
 //!
-//! It differs in what two processor cores can train in half an hour: no ResNet-50 but nine convolutions that start from
-//! random weights (normals are no photographs, and a sixth of the work of ResNet-50 buys six times the samples), ReLU for
-//! LeakyReLU in convolutions, bilinear doubling and convolutions for deconvolutions, the last step from a quarter of the resolution by a pixel shuffle.
+//! It differs so that two processor cores can train it in half an hour. Instead of ResNet-50 it has nine convolutions with random
+//! initial weights (normals differ from photographs, and with a sixth of the computation of ResNet-50 it sees six times the
+//! samples). It has ReLU instead of LeakyReLU in convolutions, and bilinear upsampling with convolutions instead of deconvolutions;
+//! the last step, from a quarter of the resolution, is a pixel shuffle.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -17,7 +18,7 @@ use sixfold_nn::ops::{pixel_shuffle, upsample};
 
 use super::{Encoded, FEATURE, half};
 
-/// Of LeakyReLU in the dense layers.
+/// Slope of LeakyReLU in the dense layers.
 const SLOPE: f64 = 0.1;
 /// Channels of the geometry encoder's maps, from 1/2 of the resolution to 1/32.
 const GEOMETRY: [usize; 5] = [24, 48, 96, 160, 192];
@@ -72,7 +73,7 @@ impl CompactConfig {
     }
 }
 
-/// The compact network, made by `CompactConfig`.
+/// The compact network, created by `CompactConfig`.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Compact {

@@ -14,7 +14,7 @@ pub(crate) use paper::PaperConfig;
 /// Length of features and codes.
 pub(crate) const FEATURE: usize = sixfold_experience::FEATURE;
 
-/// What an encoder says of a batch.
+/// An encoder's output for a batch.
 #[derive(Debug, Clone)]
 pub struct Encoded {
     /// `batch x 256`, each value from -1 to 1.
@@ -41,7 +41,7 @@ impl Encoded {
     }
 }
 
-/// The first half of a map's channels: what a skip connection carries.
+/// The first half of a map's channels: the input of a skip connection.
 fn half(map: &Tensor<4>) -> Tensor<4> {
     let channels = map.dims()[1];
     map.clone().narrow(1, 0, channels / 2)
@@ -52,9 +52,9 @@ fn half(map: &Tensor<4>) -> Tensor<4> {
 #[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
-    /// For two processor cores.
+    /// Small enough to train on two processor cores.
     Compact(Compact),
-    /// The dissertation's.
+    /// The dissertation's network.
     Paper(Paper),
 }
 
@@ -77,7 +77,7 @@ impl Network {
         }
     }
 
-    /// A network of this name with random weights, to be filled from a file.
+    /// A network of this name with random weights, whose weights are to be loaded from a file.
     pub fn of_architecture(name: &str, device: &Device) -> Option<Network> {
         match name {
             "dgcm-compact" => Some(Network::Compact(CompactConfig.init(0, device))),

@@ -1,8 +1,8 @@
 //! The dissertation's network (section 6.2.2) for input of 128x128 pixels.
 //!
-//! What the text leaves open is filled in so: LeakyReLU's slope is 0.2, deconvolutions and the convolutions after them
-//! have 3x3 kernels with 256, 256, 128, 64 and 32 channels, skips join after the deconvolution of their resolution, the
-//! last layer is linear, and ResNet-50 keeps batch normalisation as it has it.
+//! Choices that the dissertation leaves open: LeakyReLU's slope is 0.2, deconvolutions and the convolutions after them have 3x3
+//! kernels with 256, 256, 128, 64 and 32 channels, skip connections are joined after the deconvolution of their resolution, the
+//! last layer is linear, and ResNet-50 keeps its batch normalisation.
 
 use std::path::Path;
 
@@ -45,7 +45,7 @@ impl PaperConfig {
         self.init_with(ResNet50Config::features(3).init(seed, device), seed, device)
     }
 
-    /// The network on ResNet-50 with ImageNet weights from torchvision's file, the rest random.
+    /// The network with ImageNet weights of ResNet-50 from torchvision's file; the other weights are random.
     ///
     /// # Errors
     /// [`PretrainedError`].
@@ -81,7 +81,7 @@ impl PaperConfig {
             let config =
                 ConvTransposeConfig { channels: [inputs, outputs], kernel: 3, stride: 2, bias: true };
             up.push(config.init(2.0, rng, device));
-            // At full resolution there is nothing to skip from.
+            // At full resolution there is no skip connection.
             let skips = if k < 4 { (BACKBONE[3 - k] + CODE[3 - k].0) / 2 } else { 0 };
             mix.push(
                 ConvConfig::new([outputs + skips, outputs], 3, Activation::Linear).init(2.0, rng, device),
@@ -103,7 +103,7 @@ impl PaperConfig {
     }
 }
 
-/// The dissertation's network, made by `PaperConfig`.
+/// The dissertation's network, created by `PaperConfig`.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Paper {

@@ -1,4 +1,4 @@
-//! What the network learns from: views of members of the families, and pairs of views.
+//! Training samples: views of members of the families, and pairs of views.
 
 mod pairs;
 mod pool;

@@ -1,8 +1,8 @@
 //! Pairs of views and their augmentation (dissertation, section 6.2.2, table 6.1).
 //!
-//! Positive: two views of the same kind of object that share more than half of their visible vertices. The target says for
-//! every pixel of the first where the same place of the object has its VD-NOC in the second. Negative: views of different
-//! families, or of one that share less.
+//! Positive: two views of the same kind of object that share more than half of their visible vertices. The target is, for every
+//! pixel of the first, the VD-NOC of the same point of the object in the second. Negative: views of different families, or of one
+//! family that share less.
 
 use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
@@ -18,13 +18,13 @@ use super::pool::{Pool, View};
 pub struct PairOptions {
     /// Two views whose fraction of common visible vertices is above this are a positive pair.
     pub shared: f64,
-    /// Fraction of negative pairs that are of one family.
+    /// Fraction of negative pairs from the same family.
     pub same_family: f64,
-    /// Largest fraction of the object's box that is hidden by a block (table 6.1).
+    /// Largest fraction of the object's bounding box that is hidden by a block (table 6.1).
     pub occlusion: f64,
     /// Standard deviation of the noise on normals and VD-NOC (table 6.1).
     pub noise: f32,
-    /// Targets are cut off at this: places that the second view does not see lie outside of its extent.
+    /// Targets are clipped to this absolute value: points that the second view does not show may be outside its extent.
     pub limit: f64,
 }
 
@@ -34,7 +34,7 @@ impl Default for PairOptions {
     }
 }
 
-/// Two views as the network wants them: planes of `side * side` numbers, three each.
+/// Two views as the network's input: planes of `side * side` numbers, three each.
 #[derive(Debug, Clone)]
 pub struct Pair {
     /// Whether the views show similar geometry.
@@ -104,7 +104,7 @@ impl Pool {
             let first = any(views.len());
             let group = self.group(first);
             if positive {
-                // The one of some that shares enough; else another first view.
+                // Tries several second views until one shares enough; otherwise another first view.
                 for _ in 0..TRIES {
                     let second = group[any(group.len())];
                     if second != first && views[first].shared(&views[second]) > options.shared {
@@ -120,13 +120,13 @@ impl Pool {
                 }
             }
         }
-        // A pool with views of one kind only has no negative pairs; a view paired with itself is a positive one.
+        // A pool with views of only one kind has no negative pairs; a view paired with itself is a positive pair.
         let first = any(views.len());
         (&views[first], &views[if positive { first } else { any(views.len()) }])
     }
 }
 
-/// Which pixels a block hides: it comes from one side of the object's box and takes a fraction of it.
+/// Which pixels a block hides: it enters from one side of the object's bounding box and covers a fraction of it.
 fn block(
     view: &View,
     side: usize,
@@ -172,7 +172,7 @@ mod tests {
             let pair = pool.pair(true, &options, 5, number);
             let inside: Vec<usize> = (0..pixels).filter(|&i| pair.mask[i] > 0.0).collect();
             assert!(inside.len() > 150);
-            // Where the second view shows the object at a target's place, its VD-NOC is near it: most places are seen.
+            // For most targets a pixel of the second view has a nearby VD-NOC, because most points are visible there too.
             let second: Vec<usize> =
                 (0..pixels).filter(|&i| (0..3).any(|k| pair.vd_noc[k * pixels + i] != 0.0)).collect();
             let near = inside

@@ -1,5 +1,5 @@
-//! A pool of simulated views, made once before the training (dissertation, section 6.2.2: there 166,000 images on disk; here
-//! some thousands in memory, each with other partners in every pair).
+//! A pool of simulated views, generated once before the training (dissertation, section 6.2.2: 166,000 images on disk; here some
+//! thousands in memory, combined into new pairs).
 
 use std::sync::Arc;
 
@@ -22,15 +22,16 @@ pub struct GraspPoolOptions {
     pub views: usize,
     /// Views of each member of a family.
     pub views_per_member: usize,
-    /// Distance from camera to object, smallest and largest, metres (table 6.1: 1 to 1.7 m; ours reaches nearer).
+    /// Smallest and largest distance from camera to object, metres (table 6.1: 1 to 1.7 m; ours includes smaller ones).
     pub distance: (f64, f64),
-    /// The camera's angle above the table, smallest and largest, radians.
+    /// Smallest and largest elevation of the camera above the table, radians.
     pub elevation: (f64, f64),
-    /// Largest rotation of the image, radians: half the step of the in-plane copies and a little.
+    /// Largest rotation of the image, radians: slightly more than half the step of the in-plane copies.
     pub roll: f64,
-    /// Up to this height above the table nothing of the object is in the mask, metres: that is lost with the table.
+    /// The lowest part of the object up to this height above the table is not in the mask, metres: it is removed together with the
+    /// table.
     pub lost_above_table: f64,
-    /// How objects are cut out.
+    /// Options of the crops.
     pub crop: CropOptions,
     /// Seed of everything.
     pub seed: u64,
@@ -54,11 +55,11 @@ impl Default for GraspPoolOptions {
 /// A pixel of a view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SeenPixel {
-    /// Its number in the crop, row by row.
+    /// Its index in the crop, row by row.
     pub index: u16,
-    /// The face seen there.
+    /// The visible face.
     pub face: u16,
-    /// Weights of the face's first two corners, in 255ths.
+    /// Barycentric weights of the face's first two vertices, in 255ths.
     pub weights: [u8; 2],
     /// The normal, in 127ths.
     pub normal: [i8; 3],
@@ -71,26 +72,26 @@ pub(super) struct SeenPixel {
 pub struct View {
     /// The member's family.
     pub family: Family,
-    /// How it lies.
+    /// Its resting pose.
     pub rest: Rest,
-    /// The extent of what is seen.
+    /// The extent of the visible points.
     pub extent: Extent,
     mesh: Arc<Mesh>,
     camera_from_object: Pose,
     pub(super) pixels: Vec<SeenPixel>,
-    /// A bit for every vertex of a face that is seen.
+    /// A bit for every vertex: whether it belongs to a visible face.
     visible: Vec<u64>,
 }
 
 impl View {
-    /// What two views have in common of their visible vertices, 0 to 1 (Dice's coefficient).
+    /// Overlap of the visible vertices of two views, 0 to 1 (Dice's coefficient).
     pub fn shared(&self, other: &View) -> f64 {
         let count = |bits: &[u64]| bits.iter().map(|b| b.count_ones()).sum::<u32>();
         let common: u32 = self.visible.iter().zip(&other.visible).map(|(a, b)| (a & b).count_ones()).sum();
         2.0 * f64::from(common) / f64::from((count(&self.visible) + count(&other.visible)).max(1))
     }
 
-    /// The place of a pixel of `seen`, a view of the same family, on this view's object: its VD-NOC in this view.
+    /// The VD-NOC in this view of the point of its object that corresponds to a pixel of a view of the same family.
     pub(super) fn counterpart(&self, pixel: &SeenPixel) -> Vec3 {
         let [a, b, c] = self.mesh.triangle(usize::from(pixel.face));
         let [u, v] = pixel.weights.map(|w| f64::from(w) / 255.0);
@@ -99,11 +100,11 @@ impl View {
     }
 }
 
-/// Views, and which of them are of the same kind.
+/// Views, grouped by kind.
 #[derive(Debug)]
 pub struct Pool {
     views: Vec<View>,
-    /// Numbers of the views of every family and rest.
+    /// Numbers of the views of every family and resting pose.
     groups: Vec<Vec<usize>>,
     /// The group of every view.
     group_of: Vec<usize>,
@@ -111,8 +112,8 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Makes the views, the same for the same options at any number of threads; `progress` receives them. `None` when it was
-    /// stopped.
+    /// Makes the views, the same for the same options at any number of threads; `progress` is called for them. `None` if it stopped
+    /// the run.
     pub fn new(options: &GraspPoolOptions, progress: &dyn Progress) -> Option<Pool> {
         let members = options.views.div_ceil(options.views_per_member.max(1));
         let count = std::sync::atomic::AtomicUsize::new(0);
@@ -146,12 +147,12 @@ impl Pool {
         &self.views
     }
 
-    /// How they were made.
+    /// The options with which they were made.
     pub fn options(&self) -> &GraspPoolOptions {
         &self.options
     }
 
-    /// The other views of the same family and rest.
+    /// The other views of the same family and resting pose.
     pub(super) fn group(&self, view: usize) -> &[usize] {
         &self.groups[self.group_of[view]]
     }
@@ -164,7 +165,7 @@ fn views_of_member(options: &GraspPoolOptions, number: u64) -> Vec<View> {
     let rest = rests[random.random_range(0..rests.len())];
     let Ok(member) = member(family, &mut random) else { return vec![] };
     let mesh = Arc::new(member.mesh);
-    // A few more tries than views: an object may be seen edge on.
+    // A few more trials than views: an object may be seen edge-on.
     let mut views = vec![];
     for _ in 0..3 * options.views_per_member {
         if views.len() == options.views_per_member {
@@ -175,7 +176,7 @@ fn views_of_member(options: &GraspPoolOptions, number: u64) -> Vec<View> {
     views
 }
 
-/// One view with everything sampled again; `None` when too little is seen.
+/// One randomly sampled view; `None` when too little is visible.
 fn view(
     family: Family,
     rest: Rest,
@@ -254,7 +255,7 @@ fn view(
     })
 }
 
-/// A camera in front of the y axis' negative side that looks at `target`, its image rotated by `roll`.
+/// A camera on the side of the negative y axis, aimed at `target`, its image rotated by `roll`.
 fn camera_from_world(elevation: f64, distance: f64, roll: f64, target: &Vec3) -> Pose {
     let back = Vec3::new(0.0, -elevation.cos(), elevation.sin());
     let (right, z) = (Vec3::x(), -back);

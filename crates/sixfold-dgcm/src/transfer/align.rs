@@ -1,9 +1,9 @@
-//! One experience, aligned with the object: the region of interest found again by its VD-NOC, rotation by the singular
-//! value decomposition of equation 6.5, translation by extents, then iterative closest points.
+//! One experience, aligned with the object: the region of interest is located by its VD-NOC, rotation by the singular value
+//! decomposition of equation 6.5, translation by extents, then iterative closest points.
 //!
-//! An object that is wider here than in the experience may be a wider object, or the same object turned: normalised
-//! coordinates cannot tell (the dissertation's boxes fail for it, section 6.3.2). Both are tried. The first hypothesis aligns
-//! normalised coordinates, as equation 6.5 does; the second aligns metres.
+//! An object that appears wider here than in the experience may be a wider object, or the same object rotated: normalised
+//! coordinates cannot distinguish these cases (which is why the dissertation's boxes fail, section 6.3.2). Both are tried. The
+//! first hypothesis aligns normalised coordinates, as equation 6.5 does; the second aligns metres.
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{
@@ -12,20 +12,20 @@ use sixfold_geometry::{
 
 use sixfold_experience::{Crop, Extent};
 
-/// How an experience is aligned.
+/// Options of the alignment of an experience.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExperienceAlignmentOptions {
     /// Largest distance of a pixel's VD-NOC from those of the experience's region: theta_c.
     pub threshold: f64,
-    /// Fewest pixels of a region.
+    /// Minimum number of pixels of a region.
     pub min_pixels: usize,
-    /// Predicted coordinates whose alignment leaves more than this (root mean square, in units of VD-NOC) are not used.
+    /// Predicted coordinates whose alignment has a larger residual (root mean square, in units of VD-NOC) are not used.
     pub max_residual: f64,
-    /// ICP may move the alignment by this, metres.
+    /// Largest translation of the alignment by ICP, metres.
     pub icp_distance: f64,
-    /// ICP may turn the alignment by this, radians.
+    /// Largest rotation of the alignment by ICP, radians.
     pub icp_angle: f64,
-    /// Align normalised coordinates alone (equation 6.5); otherwise also metres, and the object's own VD-NOC.
+    /// Align only normalised coordinates (equation 6.5); otherwise also metric coordinates, and the object's own VD-NOC.
     pub only_scaled: bool,
 }
 
@@ -56,17 +56,17 @@ impl ExperienceAlignmentOptions {
     }
 }
 
-/// What is assumed when two extents differ.
+/// The assumption when two extents differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignmentHypothesis {
-    /// The object is another size: equation 6.5.
+    /// The object has another size: equation 6.5.
     Scaled,
     /// The object is rotated.
     Turned,
-    /// The object is seen from the same side: its own VD-NOC are taken, and nothing is turned before ICP.
+    /// The object is seen from the same side: its own VD-NOC are used, and there is no rotation before ICP.
     SameSide,
-    /// The object stands upright, rotated about the vertical and stretched: found by its shape, without the network.
+    /// The object stands upright, rotated about the vertical and stretched: determined by its shape, without the network.
     Upright,
 }
 
@@ -82,25 +82,25 @@ impl AlignmentHypothesis {
     }
 }
 
-/// An experience's frame, found in what is seen.
+/// The pose of an experience's camera frame in the current view.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Transferred {
-    /// Takes points of the experience's camera to the camera of what is seen.
+    /// Takes points of the experience's camera frame to the current camera frame.
     pub camera_from_experience: Pose,
-    /// What was assumed.
+    /// The assumption.
     pub hypothesis: AlignmentHypothesis,
-    /// Pixels of the region here.
+    /// Pixels of the region in the current view.
     pub pixels: usize,
-    /// Root mean square of the point-to-plane distances after ICP, metres; `None` where ICP was not used: it found too little, or
-    /// went too far.
+    /// Root mean square of the point-to-plane distances after ICP, metres; `None` if the result of ICP was not used, because it had
+    /// too few correspondences or moved too far.
     pub rms: Option<f64>,
-    /// How much larger the region is here than in the experience, along the experience's camera axes.
+    /// Size of the region here relative to that in the experience, along the experience's camera axes.
     pub scale: Vec3,
 }
 
-/// Aligns an experience (its crop and region) with an object (its crop and cloud), given the VD-NOC of the object's
-/// pixels in the experience's frame as the network predicts them. Up to three alignments, one per hypothesis; none when the
-/// region is not found again.
+/// Aligns an experience (its crop and region) with an object (its crop and cloud), given the VD-NOC of the object's pixels in the
+/// experience's frame as the network predicts them. Up to three alignments, one per hypothesis; none when the region is not
+/// located.
 pub fn transfer(
     input: &Crop,
     cloud: &IndexedCloud,
@@ -114,7 +114,7 @@ pub fn transfer(
     if wanted.len() < options.min_pixels {
         return vec![];
     }
-    // Some of the region's points stand for all: theta_c is far larger than their distances.
+    // A subset of the region's points suffices: theta_c is far larger than their distances.
     let stride = wanted.len().div_ceil(150);
     let anchors: Vec<Vec3> = wanted.iter().step_by(stride).map(|&i| noc(&experience.vd_noc[i])).collect();
     let experience_points: Vec<Vec3> = wanted.iter().map(|&i| experience.point(i)).collect();
@@ -153,7 +153,7 @@ pub(super) fn noc(v: &[f32; 3]) -> Vec3 {
     Vec3::from_fn(|k, _| f64::from(v[k]))
 }
 
-/// The region of interest here: pixels whose VD-NOC are within `threshold` of one of the region's there.
+/// The region of interest in the current view: pixels whose VD-NOC are within `threshold` of one of the experience's region.
 pub(super) fn pixels_near(
     input: &Crop,
     coordinates: &[[f32; 3]],
@@ -170,8 +170,8 @@ pub(super) fn pixels_near(
         .collect()
 }
 
-/// The rotation from the experience's camera to the object's under a hypothesis; `None` where the coordinates do not agree
-/// with any rotation.
+/// The rotation from the experience's camera to the object's under a hypothesis; `None` if the coordinates do not agree with any
+/// rotation.
 fn rotation(
     hypothesis: AlignmentHypothesis,
     restored: &[Vec3],
@@ -198,7 +198,8 @@ fn rotation(
     (residual <= options.max_residual * unit).then(|| pose.with_translation(Vec3::zeros()))
 }
 
-/// ICP of the experience's region on the object's cloud. What slides away along a surface that fixes nothing is not used.
+/// ICP of the experience's region on the object's cloud. The result is rejected if it slid along a surface that does not constrain
+/// it.
 fn refine(
     experience: &Crop,
     wanted: &[usize],

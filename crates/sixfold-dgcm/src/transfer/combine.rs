@@ -1,8 +1,8 @@
-//! Grasps by geometry and grasps from experience, ranked together.
+//! Ranks grasps from geometry and grasps from experience together.
 //!
-//! The dissertation adds to the score of each geometric candidate what experience says of it (section 6.3.2). So it can
-//! only choose among what the geometric planner proposes, and fails where all of that is bad. Here the transferred grasps
-//! are candidates as well, judged by the same numbers; and what came of earlier attempts says how much each number counts
+//! The dissertation combines the score of each geometric candidate with a score from experience (section 6.3.2). So it can only
+//! choose among the proposals of the geometric planner, and fails if all of them are bad. Here the transferred grasps are
+//! candidates as well, described by the same numbers; and the outcomes of earlier attempts determine the weight of each number
 //! ([`crate::outcome`]).
 
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
@@ -13,7 +13,7 @@ use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
 use super::{Proposal, Proposals};
 use crate::outcome::OutcomeModel;
 
-/// Where a grasp comes from.
+/// The origin of a grasp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
@@ -23,22 +23,22 @@ pub enum Kind {
     Experience,
 }
 
-/// A grasp with its rank's numbers.
+/// A grasp with the scores for its rank.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ranked {
     /// The grasp.
     pub grasp: Grasp,
-    /// Where it comes from.
+    /// Its origin.
     pub kind: Kind,
-    /// What decides: the mean of the next two for both kinds together, or the chance to hold ([`rank_by_outcome`]).
+    /// The score by which grasps are ranked: the mean of the next two, or the success probability ([`rank_by_outcome`]).
     pub score: f64,
-    /// Quality of its contacts over the best one's, 0 to 1.
+    /// Quality of its contacts relative to the best one's, 0 to 1.
     pub geometry: f64,
-    /// The fraction of experience that agrees with it, 0 to 1.
+    /// The fraction of experience that agrees with the grasp, 0 to 1.
     pub experience: f64,
-    /// The number of the proposal it is, for grasps from experience.
+    /// The number of its proposal, for grasps from experience.
     pub proposal: Option<usize>,
-    /// Grasps within the cluster.
+    /// Number of grasps in the cluster.
     pub members: usize,
 }
 
@@ -50,7 +50,7 @@ impl Ranked {
 }
 
 /// Ranks grasps of both kinds, best first, one of each cluster (5 cm and 15 degrees), by the mean of their quality and of the
-/// fraction of experience that agrees. Without experience that is the order of the planner's clusters, without geometry that of
+/// fraction of experience that agrees. Without experience the order is that of the planner's clusters, without geometry that of the
 /// summed scores of equation 6.6 (section 6.3.2).
 pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, experience, clusters);
@@ -63,7 +63,7 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
     }
     let (chosen, sums) = joined(candidates, clusters);
     if experience.is_empty() {
-        // The planner alone: clusters by summed quality.
+        // Planner only: clusters by summed quality.
         let mut order: Vec<usize> = (0..chosen.len()).collect();
         order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]).then(a.cmp(&b)));
         return order.into_iter().map(|i| chosen[i]).collect();
@@ -71,8 +71,8 @@ pub fn rank(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptio
     chosen
 }
 
-/// Ranks experience's grasps as the dissertation does for its network alone (section 6.3.2): those within 5 cm and 15 degrees
-/// of the best one left are a cluster, whose grasp is their mean pose and whose score is the sum of equation 6.6.
+/// Ranks experience's grasps as the dissertation does for its network alone (section 6.3.2): those within 5 cm and 15 degrees of
+/// the best remaining one form a cluster, whose grasp is their mean pose and whose score is the sum of equation 6.6.
 pub fn rank_experience_as_published(experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let mut left: Vec<usize> = (0..experience.len()).collect();
     left.sort_by(|&a, &b| experience[b].score.total_cmp(&experience[a].score).then(a.cmp(&b)));
@@ -98,7 +98,7 @@ pub fn rank_experience_as_published(experience: &[Proposal], clusters: &ClusterO
     ranked
 }
 
-/// The mean of poses that are near to one another, as grippers: the half turn of each that is nearer to the first.
+/// The mean of gripper poses that are close to one another; each is rotated by half a turn if that is closer to the first.
 fn mean_pose(poses: &[Pose]) -> Pose {
     let half_turn = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
     let (mut translation, mut rotation) = (Vec3::zeros(), Quaternion::from_parts(0.0, Vec3::zeros()));
@@ -116,15 +116,15 @@ fn mean_pose(poses: &[Pose]) -> Pose {
 }
 
 /// Ranks the planner's grasps as the dissertation does with its network ("GPD + DGCM-Net", section 6.3.2): the mean of the
-/// planner's score (quality, or what a planner learned), brought to 0..1, and of the experience's score, which is the average of equation 6.6 over the proposals within
-/// 5 cm and 15 degrees, 0 where there are none.
+/// planner's score (quality, or that of a learned planner), scaled to 0..1, and of the experience's score, which is the average of
+/// equation 6.6 over the proposals within 5 cm and 15 degrees, 0 if there are none.
 pub fn rank_as_published(
     planned: &[ScoredGrasp],
     experience: &[Proposal],
     clusters: &ClusterOptions,
 ) -> Vec<Ranked> {
     let geometry: Vec<Grasp> = planned.iter().map(|p| p.grasp).collect();
-    // The planner's grasps come first, in their order.
+    // The planner's grasps are first, in their order.
     let mut candidates = candidates(&geometry, experience, clusters);
     candidates.truncate(planned.len());
     let scores = || planned.iter().map(|p| p.score);
@@ -139,8 +139,8 @@ pub fn rank_as_published(
     joined(candidates, clusters).0
 }
 
-/// Ranks the planner's grasps by the mean of quality over the best one's and of the fraction of experience that agrees; nothing
-/// but experience's own proposals is left out. For comparison: where all of the planner's grasps are bad, so is the best.
+/// Ranks the planner's grasps by the mean of relative quality and of the fraction of experience that agrees; only the proposals
+/// from experience are left out. For comparisons: if all of the planner's grasps are bad, so is the best.
 pub fn rank_by_agreement(
     geometry: &[Grasp],
     experience: &[Proposal],
@@ -154,8 +154,8 @@ pub fn rank_by_agreement(
     joined(candidates, clusters).0
 }
 
-/// Ranks grasps of both kinds by their success probability, best first, one of each cluster. The score is that probability. With a
-/// model that has seen no attempt, what simulated attempts taught beforehand decides.
+/// Ranks grasps of both kinds by their success probability, best first, one of each cluster. The score is that probability. A model
+/// without attempts uses its prior from simulated attempts.
 pub fn rank_by_outcome(
     geometry: &[Grasp],
     experience: &[Proposal],
@@ -176,10 +176,10 @@ pub fn rank_by_outcome(
     chosen
 }
 
-/// Ranks grasps of both kinds by their chance to hold what experience held: the chance to hold anything times
-/// `Proposals::holds_the_same`. With experience on one part alone (a handle) the best is on the counterpart of that part,
-/// whoever proposed it. The planner's grasps that hold nothing of it are left out; those transferred stay, last, for it is from
-/// such a part that they come.
+/// Ranks grasps of both kinds by the probability of holding the same part as the experience: the success probability times
+/// `Proposals::holds_the_same`. With experience on one part only (a handle) the best grasp is on the counterpart of that part,
+/// whether geometry or experience proposed it. The planner's grasps that do not hold it are left out; transferred ones are kept,
+/// last, because they come from such a part.
 pub fn rank_on_part(
     geometry: &[Grasp],
     experience: &Proposals,
@@ -197,11 +197,11 @@ pub fn rank_on_part(
     joined(candidates, clusters).0
 }
 
-/// How many of the best are refined.
+/// Number of best grasps that are refined.
 const REFINED: usize = 6;
 
-/// Moves a grasp by small steps while that raises its chance to hold: forth and back, along the pads, and rotated about each of
-/// its axes. When none does, the steps are halved, once.
+/// Moves a grasp by small steps while this increases its success probability: along the approach, along the pads, and rotated about
+/// each of its axes. When no step helps, the step size is halved, once.
 fn refine(c: &mut Ranked, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) {
     const ROUNDS: usize = 5;
     const STEP: f64 = 0.006;
@@ -234,7 +234,7 @@ fn near(a: &Grasp, b: &Grasp, clusters: &ClusterOptions) -> bool {
     distance <= clusters.distance && angle <= clusters.angle
 }
 
-/// All grasps with quality and the fraction of experience that agrees, without a score.
+/// All grasps with quality and the fraction of experience that agrees, but without a score.
 fn candidates(geometry: &[Grasp], experience: &[Proposal], clusters: &ClusterOptions) -> Vec<Ranked> {
     let all: f64 = experience.iter().map(|p| p.score).sum();
     let best = geometry
@@ -320,7 +320,7 @@ mod tests {
         let both = rank(&geometry, &[proposal(0.21, 0.5), proposal(0.2, 0.4)], &options);
         assert!((both[0].grasp.camera_from_gripper.translation().x - 0.2).abs() < 0.02);
         assert_eq!((both[0].kind, both[0].members), (Kind::Geometry, 3));
-        // Candidates of experience where geometry has nothing.
+        // Candidates from experience if geometry has none.
         let only = rank(&geometry, &[proposal(-0.3, 0.5)], &options);
         assert!(only.iter().any(|r| r.kind == Kind::Experience && r.proposal == Some(0)));
         let dgcm = rank(&[], &[proposal(0.0, 0.1), proposal(0.2, 0.3), proposal(0.21, 0.3)], &options);
@@ -357,13 +357,13 @@ mod tests {
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
         let fitter = GraspFitter::new(&view, &gripper, &options).unwrap();
-        // Both across the bar, at its end and near its middle, with the tips just over its upper edge.
+        // Both across the bar, at its end and near its centre, with the tips reaching just over its upper edge.
         let at = |x: f64| {
             let tip = Vec3::new(x, 0.0, 0.575);
             fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
         };
         let (end, middle) = (at(0.12), at(0.05));
-        // A hand that has lost whatever its pads reached over by less than 3 cm, wherever it was.
+        // A gripper that lost every object over which its pads reached by less than 3 cm, wherever it was held.
         let attempts: Vec<Attempt> = (0..80)
             .map(|k| {
                 let overlap = 0.001 * f64::from(k % 50);
@@ -396,7 +396,7 @@ mod tests {
         let unmoved = outcomes.success_probability(&fitter.describe(&middle), 0.0, false);
         assert!(taught[0].score > 1.5 * unmoved, "{} {unmoved}", taught[0].score);
         assert!(taught.is_sorted_by(|a, b| a.score >= b.score));
-        // What was moved is still a grasp that the planner would make.
+        // The moved grasp still satisfies the planner's tests.
         let again = fitter.fit(&taught[0].grasp.camera_from_gripper, taught[0].grasp.opening);
         assert!(again.is_some());
     }
@@ -411,7 +411,7 @@ mod tests {
             let tip = Vec3::new(x, 0.0, 0.575);
             fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
         };
-        // What the network sees of the bar: its upper side, of whose left end experience was held.
+        // The network's view of the bar: its upper side, whose left end was held in experience.
         let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
         let inside = |x: usize, y: usize| (40..280).contains(&x) && (104..136).contains(&y);
         let depth = DepthImage::from_fn(320, 240, |x, y| if inside(x, y) { 0.56 } else { 0.0 });
@@ -422,7 +422,7 @@ mod tests {
         let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
         let found =
             Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before, middles: vec![] };
-        // The centre of the bar is where it holds best, and its left end is what was asked for.
+        // The success probability is highest at the centre of the bar, but its left end was requested.
         let ranked = rank_on_part(
             &[at(0.0), at(-0.09)],
             &found,
@@ -440,7 +440,7 @@ mod tests {
     fn as_published_the_planners_score_and_the_mean_of_the_near_experience_are_averaged() {
         // Qualities 0.3 + 0.7 a: 0.3, 0.65 and 1, which become 0, 0.5 and 1.
         let geometry = [grasp(0.0, 0.0), grasp(0.3, 0.5), grasp(-0.3, 1.0)];
-        // Two near to the second, whose mean counts, and one near to nothing.
+        // Two near to the second, whose mean counts, and one near no grasp.
         let proposals = [proposal(0.29, 0.6), proposal(0.33, 0.9), proposal(0.1, 1.0)];
         let planned = geometry.map(|grasp| ScoredGrasp { grasp, score: grasp.quality.total() });
         let ranked = rank_as_published(&planned, &proposals, &ClusterOptions::default());
@@ -455,7 +455,7 @@ mod tests {
                 assert!((a - b).abs() < 1e-9, "{found:?} {expected:?}");
             }
         }
-        // By the fraction of experience that agrees, 1.5 of 2.5, it is another number.
+        // By the fraction of experience that agrees, 1.5 of 2.5, the score differs.
         let agreed = rank_by_agreement(&geometry, &proposals, &ClusterOptions::default());
         assert!((agreed[0].score - 0.5 * (0.65 + 0.6)).abs() < 1e-9, "{}", agreed[0].score);
     }
@@ -469,7 +469,7 @@ mod tests {
             p
         };
         let half = std::f64::consts::PI;
-        // The best one alone; three that mean the same, one of them half a turn on.
+        // The best one alone; three of about the same grasp, one of them rotated by half a turn.
         let found = [at(0.0, 0.1, 0.4), at(0.3, 0.0, 0.7), at(0.04, 0.3, 0.3), at(0.02, 0.2 + half, 0.5)];
         let ranked = rank_experience_as_published(&found, &ClusterOptions::default());
         assert_eq!(ranked.iter().map(|r| r.members).collect::<Vec<_>>(), [3, 1]);

@@ -1,5 +1,5 @@
-//! How well an experience's object, moved and stretched, explains what is seen, and the other way round. Both are single views:
-//! what one hides from its camera says nothing against the other.
+//! Measures how well an experience's object, moved and scaled, explains the current view, and vice versa. Both are single views:
+//! parts hidden from one camera are no evidence against the other view.
 
 use sixfold_geometry::nalgebra::Rotation3;
 use sixfold_geometry::{Pose, Vec3};
@@ -8,26 +8,26 @@ use sixfold_experience::Crop;
 
 /// Side of a cell, metres.
 const CELL: f64 = 0.005;
-/// Points this far off count by `exp(-1/2)`, metres.
+/// Distance at which a point counts `exp(-1/2)`, metres.
 const NEAR: f64 = 0.005;
-/// How far a point may count at all, in cells.
+/// Largest distance at which a point counts, in cells.
 const REACH: i64 = 2;
-/// What a point counts that lies where the camera could not see.
+/// Score of a point in a hidden cell.
 const HIDDEN: f32 = 0.45;
 /// Points of a view that are compared.
 const POINTS: usize = 260;
 
-/// One view of an object in a frame whose z axis stands on the table, where that is known, with what its camera saw of the space
-/// around.
+/// One view of an object in a frame whose z axis is normal to the table, if that is known, with a grid of the visible and hidden
+/// space around it.
 pub(super) struct Shape {
-    /// Takes points of the camera to the table; the x axis points away from the camera. The camera's own frame where no table is
-    /// known.
+    /// Takes points of the camera to the table; the x axis points away from the camera. The camera's own frame if the table is
+    /// unknown.
     pub table_from_camera: Pose,
-    /// The table is known.
+    /// Whether the table is known.
     pub stands: bool,
     /// Some of the object's points.
     pub points: Vec<Vec3>,
-    /// Nearly the highest point.
+    /// Height of the object, without outliers.
     pub height: f64,
     low: Vec3,
     size: [usize; 3],
@@ -35,7 +35,7 @@ pub(super) struct Shape {
 }
 
 impl Shape {
-    /// Of a view.
+    /// The shape of a view.
     pub(crate) fn new(crop: &Crop) -> Shape {
         let table_from_camera = table_frame(crop);
         let all: Vec<Vec3> =
@@ -61,9 +61,9 @@ impl Shape {
         shape
     }
 
-    /// Cells behind what was seen.
+    /// Marks cells behind visible surfaces.
     fn hide(&mut self, crop: &Crop) {
-        // The depth around each pixel: edges are often not measured.
+        // The depth in a neighbourhood of each pixel, because edges are often not measured.
         let side = crop.side as i64;
         let depth = |u: i64, v: i64| {
             let mut nearest = f64::INFINITY;
@@ -95,7 +95,7 @@ impl Shape {
         }
     }
 
-    /// Cells near what was seen.
+    /// Marks cells near visible points.
     fn mark(&mut self, points: &[Vec3]) {
         for p in points {
             let cell = ((p - self.low) / CELL).map(|v| v.floor() as i64);
@@ -120,17 +120,17 @@ impl Shape {
         inside.then(|| (cell[2] as usize * self.size[1] + cell[1] as usize) * self.size[0] + cell[0] as usize)
     }
 
-    /// 1 on what was seen, less beside it, some where nothing could be seen, 0 where there is nothing.
+    /// Score of a point: 1 on a visible surface, less near it, [`HIDDEN`] in hidden space, 0 in empty space.
     pub(crate) fn at(&self, p: &Vec3) -> f64 {
         let cell = (p - self.low) * (1.0 / CELL);
-        // Below the first cell is none; a comparison costs less than rounding down.
+        // There are no cells below the first; a comparison is cheaper than rounding down.
         if cell.x < 0.0 || cell.y < 0.0 || cell.z < 0.0 {
             return 0.0;
         }
         self.index([cell.x as i64, cell.y as i64, cell.z as i64]).map_or(0.0, |i| f64::from(self.cells[i]))
     }
 
-    /// The centre of the box around points, seen from above.
+    /// The centre of the bounding box of points, seen from above.
     pub(crate) fn middle(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
         let (mut low, mut high) = (Vec3::repeat(f64::MAX), Vec3::repeat(f64::MIN));
         for p in points {

@@ -1,4 +1,4 @@
-//! All grasps on what is seen now, those of experience and those of geometry, in one order.
+//! All grasps for a view, from experience and from geometry, in one ranking.
 
 use sixfold_grasp::learned::ScoredGrasp;
 use sixfold_grasp::{
@@ -12,14 +12,14 @@ use super::{
 };
 use crate::model::DgcmModel;
 
-/// Why there are no grasps.
+/// Errors of the ranking.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GraspsError {
     /// The planner's options.
     #[error(transparent)]
     Options(#[from] OptionsError),
-    /// Experience cannot be asked.
+    /// The proposals from experience.
     #[error(transparent)]
     Propose(#[from] ProposeError),
 }
@@ -27,14 +27,14 @@ pub enum GraspsError {
 /// Grasps of both kinds.
 #[derive(Debug, Clone)]
 pub struct RankedGrasps {
-    /// What experience says.
+    /// The proposals from experience.
     pub found: Proposals,
     /// The grasps, the best first.
     pub ranked: Vec<Ranked>,
 }
 
-/// Grasps from experience and from geometry, by the success probability that the attempts with this gripper predict. With the
-/// name of a part: only experiences on such parts, and only grasps that hold what they held.
+/// Grasps from experience and from geometry, by the success probability that the attempts with this gripper predict. With the name
+/// of a part: only experiences on such parts, and only grasps on the same part.
 ///
 /// # Errors
 /// [`GraspsError`].
@@ -59,8 +59,9 @@ pub fn grasps_from_experience(
     Ok(RankedGrasps { found, ranked })
 }
 
-/// As [`grasps_from_experience`], in the dissertation's form (sections 6.2.3 and 6.3.2): the network's transfer alone, its clusters
-/// by their summed scores; or the grasps that a planner `planned`, whose scores are averaged with those of experience nearby.
+/// As [`grasps_from_experience`], in the dissertation's form (sections 6.2.3 and 6.3.2): only transfers by the network, with
+/// clusters ranked by their summed scores; or the grasps `planned` by a planner, whose scores are averaged with those of nearby
+/// experience.
 ///
 /// # Errors
 /// [`GraspsError`].

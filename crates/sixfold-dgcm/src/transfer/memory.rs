@@ -1,4 +1,4 @@
-//! The experiences at hand: the index of all features and the experiences that were retrieved lately.
+//! Experiences in memory: the index of all features, and recently retrieved experiences.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -12,15 +12,15 @@ use crate::outcome::OutcomeModel;
 pub struct Memory {
     store: Box<dyn ExperienceStore + Send>,
     index: FeatureIndex,
-    /// By number; what is known for steering.
+    /// Summaries of the experiences by number, for filtering.
     labels: HashMap<i64, Summary>,
     kept: HashMap<i64, Arc<Stored>>,
     attempts: Vec<Attempt>,
-    /// Number of the last attempt at hand.
+    /// Number of the last attempt read.
     last_attempt: i64,
-    /// What was learned from them, by gripper.
+    /// Outcome models fitted to the attempts, by gripper.
     outcomes: HashMap<String, OutcomeModel>,
-    /// What is wrong with rows that are left out, and was not asked for yet.
+    /// Errors of rows that are left out and were not yet reported.
     left_out: Vec<StoreError>,
     /// Experiences that are left out.
     broken: HashSet<i64>,
@@ -47,7 +47,7 @@ impl Memory {
         Ok(memory)
     }
 
-    /// Takes over what others have stored and forgotten.
+    /// Applies what others have stored and removed.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -75,7 +75,7 @@ impl Memory {
         Ok(())
     }
 
-    /// What is wrong with experiences and attempts that were left out since the last call, for the user to hear of.
+    /// Errors of experiences and attempts that were left out since the last call, for the user.
     pub fn take_left_out(&mut self) -> Vec<StoreError> {
         std::mem::take(&mut self.left_out)
     }
@@ -86,7 +86,7 @@ impl Memory {
         }
     }
 
-    /// What the attempts with a gripper say of the next one.
+    /// The outcome model fitted to the attempts with a gripper.
     pub fn outcomes(&mut self, gripper: &str) -> OutcomeModel {
         let attempts = &self.attempts;
         let learn = || OutcomeModel::learn(attempts, gripper);
@@ -98,17 +98,17 @@ impl Memory {
         &mut *self.store
     }
 
-    /// Features at hand.
+    /// The index of features.
     pub fn index(&self) -> &FeatureIndex {
         &self.index
     }
 
-    /// Experiences at hand, those of other networks included.
+    /// Number of experiences, including those of other networks.
     pub fn len(&self) -> usize {
         self.labels.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no experiences.
     pub fn is_empty(&self) -> bool {
         self.labels.is_empty()
     }
@@ -124,7 +124,7 @@ impl Memory {
         self.index.nearest(feature, count, |id| labels.get(&id).is_some_and(&wanted))
     }
 
-    /// An experience; `None` when it was forgotten meanwhile, or cannot be read and is left out ([`Memory::take_left_out`]).
+    /// An experience; `None` when it was removed meanwhile, or cannot be read and is left out ([`Memory::take_left_out`]).
     ///
     /// # Errors
     /// [`StoreError`].

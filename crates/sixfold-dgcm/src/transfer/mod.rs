@@ -1,4 +1,4 @@
-//! From experiences to grasps on what is seen now (dissertation, section 6.2.3).
+//! From experiences to grasps for the current view (dissertation, section 6.2.3).
 
 mod align;
 mod combine;

@@ -1,4 +1,4 @@
-//! Grasps from the nearest experiences: retrieval, transfer, stand-off, and a place where the gripper is free.
+//! Grasps from the nearest experiences: retrieval, transfer, stand-off, and search for a collision-free pose.
 
 use std::collections::BTreeSet;
 
@@ -15,11 +15,11 @@ use super::align::{
 };
 use crate::model::DgcmModel;
 
-/// Why nothing can be proposed.
+/// Errors of proposals from experience.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProposeError {
-    /// The object cannot be cut out.
+    /// The object cannot be cropped.
     #[error(transparent)]
     Crop(#[from] CropError),
     /// The store.
@@ -33,23 +33,23 @@ pub enum ProposeError {
     Option(#[from] OptionError),
 }
 
-/// How grasps are transferred.
+/// Options of the transfer of grasps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProposeOptions {
     /// Nearest features that are tried (dissertation: 10).
     pub neighbours: usize,
     /// How they are aligned.
     pub align: ExperienceAlignmentOptions,
-    /// Compare the shapes of upright objects too, beside what the network predicts.
+    /// Also compare the shapes of upright objects, in addition to the network's predictions.
     pub shapes: bool,
     /// How far the tips reach over the nearest point of the object's surface, metres: the dissertation's fixed distance, at which a
-    /// grasp is taken as it was transferred. `None`: as far as in the experience, at the nearest place where the gripper is free.
+    /// grasp is used as transferred. `None`: as far as in the experience, at the nearest pose where the gripper is free.
     pub reach: Option<f64>,
-    /// Only experiences on parts of this name.
+    /// Only experiences on parts with this name.
     pub part: Option<String>,
     /// Only the experiences with these numbers.
     pub only: Option<BTreeSet<i64>>,
-    /// Not those whose object has this name: what a test must not know.
+    /// Exclude experiences with this object, for tests on it.
     pub without_object: Option<String>,
 }
 
@@ -67,12 +67,12 @@ impl Default for ProposeOptions {
     }
 }
 
-/// [`ProposeOptions::reach`] of the published form. The dissertation does not say how far; chosen by hand, not swept.
+/// [`ProposeOptions::reach`] of the published form. The dissertation does not state the distance; chosen by hand, not swept.
 const PUBLISHED_REACH: f64 = 0.02;
 
 impl ProposeOptions {
     /// The network alone (section 6.2.3): ten neighbours, theta_c = 0.3, the rotation of equation 6.5, the translation by extents,
-    /// ICP, and the gripper at a fixed distance from the surface. What would hit something is left out.
+    /// ICP, and the gripper at a fixed distance from the surface. Grasps that would collide are left out.
     pub fn published() -> ProposeOptions {
         ProposeOptions {
             align: ExperienceAlignmentOptions { only_scaled: true, ..ExperienceAlignmentOptions::default() },
@@ -82,7 +82,7 @@ impl ProposeOptions {
         }
     }
 
-    /// Checks every field, also those of the alignment.
+    /// Checks every field, including those of the alignment.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
@@ -96,40 +96,41 @@ impl ProposeOptions {
 /// A grasp from experience.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Proposal {
-    /// The grasp, free of collisions with what is known.
+    /// The grasp, free of collisions with known points.
     pub grasp: Grasp,
     /// Equation 6.6: `exp(-distance of the features)`.
     pub score: f64,
     /// The experience.
     pub from: Match,
-    /// What was assumed about its size.
+    /// The assumption about the object's size or rotation.
     pub hypothesis: AlignmentHypothesis,
-    /// How far the grasp was moved from where the transfer had put it, metres.
+    /// Distance by which the grasp was moved from its transferred pose, metres.
     pub moved: f64,
-    /// The contacts are inside their friction cones as far as they are known.
+    /// Whether the contacts are inside their friction cones, as far as known.
     pub firm: bool,
 }
 
-/// All that experience says of an object.
+/// Everything that experience predicts for an object.
 #[derive(Debug, Clone)]
 pub struct Proposals {
     /// The nearest experiences, nearest first.
     pub nearest: Vec<Match>,
-    /// The object as the network sees it.
+    /// The network's input for the object.
     pub crop: Crop,
     /// The grasps, those of the nearest experience first.
     pub proposals: Vec<Proposal>,
-    /// For every pixel of the crop the fraction of experience (weighted by equation 6.6) that was held there, 0 to 1: where on this
-    /// object the counterparts of what lay between the pads are.
+    /// For every pixel of the crop the fraction of experiences (weighted by equation 6.6) in which its counterpart was between the
+    /// pads, 0 to 1.
     pub held_before: Vec<f64>,
-    /// Where on this object the middles between the pads of experience are, camera frame, with their weights; empty where shapes
-    /// were not compared.
+    /// Centres between the pads, transferred from experience to this object, camera frame, with their weights; empty if shapes were
+    /// not compared.
     pub middles: Vec<(Vec3, f64)>,
 }
 
 impl Proposals {
-    /// How much a grasp holds what experience held: the mean of [`Proposals::held_before`] over the pixels between its pads, 0
-    /// where none of them was seen, times how near the middle between its pads is to those of experience.
+    /// How much a grasp holds the same part as the experience: the mean of [`Proposals::held_before`] over the pixels between its
+    /// pads (0 if too few are visible), times a weight for the distance of the centre between its pads from those of the
+    /// experiences.
     pub(crate) fn holds_the_same(&self, grasp: &Grasp, gripper: &Gripper) -> f64 {
         let held = between_pads(&self.crop, &grasp.camera_from_gripper, grasp.opening, gripper);
         if held.len() < FEWEST_HELD {
@@ -146,16 +147,16 @@ impl Proposals {
     }
 }
 
-/// The centre between the pads may be this far from where it was in experience (standard deviation), metres.
+/// Standard deviation of the centre between the pads around that of the experience, metres.
 const MIDDLES: f64 = 0.02;
 
-/// A grasp that holds fewer pixels holds too little to be rated.
+/// Fewest pixels between the pads of a grasp that can be rated.
 pub(super) const FEWEST_HELD: usize = 4;
-/// Pixels whose VD-NOC are nearer than this to those that were held are their counterparts. Less than the 0.3 by which a whole
-/// region is found again: a handle is thin.
+/// Pixels whose VD-NOC are closer than this to those of held pixels are their counterparts. It is less than the 0.3 by which a
+/// whole region is located, because a handle is thin.
 const COUNTERPART: f64 = 0.2;
 
-/// Pixels whose points lie between the pads of a gripper.
+/// Pixels whose points are between the pads of a gripper.
 pub(super) fn between_pads(
     crop: &Crop,
     camera_from_gripper: &Pose,
@@ -168,13 +169,13 @@ pub(super) fn between_pads(
     crop.pixels().filter(inside).collect()
 }
 
-/// Nearest features, in-plane copies among them, whose experiences are compared by shape.
+/// Number of nearest features, including in-plane copies, whose experiences are compared by shape.
 const IN_SHAPES: usize = 60;
 
-/// Proposes grasps on the object of a fitter's view, tested and judged as the fitter does.
+/// Proposes grasps on the object of a fitter's view, tested and rated by the fitter.
 ///
 /// # Errors
-/// [`ProposeError`]. No experience, or none that fits, is no error: there are no proposals then.
+/// [`ProposeError`]. It is not an error if there is no experience, or none that fits: then there are no proposals.
 pub fn propose(
     fitter: &GraspFitter<'_>,
     model: &DgcmModel,
@@ -190,7 +191,7 @@ pub fn propose(
             && options.only.as_ref().is_none_or(|only| only.contains(&s.id))
             && options.without_object.as_ref().is_none_or(|object| s.object != *object)
     };
-    // One search for both; what the network aligns are the first of them.
+    // One search for both methods; the network aligns the first of them.
     let in_shapes = memory.nearest(&input.feature, options.neighbours.max(IN_SHAPES), wanted);
     let nearest = in_shapes[..in_shapes.len().min(options.neighbours)].to_vec();
     let trim = model.crop_options().trim;
@@ -276,14 +277,14 @@ pub fn propose(
     Ok(found)
 }
 
-/// The region of an experience in its in-plane copy, whose pixels know where they come from.
+/// The region of an experience in its in-plane copy, from the source pixels of the copy.
 fn rotated_region(region: &[bool], copy: &Crop) -> Vec<bool> {
     (0..copy.mask.len())
         .map(|i| copy.mask[i] && region.get(copy.source[i] as usize).copied().unwrap_or(false))
         .collect()
 }
 
-/// What is transferred.
+/// The grasp to be transferred.
 pub(super) struct Source<'a> {
     pub copy: &'a Crop,
     pub grasp: &'a Pose,
@@ -291,8 +292,8 @@ pub(super) struct Source<'a> {
     pub width: f64,
 }
 
-/// The transferred grasp at its stand-off, at the nearest place where the gripper is free: shifted and rotated by a little,
-/// or drawn back. The grasp, how far it was moved, and whether its contacts are inside their friction cones.
+/// Places the transferred grasp at its stand-off, at the nearest pose where the gripper is free: slightly shifted and rotated, or
+/// retracted. Returns the grasp, the distance by which it was moved, and whether its contacts are inside their friction cones.
 pub(super) fn place(
     fitter: &GraspFitter<'_>,
     gripper: &Gripper,
@@ -309,7 +310,7 @@ pub(super) fn place(
         .iter()
         .map(|w| w + room)
         .chain([gripper.max_opening])
-        // Not `clamp`: a small gripper opens less than a centimetre.
+        // Not `clamp`, because the maximum opening of a small gripper may be less than a centimetre.
         .map(|o| o.max(0.01).min(gripper.max_opening))
         .collect();
     openings.dedup_by(|a, b| (*a - *b).abs() < 0.002);
@@ -325,7 +326,7 @@ pub(super) fn place(
                 let moved = back + f64::abs(shift) + 0.05 * angle.abs();
                 for &opening in &openings {
                     if let Some(grasp) = fitter.fit(&pose, opening) {
-                        // Something much wider or thinner is another part of the object.
+                        // A much wider or thinner part is another part of the object.
                         let other = expected.iter().map(|w| (grasp.width / w).ln().abs());
                         let other = other.fold(f64::INFINITY, f64::min);
                         if other > OTHER_PART.ln() {
@@ -348,8 +349,8 @@ pub(super) fn place(
     best.map(|(_, grasp, moved)| (grasp, moved, true)).or(loose.map(|(grasp, moved)| (grasp, moved, false)))
 }
 
-/// The transferred grasp, moved along its approach until its tips reach so far over the object's surface (section 6.2.3); `None`
-/// where nothing is between its pads there, or the gripper hits something.
+/// The transferred grasp, moved along its approach until its tips reach `reach` metres over the object's surface (section 6.2.3);
+/// `None` if nothing is between its pads there, or the gripper collides.
 fn at_distance(fitter: &GraspFitter<'_>, source: &Source<'_>, t: &Transferred, reach: f64) -> Option<Grasp> {
     let pose = t.camera_from_experience * *source.grasp;
     let opening = fitter.gripper().max_opening;
@@ -357,7 +358,7 @@ fn at_distance(fitter: &GraspFitter<'_>, source: &Source<'_>, t: &Transferred, r
     fitter.accept(&(pose * Pose::from_translation(Vec3::z() * (surface + reach))), opening)
 }
 
-/// Contacts that are this many times as far apart as in the experience, or as little, are on another part.
+/// Contacts whose distance differs from that in the experience by more than this factor are on another part.
 const OTHER_PART: f64 = 2.2;
 
 /// Moves a grasp along its approach until its tips reach over the object as far as they did in the experience.
@@ -399,7 +400,7 @@ mod tests {
 
     #[test]
     fn what_a_grasp_holds_is_looked_up_between_its_pads() {
-        // A plate of 12 x 4 cm at 0.7 m, of whose left third experience was held.
+        // A plate of 12 x 4 cm at 0.7 m, whose left third was held in experience.
         let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
         let inside = |x: usize, y: usize| (110..209).contains(&x) && (103..136).contains(&y);
         let depth = Image::from_fn(320, 240, |x, y| if inside(x, y) { 0.7 } else { 0.0 });
@@ -419,10 +420,10 @@ mod tests {
         };
         assert!((at(-0.04) - 0.8).abs() < 1e-9);
         assert_eq!(at(0.04), 0.0);
-        // Half of what is between the pads.
+        // Half of the pixels between the pads.
         assert!((at(-0.02) - 0.4).abs() < 0.06, "{}", at(-0.02));
         assert_eq!(at(0.5), 0.0, "beside the object");
-        // Experience had its middle 1.5 cm behind what this one holds, and another one, which fits worse, far off.
+        // In one experience the centre was 1.5 cm behind that of this grasp, in another one, which fits worse, far away.
         let grasp = |x: f64| {
             let pose = gripper_pose(&Vec3::new(x, 0.0, 0.72), &Vec3::z(), &Vec3::y()).unwrap();
             let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };

@@ -1,4 +1,4 @@
-//! What the shapes of upright objects say, beside the network: where the counterparts of what was held are, and grasps there.
+//! Transfer by the shapes of upright objects, in addition to the network: the counterparts of held parts, and grasps there.
 
 use std::sync::Arc;
 
@@ -13,32 +13,32 @@ use super::fit::Shape;
 use super::propose::{FEWEST_HELD, Proposal, Proposals, Source, between_pads, place};
 use super::upright::upright;
 
-/// Experiences that are compared.
+/// Number of experiences that are compared.
 const EXPERIENCES: usize = 10;
-/// A fit that is worse by this counts `1/e`.
+/// A fit that is worse than the best by this has the weight `1/e`.
 const FIT: f64 = 0.03;
-/// Counterparts whose fit is worse than the best by this many times that say nothing.
+/// Counterparts whose fit is worse than the best by more than this multiple of [`FIT`] are dropped.
 const WORST: f64 = 3.0;
-/// Pixels this near to the counterpart of a point that was held are held, metres.
+/// Pixels within this distance of the counterpart of a held point count as held, metres.
 const AROUND: f64 = 0.008;
-/// Points of what was held that are compared.
+/// Number of held points that are compared.
 const HELD: usize = 60;
 
-/// What one experience says, found again in one place.
+/// One experience, located at one place on the current object.
 struct Counterpart {
     from: Match,
     fit: f64,
-    /// Where it comes from, and how its grasp comes here.
+    /// The experience, and the transfer of its grasp.
     stored: Arc<Stored>,
     transferred: Transferred,
-    /// What was held, in this camera's frame.
+    /// The held points, in the current camera's frame.
     held: Vec<Vec3>,
-    /// The centre between the pads, in this camera's frame.
+    /// The centre between the pads, in the current camera's frame.
     middle: Vec3,
 }
 
 impl Counterpart {
-    /// The grasp, how far it was moved, and whether it is firm; `None` where the gripper is nowhere free.
+    /// The grasp, the distance by which it was moved, and whether it is firm; `None` if the gripper is nowhere free.
     fn place(&self, fitter: &GraspFitter<'_>) -> Option<(Grasp, f64, bool)> {
         let e = &self.stored.experience;
         let source =
@@ -48,8 +48,8 @@ impl Counterpart {
 }
 
 impl Proposals {
-    /// Adds grasps of the experiences of `nearest` that know the table they were made on. Where there are any, they alone say
-    /// what was held: shapes find a thin part where the network's coordinates miss it.
+    /// Adds grasps of those experiences of `nearest` whose table is known. If there are any, only they determine
+    /// [`Proposals::held_before`]: shapes locate thin parts that the network's coordinates miss.
     pub(super) fn add_shapes(
         &mut self,
         fitter: &GraspFitter<'_>,
@@ -105,7 +105,7 @@ impl Proposals {
     }
 }
 
-/// Where one experience is found again.
+/// The places at which one experience is located.
 fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterpart> {
     let e = &stored.experience;
     let there = Shape::new(&e.crop);
@@ -114,7 +114,7 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
     let held: Vec<Vec3> = held.iter().step_by(stride).map(|&i| e.crop.point(i)).collect();
     let on_table: Vec<Vec3> = held.iter().map(|p| there.table_from_camera.transform_point(p)).collect();
     let tips = centre_between_pads(&e.camera_from_gripper);
-    // What is to be held again.
+    // The centre of the points to be held again.
     let middle = if held.is_empty() { tips } else { held.iter().sum::<Vec3>() / held.len() as f64 };
     upright(here, &there, &on_table)
         .into_iter()

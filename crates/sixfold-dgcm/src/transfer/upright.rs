@@ -1,6 +1,6 @@
-//! An experience on an upright object, found again by its shape: rotated about the vertical, moved over the table and
-//! stretched until each view explains the other ([`super::fit`]). Beyond the dissertation: the network's coordinates find a
-//! large part, but a handle is a few pixels of them.
+//! Locates an experience on an upright object by its shape: rotated about the vertical, moved over the table and stretched until
+//! each view explains the other ([`super::fit`]). This goes beyond the dissertation: the network's coordinates locate large parts,
+//! but a handle has only a few pixels.
 
 use std::f64::consts::TAU;
 
@@ -9,34 +9,34 @@ use sixfold_geometry::{Pose, Vec3};
 
 use super::fit::Shape;
 
-/// Steps of the turn in the first search.
+/// Rotations about the vertical in the first search.
 const TURNS: usize = 20;
-/// Stretches along the table that are tried first.
+/// Scale factors along the table that are tried first.
 const STRETCHES: [f64; 3] = [0.76, 1.0, 1.3];
-/// How far the first search moves an object, in steps of a centimetre.
+/// Largest shift of an object in the first search, in steps of a centimetre.
 const MOVES: i64 = 3;
-/// How many of the first search are refined.
+/// Number of results of the first search that are refined.
 const CLOSER: usize = 8;
 /// Alignments rotated by less than this are the same, radians.
 const SAME: f64 = 0.6;
-/// What a turn by 180 degrees costs: of a round thing the same side is taken.
+/// Penalty of a rotation by 180 degrees, so that for a round object the same side is chosen.
 const TURNED: f64 = 0.01;
 
-/// Where an experience's object is, upright.
+/// The alignment of an experience's upright object.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Upright {
-    /// About the vertical, radians.
+    /// Rotation about the vertical, radians.
     pub yaw: f64,
-    /// Along the table, and upwards.
+    /// Scale factors along the table and along the vertical.
     pub stretch: [f64; 2],
-    /// On the table, metres.
+    /// Translation on the table, metres.
     pub shift: Vec3,
     /// How well each view explains the other, 0 to 1.
     pub fit: f64,
 }
 
 impl Upright {
-    /// A point of the experience's table frame in that of what is seen.
+    /// Maps a point of the experience's table frame to that of the current view.
     pub(crate) fn map(&self, p: &Vec3) -> Vec3 {
         let (sin, cos) = self.yaw.sin_cos();
         let (x, y) = (p.x * self.stretch[0], p.y * self.stretch[0]);
@@ -50,14 +50,14 @@ impl Upright {
         Vec3::new(x / self.stretch[0], y / self.stretch[0], p.z / self.stretch[1])
     }
 
-    /// The rotation from the experience's camera to this one's.
+    /// The rotation from the experience's camera to the current one's.
     pub(crate) fn rotation(&self, there: &Shape, here: &Shape) -> Pose {
         let turn = Pose::new(UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw), Vec3::zeros());
         let whole = here.table_from_camera.inverse() * turn * there.table_from_camera;
         whole.with_translation(Vec3::zeros())
     }
 
-    /// A point of the experience's camera in this one's.
+    /// Maps a point of the experience's camera frame to the current camera frame.
     pub(crate) fn map_camera(&self, p: &Vec3, there: &Shape, here: &Shape) -> Vec3 {
         let p = self.map(&there.table_from_camera.transform_point(p));
         here.table_from_camera.inverse().transform_point(&p)
@@ -80,18 +80,19 @@ impl Upright {
     }
 }
 
-/// Two views that are compared.
+/// Two views to compare.
 struct Pair<'a> {
     here: &'a Shape,
     there: &'a Shape,
     held: &'a [Vec3],
-    /// How much each point tells of where the experience's object is.
+    /// Weight of each point: how much it constrains the alignment.
     telling_here: Vec<f64>,
     telling_there: Vec<f64>,
 }
 
 impl Pair<'_> {
-    /// Points that are explained wherever the object is turned tell little: those of a mug's wall, against those of its handle.
+    /// Points that are explained at every rotation of the object get a low weight: those of a mug's wall, in contrast to those of
+    /// its handle.
     fn weigh(&mut self, anywhere: &[Upright]) {
         let telling = |value: f64| (1.0 - value / anywhere.len().max(1) as f64).max(0.05).powi(2);
         let here = self.here.points.iter();
@@ -103,8 +104,8 @@ impl Pair<'_> {
     }
 }
 
-/// Up to two places where an experience's object could be, best first; `held` are the points that were held, in the
-/// experience's table frame. None where either table is unknown.
+/// Up to two alignments of an experience's object, best first; `held` are the held points, in the experience's table frame. Empty
+/// if either table is unknown.
 pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright> {
     if !(here.stands && there.stands && here.height > 0.005 && there.height > 0.005) {
         return vec![];
@@ -140,7 +141,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
         }
     }
     first.sort_by(|a, b| b.fit.total_cmp(&a.fit));
-    // Of every rotation the best, of those the best ones.
+    // The best of every rotation, sorted.
     let mut starts: Vec<Upright> = vec![];
     for tried in first {
         if starts.iter().all(|s| s.yaw != tried.yaw) {
@@ -168,7 +169,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
     found
 }
 
-/// Steps of a size while they help.
+/// Hill climbing with steps of one size while they improve the fit.
 fn climb(best: &mut Upright, size: f64, pair: &Pair<'_>) {
     for _ in 0..4 {
         let before = best.fit;
@@ -202,7 +203,7 @@ mod tests {
     use super::*;
     use sixfold_experience::{Crop, CropOptions};
 
-    /// A synthetic object on a table, 0.7 m from a camera that looks down by 40 degrees.
+    /// A synthetic object on a table, 0.7 m from a camera that looks down at 40 degrees.
     struct Seen {
         member: Member,
         crop: Crop,
@@ -234,7 +235,7 @@ mod tests {
         }
     }
 
-    /// The best place of one view's handle in another, and the fraction of it that is on that one's handle.
+    /// The best alignment of one view's handle with another view, and the fraction of it that is on the handle there.
     fn handle_found(here: &Seen, there: &Seen) -> (Upright, f64) {
         let on_handle: Vec<Vec3> = there
             .crop
@@ -254,7 +255,7 @@ mod tests {
 
     #[test]
     fn a_handle_is_found_on_another_mug_wherever_it_points() {
-        // The handles point to both sides and to the camera: away from it they are hidden.
+        // The handles point to both sides and towards the camera; pointing away they would be hidden.
         for (k, (there, here)) in
             [(0.2, -1.2), (-2.8, -0.4), (-1.4, 0.1), (-0.5, -2.7)].into_iter().enumerate()
         {
@@ -280,10 +281,10 @@ mod tests {
         let shapes = [(); 2].map(|()| Shape::new(&round.next().unwrap().crop));
         let best = upright(&shapes[0], &shapes[1], &[])[0];
         assert!(best.yaw.cos() > 0.9 && best.fit > 0.7, "{best:?}");
-        // What was mapped there is mapped back.
+        // Mapping there and back gives the same point.
         let p = Vec3::new(0.03, -0.02, 0.05);
         assert!((best.back(&best.map(&p)) - p).norm() < 1e-12);
-        // Its height is the other's.
+        // The mapped height is that of the other object.
         let top = best.map(&Vec3::new(0.0, 0.0, shapes[1].height)).z;
         assert!((top - shapes[0].height).abs() < 0.002, "{top}");
     }

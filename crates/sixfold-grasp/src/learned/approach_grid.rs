@@ -1,5 +1,5 @@
 //! HAF's candidates (Fischinger, Weiss and Vincze 2015): a few approach directions, rotations of the hand about each, and a grid of
-//! places over what is seen along it.
+//! positions over the points visible along it.
 
 use std::f64::consts::PI;
 
@@ -9,12 +9,12 @@ use sixfold_geometry::Vec3;
 use super::push::Pusher;
 use crate::{Grasp, GraspView, Gripper};
 
-/// Which places are tried.
+/// Which positions are tried.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ApproachGridOptions {
     /// Rotations of the hand about the approach direction, over 180 degrees; the original has one every 15 degrees.
     pub rolls: usize,
-    /// Distance of the places, metres; the original's cells measure 1 cm.
+    /// Distance of the positions, metres; the cells of the original measure 1 cm.
     pub step: f64,
 }
 
@@ -24,11 +24,11 @@ impl Default for ApproachGridOptions {
     }
 }
 
-/// Angles of the approaches from straight down, away from the camera, radians: from the top, slanted and nearly from the front
+/// Tilt of the approaches from straight down, away from the camera, radians: from the top, slanted and nearly from the front
 /// (dissertation, section 6.3.2: "top-down and forward-facing grasps"). Chosen by hand; not swept.
 const TILTS: [f64; 3] = [0.0, 0.25 * PI, 0.45 * PI];
 
-/// Candidates on the object of a view, in the order of approach, roll and place.
+/// Candidates on the object of a view, in the order of approach, roll and position.
 pub fn approach_grid_grasps(
     view: &GraspView,
     gripper: &Gripper,
@@ -53,16 +53,16 @@ pub fn approach_grid_grasps(
     found.into_iter().flatten().collect()
 }
 
-/// The approach tilted from straight down towards where the camera looks, and a level direction across it.
+/// The approach tilted from straight down towards the viewing direction, and a horizontal direction perpendicular to it.
 fn approach(down: &Vec3, tilt: f64) -> (Vec3, Vec3) {
     let level = |v: Vec3| (v - down * v.dot(down)).try_normalize(1e-3);
-    // Straight from above any direction is away from the camera.
+    // For a camera that looks straight down, any horizontal direction is away from the camera.
     let away = level(Vec3::z()).or_else(|| level(Vec3::y())).unwrap_or_else(Vec3::x);
     let approach = down * tilt.cos() + away * tilt.sin();
     (approach, down.cross(&away))
 }
 
-/// Candidates of one hand over a grid of places: each begins over the first point that lies between the pads.
+/// Candidates for one orientation of the hand over a grid of positions: each starts above the first point between the pads.
 fn over_the_object(pusher: &Pusher<'_>, approach: &Vec3, closing: &Vec3, step: f64) -> Vec<Grasp> {
     let points = &pusher.view.object.points;
     let across = approach.cross(closing);

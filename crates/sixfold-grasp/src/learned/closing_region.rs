@@ -1,26 +1,27 @@
-//! What GPD's network sees of a candidate (Ten Pas et al. 2017, section 5): the region that the hand closes on, projected along each
-//! of its three axes; for each the mean height of the points, their mean normal, and the mean height of what nobody could see.
+//! Input of GPD's network for a candidate (Ten Pas et al. 2017, section 5): the closing region of the hand, projected along each of
+//! its three axes; for each the mean height of the points, their mean normal, and the mean height of the unobserved volume.
 //!
-//! Three differences from the paper: 32x32 pixels for 60x60, a region as large as this gripper's, and points of the object alone.
+//! Three differences from the paper: 32x32 pixels instead of 60x60, a region of the size of this gripper's, and points of the
+//! object alone.
 
 use sixfold_geometry::{Pose, Vec2, Vec3};
 
 use crate::{Grasp, GraspView, Gripper};
 
-/// Pixels of each side.
+/// Pixels along each side.
 pub const SIDE: usize = 32;
-/// For each axis height, three of the normal, height of what is unobserved.
+/// For each axis: height, three channels of the normal, height of the unobserved volume.
 pub const CHANNELS: usize = 15;
 /// Channels of one axis.
 const OF_AXIS: usize = CHANNELS / 3;
-/// Cells along each side in which is asked whether they could be seen.
+/// Voxels along each side that are tested for visibility.
 const VOXELS: usize = 16;
-/// The region reaches this far before the tips, metres.
+/// The region extends this far beyond the tips, metres.
 const BEFORE_TIPS: f64 = 0.01;
-/// What is this far behind a measured surface is unobserved, metres.
+/// Voxels more than this behind a measured surface are unobserved, metres.
 const BEHIND: f64 = 0.01;
 
-/// Coordinates of the images of each axis: the axis itself, the one from left to right, the one from top to bottom.
+/// Coordinates of the images of each axis: the axis itself, the one that points right, the one that points down.
 const AXES: [[usize; 3]; 3] = [[2, 0, 1], [1, 0, 2], [0, 1, 2]];
 
 /// Images of the region between the pads: 15 channels of 32x32 pixels, one after the other, row by row.
@@ -58,12 +59,12 @@ impl ClosingRegion {
         ClosingRegion { pixels: bytes(values, counts) }
     }
 
-    /// The images, 0 where nothing is, up to 255.
+    /// The images, 0 where there is nothing, up to 255.
     pub fn pixels(&self) -> &[u8] {
         &self.pixels
     }
 
-    /// The images of the scene mirrored along the closing direction, across it, or both: as good a grasp.
+    /// The images of the scene mirrored along the closing direction, across it, or both: these grasps are equally good.
     pub fn mirrored(&self, closing: bool, across: bool) -> ClosingRegion {
         let flip = [closing, across, false];
         let mut pixels = vec![0; self.pixels.len()];
@@ -83,11 +84,11 @@ impl ClosingRegion {
     }
 }
 
-/// The box around what the hand closes on, in the gripper's frame.
+/// The bounding box of the closing region, in the gripper's frame.
 struct Extent {
     low: Vec3,
     size: Vec3,
-    /// Beyond this along x are the pads.
+    /// Position of the pads along x.
     half_opening: f64,
 }
 
@@ -101,7 +102,7 @@ impl Extent {
         }
     }
 
-    /// A point of the gripper's frame in 0 to 1 along each axis, the last from the tips to the palm; `None` outside.
+    /// A point of the gripper's frame scaled to 0 to 1 along each axis, the last from the tips to the palm; `None` outside.
     fn normalised(&self, p: &Vec3) -> Option<Vec3> {
         let q = (p - self.low).component_div(&self.size);
         let inside = (0..3).all(|k| (0.0..1.0).contains(&q[k])) && p.x.abs() < self.half_opening;
@@ -115,7 +116,7 @@ impl Extent {
     }
 }
 
-/// Pixels that a point covers, as wide as the cloud's step: at least its own.
+/// Pixels that a point covers: as wide as the cloud's spacing, at least its own pixel.
 fn pixels_around(at: f64, half: f64) -> std::ops::RangeInclusive<usize> {
     let side = SIDE as f64;
     let own = (at * side) as usize;
@@ -124,7 +125,7 @@ fn pixels_around(at: f64, half: f64) -> std::ops::RangeInclusive<usize> {
     first.min(own)..=last.max(own).min(SIDE - 1)
 }
 
-/// Adds the heights of cells that lie behind a measured surface.
+/// Adds the heights of voxels behind a measured surface.
 fn add_unobserved(
     view: &GraspView,
     region: &Extent,
@@ -161,7 +162,7 @@ fn add_unobserved(
     }
 }
 
-/// Means as bytes: heights from 1, so that 0 is nothing.
+/// Means as bytes: heights start at 1, because 0 means empty.
 fn bytes(values: &[f32], counts: &[f32]) -> Vec<u8> {
     let area = SIDE * SIDE;
     let byte = |i: usize| {
@@ -187,7 +188,7 @@ mod tests {
     use super::*;
     use crate::{AntipodalQuality, gripper_pose};
 
-    /// A wall at x = 1 cm of the hand that comes from above, from its tips to halfway to the palm, and its images.
+    /// A wall at x = 1 cm in the frame of a hand that approaches from above, from its tips to halfway to the palm, and its images.
     fn images(x: f64) -> (ClosingRegion, Gripper) {
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let mut object = PointCloud::default();
@@ -198,7 +199,7 @@ mod tests {
             }
         }
         let mut view = GraspView::from_above(object, 0.6, 0.003);
-        // Measured 2 cm behind the tips, towards the palm, in the left half of the image alone.
+        // Measured 2 cm behind the tips, towards the palm, in the left half of the image only.
         view.depth = DepthImage::from_fn(64, 64, |u, _| if u < 32 { 0.48 } else { 0.0 });
         let pose = gripper_pose(&Vec3::new(0.0, 0.0, 0.5), &Vec3::z(), &Vec3::x()).unwrap();
         let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.5, observed: 1.0 };
@@ -220,7 +221,7 @@ mod tests {
         // Along the closing direction: as far as the column.
         let expected = 1.0 + 254.0 * (0.5 + 0.01 / gripper.max_opening);
         assert!((f64::from(at(10, 16, tips + 2)) - expected).abs() <= 1.0);
-        // Unobserved is what lies behind the measured half.
+        // Voxels behind the measured half are unobserved.
         assert!(at(4, 14, 16) > 0 && at(4, SIDE - 1, 16) == 0, "{} {}", at(4, 14, 16), at(4, SIDE - 1, 16));
     }
 

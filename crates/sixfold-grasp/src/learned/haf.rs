@@ -1,7 +1,7 @@
-//! HAF as a planner: a linear classifier of height accumulated features, and the candidates that it orders.
+//! HAF as a planner: a linear classifier of height accumulated features, and the candidates that it ranks.
 //!
-//! The original trains a support vector machine (Fischinger, Weiss and Vincze 2015); ours is linear, and its margin becomes a success
-//! probability by a logistic curve (Platt 1999).
+//! The original trains a support vector machine (Fischinger, Weiss and Vincze 2015); ours is linear, and its margin is converted to
+//! a success probability with a logistic curve (Platt 1999).
 
 use rayon::prelude::*;
 
@@ -9,7 +9,7 @@ use super::heights::{HeightFeature, HeightGrid};
 use super::{ApproachGridOptions, ScoredGrasp, approach_grid_grasps};
 use crate::{GraspView, Gripper};
 
-/// Where HAF looks for grasps.
+/// Options of HAF's candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HafOptions {
     /// The candidates.
@@ -25,12 +25,12 @@ pub struct HafModel {
     pub bias: f32,
     /// Slope and offset of the logistic curve over the margin.
     pub probability: [f32; 2],
-    /// What is known of the training, for people: an object.
+    /// Information about the training for people: a JSON object.
     pub card: serde_json::Value,
 }
 
 impl HafModel {
-    /// The model that comes with Sixfold; `haf.md` beside its file says how it was trained.
+    /// The shipped model; `haf.md` next to its file describes its training.
     ///
     /// # Panics
     /// Never: a test reads it.
@@ -39,7 +39,7 @@ impl HafModel {
             .unwrap_or_else(|error| unreachable!("the shipped planner: {error}"))
     }
 
-    /// Signed distance from the border between grasps that hold and others, in its own unit.
+    /// The classifier's margin: positive for grasps predicted to hold, without a physical unit.
     pub fn margin(&self, grid: &HeightGrid) -> f32 {
         self.features.iter().map(|(feature, weight)| weight * feature.value(grid)).sum::<f32>() + self.bias
     }
@@ -63,7 +63,7 @@ pub fn haf_grasps(
         .into_par_iter()
         .map(|grasp| ScoredGrasp { score: model.score(&HeightGrid::new(view, &grasp)), grasp })
         .collect();
-    // Stable: equal ones stay in the order of the grid.
+    // A stable sort: ties keep the order of the grid.
     scored.sort_by(|a, b| b.score.total_cmp(&a.score));
     scored
 }

@@ -8,12 +8,12 @@ use thiserror::Error;
 use super::haf::HafModel;
 use super::heights::{CELLS, HeightFeature, Region};
 
-/// What the file's `kind` says.
+/// Value of the file's field `kind`.
 const KIND: &str = "haf-linear-1";
-/// The longest file that is read, bytes: ten times a planner of 1000 features.
+/// Largest file that is read, bytes: ten times a planner of 1000 features.
 const MAX_BYTES: u64 = 4 << 20;
 
-/// Why a file holds no HAF planner.
+/// Errors of HAF planner files.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum HafError {
@@ -22,29 +22,29 @@ pub enum HafError {
     Io {
         /// The file.
         file: String,
-        /// What went wrong.
+        /// The cause.
         source: std::io::Error,
     },
-    /// It is not JSON of this form.
+    /// It is not JSON in this format.
     #[error(
         "planner file {file}: expected a file that `sixfold train planner --planner haf` wrote: {source}"
     )]
     Json {
         /// The file.
         file: String,
-        /// Where and why.
+        /// Position and cause.
         source: serde_json::Error,
     },
-    /// A field holds what no planner has.
+    /// A field has an invalid value.
     #[error("planner file {file}: field {field}: found {found}, expected {expected}; train it again")]
     Field {
         /// The file.
         file: String,
         /// The field.
         field: String,
-        /// What it holds.
+        /// Its value.
         found: String,
-        /// What it may hold.
+        /// The values allowed.
         expected: &'static str,
     },
 }
@@ -63,11 +63,11 @@ struct Content {
 #[serde(deny_unknown_fields)]
 struct Weighted {
     weight: f32,
-    /// First column and row, the column and row behind the last, weight of the mean height.
+    /// First column and row, the column and row after the last, weight of the mean height.
     regions: Vec<(usize, usize, usize, usize, f32)>,
 }
 
-/// Reads a planner file; [`parse_haf`] says what it holds.
+/// Reads a planner file; see [`parse_haf`] for its contents.
 ///
 /// # Errors
 /// [`HafError`].
@@ -83,9 +83,9 @@ pub fn read_haf(path: &Path) -> Result<HafModel, HafError> {
     parse_haf(&text, &file)
 }
 
-/// Reads a planner from the text of its file; `file` stands for it in messages. The text is JSON: `kind`, the `card` of the
-/// training, the `probability` curve's slope and offset, the `bias`, and `features` with `weight` and one to four `regions` as
-/// `[column, row, end column, end row, weight]`.
+/// Reads a planner from the text of its file; `file` is used in messages. The text is JSON: `kind`, the `card` of the training, the
+/// `probability` curve's slope and offset, the `bias`, and `features` with `weight` and one to four `regions` as `[column, row, end
+/// column, end row, weight]`.
 ///
 /// # Errors
 /// [`HafError`].
@@ -126,7 +126,7 @@ pub fn parse_haf(text: &str, file: &str) -> Result<HafModel, HafError> {
     Ok(HafModel { features, bias, probability, card })
 }
 
-/// The text of a planner's file, a feature a line.
+/// The text of a planner's file, with one feature per line.
 ///
 /// # Errors
 /// [`HafError::Json`] for numbers that are not finite.

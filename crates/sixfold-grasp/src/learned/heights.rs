@@ -9,24 +9,24 @@ use crate::{Grasp, GraspView};
 pub const CELLS: usize = 14;
 /// Size of a cell, metres, as in the original.
 const CELL: f64 = 0.01;
-/// Heights are cut off this far from the tips, metres: about the length of a finger. Chosen by hand; not swept.
+/// Heights are clipped to this distance from the tips, metres: about the length of a finger. Chosen by hand; not swept.
 const MAX_HEIGHT: f64 = 0.06;
 
-/// Heights over the plane of the finger tips, towards the palm, metres: a grid around the tips, along the closing direction and
+/// Heights above the plane of the finger tips, towards the palm, metres: a grid around the tips, along the closing direction and
 /// across it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeightGrid {
     heights: [[f32; CELLS]; CELLS],
-    /// Sums of all cells before each, row and column.
+    /// Integral image: for each cell the sum of all cells in earlier rows and columns.
     sums: [[f32; CELLS + 1]; CELLS + 1],
 }
 
-/// A rectangle of cells and what its mean height counts.
+/// A rectangle of cells with a weight for its mean height.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
     /// First column and row.
     pub low: [usize; 2],
-    /// The column and row behind the last: above `low`, at most [`CELLS`].
+    /// The column and row after the last: above `low`, at most [`CELLS`].
     pub high: [usize; 2],
     /// Weight of the mean height.
     pub weight: f32,
@@ -40,7 +40,8 @@ pub struct HeightFeature {
 }
 
 impl HeightGrid {
-    /// The grid under a grasp's hand: the highest point of each cell; where there is none, the table, or the lowest height.
+    /// The grid under a grasp's hand: the highest point of each cell; if there is none, the height of the table, or the lowest
+    /// height.
     pub fn new(view: &GraspView, grasp: &Grasp) -> HeightGrid {
         let gripper_from_camera = grasp.camera_from_gripper.inverse();
         let half = 0.5 * CELL * CELLS as f64;
@@ -59,7 +60,7 @@ impl HeightGrid {
             let table = view.table?;
             let [x, y] = [x, y].map(|k| (k as f64 + 0.5) * CELL - half);
             let p = grasp.camera_from_gripper.transform_point(&Vec3::new(x, y, 0.0));
-            // How far along the approach the table is from the plane of the tips.
+            // Distance of the table from the plane of the tips along the approach.
             let slope = table.normal.dot(&grasp.approach());
             (slope < -1e-3).then(|| limit(table.distance(&p) / slope))
         };
@@ -89,7 +90,7 @@ impl HeightGrid {
         &self.heights
     }
 
-    /// The grid of the scene mirrored along the closing direction, across it, or both: as good a grasp.
+    /// The grid of the scene mirrored along the closing direction, across it, or both: these grasps are equally good.
     pub fn mirrored(&self, closing: bool, across: bool) -> HeightGrid {
         let mut heights = self.heights;
         if across {
@@ -125,7 +126,7 @@ mod tests {
 
     #[test]
     fn a_ridge_under_the_hand() {
-        // 3 cm over the tips along a line across the fingers at x = 2.5 cm, the table 2 cm under them.
+        // A ridge 3 cm above the tips along a line across the fingers at x = 2.5 cm, with the table 2 cm below the tips.
         let ridge: Vec<Vec3> =
             (-13..=13).map(|k| Vec3::new(0.025, 0.005 * f64::from(k) + 0.0001, 0.47)).collect();
         let view = GraspView::from_above(PointCloud { points: ridge, normals: vec![] }, 0.52, 0.003);

@@ -1,5 +1,5 @@
 //! GPD's candidates (Ten Pas et al. 2017, section 4): a point of the cloud, its frame of normal and curvature axis, rotations about
-//! that axis and placements along the closing direction, each pushed forward until the hand meets something.
+//! that axis and placements along the closing direction, each pushed forward until the hand touches something.
 
 use std::f64::consts::PI;
 
@@ -12,7 +12,7 @@ use sixfold_geometry::{KdTree, Mat3, Vec3};
 use super::push::Pusher;
 use crate::{Grasp, GraspView, Gripper};
 
-/// How candidates are sampled. Numbers of the paper's code where nothing else is said.
+/// How candidates are sampled. The defaults are those of the paper's code unless stated otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalFrameOptions {
     /// Points that are sampled.
@@ -34,11 +34,11 @@ impl Default for LocalFrameOptions {
     }
 }
 
-/// The hand is open as far as it goes, or half as far: GPD's hand has one opening, of about the latter.
+/// Openings of the hand as fractions of its maximum: GPD's hand has one opening, about equal to the second.
 const OPENINGS: [f64; 2] = [1.0, 0.5];
 
-/// Candidates on the object of a view, in the order of their samples: free of what was seen, with something between the pads,
-/// approaching from above the horizontal. The same seed gives the same at any number of threads.
+/// Candidates on the object of a view, in the order of their samples: free of collisions with measured points, with something
+/// between the pads, and approaching from above the horizontal. The same seed gives the same candidates at any number of threads.
 pub fn local_frame_grasps(view: &GraspView, gripper: &Gripper, options: &LocalFrameOptions) -> Vec<Grasp> {
     let cloud = &view.object;
     if cloud.is_empty() || cloud.normals.len() != cloud.len() {
@@ -65,7 +65,7 @@ pub fn local_frame_grasps(view: &GraspView, gripper: &Gripper, options: &LocalFr
 fn local_frame(pusher: &Pusher<'_>, tree: &KdTree, point: usize, radius: f64) -> Option<(Vec3, Vec3)> {
     let cloud = &pusher.view.object;
     let near = tree.within(&cloud.points[point], radius);
-    // Normals turn least along the axis of least curvature.
+    // Normals vary least along the axis of least curvature.
     let scatter: Mat3 =
         near.iter().map(|n| cloud.normals[n.index] * cloud.normals[n.index].transpose()).sum();
     let eigen = SymmetricEigen::new(scatter);
@@ -75,7 +75,7 @@ fn local_frame(pusher: &Pusher<'_>, tree: &KdTree, point: usize, radius: f64) ->
     Some((normal, axis))
 }
 
-/// The candidates of one frame: the hand's plane is that of the normal and the direction of most curvature.
+/// The candidates of one frame: the hand's plane contains the normal and the direction of largest curvature.
 fn of_frame(
     pusher: &Pusher<'_>,
     point: &Vec3,
@@ -109,7 +109,7 @@ mod tests {
 
     #[test]
     fn a_lying_cylinder_is_held_across_its_axis() {
-        // Of 4 cm across, along x, on a table that the camera looks straight down on: its upper half is seen.
+        // A cylinder of 4 cm diameter along x on a table, with the camera looking straight down: its upper half is visible.
         let mut object = PointCloud::default();
         for i in 0..=60 {
             for k in 0..=24 {

@@ -1,8 +1,8 @@
-//! What planners that learn need of geometry: candidates, and what describes one. No network is here.
+//! Geometry for learned planners: candidates and their descriptions. This crate has no networks.
 //!
 //! Two published planners with which the dissertation compares (section 6.3.2): GPD (Ten Pas et al. 2017, "Grasp pose detection in
-//! point clouds") and HAF (Fischinger, Weiss and Vincze 2015, "Learning grasps with topographic features"). What they learn from,
-//! and GPD's network, is in `sixfold-planners`.
+//! point clouds") and HAF (Fischinger, Weiss and Vincze 2015, "Learning grasps with topographic features"). Their training data and
+//! GPD's network are in `sixfold-planners`.
 
 mod approach_grid;
 mod closing_region;

@@ -1,18 +1,18 @@
-//! A hand that moves forward until it meets something, as both planners place it.
+//! Moves a hand forward until it touches something, as both planners do.
 
 use sixfold_geometry::Vec3;
 
 use crate::antipodal::THICKNESS;
 use crate::{AntipodalQuality, CollisionScene, Grasp, GraspView, Gripper, gripper_pose};
 
-/// The tips first reach this far over the surface, metres.
+/// Initial reach of the tips over the surface, metres.
 const FIRST_BITE: f64 = 0.01;
 /// Steps of the hand, metres.
 const STEP: f64 = 0.005;
-/// Minimum number of points between the pads: as the antipodal planner asks for.
+/// Minimum number of points between the pads: as in the antipodal planner.
 const MIN_POINTS: usize = 8;
 
-/// What the hand moves among: the object and its surroundings as they were seen. Nothing is assumed of the far side.
+/// The obstacles of the hand: the object and its surroundings as measured. Nothing is assumed about the far side.
 pub(super) struct Pusher<'a> {
     pub gripper: &'a Gripper,
     pub view: &'a GraspView,
@@ -26,9 +26,9 @@ impl<'a> Pusher<'a> {
         Pusher { gripper, view, scene }
     }
 
-    /// Moves the open hand along `approach` from 1 cm over `contact` on until it meets something, then along the closing direction
-    /// so that what it encloses is midway, where it stands free there. `None` when it is not free at first, or encloses next to
-    /// nothing. The grasp's quality says nothing of its contacts.
+    /// Moves the open hand along `approach`, starting with its tips 1 cm beyond `contact`, until it would collide, then along the
+    /// closing direction so that the enclosed points are midway between the pads, if the hand is free there. `None` when it is not
+    /// free at first, or encloses too few points. The grasp's quality does not describe its contacts.
     pub(super) fn push(
         &self,
         contact: &Vec3,
@@ -66,7 +66,7 @@ impl<'a> Pusher<'a> {
         Some(Grasp { camera_from_gripper: pose, opening, width: high - low, quality })
     }
 
-    /// Straight down; along the viewing direction where no table is known.
+    /// Straight down; along the viewing direction if the table is unknown.
     pub(super) fn down(&self) -> Vec3 {
         self.view.table.map_or_else(Vec3::z, |t| -t.normal)
     }

@@ -1,8 +1,8 @@
-//! Grasps with the score of whatever planner, and their clusters.
+//! Grasps with the score of any planner, and their clusters.
 
 use crate::{ClusterOptions, Grasp, GraspCluster};
 
-/// A grasp with what its planner thinks of it.
+/// A grasp with its planner's score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScoredGrasp {
     /// The grasp.
@@ -11,15 +11,15 @@ pub struct ScoredGrasp {
     pub score: f64,
 }
 
-/// Joins grasps, best first: the best grasp left takes all that are near to it. The clusters come in the order of their summed
-/// score, the highest first; equal ones in the order of their best members.
+/// Clusters grasps greedily by score: the best remaining grasp takes all that are close to it. The clusters are sorted by their
+/// summed score, the highest first; ties by their best members.
 pub fn cluster_scored(grasps: &[ScoredGrasp], options: &ClusterOptions) -> Vec<GraspCluster> {
     let mut clusters = best_of_clusters(grasps, options);
     clusters.sort_by(|a, b| b.score.total_cmp(&a.score));
     clusters
 }
 
-/// As [`cluster_scored`], in the order of their best members: the grasp with the highest score comes first, as HAF executes it.
+/// As [`cluster_scored`], sorted by their best members: the grasp with the highest score, which HAF executes, is first.
 pub fn best_of_clusters(grasps: &[ScoredGrasp], options: &ClusterOptions) -> Vec<GraspCluster> {
     let mut order: Vec<usize> = (0..grasps.len()).collect();
     order.sort_by(|&a, &b| grasps[b].score.total_cmp(&grasps[a].score).then(a.cmp(&b)));

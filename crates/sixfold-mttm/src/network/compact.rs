@@ -1,6 +1,5 @@
-//! The compact network: six convolutions on patches of 28x28 pixels in place of ResNet-50 on the whole image. A patch spans a
-//! fixed metric size, so nothing has to be learned about distances, and normals are no photographs: random weights to start
-//! from.
+//! The compact network: six convolutions on patches of 28x28 pixels in place of ResNet-50 on the whole image. A patch spans a fixed
+//! metric size, so the network need not learn distances. Normals differ from photographs, so training starts from random weights.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -15,9 +14,9 @@ use sixfold_nn::layers::{Conv, ConvConfig};
 use super::{DESCRIPTOR, flat};
 use crate::patch::PLANES;
 
-/// Channels of the maps.
+/// Channels of the feature maps.
 const CHANNELS: usize = 48;
-/// Channels of the comparison.
+/// Channels of the comparison head.
 const PAIR: usize = 64;
 
 /// Sizes of the compact network.
@@ -70,7 +69,7 @@ impl CompactConfig {
     }
 }
 
-/// The compact network, made by [`CompactConfig`].
+/// The compact network, created by [`CompactConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Compact {

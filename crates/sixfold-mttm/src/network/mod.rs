@@ -1,9 +1,9 @@
-//! The network of template matching (dissertation, section 5.2.2, figure 5.2): maps of regions, a descriptor for each, and for
-//! pairs of a region and a template a mask, a rotation, and more.
+//! The network of template matching (dissertation, section 5.2.2, figure 5.2): feature maps of regions, a descriptor for each, and
+//! for each pair of a region and a template a mask, a rotation, and more.
 //!
-//! Beyond the dissertation: depth and a plane of what was measured go in beside the normals, and a pair also gets the place of the
-//! template's reference point (the dissertation takes the visible centroid for it, its main failure by section 5.3.3) and
-//! how likely it shows the same object in about the same pose.
+//! Beyond the dissertation: the input has depth and a plane of measured pixels next to the normals. For a pair the network also
+//! predicts the position of the template's reference point (the dissertation uses the visible centroid, its main failure according
+//! to section 5.3.3) and the probability that both show the same object in about the same pose.
 
 mod compact;
 mod paper;
@@ -19,17 +19,17 @@ pub(crate) const DESCRIPTOR: usize = 128;
 /// Side of a region's map (dissertation: 14).
 pub const MAP: usize = 14;
 
-/// What the network predicts for pairs.
+/// Predictions of the network for pairs.
 #[derive(Debug, Clone)]
 pub struct Compared {
-    /// Logit of every cell of the region being the object's: `batch x 1 x 14 x 14`.
+    /// Logit that each cell of the region belongs to the object: `batch x 1 x 14 x 14`.
     pub mask: Tensor<4>,
     /// The object's rotation in the region from that in the template, a quaternion w, x, y, z that is not yet normalised:
     /// `batch x 4`.
     pub rotation: Tensor<2>,
-    /// Where the template's reference point lies, from the region's centre, as a fraction of the patch: `batch x 3`.
+    /// Position of the template's reference point relative to the region's centre, as a fraction of the patch: `batch x 3`.
     pub offset: Tensor<2>,
-    /// Logit of the pair being a match: `batch x 1`.
+    /// Logit that the pair is a match: `batch x 1`.
     pub matching: Tensor<2>,
 }
 
@@ -38,7 +38,7 @@ pub struct Compared {
 #[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
-    /// For two processor cores.
+    /// Small enough to train on two processor cores.
     Compact(Compact),
     /// The dissertation's sizes.
     Paper(Paper),
@@ -47,7 +47,7 @@ pub enum Network {
 sixfold_nn::displayed_by_name!(Network);
 
 impl Network {
-    /// Side of the patches that go in, pixels.
+    /// Side of the input patches, pixels.
     pub fn side(&self) -> usize {
         match self {
             Network::Compact(_) => CompactConfig::SIDE,
@@ -63,7 +63,7 @@ impl Network {
         }
     }
 
-    /// A network of this name with random weights, to be filled from a file.
+    /// A network of this name with random weights, whose weights are to be loaded from a file.
     pub fn of_architecture(name: &str, device: &Device) -> Option<Network> {
         match name {
             "mttm-compact" => Some(Network::Compact(CompactConfig.init(0, device))),
@@ -88,7 +88,7 @@ impl Network {
         }
     }
 
-    /// Pairs of maps: of regions, and of templates with zeros beside the object.
+    /// Predictions for pairs of maps: of regions, and of templates with zeros outside the object.
     pub fn compare(&self, regions: Tensor<4>, templates: Tensor<4>) -> Compared {
         let (mask, numbers) = match self {
             Network::Compact(n) => n.compare(regions, templates),
@@ -103,7 +103,7 @@ impl Network {
     }
 }
 
-/// Maps with zeros where the object is not; `mask` is `batch x 1 x 14 x 14` from 0 to 1.
+/// Maps with zeros outside the object; `mask` is `batch x 1 x 14 x 14` from 0 to 1.
 pub fn masked(maps: Tensor<4>, mask: Tensor<4>) -> Tensor<4> {
     maps * mask
 }

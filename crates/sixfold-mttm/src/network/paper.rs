@@ -1,9 +1,9 @@
 //! The dissertation's sizes (section 5.2.2): ResNet-50 up to an eighth of the resolution, maps of 256 channels, dense layers of
-//! 256, 256 and 128 (256, 256 and what is asked for pairs).
+//! 256, 256 and 128 (256, 256 and the number of outputs for pairs).
 //!
-//! The dissertation runs ResNet-50 once over the image and cuts regions out of its map. Here every region is looked up
-//! in the image first, 112x112 pixels of it, which gives the same map of 14x14 in the region's own scale; it costs more where many
-//! regions overlap. The planes beyond the three of the normals are not used.
+//! The dissertation runs ResNet-50 once over the image and cuts regions out of its map. Here every region is first resampled from
+//! the image to 112x112 pixels, which gives the same map of 14x14 in the region's own scale but costs more where many regions
+//! overlap. Only the three planes of the normals are used.
 
 use std::path::Path;
 
@@ -38,7 +38,7 @@ impl PaperConfig {
         self.init_with(ResNet50Config::features(2).init(seed, device), seed, device)
     }
 
-    /// The network on ResNet-50 with ImageNet weights from torchvision's file, the rest random.
+    /// The network with ImageNet weights of ResNet-50 from torchvision's file; the other weights are random.
     ///
     /// # Errors
     /// [`PretrainedError`].
@@ -73,7 +73,7 @@ impl PaperConfig {
     }
 }
 
-/// The dissertation's network, made by [`PaperConfig`].
+/// The dissertation's network, created by [`PaperConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Paper {

@@ -22,10 +22,10 @@ const DISTANCE: f64 = 0.8;
 pub struct AnchorOptions {
     /// Side of the network's input, pixels.
     pub side: usize,
-    /// Pixels kept around it on each side, for shifts.
+    /// Border kept on each side for shifts, pixels.
     pub border: usize,
-    /// Largest tilt and turn in the image plane between a region and its positive templates, radians: half the step between
-    /// templates and more, because the nearest is not always the one that is found.
+    /// Largest tilt and in-plane rotation between a region and its positive templates, radians: more than half the step between
+    /// templates, because the nearest is not always the one that is found.
     pub tilt: f64,
     /// See `tilt`.
     pub turn: f64,
@@ -45,10 +45,10 @@ impl AnchorOptions {
     }
 }
 
-/// Steps of stored depth: 127 are a whole patch.
+/// Quantisation steps of stored depth: 127 correspond to the patch's size.
 const DEPTH_STEPS: f32 = 127.0;
 
-/// A patch in bytes: normals and depth in 127ths, the depth of the whole patch's size, and whether a pixel is known.
+/// A patch in bytes: normals in 127ths, depth in 127ths of the patch's size, and whether a pixel was measured.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct SeenPatch {
     /// Pixels along a side.
@@ -83,7 +83,7 @@ impl SeenPatch {
         }
     }
 
-    /// The five planes of pixel `i` when the region's centre lies `nearer` patch sizes further away.
+    /// The five planes of pixel `i` when the region's centre is `nearer` patch sizes further away.
     pub(super) fn planes(&self, i: usize, nearer: f32) -> [f32; PLANES] {
         if !self.known[i] {
             return [0.0; PLANES];
@@ -94,13 +94,13 @@ impl SeenPatch {
     }
 }
 
-/// A template with where it belongs in the anchor's region.
+/// A template with its pose in the anchor's region.
 #[derive(Debug, Clone)]
 pub(super) struct Positive {
     pub patch: SeenPatch,
     /// Region from template.
     pub rotation: UnitQuaternion<f32>,
-    /// The reference point in the region, patch sizes.
+    /// The reference point in the region, in patch sizes.
     pub offset: [f32; 3],
 }
 
@@ -118,7 +118,7 @@ pub struct Anchor {
     /// Number of the object; `None` for a region without one.
     pub object: Option<usize>,
     pub(super) region: SeenPatch,
-    /// Which pixels of the region are the object's.
+    /// Which pixels of the region belong to the object.
     pub(super) mask: Vec<bool>,
     pub(super) positives: Vec<Positive>,
     pub(super) negative: Option<Negative>,
@@ -126,7 +126,7 @@ pub struct Anchor {
 
 /// A region with an object.
 ///
-/// `visible` are the object's pixels in the scene. `None` when the object cannot be rendered from there.
+/// `visible` are the object's pixels in the scene. `None` when nothing of the object is rendered.
 pub(super) fn anchor(
     scene: &DepthRegion,
     (number, mesh): (usize, &Mesh),
@@ -141,7 +141,7 @@ pub(super) fn anchor(
     let draw = |rotation| draw_rotated(mesh, rotation, drawn_size, DISTANCE);
     let patch =
         |t: &Template| SeenPatch::of_patch(&TemplateSurface::new(t, drawn_size).patch(0.0, size, side));
-    // The region is centred where the object's reference point lies, whether that is hidden or not.
+    // The region is centred on the object's reference point, even if that is hidden.
     let (low, high) = mesh.bounding_box();
     let middle = camera_from_object.transform_point(&((low + high) * 0.5));
     let toward = Roi { centre: middle }.camera_from_roi().inverse() * *camera_from_object;
@@ -173,7 +173,7 @@ pub(super) fn anchor(
         let turn = any_rotation(random);
         let template = draw(turn * rotation)?;
         let distance = pose_distance((&rotation, &exact), (&(turn * rotation), &template));
-        // What looks the same is no negative template.
+        // Views that look the same are not negative templates.
         (turn.angle() > 0.5 && distance > 0.05)
             .then(|| Negative { patch: patch(&template), distance: distance as f32 })
     });
@@ -186,7 +186,7 @@ pub(super) fn anchor(
     })
 }
 
-/// A region about a point where no object is looked for, as if for an object of `diameter` metres.
+/// A region without an object around a point, of the size used for an object of `diameter` metres.
 pub(super) fn without_object(
     scene: &DepthRegion,
     point: &Vec3,
@@ -204,7 +204,7 @@ pub(super) fn without_object(
     }
 }
 
-/// Which cells of a region look at pixels of a kind.
+/// Which cells of a region show pixels for which `of_kind` is true.
 fn looks_at(
     scene: &DepthRegion,
     roi: &Roi,
@@ -215,7 +215,7 @@ fn looks_at(
     roi.look(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
 }
 
-/// A rotation as there is between a view and the templates near to it.
+/// A random rotation as occurs between a view and the templates near it.
 fn small_turn(options: &AnchorOptions, random: &mut impl Rng) -> UnitQuaternion<f64> {
     let mut even = |limit: f64| limit * (2.0 * random.random::<f64>() - 1.0);
     let turn = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), even(options.turn));
@@ -223,7 +223,7 @@ fn small_turn(options: &AnchorOptions, random: &mut impl Rng) -> UnitQuaternion<
     turn * UnitQuaternion::from_axis_angle(&axis, even(options.tilt))
 }
 
-/// Any rotation, evenly (Shoemake 1992).
+/// A uniformly random rotation (Shoemake 1992).
 pub(super) fn any_rotation(random: &mut impl Rng) -> UnitQuaternion<f64> {
     let (u, v, w) = (random.random::<f64>(), random.random::<f64>(), random.random::<f64>());
     let (v, w) = (std::f64::consts::TAU * v, std::f64::consts::TAU * w);

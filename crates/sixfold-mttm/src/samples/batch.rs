@@ -1,4 +1,4 @@
-//! A step's numbers: regions, shifted, mirrored, rotated and hidden in part, with their templates.
+//! The batch of a step: regions, shifted, mirrored, rotated and partly hidden, with their templates.
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
@@ -10,18 +10,18 @@ use crate::loss::GAMMA;
 use crate::network::MAP;
 use crate::patch::PLANES;
 
-/// How regions are changed.
+/// How regions are augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Augmentation {
     /// Largest shift of the centre across the region, as a fraction of the patch (dissertation: "randomly shifted").
     pub shift: f64,
-    /// And along its axis.
+    /// Largest shift along its axis, as a fraction of the patch.
     pub depth: f64,
-    /// How often a patch and its templates are rotated by a quarter, a half or three.
+    /// Probability that a patch and its templates are rotated by 90, 180 or 270 degrees.
     pub turned: f64,
-    /// How often something stands in front.
+    /// Probability of an occluder in front.
     pub hidden: f64,
-    /// How often a rectangle was not measured.
+    /// Probability of a rectangle without measurements.
     pub lost: f64,
 }
 
@@ -31,18 +31,18 @@ impl Default for Augmentation {
     }
 }
 
-/// What is in a step.
+/// Contents of a batch.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PairBatchOptions {
     /// Regions with an object.
     pub anchors: usize,
     /// Regions without one.
     pub without_object: usize,
-    /// Fraction of the regions whose negative template is one of another object (dissertation: half); the others have one of the
-    /// same object.
+    /// Fraction of the regions whose negative template shows another object (dissertation: half); for the others it shows the same
+    /// object.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub other_objects: f64,
-    /// How regions are changed.
+    /// How regions are augmented.
     pub augmentation: Augmentation,
 }
 
@@ -61,7 +61,7 @@ fn is_zero(fraction: &f64) -> bool {
     *fraction == 0.0
 }
 
-/// Numbers of tensors: regions with an object first, then those without.
+/// Values of the input tensors: regions with an object first, then those without.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Batch {
     /// Patches of regions.
@@ -70,7 +70,7 @@ pub struct Batch {
     pub positives: Vec<f32>,
     /// See `positives`.
     pub negatives: Vec<f32>,
-    /// Fraction of every cell of the regions with an object that is the object's, `14 x 14`.
+    /// For regions with an object, the fraction of every cell that belongs to it, `14 x 14`.
     pub region_masks: Vec<f32>,
     /// The same of both kinds of templates.
     pub positive_masks: Vec<f32>,
@@ -78,17 +78,17 @@ pub struct Batch {
     pub negative_masks: Vec<f32>,
     /// Quaternions w, x, y, z: region from template.
     pub rotations: Vec<f32>,
-    /// Where the positive template's reference point lies.
+    /// Positions of the positive templates' reference points.
     pub offsets: Vec<f32>,
-    /// Margins of the negative templates (equation 5.4): twice the pose distance for one of the same object, gamma for one of another;
-    /// 0 where there is none.
+    /// Margins of the negative templates (equation 5.4): twice the pose distance for one of the same object, gamma for one of
+    /// another; 0 if there is none.
     pub margins: Vec<f32>,
     /// Numbers of the objects.
     pub objects: Vec<usize>,
 }
 
 impl Batch {
-    /// The numbers of a step: a function of pool, options, seed and step.
+    /// The batch of a step, a function of pool, options, seed and step.
     pub fn of_step(pool: &Pool, options: &PairBatchOptions, seed: u64, step: u64) -> Batch {
         let mut random = stream(seed, step);
         let mut batch = Batch::default();
@@ -113,7 +113,7 @@ impl Batch {
         batch
     }
 
-    /// Gives a fraction of the regions a positive template of another object in the batch as their negative one.
+    /// For a fraction of the regions, uses a positive template of another object in the batch as the negative one.
     fn take_others(&mut self, fraction: f64, side: usize, random: &mut impl Rng) {
         let (patch, cells, count) = (PLANES * side * side, MAP * MAP, self.objects.len());
         for k in 0..count {
@@ -173,7 +173,7 @@ fn to_cells(mask: &[bool], side: usize) -> Vec<f32> {
         .collect()
 }
 
-/// A mirror image and quarter turns: those changes of a patch that need no interpolation.
+/// Mirroring and quarter turns, which need no interpolation of a patch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Quarter {
     mirrored: bool,
@@ -181,7 +181,7 @@ struct Quarter {
 }
 
 impl Quarter {
-    /// Where a direction goes.
+    /// The image of a direction.
     fn vector(&self, [x, y, z]: [f32; 3]) -> [f32; 3] {
         let x = if self.mirrored { -x } else { x };
         match self.turns {
@@ -192,14 +192,14 @@ impl Quarter {
         }
     }
 
-    /// What a rotation becomes: its axis goes along, and a mirror image turns the other way round.
+    /// The image of a rotation: its axis is transformed, and mirroring reverses its angle.
     fn quaternion(&self, [w, x, y, z]: [f32; 4]) -> [f32; 4] {
         let axis = self.vector([x, y, z]);
         let sign = if self.mirrored { -1.0 } else { 1.0 };
         [w, sign * axis[0], sign * axis[1], sign * axis[2]]
     }
 
-    /// The pixel that comes to lie at a place.
+    /// The source pixel of a pixel.
     fn source(&self, x: usize, y: usize, side: usize) -> (usize, usize) {
         let last = side - 1;
         let (x, y) = match self.turns {
@@ -212,15 +212,15 @@ impl Quarter {
     }
 }
 
-/// What is done to a region.
+/// The augmentation of one region.
 struct Change {
     quarter: Quarter,
     /// First column and row of the kept region.
     first: [usize; 2],
-    /// How far the centre moves, patch sizes, before turning.
+    /// Shift of the centre before the rotation, in patch sizes.
     shift: [f32; 3],
-    /// Rectangles in the shifted region: x, y, width, height, and the depth of what stands there (none: not measured) with
-    /// its normal.
+    /// Rectangles in the shifted region: x, y, width, height, and the normal and depth of the occluder there (`None`: not
+    /// measured).
     rectangles: Vec<([usize; 4], Option<[f32; 4]>)>,
 }
 
@@ -240,7 +240,7 @@ impl Change {
             rectangles.push(([at[0], at[1], width, height], None));
         }
         if random.random_bool(how.hidden) {
-            // From one side of the region.
+            // The occluder enters from one side of the region.
             let deep = random.random_range(side / 8..=side / 2);
             let area = match random.random_range(0..4u32) {
                 0 => [0, 0, deep, side],
@@ -284,7 +284,7 @@ impl Change {
         (patch, mask)
     }
 
-    /// A template and its pixels: mirrored and turned, but whole and where it was.
+    /// A template and its pixels: mirrored and rotated, but neither hidden nor shifted.
     fn template(&self, seen: &SeenPatch) -> (Vec<f32>, Vec<bool>) {
         let side = seen.side;
         let (mut patch, mut mask) = (vec![0.0; PLANES * side * side], vec![false; side * side]);
@@ -318,7 +318,7 @@ mod tests {
         for mirrored in [false, true] {
             for turns in 0..4 {
                 let quarter = Quarter { mirrored, turns };
-                // A rotated direction, changed, is the changed direction, rotated by the changed rotation.
+                // Transforming a rotated direction equals rotating the transformed direction by the transformed rotation.
                 let d = Vector3::new(0.3f32, -0.8, 0.5);
                 let changed = quarter.quaternion([q.w, q.i, q.j, q.k]);
                 let p = UnitQuaternion::new_unchecked(Quaternion::new(
@@ -327,7 +327,7 @@ mod tests {
                 let a = Vector3::from(quarter.vector((q * d).into()));
                 let b = p * Vector3::from(quarter.vector(d.into()));
                 assert!((a - b).norm() < 1e-5, "{quarter:?}");
-                // The pixel to the right of the middle goes where the direction to the right goes.
+                // The pixel to the right of the centre moves as the direction to the right does.
                 let goes = quarter.vector([1.0, 0.0, 0.0]);
                 let (x, y) = ((2.0 + goes[0]) as usize, (2.0 + goes[1]) as usize);
                 assert_eq!(quarter.source(x, y, 5), (3, 2), "{quarter:?}");

@@ -1,5 +1,5 @@
-//! Training material (dissertation, sections 5.2.1, 5.2.3 and 5.3.1): cluttered scenes of synthetic objects as depth cameras see
-//! them, cut into regions with their templates once, and augmented again in every step.
+//! Training material (dissertation, sections 5.2.1, 5.2.3 and 5.3.1): cluttered scenes of synthetic objects as seen by depth
+//! cameras. Regions and their templates are cut out once and augmented again in every step.
 
 mod anchor;
 mod batch;

@@ -1,4 +1,4 @@
-//! All regions a training draws from, cut out of simulated scenes once (dissertation, section 5.3.1: about 20,000 scenes).
+//! All regions from which a training samples, cut out of simulated scenes once (dissertation, section 5.3.1: about 20,000 scenes).
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -18,18 +18,18 @@ use super::anchor::{Anchor, AnchorOptions, anchor, without_object};
 /// Objects on the table z = 0: numbers of meshes with their poses (world from object).
 pub(crate) type Arrangement = Vec<(usize, Pose)>;
 
-/// How scenes are seen.
+/// How scenes are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthPoolOptions {
-    /// Cameras that look at each arrangement.
+    /// Cameras per arrangement.
     pub views: usize,
-    /// Distance of the camera, smallest and largest, metres.
+    /// Smallest and largest distance of the camera, metres.
     pub distance: (f64, f64),
-    /// Its angle above the table, smallest and largest, radians.
+    /// Smallest and largest elevation of the camera above the table, radians.
     pub elevation: (f64, f64),
     /// Largest rotation of the image, radians.
     pub roll: f64,
-    /// Objects of which less is visible are left out (dissertation: half).
+    /// Smallest visible fraction of an object; others are left out (dissertation: half).
     pub visible: f64,
     /// Regions without an object from each view.
     pub without_object: usize,
@@ -64,11 +64,11 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Draws every arrangement from all of its cameras and cuts the regions out. The same input gives the same pool at any
-    /// number of threads; `progress` receives every arrangement. `None` when it was stopped.
+    /// Renders every arrangement from all of its cameras and cuts the regions out. The same input gives the same pool at any number
+    /// of threads; `progress` receives every arrangement. `None` when it was stopped.
     ///
     /// # Panics
-    /// For an arrangement with a number beyond the meshes.
+    /// If an arrangement has a number beyond the meshes.
     pub fn new(
         meshes: &[Mesh],
         arrangements: &[Arrangement],
@@ -94,7 +94,7 @@ impl Pool {
         Some(Pool { options: *options, with_object, without })
     }
 
-    /// How it was made.
+    /// Its options.
     pub fn options(&self) -> &DepthPoolOptions {
         &self.options
     }
@@ -165,7 +165,7 @@ fn see(
         let mesh = (*number, &meshes[*number]);
         anchors.extend(anchor(&scene, mesh, &camera_from_object, &masks[k], &options.anchors, random));
     }
-    // Elsewhere: on the table, on other things' edges, between objects.
+    // Regions elsewhere: on the table, at edges of objects, between objects.
     for _ in 0..options.without_object {
         let pixel = random.random_range(0..scene.depth().as_slice().len());
         let z = f64::from(scene.depth().as_slice()[pixel]);
@@ -190,7 +190,7 @@ fn table(size: f64) -> Option<Mesh> {
     Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).ok()
 }
 
-/// Camera from world of a camera that looks at `target`, its image rotated by `roll`.
+/// Camera from world of a camera aimed at `target`, its image rotated by `roll`.
 fn look_at(azimuth: f64, elevation: f64, distance: f64, roll: f64, target: &Vec3) -> Pose {
     let back = Vec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
     let right = Vec3::new(-azimuth.sin(), azimuth.cos(), 0.0);

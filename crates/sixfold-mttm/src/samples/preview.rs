@@ -1,4 +1,4 @@
-//! An image of what the training sees.
+//! An image of training samples.
 
 use sixfold_geometry::RgbImage;
 
@@ -6,7 +6,7 @@ use super::batch::Batch;
 use crate::network::MAP;
 use crate::patch::PLANES;
 
-/// Pixels of the image for one of a patch.
+/// Pixels of the image per pixel of a patch.
 const ZOOM: usize = 3;
 
 /// A row for each of the first regions of a batch (patches of `side` pixels): the region, the object's cells in it, the positive

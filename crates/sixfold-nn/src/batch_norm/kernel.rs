@@ -1,14 +1,14 @@
 //! Batch normalisation on plain `f32` slices (Ioffe and Szegedy 2015), with an added residual and a leaky rectifier in the
 //! same pass over memory.
 //!
-//! Every channel is one task that goes through all its pixels while they are in the cache: statistics, then output; in the
-//! backward pass sums, then gradient. A channel's sums run in a fixed order, so the number of threads changes no bit.
+//! Every channel is one task that processes all its pixels while they are in the cache: statistics, then output; in the backward
+//! pass sums, then gradient. A channel's sums have a fixed order, so the result does not depend on the number of threads.
 
 use rayon::prelude::*;
 
 use super::NormOptions;
 
-/// Sums run over pieces of this many numbers in f32 and over the pieces in f64.
+/// Sums are computed in f32 over pieces of this many numbers, and in f64 over the pieces.
 const PIECE: usize = 2048;
 const LANES: usize = 16;
 
@@ -21,7 +21,7 @@ pub(super) struct Planes {
 }
 
 impl Planes {
-    /// Numbers of one channel in the whole batch.
+    /// Count of the numbers of one channel in the whole batch.
     fn count(&self) -> f64 {
         (self.images * self.pixels) as f64
     }
@@ -32,7 +32,7 @@ impl Planes {
         values.chunks_exact(pixels).skip(channel).step_by(channels)
     }
 
-    /// The planes of every channel, to be written by one task a channel.
+    /// The planes of every channel, to be written by one task per channel.
     fn by_channel<'a>(&self, values: &'a mut [f32]) -> Vec<Vec<&'a mut [f32]>> {
         let mut channels: Vec<Vec<_>> = (0..self.channels).map(|_| Vec::with_capacity(self.images)).collect();
         for (i, plane) in values.chunks_exact_mut(self.pixels).enumerate() {
@@ -53,7 +53,7 @@ pub(super) struct Statistics {
 #[derive(Clone, Copy)]
 struct Affine {
     mean: f32,
-    /// One over the standard deviation.
+    /// Inverse of the standard deviation.
     inverse: f32,
     scale: f32,
     shift: f32,
@@ -70,8 +70,8 @@ impl Affine {
     }
 }
 
-/// Normalises with the statistics of the batch, or with `given` ones, adds the residual (empty for none) and rectifies.
-/// Writes to `y` and gives the statistics that were used.
+/// Normalises with the statistics of the batch, or with `given` ones, adds the residual (empty for none) and rectifies. Writes to
+/// `y` and returns the statistics used.
 pub(super) fn forward(
     x: &[f32],
     planes: Planes,
@@ -115,14 +115,14 @@ pub(super) fn forward(
     Statistics { mean, variance }
 }
 
-/// Mean and biased variance of all numbers, by pieces as Chan, Golub and LeVeque 1979 combine them.
+/// Mean and biased variance of all numbers, combined from pieces by the method of Chan, Golub and LeVeque 1979.
 fn moments<'a>(planes: impl Iterator<Item = &'a [f32]>) -> (f32, f32) {
     let (mut count, mut mean, mut squares) = (0.0f64, 0.0f64, 0.0f64);
     for piece in planes.flat_map(|plane| plane.chunks(PIECE)) {
         let n = piece.len() as f64;
         let center = (f64::from(sum(piece)) / n) as f32;
         let [deviation, square] = deviations(piece, center);
-        // The rounding of the piece's mean is taken back by the sum of deviations.
+        // The sum of deviations corrects the rounding of the piece's mean.
         let piece_mean = f64::from(center) + f64::from(deviation) / n;
         let piece_squares = f64::from(square) - f64::from(deviation) * f64::from(deviation) / n;
         let (total, gap) = (count + n, piece_mean - mean);
@@ -171,20 +171,20 @@ pub(super) struct Gradients {
     pub(super) bias: Vec<f32>,
 }
 
-/// What the forward pass used and gave.
+/// Inputs and results of the forward pass.
 pub(super) struct Forward<'a> {
     pub(super) x: &'a [f32],
-    /// The output; only used where there was a residual.
+    /// The output; used only if there was a residual.
     pub(super) y: &'a [f32],
     pub(super) weight: &'a [f32],
     pub(super) bias: &'a [f32],
     pub(super) statistics: &'a Statistics,
-    /// The statistics were given and do not depend on `x`.
+    /// Whether the statistics were given and do not depend on `x`.
     pub(super) given: bool,
 }
 
-/// Turns the output's gradient `dy` into the input's. With a residual, `dx` takes the input's gradient and `dy` becomes the
-/// residual's; without, `dx` is empty.
+/// Converts the output's gradient `dy` to the input's, in place. With a residual, the input's gradient is written to `dx` and `dy`
+/// becomes the residual's; without one, `dx` is empty.
 pub(super) fn backward(
     forward: &Forward<'_>,
     planes: Planes,
@@ -224,7 +224,7 @@ pub(super) fn backward(
                 }
             }
             let inverse = f64::from(affine.inverse);
-            // Ioffe and Szegedy 2015, section 3; with given statistics only the first term is left.
+            // Ioffe and Szegedy 2015, section 3; with given statistics only the first term remains.
             let of_x = if forward.given { 0.0 } else { product * inverse * inverse / planes.count() };
             let constant = if forward.given { 0.0 } else { total / planes.count() };
             let (of_x, constant) = (of_x as f32, constant as f32);

@@ -1,7 +1,7 @@
 //! Batch normalisation (Ioffe and Szegedy 2015) with its rectifier and a residual in one operation.
 //!
-//! Burn composes it of elementwise operations, a pass over memory each; here a channel is read once while it is in the
-//! cache. PyTorch's names of the tensors and its unbiased running variance.
+//! Burn composes it from elementwise operations with one pass over memory each; here a channel is read once while it is in the
+//! cache. Tensor names and the unbiased running variance are as in PyTorch.
 
 mod kernel;
 mod operation;
@@ -11,12 +11,12 @@ pub use operation::{BatchNormOps, NormKind};
 use burn::module::{Flag, Module, Param, RunningState};
 use burn::tensor::{Device, Tensor};
 
-/// Numbers of one normalisation.
+/// Parameters of one normalisation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NormOptions {
     /// Added to the variance.
     pub epsilon: f64,
-    /// Factor for values below zero: 1 for no rectifier, 0 for ReLU, between them for a leaky one.
+    /// Factor for values below zero: 1 for no rectifier, 0 for ReLU, in between for a leaky one.
     pub slope: f32,
 }
 
@@ -27,7 +27,7 @@ pub struct BatchNormConfig {
     pub channels: usize,
     /// Added to the variance.
     pub epsilon: f64,
-    /// Fraction of a new batch in the running statistics.
+    /// Weight of a new batch in the running statistics.
     pub momentum: f64,
 }
 
@@ -52,10 +52,9 @@ impl BatchNormConfig {
     }
 }
 
-/// `weight * (x - mean) / sqrt(variance + epsilon) + bias` for every channel, made by [`BatchNormConfig`].
+/// `weight * (x - mean) / sqrt(variance + epsilon) + bias` for every channel, created by [`BatchNormConfig`].
 ///
-/// On a device with gradients, mean and variance are the batch's, unless the layer is frozen; else they are the running
-/// ones.
+/// On a device with gradients, mean and variance are the batch's, unless the layer is frozen; otherwise they are the running ones.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct BatchNorm {
@@ -76,7 +75,7 @@ pub struct BatchNorm {
 crate::displayed_by_name!(BatchNorm);
 
 impl BatchNorm {
-    /// `batch x channels x height x width` in and out.
+    /// Input and output are `batch x channels x height x width`.
     ///
     /// # Panics
     /// If the number of channels is not the layer's.
@@ -84,10 +83,10 @@ impl BatchNorm {
         self.forward_rectified(x, None, 1.0)
     }
 
-    /// [`Self::forward`], then plus the residual, then values below zero times `slope`.
+    /// As [`Self::forward`], then adds the residual and multiplies values below zero by `slope`.
     ///
     /// # Panics
-    /// If the number of channels is not the layer's, or the residual's shape not the input's.
+    /// If the number of channels is not the layer's, or the residual's shape is not the input's.
     pub fn forward_rectified(&self, x: Tensor<4>, residual: Option<Tensor<4>>, slope: f32) -> Tensor<4> {
         let ([batch, channels, height, width], [expected]) = (x.dims(), self.weight.dims());
         assert_eq!(channels, expected, "batch normalisation: channels of the input {:?}", x.dims());
@@ -107,13 +106,13 @@ impl BatchNorm {
         y
     }
 
-    /// Whether the statistics of the batch are used and kept for this input.
+    /// Whether the statistics of the batch are used and recorded for this input.
     pub(crate) fn is_training(&self, x: &Tensor<4>) -> bool {
         x.device().is_autodiff() && self.training.is_enabled()
     }
 
-    /// Weights (`channels x inputs x kernel x kernel`) and bias of one convolution that does what a convolution with
-    /// these weights and no bias, followed by this layer with its running statistics, does.
+    /// Weights (`channels x inputs x kernel x kernel`) and bias of the single convolution that is equivalent to a convolution with
+    /// these weights and no bias, followed by this layer with its running statistics.
     pub fn fold(&self, weight: Tensor<4>) -> (Tensor<4>, Tensor<1>) {
         let deviation = (self.running_var.value_sync() + self.epsilon).sqrt();
         let factor = self.weight.val() / deviation;
@@ -149,7 +148,7 @@ mod tests {
         t.try_into_vec_as().unwrap()
     }
 
-    /// Both layers with the same, uneven parameters.
+    /// Both layers with the same, non-uniform parameters.
     fn layers(channels: usize, device: &Device) -> (BatchNorm, nn::BatchNorm) {
         let mut ours = BatchNormConfig::new(channels).init(device);
         let mut burns = nn::BatchNormConfig::new(channels).init(device);
@@ -195,7 +194,7 @@ mod tests {
 
             let count = (shape[0] * shape[2] * shape[3]) as f32;
             let biased = |v: Vec<f32>| -> Vec<f32> {
-                // Burn keeps the biased variance: take the factor out of the new batch's share.
+                // Burn keeps the biased variance: remove the factor from the new batch's part.
                 v.iter().map(|v| (v - 0.9) * (count - 1.0) / count + 0.9).collect()
             };
             close(vec(ours.running_mean.value_sync()), vec(burns.running_mean.value_sync()), "running mean");

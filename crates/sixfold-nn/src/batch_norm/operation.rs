@@ -1,6 +1,6 @@
 //! Batch normalisation as an operation of Burn, with its gradient: a backend extension like [`crate::ops`].
 
-// Burn's extensions take every tensor as an argument of its own.
+// Burn's extensions take every tensor as a separate argument.
 #![allow(clippy::too_many_arguments)]
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -18,8 +18,8 @@ use super::kernel::{Forward, Planes, Statistics, backward, forward};
 /// Batch normalisation for a backend.
 #[backend_extension(Flex, Autodiff)]
 pub trait BatchNormOps: Backend {
-    /// Output, mean and variance. `residual` has length 0 for none; `mean` and `variance` have length 0 where the batch's
-    /// own are to be used.
+    /// Output, mean and variance. `residual` has length 0 for none; `mean` and `variance` have length 0 if the batch's own are to
+    /// be used.
     fn sixfold_batch_norm(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -44,12 +44,12 @@ pub trait BatchNormOps: Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 }
 
-/// What took part in the forward pass.
+/// Which inputs the forward pass had.
 #[derive(Debug, Clone, Copy)]
 pub struct NormKind {
-    /// A residual was added.
+    /// Whether a residual was added.
     pub residual: bool,
-    /// Mean and variance were given.
+    /// Whether mean and variance were given.
     pub given: bool,
 }
 
@@ -122,7 +122,7 @@ impl BatchNormOps for Flex {
         };
         let length = values(&x).len();
         let mut dx = vec![0.0; if kind.residual { length } else { 0 }];
-        // In place where nobody else holds the gradient, else in a copy.
+        // In place if the gradient is not shared, otherwise in a copy.
         let gradient = &mut dy.storage_mut::<f32>()[..length];
         let gradients = backward(&used, planes(&x), options, gradient, &mut dx);
         let (weight, bias) = (per_channel(gradients.weight), per_channel(gradients.bias));

@@ -1,23 +1,23 @@
-//! Dense convolutions as matrix products: pointwise ones directly on the image, others through patches laid out as
-//! columns (im2col), a band of rows at a time so that the patches stay in the cache.
+//! Dense convolutions as matrix products: pointwise ones directly on the image, others through patches arranged as columns
+//! (im2col), one band of rows at a time, so that the patches stay in the cache.
 
 use super::shared::{Shared, View, activate, before_activation, multiply, sum, unwritten, written, zeroed};
 use super::{ConvGradients, ConvShape, ConvSpec};
 use rayon::prelude::*;
 use std::cell::RefCell;
 
-/// Patch matrices are kept below this many numbers (1 MiB).
+/// Upper bound of the size of patch matrices, numbers (1 MiB).
 const BAND: usize = 1 << 18;
 
-/// Groups of images whose weight gradients are summed apart and then together: fixed, so that the sum does not depend
-/// on the number of threads.
+/// Number of groups of images whose weight gradients are summed separately and then together: fixed, so that the sum does not
+/// depend on the number of threads.
 const GROUPS: usize = 8;
 
 thread_local! {
     static COLUMNS: RefCell<[Vec<f32>; 3]> = const { RefCell::new([Vec::new(), Vec::new(), Vec::new()]) };
 }
 
-/// A buffer of at least `length` numbers; what it held is undefined.
+/// A buffer of at least `length` numbers; its content is undefined.
 fn sized(buffer: &mut Vec<f32>, length: usize) -> &mut [f32] {
     if buffer.len() < length {
         buffer.resize(length, 0.0);
@@ -41,7 +41,7 @@ impl Plan {
         let out = shape.output_size(spec);
         let patch = shape.inputs * shape.kernel * shape.kernel;
         let pointwise = shape.kernel == 1 && spec.stride == 1 && spec.padding == [0, 0];
-        // Products of fewer than 128 columns are slow, whatever the cache.
+        // Products of fewer than 128 columns are slow, independent of the cache.
         let longest = if pointwise { BAND / (shape.inputs + shape.outputs) } else { (BAND / patch).max(128) };
         Self { out, patch, rows: (longest / out[1]).clamp(1, out[0]), pointwise }
     }
@@ -61,14 +61,14 @@ impl Plan {
     }
 }
 
-/// Output columns for which column `kx` of the kernel lies inside the image: `[first, last)`.
+/// Output columns for which column `kx` of the kernel is inside the image: `[first, last)`.
 fn inside(kx: usize, width: usize, out: usize, spec: &ConvSpec) -> (usize, usize) {
     let first = spec.padding[0].saturating_sub(kx).div_ceil(spec.stride);
     let last = (width + spec.padding[0]).saturating_sub(kx).div_ceil(spec.stride);
     (first.min(out), last.min(out))
 }
 
-/// Lays the patches of output rows `first..first + rows` of one image out as columns: `patch x (rows * out columns)`.
+/// Arranges the patches of output rows `first..first + rows` of one image as columns: `patch x (rows * out columns)`.
 fn columns(
     x: &[f32],
     shape: &ConvShape,
@@ -110,7 +110,7 @@ fn columns(
     }
 }
 
-/// The transpose of [`columns`]: adds each number of the patches to the pixel it came from.
+/// The transpose of [`columns`]: adds each number of the patches to its source pixel.
 fn add_columns(
     patches: &[f32],
     shape: &ConvShape,
@@ -164,7 +164,7 @@ pub(super) fn dense_forward(
     let mut y = unwritten(shape.batch * shape.outputs * pixels);
     let shared = Shared::new(&mut y);
     let image = shape.inputs * shape.pixels();
-    // Several images keep both cores busy; a single one is cut into bands (at least four where it can be).
+    // Several images keep both cores busy; a single one is split into bands (at least four if possible).
     let plan =
         if shape.batch == 1 { Plan { rows: plan.rows.min(plan.out[0].div_ceil(4)), ..plan } } else { plan };
     (0..shape.batch * plan.bands()).into_par_iter().for_each(|task| {

@@ -1,7 +1,7 @@
-//! Depthwise convolutions (one kernel a channel), directly, a row at a time.
+//! Depthwise convolutions (one kernel per channel), computed directly, one row at a time.
 //!
-//! Each channel is copied into a padded buffer; with a stride of two its even and odd columns are kept apart, so that
-//! every inner loop runs over neighbouring numbers.
+//! Each channel is copied into a padded buffer; with a stride of two its even and odd columns are stored separately, so that every
+//! inner loop runs over contiguous numbers.
 
 use super::shared::{Shared, activate, before_activation, sum, unwritten, vectorised, written};
 use super::{ConvGradients, ConvShape, ConvSpec};
@@ -32,7 +32,7 @@ impl Padded {
         ((kx % self.stride) * self.rows + row) * self.columns + kx / self.stride
     }
 
-    /// First image column that lies in a phase of a padded row, and its place in the buffer.
+    /// First image column in a phase of a padded row, and its index in the buffer.
     fn phase(&self, row: usize, phase: usize, spec: &ConvSpec) -> (usize, usize) {
         let first = (phase + self.stride - spec.padding[0] % self.stride) % self.stride;
         (first, self.start(row, phase) + (first + spec.padding[0]) / self.stride)
@@ -92,8 +92,8 @@ vectorised! {
 }
 
 vectorised! {
-    /// Weight gradient of one channel: for every tap the sum over the rows of `gradient * source`. `starts` holds the
-    /// taps of each row, `gradient` rows of `wide` columns, a multiple of sixteen.
+    /// Weight gradient of one channel: for every tap the sum over the rows of `gradient * source`. `starts` has the taps of each
+    /// row, `gradient` has rows of `wide` columns, a multiple of sixteen.
     fn weight_gradient(dweight: &mut [f32], gradient: &[f32], wide: usize, source: &[f32], starts: &[usize]) {
         let area = dweight.len();
         for (tap, d) in dweight.iter_mut().enumerate() {
@@ -198,7 +198,7 @@ pub(super) fn depthwise_backward(
     let turned_starts = if turned { taps(&turned_padded, shape.kernel, shape.size[0]) } else { Vec::new() };
     let shared = Shared::new(&mut dx);
     let starts = taps(&padded, shape.kernel, rows);
-    // Rows of the gradient, filled up with zeros to whole vectors.
+    // Rows of the gradient, padded with zeros to whole vectors.
     let wide = columns.next_multiple_of(16);
     let gradients: Vec<(Vec<f32>, f32)> = (0..shape.outputs)
         .into_par_iter()

@@ -1,8 +1,8 @@
-//! Bilinear look-up of feature maps at given places, and its gradient. Only the places cost anything.
+//! Bilinear sampling of feature maps at given positions, and its gradient. The cost depends only on the number of positions.
 
 use rayon::prelude::*;
 
-/// A pixel that is to be filled and where its value comes from.
+/// A pixel to be filled, and the position of its value in the map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SampledPixel {
     /// Number of the pixel, row by row.
@@ -13,17 +13,17 @@ pub struct SampledPixel {
     pub y: f32,
 }
 
-/// What a batch of images is made of: for every one the places in its map; pixels without a place are 0.
+/// The sampling positions for a batch of images: for every image the positions in its map; pixels without a position are 0.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Places {
-    /// Rows and columns of the images that are made.
+    /// Rows and columns of the output images.
     pub size: [usize; 2],
-    /// Places of every image.
+    /// Positions of every image.
     pub images: Vec<Vec<SampledPixel>>,
 }
 
-/// The four neighbours of a place in a map of `height x width`, and their weights. Beyond the outer pixels' centres the map
-/// continues as it ends.
+/// The four neighbours of a position in a map of `height x width`, and their weights. Beyond the outer pixels' centres the border
+/// values are repeated.
 #[inline]
 pub fn neighbours(x: f32, y: f32, [height, width]: [usize; 2]) -> ([usize; 4], [f32; 4]) {
     let u = (x * width as f32 - 0.5).clamp(0.0, (width - 1) as f32);
@@ -66,7 +66,7 @@ pub(crate) fn gather_backward(dout: &[f32], channels: usize, size: [usize; 2], p
     if dmaps.is_empty() {
         return dmaps;
     }
-    // An image's places add up in their order on one thread, whatever the number of threads.
+    // The positions of an image are summed in order on one thread, independent of the number of threads.
     dmaps
         .par_chunks_mut(channels * small)
         .zip(dout.par_chunks(channels * large))

@@ -1,13 +1,13 @@
 //! The element-wise half of a convolutional LSTM (Shi et al. 2015, equation 3, without peepholes), forward and backward in one
 //! pass each.
 //!
-//! Gates of one channel lie beside each other: planes `4c` to `4c + 3` are input, forget and output gate and the candidate
-//! of channel `c`, before their activation.
+//! Gates of one channel are adjacent: planes `4c` to `4c + 3` are input, forget and output gate and the candidate of channel `c`,
+//! before their activation.
 
 use super::shared::vectorised;
 use rayon::prelude::*;
 
-/// tanh as a ratio of polynomials, off by 4e-7 at most: unlike the library's it is computed sixteen numbers at a time.
+/// tanh as a ratio of polynomials, with an error of at most 4e-7: unlike the library's it processes sixteen numbers at a time.
 #[inline(always)]
 fn tanh(x: f32) -> f32 {
     let x = x.clamp(-7.9, 7.9);
@@ -75,7 +75,7 @@ vectorised! {
     }
 }
 
-/// Gates (four planes of `pixels` numbers a channel) and the cell's state before to, first, the hidden state, then the new
+/// From gates (four planes of `pixels` numbers per channel) and the cell's previous state to the hidden state followed by the new
 /// state, both in the shape of `before`.
 pub(crate) fn lstm_forward(gates: &[f32], before: &[f32], pixels: usize) -> Vec<f32> {
     let mut out = vec![0.0; 2 * before.len()];
@@ -89,7 +89,7 @@ pub(crate) fn lstm_forward(gates: &[f32], before: &[f32], pixels: usize) -> Vec<
     out
 }
 
-/// Gradients with respect to gates and state before, from the output of [`lstm_forward`] and the gradient with respect to it.
+/// Gradients with respect to gates and previous state, from the output of [`lstm_forward`] and the gradient with respect to it.
 pub(crate) fn lstm_backward(
     gates: &[f32],
     before: &[f32],

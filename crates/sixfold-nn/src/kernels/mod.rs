@@ -1,8 +1,8 @@
 //! Convolution kernels on plain `f32` slices: forward and backward of dense, pointwise and depthwise convolutions
 //! with bias and activation in one pass.
 //!
-//! All images are `channels x height x width`, row-major, batches one image after the other. Every sum runs in an
-//! order that the thread count does not change.
+//! All images are `channels x height x width`, row-major, batches one image after another. The order of every sum is independent of
+//! the number of threads.
 
 mod dense;
 mod depthwise;
@@ -28,7 +28,7 @@ use depthwise::{depthwise_backward, depthwise_forward};
 /// `outputs x inputs / groups x kernel x kernel`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ConvShape {
-    /// Images.
+    /// Number of images.
     pub batch: usize,
     /// Input channels.
     pub inputs: usize,
@@ -53,14 +53,14 @@ impl ConvShape {
     }
 }
 
-/// Gradients of a convolution; those that were not asked for are empty.
+/// Gradients of a convolution; those not requested are empty.
 #[derive(Debug, Default)]
 pub struct ConvGradients {
-    /// With respect to the input, in its shape.
+    /// Gradient with respect to the input, in its shape.
     pub x: Vec<f32>,
-    /// With respect to the weights, in their shape.
+    /// Gradient with respect to the weights, in their shape.
     pub weight: Vec<f32>,
-    /// With respect to the bias.
+    /// Gradient with respect to the bias.
     pub bias: Vec<f32>,
 }
 
@@ -81,7 +81,7 @@ pub(crate) fn conv_forward(
 
 /// Gradients of [`conv_forward`], from its output `y` and the gradient `dy` with respect to it.
 ///
-/// `wanted` says which of input, and weight with bias, are needed.
+/// `wanted` selects the gradients that are needed: that of the input, and those of weight and bias.
 pub(crate) fn conv_backward(
     x: &[f32],
     weight: &[f32],

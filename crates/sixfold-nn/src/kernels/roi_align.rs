@@ -1,12 +1,12 @@
-//! RoIAlign (He et al. 2017, section 3): boxes of a feature map brought to one size by bilinear samples in every bin, and its
-//! gradient.
+//! RoIAlign (He et al. 2017, section 3): resamples boxes of a feature map to a common size by bilinear samples in every bin, and
+//! its gradient.
 //!
-//! As torchvision has it without `aligned`: a box's coordinates times the scale are places in the map, pixel centres lie on whole
-//! numbers, a box has at least one pixel, and samples more than one pixel outside of the map are 0.
+//! As in torchvision without `aligned`: a box's coordinates times the scale are positions in the map, pixel centres are at whole
+//! numbers, a box has at least one pixel, and samples more than one pixel outside the map are 0.
 
 use rayon::prelude::*;
 
-/// Boxes to be pooled, and how.
+/// Boxes to be pooled, and the options.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Regions {
     /// Left, top, right and bottom in the image's pixels.
@@ -15,7 +15,7 @@ pub struct Regions {
     pub scale: f32,
     /// Bins along each side of the output.
     pub side: usize,
-    /// Samples along each side of a bin; `None`: one a pixel of the map.
+    /// Samples along each side of a bin; `None`: one per pixel of the map.
     pub samples: Option<usize>,
 }
 
@@ -26,15 +26,15 @@ struct Sample {
     weights: [f32; 4],
 }
 
-/// The samples of a box, bin by bin, and how many a bin has.
+/// The samples of a box, bin by bin, and their number per bin.
 struct Grid {
     samples: Vec<Sample>,
     per_bin: usize,
 }
 
-/// Neighbours of a place along one side and the fraction of the second; `None` outside.
+/// Neighbours of a position along one side and the weight of the second; `None` outside.
 fn along(place: f32, side: usize) -> Option<(usize, usize, f32)> {
-    // Not a number is outside, too.
+    // NaN counts as outside, too.
     if !(place >= -1.0 && place <= side as f32) {
         return None;
     }
@@ -79,7 +79,7 @@ impl Regions {
     }
 }
 
-/// `boxes x channels x side x side` from a map of `channels x size`.
+/// Computes `boxes x channels x side x side` from a map of `channels x size`.
 pub fn roi_align_forward(map: &[f32], channels: usize, size: [usize; 2], regions: &Regions) -> Vec<f32> {
     let (plane, bins) = (size[0] * size[1], regions.side * regions.side);
     let mut out = vec![0.0; regions.boxes.len() * channels * bins];
@@ -116,7 +116,7 @@ pub(crate) fn roi_align_backward(
         return dmap;
     }
     let grids: Vec<Grid> = regions.boxes.par_iter().map(|b| regions.grid(b, size)).collect();
-    // A channel's boxes add up in their order on one thread, whatever the number of threads.
+    // The boxes of a channel are summed in order on one thread, independent of the number of threads.
     dmap.par_chunks_mut(plane).enumerate().for_each(|(channel, dmap)| {
         for (number, grid) in grids.iter().enumerate() {
             let dout = &dout[(number * channels + channel) * bins..][..bins];
@@ -155,7 +155,7 @@ mod tests {
                             continue;
                         }
                         let (x, y) = (x.clamp(0.0, (width - 1) as f64), y.clamp(0.0, (height - 1) as f64));
-                        // The tent about each pixel.
+                        // The tent function around each pixel.
                         for py in [y.floor() as i64, y.floor() as i64 + 1] {
                             for px in [x.floor() as i64, x.floor() as i64 + 1] {
                                 if px < width && py < height {

@@ -1,5 +1,5 @@
-//! What all convolution kernels share: their options, the activation, vector code for several processors, and
-//! writing to disjoint parts of one output from several threads.
+//! Code shared by all convolution kernels: their options, the activation, vector code for several processors, and writing to
+//! disjoint parts of one output from several threads.
 
 use std::marker::PhantomData;
 use std::mem::{ManuallyDrop, MaybeUninit};
@@ -36,8 +36,8 @@ impl ConvSpec {
     }
 }
 
-/// Compiles the body once for AVX-512, once for AVX2 and once for any processor, and calls the best one.
-/// Multiplication and addition stay apart, so that all of them give the same bits.
+/// Compiles the body once for AVX-512, once for AVX2 and once for any processor, and calls the best one. Multiplication and
+/// addition are not fused, so that all of them give the same bits.
 macro_rules! vectorised {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block) => {
         $(#[$meta])*
@@ -91,7 +91,7 @@ vectorised! {
 }
 
 vectorised! {
-    /// Gradient before the activation: `dy` where the output `y` is inside the activation's linear part, else 0.
+    /// Gradient before the activation: `dy` where the output `y` is inside the activation's linear part, otherwise 0.
     pub(super) fn before_activation(out: &mut [f32], y: &[f32], dy: &[f32], activation: Activation) {
         match activation {
             Activation::Linear => out.copy_from_slice(dy),
@@ -110,7 +110,7 @@ vectorised! {
 }
 
 vectorised! {
-    /// Sum of a slice, in sixteen lanes.
+    /// Sum of a slice, computed in sixteen lanes.
     pub(super) fn sum(values: &[f32]) -> f32 {
         let mut lanes = [0.0f32; 16];
         let chunks = values.chunks_exact(16);
@@ -124,7 +124,7 @@ vectorised! {
     }
 }
 
-/// A mutable buffer that several threads write to, each its own part.
+/// A mutable buffer to which several threads write, each to its own part.
 #[derive(Clone, Copy)]
 pub(super) struct Shared<'a> {
     start: *mut MaybeUninit<f32>,
@@ -161,7 +161,7 @@ impl<'a> Shared<'a> {
     }
 }
 
-/// A buffer whose every number is written before it is read: zeroing large outputs first takes as long as a layer.
+/// A buffer in which every number is written before it is read: zeroing large outputs first would take as long as a layer.
 pub(super) fn unwritten(length: usize) -> Vec<MaybeUninit<f32>> {
     let mut buffer = Vec::with_capacity(length);
     // SAFETY: the capacity is there, and a `MaybeUninit` needs no value.
@@ -172,9 +172,9 @@ pub(super) fn unwritten(length: usize) -> Vec<MaybeUninit<f32>> {
     buffer
 }
 
-/// The same, with zeros in it.
+/// The same, filled with zeros.
 pub(super) fn zeroed(length: usize) -> Vec<MaybeUninit<f32>> {
-    // Zeroed as numbers: the system gives pages of zeros for nothing.
+    // Allocated as zeroed numbers: the system provides zeroed pages without cost.
     let mut buffer = ManuallyDrop::new(vec![0.0f32; length]);
     // SAFETY: the parts of a vector that nobody drops; `MaybeUninit<f32>` has the layout of `f32`.
     #[allow(unsafe_code)]

@@ -1,18 +1,18 @@
-//! Doubling an image by repeating pixels or bilinearly, and the gradients.
+//! Upsampling an image by two, by repeating pixels or bilinearly, and the gradients.
 
 use super::shared::vectorised;
 use rayon::prelude::*;
 
-/// What the pixels between the pixels of the small image are.
+/// Interpolation between the pixels of the small image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Upsampling {
     /// Copies: every pixel becomes 2x2 pixels.
     Repeated,
-    /// Three quarters of the nearest pixel and one of the next one in each direction; the border's pixel beyond the border.
+    /// Three quarters of the nearest pixel and one of the next one in each direction; beyond the border its pixels are repeated.
     Bilinear,
 }
 
-/// Twice the rows and columns. `x` holds planes of `height x width`.
+/// Upsamples to twice the rows and columns. `x` has planes of `height x width`.
 pub(crate) fn upsample_2x(x: &[f32], [height, width]: [usize; 2], kind: Upsampling) -> Vec<f32> {
     let mut out = vec![0.0; x.len() * 4];
     let planes = out.par_chunks_mut(4 * height * width).zip(x.par_chunks(height * width));

@@ -1,8 +1,8 @@
-//! U2-Net-p (Qin, Zhang, Huang, Dehghan, Zaiane and Jagersand 2020, "U2-Net: Going deeper with nested U-structure for salient object
-//! detection"): which pixels of a photograph belong to what stands out in it, with weights that its authors trained.
+//! U2-Net-p (Qin, Zhang, Huang, Dehghan, Zaiane and Jagersand 2020, "U2-Net: Going deeper with nested U-structure for salient
+//! object detection"): which pixels of a photograph belong to salient objects, with its authors' weights.
 //!
-//! Batch normalisation is folded into the convolutions. Images are resized to 320x320 pixels by a triangle filter as wide as the
-//! scale asks for (Pillow's `BILINEAR`), the map back by the same.
+//! Batch normalisation is folded into the convolutions. Images are resized to 320x320 pixels by a triangle filter whose width
+//! depends on the scale (Pillow's `BILINEAR`), and the map is resized back in the same way.
 
 mod network;
 mod resize;
@@ -19,26 +19,26 @@ use crate::weights::{WeightsError, load_weights, load_weights_from_bytes};
 
 /// Name of the network in weight files.
 pub const ARCHITECTURE: &str = "u2netp";
-/// Side in pixels of the images that the network was trained on and sees here.
+/// Side of the network's input images, in training and here, pixels.
 pub const SIDE: usize = 320;
-/// Mean of red, green and blue that the network expects, in parts of the largest value of the image.
+/// Mean of red, green and blue that the network expects, as a fraction of the largest value of the image.
 pub const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// Their standard deviation.
 pub const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 
-/// The weights that this crate carries (2.3 MB, Apache-2.0; their card lies beside them).
+/// The weights shipped with this crate (2.3 MB, Apache-2.0; their card is next to them).
 const WEIGHTS: &[u8] = include_bytes!("../../weights/u2netp.safetensors");
 
-/// Why nothing salient could be looked for in an image.
+/// Why the salience of an image could not be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SalientError {
     /// The image has no pixels.
     #[error("image: expected at least one pixel, found {width}x{height}")]
     EmptyImage {
-        /// Columns.
+        /// Number of columns.
         width: usize,
-        /// Rows.
+        /// Number of rows.
         height: usize,
     },
     /// No pixel of the image has its centre in the rectangle.
@@ -48,28 +48,29 @@ pub enum SalientError {
         rect.x, rect.y, rect.width, rect.height
     )]
     OutsideImage {
-        /// Columns.
+        /// Number of columns.
         width: usize,
-        /// Rows.
+        /// Number of rows.
         height: usize,
-        /// What was asked for.
+        /// The requested rectangle.
         rect: Rect,
     },
 }
 
-/// How salient the pixels of an image are.
+/// Salience of the pixels of an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Salience {
-    /// The network's answer for each pixel, 0 to 1, of the image's size. For a rectangle of the image, 0 around it.
+    /// The network's output for each pixel, 0 to 1, of the image's size. For a rectangle of the image it is 0 outside the
+    /// rectangle.
     pub probability: Image<f32>,
-    /// The smallest answer at the network's resolution.
+    /// The smallest output at the network's resolution.
     pub lowest: f32,
-    /// The largest. Where it is far below 1 nothing stands out, and [`Salience::relative`] shows noise.
+    /// The largest output. If it is far below 1, nothing is salient, and [`Salience::relative`] shows noise.
     pub highest: f32,
 }
 
 impl Salience {
-    /// The answers stretched so that the smallest is 0 and the largest 1, as the network's authors do. All 0 where they are equal.
+    /// The outputs scaled so that the smallest is 0 and the largest 1, as the network's authors do. All 0 if they are equal.
     pub fn relative(&self) -> Image<f32> {
         let range = self.highest - self.lowest;
         if range > 0.0 {
@@ -79,7 +80,7 @@ impl Salience {
         }
     }
 
-    /// Pixels whose [`Salience::relative`] value is above a threshold, 0.5 for what is more likely salient than not.
+    /// Pixels whose [`Salience::relative`] value is above a threshold, 0.5 for pixels that are more likely salient than not.
     pub fn mask(&self, threshold: f32) -> Mask {
         self.relative().map(|v| *v > threshold)
     }
@@ -93,20 +94,20 @@ pub struct SalientNetwork {
 }
 
 impl SalientNetwork {
-    /// The network with its authors' weights, from within the program.
+    /// The network with its authors' weights, which are shipped with the program.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped(device: &Device) -> Result<SalientNetwork, WeightsError> {
         let name = Path::new("u2netp.safetensors");
         let layers = load_weights_from_bytes(Layers::empty(device), name, WEIGHTS, ARCHITECTURE)?.0;
         Ok(SalientNetwork { layers, device: device.clone() })
     }
 
-    /// The network with the weights of a file that `checks/convert_u2netp.py` made.
+    /// The network with the weights of a file from `checks/convert_u2netp.py`.
     ///
     /// # Errors
-    /// [`WeightsError`]: an unreadable or broken file, another network's, and the first tensor that does not fit.
+    /// [`WeightsError`]: for an unreadable or broken file, one of another network, and the first tensor that does not fit.
     pub fn load(path: &Path, device: &Device) -> Result<SalientNetwork, WeightsError> {
         let layers = load_weights(Layers::empty(device), path, ARCHITECTURE)?.0;
         Ok(SalientNetwork { layers, device: device.clone() })
@@ -117,7 +118,7 @@ impl SalientNetwork {
         &self.layers
     }
 
-    /// What the layers see of an image, `1 x 3 x 320 x 320`: resized, divided by its largest value, normalised.
+    /// The layers' input for an image, `1 x 3 x 320 x 320`: resized, divided by its largest value, normalised.
     ///
     /// # Errors
     /// [`SalientError::EmptyImage`].
@@ -130,7 +131,7 @@ impl SalientNetwork {
             .map(|channel| resized(&image.map(|pixel| f32::from(pixel[channel])), [SIDE, SIDE]))
             .collect();
         let largest = planes.iter().flat_map(Image::as_slice).copied().fold(0.0, f32::max);
-        // A black image stays black.
+        // A black image is not scaled.
         let scale = if largest > 0.0 { 1.0 / largest } else { 1.0 };
         let values: Vec<f32> = planes
             .iter()
@@ -142,7 +143,7 @@ impl SalientNetwork {
         Ok(Tensor::from_data(TensorData::new(values, [1, 3, SIDE, SIDE]), &self.device))
     }
 
-    /// How salient each pixel of an image is.
+    /// The salience of each pixel of an image.
     ///
     /// # Errors
     /// [`SalientError::EmptyImage`].
@@ -156,13 +157,13 @@ impl SalientNetwork {
         Ok(Salience { probability: resized(&small, [width, height]), lowest, highest })
     }
 
-    /// How salient each pixel whose centre lies in a rectangle is, seen without what is around it; the map has the image's size.
+    /// The salience of each pixel whose centre is in a rectangle, computed without its surroundings; the map has the image's size.
     ///
     /// # Errors
-    /// [`SalientError::OutsideImage`] where the rectangle holds no pixel's centre.
+    /// [`SalientError::OutsideImage`] if the rectangle contains no pixel's centre.
     pub fn salience_in(&self, image: &RgbImage, rect: Rect) -> Result<Salience, SalientError> {
         let (width, height) = image.size();
-        // A pixel's centre lies half a pixel from its edges; NaN gives an empty range.
+        // A pixel's centre is half a pixel from its edges; NaN gives an empty range.
         let range = |start: f64, length: f64, side: usize| {
             let first = (start - 0.5).ceil().max(0.0) as usize;
             let last = (start + length - 0.5).ceil().clamp(0.0, side as f64) as usize;

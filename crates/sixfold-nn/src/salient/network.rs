@@ -1,4 +1,4 @@
-//! The layers of U2-Net-p: a U-shaped network whose every stage is a small U-shaped network.
+//! The layers of U2-Net-p: a U-shaped network in which every stage is a small U-shaped network.
 
 use burn::module::Module;
 use burn::tensor::module::max_pool2d;
@@ -9,25 +9,25 @@ use crate::enlarge::{doubled, enlarged};
 use crate::kernels::Activation;
 use crate::layers::{Conv, ConvConfig, Padding};
 
-/// Sides of images are multiples of this many pixels.
+/// Sides of images must be multiples of this many pixels.
 pub const MULTIPLE: usize = 32;
 
 /// Channels between the stages.
 const OUTER: usize = 64;
 /// Channels within a stage.
 const INNER: usize = 16;
-/// Levels of the stages from fine to coarse: the first four halve the map between their levels, the others widen the kernels.
+/// Levels of the stages from fine to coarse: the first four halve the map between their levels, the others dilate the kernels.
 const LEVELS: [usize; 6] = [7, 6, 5, 4, 4, 4];
-/// Stages that halve the map between their levels.
+/// Number of stages that halve the map between their levels.
 const HALVING: usize = 4;
 
-/// One stage: down over its levels, up again, and added to where it began ("residual U-block").
+/// One stage: down through its levels, up again, and added to its input ("residual U-block").
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct Stage {
     input: Conv,
     down: Vec<Conv>,
-    /// The deepest first.
+    /// The layers of the upward path, the deepest first.
     up: Vec<Conv>,
     halves: bool,
 }
@@ -41,7 +41,7 @@ impl Stage {
         Stage { input: layer(inputs, OUTER), down, up, halves: level < HALVING }
     }
 
-    /// How far apart the nine pixels are that a convolution at a level looks at.
+    /// Distance of the nine pixels of a convolution at a level.
     fn dilation(&self, level: usize) -> usize {
         match (self.halves, level + 1 == self.down.len()) {
             (true, false) => 1,
@@ -77,14 +77,14 @@ impl Stage {
     }
 }
 
-/// The layers, made by `Layers::empty` and filled from a weight file.
+/// The layers, created by `Layers::empty` and filled from a weight file.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Layers {
     encoder: Vec<Stage>,
-    /// The coarsest first.
+    /// The stages of the decoder, the coarsest first.
     decoder: Vec<Stage>,
-    /// One map from every stage of the way up, the finest first, and from the last stage of the way down.
+    /// One map from every stage of the decoder, the finest first, and from the last stage of the encoder.
     sides: Vec<Conv>,
     fusion: Conv,
 }
@@ -105,12 +105,12 @@ impl Layers {
         }
     }
 
-    /// How salient each pixel is, 0 to 1, `batch x 1 x height x width`: the first of the seven maps that the network is trained
-    /// on, which is made of the other six. `x` is `batch x 3 x height x width`, red, green and blue divided by the largest value
-    /// of the image, then normalised by [`MEAN`](super::MEAN) and [`DEVIATION`](super::DEVIATION).
+    /// The salience of each pixel, 0 to 1, `batch x 1 x height x width`: the first of the seven maps that the network is trained
+    /// on, which is computed from the other six. `x` is `batch x 3 x height x width`, red, green and blue divided by the largest
+    /// value of the image, then normalised by [`MEAN`](super::MEAN) and [`DEVIATION`](super::DEVIATION).
     ///
     /// # Panics
-    /// If a side is no multiple of 32 pixels.
+    /// If a side is not a multiple of 32 pixels.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let [_, _, height, width] = x.dims();
         assert!(
@@ -126,7 +126,7 @@ impl Layers {
             x = stage.forward(x);
             maps.push(x.clone());
         }
-        // The coarsest map is where the way up begins.
+        // The decoder starts with the coarsest map.
         maps.pop();
         let side = |level: usize, x: &Tensor<4>| enlarged(self.sides[level].forward(x.clone()), 1 << level);
         let mut sides = vec![side(LEVELS.len() - 1, &x)];
@@ -147,12 +147,12 @@ fn empty(channels: [usize; 2], kernel: usize, activation: Activation, device: &D
     config.with_values(vec![0.0; count], vec![0.0; channels[1]], device)
 }
 
-/// The largest of every 2x2 pixels.
+/// Maximum over blocks of 2x2 pixels.
 fn halved(x: Tensor<4>) -> Tensor<4> {
     max_pool2d(x, MaxPoolOptions::new([2, 2]))
 }
 
-/// A convolution whose nine pixels lie `by` apart: every `by`-th row and column is an image of its own to it.
+/// A convolution whose nine pixels are `by` apart: it treats every `by`-th row and column as a separate image.
 fn dilated(layer: &Conv, x: Tensor<4>, by: usize) -> Tensor<4> {
     if by == 1 {
         return layer.forward(x);

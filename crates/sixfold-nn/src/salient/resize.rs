@@ -1,11 +1,11 @@
-//! Resizing by a triangle filter, as wide as the scale asks for: bilinear where an image grows, without aliases where it shrinks.
+//! Resizing with a triangle filter whose width depends on the scale: bilinear for enlarging, without aliasing for shrinking.
 
 use sixfold_geometry::Image;
 
-/// What the values of a line count in one value of the resized line: the first of them, and their weights.
+/// Weights of the values of a line in one value of the resized line: the index of the first, and the weights.
 struct Taps(usize, Vec<f32>);
 
-/// The taps of all values of a line of `to` values made of `from`.
+/// The taps for all values of a line resized from `from` to `to` values.
 fn taps(from: usize, to: usize) -> Vec<Taps> {
     let scale = from as f64 / to as f64;
     let reach = scale.max(1.0);

@@ -3,7 +3,7 @@ use std::fs;
 use super::*;
 use crate::weights::{ModelCard, save_weights};
 
-/// What onnxruntime 1.32 gives with the package's weights for the image below: column, row, value.
+/// Result of onnxruntime 1.32 with the package's weights for the image below: column, row, value.
 const EXPECTED: [(usize, usize, f32); 11] = [
     (0, 0, 0.0011),
     (180, 140, 0.9999),
@@ -33,8 +33,8 @@ fn network() -> SalientNetwork {
     SalientNetwork::shipped(&Device::default()).unwrap()
 }
 
-/// `checks/salient_vs_onnxruntime.py` compares whole maps in full precision to 1e-4; the weights within the program are rounded to
-/// half precision.
+/// `checks/salient_vs_onnxruntime.py` compares whole maps in full precision to 1e-4; the shipped weights are rounded to half
+/// precision.
 #[test]
 fn the_shipped_weights_see_what_onnxruntime_sees() {
     let seen = network().salience(&disk()).unwrap();
@@ -114,7 +114,7 @@ fn weight_files_that_do_not_fit_are_refused() {
     fs::write(&path, include_bytes!("../../weights/xfeat.safetensors")).unwrap();
     let text = error(&path).to_string();
     assert!(text.contains("expected weights of u2netp, found weights of xfeat"), "{text}");
-    // The right card over another network's tensors.
+    // The right card with another network's tensors.
     let other = crate::xfeat::XFeat::shipped(&device).unwrap();
     save_weights(&other, &ModelCard::new(ARCHITECTURE, ""), &path).unwrap();
     let text = error(&path).to_string();

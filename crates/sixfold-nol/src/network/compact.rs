@@ -1,8 +1,8 @@
-//! The compact network: the dissertation's structure for two processor cores.
+//! The compact network: the dissertation's structure sized for training on two processor cores.
 //!
-//! It differs in the encoder, EfficientNet-Lite0 with ImageNet weights that stay as they are (its maps of 16, 24, 40 and 112
-//! channels at 1/2 to 1/16 of the resolution), in two LSTM layers of 16 channels for three of 32, 32 and 16, in a narrower weight
-//! block, and in a decoder of four blocks at half the resolution.
+//! It differs in the encoder, EfficientNet-Lite0 with frozen ImageNet weights (its maps of 16, 24, 40 and 112 channels at 1/2 to
+//! 1/16 of the resolution), in two LSTM layers of 16 channels instead of three of 32, 32 and 16, in a narrower weight block, and in
+//! a decoder of four blocks at half the resolution.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -24,15 +24,15 @@ const MAPS: [(usize, usize); 4] = [(0, 16), (1, 24), (2, 40), (4, 112)];
 /// The compact network's options.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct CompactConfig {
-    /// What is left out for comparison.
+    /// Parts left out for comparisons.
     pub parts: Parts,
 }
 
 impl CompactConfig {
-    /// The network on the ImageNet encoder that the program carries, the rest random.
+    /// The network with the shipped ImageNet encoder; the other weights are random.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries another encoder than its own version's.
+    /// [`WeightsError`] if the shipped encoder has another version than the program.
     pub fn init(&self, seed: u64, device: &Device) -> Result<Compact, WeightsError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let rng = &mut rng;
@@ -62,8 +62,8 @@ impl CompactConfig {
     }
 }
 
-/// A normalisation whose factor and offset stay 1 and 0: the smoothness of equation 4.2 would have them make the features small,
-/// which is smooth and says nothing.
+/// A normalisation with factor and offset fixed at 1 and 0: otherwise the smoothness loss of equation 4.2 would shrink the
+/// features, which is smooth but carries no information.
 fn unit_norm(channels: usize, device: &Device) -> BatchNorm {
     let mut norm = BatchNormConfig::new(channels).init(device);
     norm.weight = norm.weight.set_require_grad(false);
@@ -71,11 +71,11 @@ fn unit_norm(channels: usize, device: &Device) -> BatchNorm {
     norm
 }
 
-/// The compact network, made by [`CompactConfig`].
+/// The compact network, created by [`CompactConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Compact {
-    /// Frozen, on a device without gradients, and in no file: the program carries it.
+    /// Frozen, on a device without gradients, and not stored in weight files: it is shipped with the program.
     #[module(skip)]
     encoder: Lite0,
     reduce: Vec<BareConv>,

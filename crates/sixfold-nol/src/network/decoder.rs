@@ -1,5 +1,5 @@
 //! The decoder of the training (dissertation, section 4.2.1): WDSR-B (Yu et al. 2018), wide activations before narrow linear
-//! layers. It takes up what the sources' colours are off by, so that the weights are not blamed for it.
+//! layers. It corrects colour errors of the sources, so that the loss does not attribute them to the weights.
 //!
 //! Without the original's weight normalisation; zeros at the border.
 
@@ -25,8 +25,8 @@ pub(super) struct DecoderConfig {
     pub expansion: usize,
     /// Channels of the narrow layer, in units of `filters`.
     pub linear_ratio: f32,
-    /// The blocks work at half the resolution and their result is shuffled up; else, as in the original, at the whole one, and
-    /// the result of twice that is brought down again.
+    /// Whether the blocks run at half the resolution, followed by a pixel shuffle; otherwise, as in the original, at full
+    /// resolution, and the shuffled result of twice that is averaged down again.
     pub half: bool,
 }
 
@@ -47,7 +47,7 @@ impl DecoderConfig {
             .collect();
         let tail = ConvConfig::new([filters, 4 * COLOURS], 3, Activation::Linear).init(0.1, rng, device);
         let shuffled = if self.half { 1 } else { 4 };
-        // The skip begins as the colours themselves: the decoder has to learn differences only.
+        // The skip connection is initialised to pass the colours through, so that the decoder learns only differences.
         let config = ConvConfig::new([CHANNELS, shuffled * COLOURS], 5, Activation::Linear);
         let mut weight = vec![0.0; config.weight_shape().iter().product()];
         for output in 0..shuffled * COLOURS {
@@ -66,7 +66,7 @@ struct Block {
     mix: Conv,
 }
 
-/// WDSR-B, made by [`DecoderConfig`].
+/// WDSR-B, created by [`DecoderConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub(super) struct Decoder {
@@ -91,7 +91,7 @@ impl Decoder {
         if self.half {
             return pixel_shuffle(body, 2) + skip;
         }
-        // Bilinear halving with pixel centres at halves is the mean of 2x2 pixels.
+        // Bilinear downsampling by two equals the mean of 2x2 pixels.
         avg_pool2d(pixel_shuffle(body + skip, 2), AvgPoolOptions::new([2, 2]))
     }
 }

@@ -1,4 +1,4 @@
-//! The integrated features X^I of the looked-up sources (dissertation, figure 4.3): a convolutional LSTM over the sources (Shi et
+//! The integrated features X^I of the projected sources (dissertation, figure 4.3): a convolutional LSTM over the sources (Shi et
 //! al. 2015), or their mean.
 
 use burn::module::Module;
@@ -41,7 +41,7 @@ impl IntegratorConfig {
     }
 }
 
-/// The convolution of input and hidden state to the gates. The forget gate begins open (Jozefowicz et al. 2015).
+/// The convolution of input and hidden state to the gates. The forget gate is initialised open (Jozefowicz et al. 2015).
 fn lstm_gates(inputs: usize, channels: usize, rng: &mut ChaCha8Rng, device: &Device) -> Conv {
     let config = ConvConfig::new([inputs + channels, 4 * channels], 3, Activation::Linear);
     let conv = config.init(1.0, rng, device);
@@ -50,7 +50,7 @@ fn lstm_gates(inputs: usize, channels: usize, rng: &mut ChaCha8Rng, device: &Dev
     config.with_values(weight, bias, device)
 }
 
-/// Integrates looked-up sources, made by [`IntegratorConfig`].
+/// Integrates projected sources; created by [`IntegratorConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub(super) struct Integrator {

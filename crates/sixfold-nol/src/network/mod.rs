@@ -1,8 +1,8 @@
-//! The network (dissertation, section 4.2.1, figures 4.2 to 4.4): photographs are encoded, looked up at what a new view shows,
-//! integrated over the sources, weighted and added up; for the training a decoder makes an image of the sum.
+//! The network (dissertation, section 4.2.1, figures 4.2 to 4.4): photographs are encoded, sampled at the surface points of a new
+//! view, integrated over the sources, weighted and summed; for the training a decoder turns the sum into an image.
 //!
-//! One definition trains and infers. `N` below counts sources; those of a batch of `B` views with `K` sources each lie source by
-//! source (all first ones, then all second ones, ...), so `N = K B`.
+//! Training and inference use the same definition. `N` below counts sources; those of a batch of `B` views with `K` sources each
+//! are ordered source by source (all first ones, then all second ones, ...), so `N = K B`.
 
 mod compact;
 mod decoder;
@@ -30,7 +30,7 @@ pub(crate) const COLOURS: usize = 3;
 pub(crate) const REDUCED: [usize; 4] = [4, 3, 3, 3];
 /// Channels of features.
 pub const FEATURES: usize = 13;
-/// Channels of a looked-up source: colour, features, the cosine of the angle at which it was seen.
+/// Channels of a projected source: colour, features, and the cosine between normal and line of sight.
 pub const CHANNELS: usize = COLOURS + FEATURES + 1;
 /// Channels of the integrated features.
 const INTEGRATED: usize = 16;
@@ -42,7 +42,7 @@ pub enum IntegratorKind {
     /// Convolutional LSTM over the sources.
     #[default]
     Lstm,
-    /// The mean over the sources that see a pixel: the dissertation's ablation without LSTM.
+    /// The mean over the sources that show a pixel: the dissertation's ablation without LSTM.
     Average,
 }
 
@@ -64,12 +64,12 @@ impl Choice for IntegratorKind {
     }
 }
 
-/// What of the network can be left out for comparison.
+/// Parts of the network that can be left out for comparisons.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Parts {
     /// How the sources are integrated.
     pub integrator: IntegratorKind,
-    /// Whether the training's loss looks at a decoded image, or at the weighted colours themselves.
+    /// Whether the training's loss is computed on a decoded image; otherwise on the weighted colours themselves.
     pub decoder: bool,
 }
 
@@ -104,10 +104,10 @@ impl HeadConfig {
     }
 }
 
-/// What the sources come to in a view.
+/// The weighted sum of the sources in a view.
 #[derive(Debug, Clone)]
 pub struct Blend {
-    /// Weights of the sources, `K x B x 1 x height x width`: they add up to 1 where any source is valid, and are 0 elsewhere.
+    /// Weights of the sources, `K x B x 1 x height x width`: they sum to 1 where any source is valid, and are 0 elsewhere.
     pub weights: Tensor<5>,
     /// X^S, `B x 17 x height x width`: the first three channels are the rendering X^D, -1 to 1.
     pub sum: Tensor<4>,
@@ -118,9 +118,9 @@ pub struct Blend {
 #[module(custom_display)]
 #[allow(clippy::large_enum_variant)]
 pub enum Network {
-    /// For two processor cores.
+    /// Small enough to train on two processor cores.
     Compact(Compact),
-    /// The dissertation's.
+    /// The dissertation's network.
     Paper(Paper),
 }
 
@@ -135,10 +135,10 @@ impl Network {
         }
     }
 
-    /// A network of this name to be filled from a file; `None` for names that are not known.
+    /// A network of this name whose weights are to be loaded from a file; `None` for unknown names.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries another encoder than its own version's.
+    /// [`WeightsError`] if the shipped encoder has another version than the program.
     pub fn of_architecture(
         name: &str,
         parts: Parts,
@@ -160,8 +160,8 @@ impl Network {
         }
     }
 
-    /// Blends looked-up sources: `looked_up` is `K B x 17 x height x width` with zeros where a source is not `valid`
-    /// (`K B x 1 x height x width`, 0 or 1).
+    /// Blends projected sources: `looked_up` is `K B x 17 x height x width` with zeros where a source is not `valid` (`K B x 1 x
+    /// height x width`, 0 or 1).
     pub fn blend(&self, looked_up: Tensor<4>, valid: Tensor<4>, sources: usize) -> Blend {
         let head = self.head();
         let integrated = head.integrator.forward(looked_up.clone(), &valid, sources);

@@ -21,14 +21,14 @@ use super::{Head, HeadConfig, Parts, REDUCED};
 
 /// Channels of DenseNet's maps.
 const MAPS: [usize; 4] = [64, 256, 512, 1024];
-/// ImageNet's mean and deviation of red, green and blue in 0..1.
+/// ImageNet's mean and standard deviation of red, green and blue in 0..1.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 
-/// The dissertation's network's options.
+/// Options of the dissertation's network.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PaperConfig {
-    /// What is left out for comparison.
+    /// Parts left out for comparisons.
     pub parts: Parts,
 }
 
@@ -38,7 +38,7 @@ impl PaperConfig {
         self.init_with(DenseNet121Config::features(3).init(seed, device), seed, device)
     }
 
-    /// The network on DenseNet-121 with ImageNet weights from torchvision's file, the rest random.
+    /// The network with ImageNet weights of DenseNet-121 from torchvision's file; the other weights are random.
     ///
     /// # Errors
     /// [`PretrainedError`].
@@ -71,7 +71,7 @@ impl PaperConfig {
     }
 }
 
-/// The dissertation's network, made by [`PaperConfig`].
+/// The dissertation's network, created by [`PaperConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Paper {
@@ -97,13 +97,13 @@ impl Paper {
             .collect()
     }
 
-    /// DenseNet as it is now, frozen, for the perceptual loss.
+    /// DenseNet with its current weights, frozen, for the perceptual loss.
     pub(crate) fn frozen_encoder(&self) -> DenseNet121 {
         self.encoder.clone().no_grad()
     }
 }
 
-/// Colours from -1 to 1 as torchvision's networks want them.
+/// Converts colours from -1 to 1 to the input of torchvision's networks.
 pub(crate) fn imagenet(images: Tensor<4>) -> Tensor<4> {
     let device = images.device();
     let row = |v: [f32; 3]| Tensor::<1>::from_floats(v, &device).reshape([1, 3, 1, 1]);

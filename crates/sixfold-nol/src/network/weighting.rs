@@ -1,4 +1,4 @@
-//! The weight prediction block (dissertation, figure 4.4): how far each source is to be believed, pixel by pixel, and the sum.
+//! The weight prediction block (dissertation, figure 4.4): the weight of each source per pixel, and the weighted sum.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, activation::softmax};
@@ -8,7 +8,7 @@ use sixfold_nn::layers::{Conv, ConvConfig};
 
 use super::{Blend, CHANNELS, INTEGRATED};
 
-/// Taken off the score of a source that does not see a pixel: more than any two scores differ by.
+/// Subtracted from the score of a source that does not show a pixel: larger than any difference of two scores.
 const NOT_SEEN: f64 = 1e4;
 
 /// Channels of the block's convolutions; the last has one.
@@ -33,7 +33,7 @@ impl WeightingConfig {
     }
 }
 
-/// Predicts weights, made by [`WeightingConfig`].
+/// Predicts weights; created by [`WeightingConfig`].
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub(super) struct Weighting {
@@ -59,7 +59,7 @@ impl Weighting {
         }
         let scores = x + (valid.clone() - 1.0) * NOT_SEEN;
         let weights = softmax(scores.reshape([sources, batch * height * width]), 0);
-        // Where no source is valid the softmax is even; these weights go too.
+        // Where no source is valid the softmax is uniform; these weights are set to zero too.
         let weights = weights.reshape([all, 1, height, width]) * valid;
         let sum = (looked_up * weights.clone())
             .reshape([sources, batch * channels, height, width])

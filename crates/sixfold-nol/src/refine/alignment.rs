@@ -1,5 +1,5 @@
-//! The steps of the default refinement, from coarse to fine: every pose by itself, or cameras and the places of objects that
-//! stood still. Which did, [`Places`] says by what a first refinement leaves of the errors.
+//! The steps of the default refinement, from coarse to fine: every pose separately, or cameras and the places of objects that stood
+//! still. [`Places`] determines which objects did, from the poses after a first refinement.
 
 use std::collections::BTreeSet;
 
@@ -17,35 +17,35 @@ use super::options::{PoseRefinementOptions, SceneKind};
 use super::stillness::{Joined, Places};
 use crate::maps::Maps;
 
-/// Disagreement of poses, in units of what their roughness explains, from which objects are taken to have moved.
+/// Disagreement of poses, in units of that explained by their roughness, above which objects are assumed to have moved.
 const MOVED: f64 = 2.0;
 
-/// Four fifths of the means of six squared unit normal numbers are below this.
+/// The 80 % quantile of the mean of six squared standard normal numbers.
 const EXPECTED: f64 = 1.43;
 
-/// What belongs to an object.
+/// Data of one object.
 pub(super) struct Object {
     pub points: Vec<Vec3>,
     pub normals: Vec<Vec3>,
-    /// With no more faces than its outline needs.
+    /// Its mesh, simplified to the faces that its outline needs.
     pub simple: Mesh,
     pub centre: Vec3,
     /// Numbers of its sources.
     pub sources: Vec<usize>,
 }
 
-/// Where the objects were found to have stood.
+/// The places of the objects as determined from the poses.
 pub(super) struct Standing {
     /// The places of every object.
     pub places: Vec<Vec<usize>>,
-    /// Whether each had one place in all images.
+    /// Whether each object had one place in all images.
     pub still: bool,
-    /// How far the given poses are from that, in units of what their roughness explains; `None` where there is nothing to
-    /// compare.
+    /// Disagreement of the given poses with one place per object, in units of that explained by their roughness; `None` if there is
+    /// nothing to compare.
     pub disagreement: Option<f64>,
 }
 
-/// Everything while its poses are made better.
+/// State of the refinement.
 pub(super) struct RefinementState<'a, 'b> {
     pub sources: &'a [PosedSource<'b>],
     pub meshes: &'a [Mesh],
@@ -55,20 +55,20 @@ pub(super) struct RefinementState<'a, 'b> {
     pub progress: &'a dyn Progress,
 }
 
-/// Reports a fraction of the work in millionths; whether to go on.
+/// Reports a fraction of the work in millionths; returns whether to continue.
 pub(super) fn report(progress: &dyn Progress, fraction: f64) -> bool {
     const PARTS: f64 = 1e6;
     progress.report((PARTS * fraction).round() as usize, PARTS as usize)
 }
 
-/// How rough poses still are after a first refinement, of what the given ones were.
+/// Roughness of poses after a first refinement, as a fraction of that of the given ones.
 const LEFT: f64 = 0.6;
-/// The level from which they are refined again in places.
+/// The level from which they are refined again with common places.
 const AGAIN: usize = 1;
 
 impl RefinementState<'_, '_> {
-    /// Makes the poses better: in one arrangement if all objects stood still by their given poses; otherwise every source by
-    /// itself, and then in the places where objects stood in some of the images by these better poses.
+    /// Refines the poses: in one arrangement if, by the given poses, all objects stood still; otherwise every source separately,
+    /// and then with common places for objects that, by these refined poses, stood still in some of the images.
     pub(crate) fn refine(&mut self) -> Standing {
         let given: Vec<Pose> = self.working.iter().map(|w| w.given).collect();
         let pairs: Vec<[usize; 2]> = self.sources.iter().map(|s| [s.image, s.object]).collect();
@@ -85,7 +85,7 @@ impl RefinementState<'_, '_> {
             }
         }
         let judge = self.options.scene == SceneKind::Judge && disagreement.is_some();
-        // A camera for every source: an object's one place is then no more than where its poses start from.
+        // With a separate camera for every source, the single place of an object does not constrain its poses.
         let apart = pairs.iter().enumerate().map(|(k, [_, object])| [k, *object]).collect();
         let mut arrangement = Arrangement::new(apart, &given, given.len(), self.objects.len());
         let share = if judge { 0.5 } else { 1.0 };
@@ -112,8 +112,8 @@ impl RefinementState<'_, '_> {
         Standing { places: each, still: false, disagreement }
     }
 
-    /// Cameras and places (`pairs` of image and place for every source) fitted to poses of this roughness; and by how
-    /// much the poses disagree with that, in units of what their roughness explains. `None` where there is nothing to compare.
+    /// Cameras and places (`pairs` of image and place for every source) fitted to poses of this roughness; and the disagreement of
+    /// the poses with the fit, in units of that explained by their roughness. `None` if there is nothing to compare.
     fn fit(
         &self,
         pairs: &[[usize; 2]],
@@ -123,7 +123,7 @@ impl RefinementState<'_, '_> {
     ) -> Option<(Arrangement, f64)> {
         let images = pairs.iter().map(|[image, _]| image + 1).max().unwrap_or(0);
         let used = |which: usize| pairs.iter().map(|p| p[which]).collect::<BTreeSet<_>>().len();
-        // Six numbers of every pair against those of every camera and place, less a common frame of each part that hangs together.
+        // Degrees of freedom: six per pair, minus six per camera and place, plus six for the common frame of each connected part.
         let free = 6.0 * ((pairs.len() + parts(pairs, images, places)) as f64 - (used(0) + used(1)) as f64);
         if free <= 0.0 {
             return None;
@@ -145,14 +145,14 @@ impl RefinementState<'_, '_> {
             .enumerate()
             .map(|(k, pose)| off(pose, &arrangement.camera_from_object(k), centre(k), rough).powi(2))
             .collect();
-        // Nearly all poses must agree: with few of them, some always do.
+        // The 80 % quantile is used, because with few poses some always agree.
         let most = (off.len() * 4 / 5).min(off.len() - 1);
         let usual = *off.select_nth_unstable_by(most, f64::total_cmp).1 / EXPECTED;
         Some((arrangement, (usual * 6.0 * pairs.len() as f64 / free).sqrt()))
     }
 
-    /// Moves cameras and objects from coarse to fine, starting with a level, while `progress` receives fractions in a range. `false`
-    /// when that stopped it.
+    /// Moves cameras and objects from coarse to fine, starting at level `first`; `progress` receives fractions within `range`.
+    /// Returns `false` if it stopped the run.
     fn align(
         &mut self,
         arrangement: &mut Arrangement,
@@ -213,7 +213,7 @@ impl RefinementState<'_, '_> {
         true
     }
 
-    /// Takes the poses of the arrangement over.
+    /// Sets the poses of all sources to those of the arrangement.
     fn follow(&mut self, arrangement: &Arrangement) {
         let (sources, meshes) = (self.sources, self.meshes);
         self.working.par_iter_mut().enumerate().for_each(|(k, w)| {
@@ -226,7 +226,7 @@ impl RefinementState<'_, '_> {
     }
 }
 
-/// The motion of one object that all its photographs ask for.
+/// The common motion of one object over all its photographs.
 fn shared_motion(
     object: &Object,
     working: &mut [Working<'_>],
@@ -244,7 +244,7 @@ fn shared_motion(
         .map(|k| working[*k].measure_anchors(&object.centre, reach, options).equations.parts())
         .collect();
     let working: Vec<&Working<'_>> = object.sources.iter().map(|k| &working[*k]).collect();
-    // A blur's width on the surface, seen from the usual distance.
+    // The width of the blur on the surface at the median distance.
     let mut pixels: Vec<f64> = working.iter().map(|w| w.pose.translation().z / w.view.camera.fx).collect();
     pixels.sort_by(f64::total_cmp);
     let step = f64::from(blur) * pixels[pixels.len() / 2];
@@ -261,7 +261,7 @@ fn shared_motion(
     shared.solve(options)
 }
 
-/// How many parts images and places fall into that no source joins.
+/// Number of connected parts of the graph of images and places, with sources as edges.
 fn parts(pairs: &[[usize; 2]], images: usize, places: usize) -> usize {
     let mut joined = Joined::new(images + places);
     for [image, place] in pairs {
@@ -270,10 +270,10 @@ fn parts(pairs: &[[usize; 2]], images: usize, places: usize) -> usize {
     pairs.iter().map(|[image, _]| joined.root(*image)).collect::<BTreeSet<_>>().len()
 }
 
-/// What all sources show, in a common light.
+/// The colours of all sources, adjusted to a common light.
 pub(super) struct AllShown {
     pub shown: Vec<Shown>,
-    /// Per source: what the other sources of its object show, and the weight behind it.
+    /// Per source: the mean colours of the other sources of its object, and their total weight.
     pub others: Vec<(Vec<f32>, Vec<f32>)>,
 }
 
@@ -291,7 +291,7 @@ pub(super) fn shown(working: &mut [Working<'_>], maps: &[Maps], objects: &[Objec
                 look(&w.view, &maps[*k], &w.allowed, &object.points, &object.normals)
             })
             .collect();
-        // The light twice: fitted to colours in the light of before, then the colours in the new one.
+        // The first round fits each source's light, the second computes the colours with it.
         for round in 0..2 {
             let lit: Vec<Shown> = raw
                 .par_iter()

@@ -1,14 +1,14 @@
-//! What the photographs together show at points of the surface.
+//! The common appearance of the photographs at points of the surface.
 //!
-//! The dissertation takes the first rendering of its network as the common appearance, in one target view. Points spread over
-//! the whole surface make all target views at once.
+//! The dissertation uses the first rendering of its network as the common appearance, in one target view. Points spread over the
+//! whole surface cover all target views at once.
 
 use sixfold_geometry::{Pose, Vec3};
 
 use crate::maps::Maps;
 use crate::source::SourceView;
 
-/// What one photograph shows at every point: channels, and how much it counts (0: not seen).
+/// Values of one photograph at every point: channels, and a weight (0: not visible).
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Shown {
     /// `points * channels` numbers.
@@ -16,7 +16,7 @@ pub(crate) struct Shown {
     pub weights: Vec<f32>,
 }
 
-/// Looks all points up in one photograph at its present pose, where `allowed` (0 to 1 per pixel of the crop) lets it.
+/// Samples one photograph at all points at its current pose, where `allowed` (0 to 1 per pixel of the crop) permits.
 pub(crate) fn look(
     view: &SourceView,
     maps: &Maps,
@@ -27,7 +27,7 @@ pub(crate) fn look(
     look_at(view, view.camera_from_object(), maps, allowed, points, normals)
 }
 
-/// The same with a pose near the present one.
+/// The same with a pose near the current one.
 pub(crate) fn look_at(
     view: &SourceView,
     pose: &Pose,
@@ -51,10 +51,10 @@ pub(crate) fn look_at(
     shown
 }
 
-/// Largest difference in mean brightness that is put down to light, of 0 to 1.
+/// Largest difference in mean brightness that is attributed to the light, with brightness from 0 to 1.
 const BRIGHTER: f64 = 0.15;
 
-/// Gain and offset per channel that bring a photograph's values to the common ones: light and exposure differ.
+/// Gain and offset per channel that map a photograph's values to the common ones, because light and exposure differ.
 #[derive(Debug, Clone)]
 pub(crate) struct Light {
     pub gain: Vec<f32>,
@@ -66,7 +66,7 @@ impl Light {
         Light { gain: vec![1.0; channels], offset: vec![0.0; channels] }
     }
 
-    /// Least squares of `common` on `shown`, shrunk towards no change.
+    /// Least squares of `common` on `shown`, regularised towards no change.
     pub(crate) fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
         let mut light = Light::neutral(channels);
         for c in 0..channels {
@@ -88,9 +88,9 @@ impl Light {
             }
             let (mx, my) = (s[1] / s[0], s[2] / s[0]);
             let (xx, xy) = (s[3] / s[0] - mx * mx, s[4] / s[0] - mx * my);
-            // As if a variance of 0.002 more said that the gain is one.
+            // Regularised towards a gain of one, with the weight of a variance of 0.002.
             let gain = ((xy + 0.002) / (xx + 0.002)).clamp(0.5, 2.0);
-            // More than this is no other light but another thing.
+            // A larger shift is not caused by the light but by another object.
             let shift = (my - mx).clamp(-BRIGHTER, BRIGHTER);
             light.gain[c] = gain as f32;
             light.offset[c] = (shift + (1.0 - gain) * mx) as f32;
@@ -106,14 +106,14 @@ impl Light {
     }
 }
 
-/// The common appearance: a mean over photographs in which those far from the mean count less.
+/// The common appearance: a robust mean over photographs, in which those far from the mean have less weight.
 #[derive(Debug, Clone)]
 pub(crate) struct Common {
     /// Sums of weighted values, `points * channels`.
     sums: Vec<f32>,
     /// Sums of weights.
     weights: Vec<f32>,
-    /// What each photograph has added: its weight at every point.
+    /// The weight of each photograph at every point.
     parts: Vec<Vec<f32>>,
     channels: usize,
 }
@@ -122,7 +122,7 @@ pub(crate) struct Common {
 const FAR: f32 = 0.08;
 
 impl Common {
-    /// `shown` after their light was made alike.
+    /// From values that were adjusted to a common light.
     pub(crate) fn new(shown: &[Shown], channels: usize) -> Self {
         let points = shown.first().map_or(0, |s| s.weights.len());
         let mut common = Common {
@@ -131,7 +131,7 @@ impl Common {
             parts: shown.iter().map(|s| s.weights.clone()).collect(),
             channels,
         };
-        // Twice: the second mean knows who is far from the first.
+        // A first mean, then two with weights from the previous one.
         for round in 0..3 {
             if round > 0 {
                 let mean = common.mean();
@@ -165,7 +165,7 @@ impl Common {
         common
     }
 
-    /// The mean at every point; 0 where nothing is known.
+    /// The mean at every point; 0 where no photograph shows it.
     pub(crate) fn mean(&self) -> Vec<f32> {
         let mut mean = self.sums.clone();
         for (values, w) in mean.chunks_exact_mut(self.channels.max(1)).zip(&self.weights) {
@@ -174,13 +174,13 @@ impl Common {
         mean
     }
 
-    /// The mean of all photographs but one, and the weight behind it.
+    /// The mean of all photographs but one, and their total weight.
     pub(crate) fn without(&self, k: usize, shown: &Shown) -> (Vec<f32>, Vec<f32>) {
         let mut mean = self.sums.clone();
         let mut weights = self.weights.clone();
         for (i, part) in self.parts[k].iter().enumerate() {
             let left = (weights[i] - part).max(0.0);
-            // What remains of a difference of nearly equal sums is not to be trusted.
+            // The difference of nearly equal sums is unreliable.
             let left = if left > 1e-3 { left } else { 0.0 };
             for c in 0..self.channels {
                 let at = i * self.channels + c;

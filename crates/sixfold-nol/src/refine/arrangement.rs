@@ -1,7 +1,7 @@
 //! One camera pose per image and one place per object instead of a pose for every pair of them: the normal equations of all
 //! pairs in one system (bundle adjustment; Triggs et al. 2000, with the dense solver that a few dozen poses allow).
 //!
-//! An object in an image by itself is the special case of an image with one object.
+//! A separate pose for an object in an image is the special case of an image with one object.
 
 use sixfold_geometry::nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector6};
 use sixfold_geometry::{NormalEquations, Pose, Vec3};
@@ -15,7 +15,7 @@ pub(super) struct Arrangement {
     pairs: Vec<[usize; 2]>,
 }
 
-/// A pose by which one source should move.
+/// The pose correction that one source requests.
 pub(super) struct Wanted {
     /// Normal equations of a twist about `centre`.
     pub equations: NormalEquations,
@@ -24,13 +24,13 @@ pub(super) struct Wanted {
 }
 
 impl Arrangement {
-    /// An arrangement of given poses, exact for a part of them that hangs together.
+    /// An arrangement from given poses. It reproduces exactly those that form a spanning tree of images and objects.
     pub(crate) fn new(pairs: Vec<[usize; 2]>, poses: &[Pose], images: usize, objects: usize) -> Self {
         let mut cameras: Vec<Option<Pose>> = vec![None; images];
         let mut places: Vec<Option<Pose>> = vec![None; objects];
         while let Some(first) = (0..objects).find(|o| places[*o].is_none()) {
             places[first] = Some(Pose::identity());
-            // From objects to the images that show them and back.
+            // Alternates between objects and the images that show them.
             loop {
                 let mut changed = false;
                 for ([image, object], pose) in pairs.iter().zip(poses) {
@@ -56,18 +56,18 @@ impl Arrangement {
         self.camera_from_scene[image] * self.scene_from_object[object]
     }
 
-    /// Moves an object in its own frame, in all images alike.
+    /// Moves an object in its own frame, the same in all images.
     pub(crate) fn move_object(&mut self, object: usize, motion: &Pose) {
         self.scene_from_object[object] = self.scene_from_object[object] * *motion;
     }
 
-    /// Moves all cameras and objects by one Gauss-Newton step. `false` where the system cannot be solved; nothing moves then.
+    /// Moves all cameras and objects by one Gauss-Newton step. Returns `false` if the system cannot be solved; then nothing moves.
     pub(crate) fn step(&mut self, wanted: &[Wanted], damping: f64) -> bool {
         let (images, objects) = (self.camera_from_scene.len(), self.scene_from_object.len());
         let size = 6 * (images + objects);
         let mut h = DMatrix::<f64>::zeros(size, size);
         let mut g = DVector::<f64>::zeros(size);
-        // Cameras turn about the centre of what their image shows: turns and shifts are then hardly coupled.
+        // Cameras rotate about the centre of the objects in their image, so that rotations and translations are almost decoupled.
         let mut middles = vec![(Vec3::zeros(), 0.0); images];
         for (wanted, [image, _]) in wanted.iter().zip(&self.pairs) {
             middles[*image].0 += wanted.centre;
@@ -81,7 +81,7 @@ impl Arrangement {
         for (wanted, &[image, object]) in wanted.iter().zip(&self.pairs) {
             let (hessian, gradient) = wanted.equations.parts();
             let camera = &self.camera_from_scene[image];
-            // A turn of the camera about its centre carries the object's centre along.
+            // A rotation of the camera about this centre also moves the object's centre.
             let mut by_camera = Matrix6::identity();
             let arm = (wanted.centre - middles[image]).cross_matrix();
             by_camera.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm);
@@ -89,8 +89,8 @@ impl Arrangement {
             let mut by_object = Matrix6::zeros();
             by_object.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
             by_object.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
-            // The centre in the scene is that of the last image which shows the object: the same place up to what they
-            // disagree by.
+            // The object's centre in the scene is taken from the last image that shows it; it differs between images only by their
+            // disagreement.
             let there = camera.transform_point(&centres[object]);
             by_object
                 .fixed_view_mut::<3, 3>(0, 3)
@@ -138,7 +138,7 @@ mod tests {
         let cameras = [camera(0.1, 0.2), camera(-0.2, -0.5), camera(0.0, 1.0)];
         let objects = [Pose::identity(), Pose::exp(&[0.2, 0.05, -0.1, 0.5, 0.2, -0.4].into())];
         let poses: Vec<Pose> = pairs.iter().map(|[i, o]| cameras[*i] * objects[*o]).collect();
-        // Small motions of every camera about its own centre, and of one object.
+        // Small motions of every camera around its own centre, and of one object.
         let small = |k: f64| Pose::exp(&(Vector6::new(1.0, -0.5, 0.7, 0.8, -0.6, 0.9) * (1e-4 * k)));
         let truth: Vec<Pose> = pairs
             .iter()

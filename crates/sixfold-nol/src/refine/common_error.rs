@@ -1,10 +1,10 @@
-//! The error that all poses of an object share.
+//! The error that is common to all poses of an object.
 //!
-//! When every photograph compares itself with the others, nothing pulls on a motion of the object that is the same in all
-//! of them: the common colours slide over the surface along with it. Yet they fit worse then, because places off the true
-//! surface are seen by different photographs before different backgrounds (parallax). So the common motion is looked for by
-//! itself: the disagreement of all photographs, with their common colours made again, as a parabola along each of six axes, and
-//! with what outlines and given poses say about it.
+//! When every photograph is compared with the others, a motion of the object that is the same in all of them has no gradient: the
+//! common colours move over the surface with it. The fit is nevertheless worse, because points off the true surface appear in front
+//! of different backgrounds in different photographs (parallax). The common motion is therefore searched separately: the
+//! disagreement of all photographs, with recomputed common colours, is approximated by a parabola along each of six axes and
+//! combined with the terms of outlines and given poses.
 
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Matrix6, Vector6};
@@ -15,7 +15,7 @@ use super::measure::Working;
 use super::options::PoseRefinementOptions;
 use crate::maps::Maps;
 
-/// One object's photographs while their common motion is looked for.
+/// One object's photographs during the search for their common motion.
 pub(super) struct Shared<'a, 'b> {
     pub working: Vec<&'a Working<'b>>,
     pub maps: Vec<&'a Maps>,
@@ -25,7 +25,7 @@ pub(super) struct Shared<'a, 'b> {
     pub centre: Vec3,
     /// Step along each axis for the parabola: metres and radians.
     pub reach: [f64; 2],
-    /// What outlines and given poses say: normal equations of a twist about the centre in each camera's frame.
+    /// Terms of outlines and given poses: normal equations of a twist about the centre in each camera's frame.
     pub anchors: Vec<(Matrix6<f64>, Vector6<f64>)>,
 }
 
@@ -50,8 +50,8 @@ impl Shared<'_, '_> {
             .collect()
     }
 
-    /// Squared differences of all photographs to the others, per weight; robust, in units of `noise`. The number of points that
-    /// were compared comes with it.
+    /// Weighted mean of the squared differences of all photographs to the others; robust, in units of `noise`. Returned with the
+    /// noise, which is estimated if `None`.
     fn disagreement(&self, twist: &Vector6<f64>, noise: Option<f64>) -> (f64, f64) {
         let shown = self.shown(twist);
         let common = Common::new(&shown, 3);
@@ -83,14 +83,14 @@ impl Shared<'_, '_> {
         let (mut sum, mut weight) = (0.0, 0.0);
         for (square, w) in rows.iter().flatten() {
             let r = square / (noise * noise);
-            // Geman and McClure's function: differences far above the noise are something else's.
+            // Geman and McClure's function: differences far above the noise come from other objects.
             sum += w * r / (1.0 + r / 9.0);
             weight += w;
         }
         (if weight > 0.0 { sum / weight } else { 0.0 }, noise)
     }
 
-    /// The motion that the photographs agree on best; `None` where they say nothing about it.
+    /// The motion with the smallest disagreement; `None` if the photographs do not determine it.
     pub(crate) fn solve(&self, options: &PoseRefinementOptions) -> Option<Pose> {
         let scale = options.colors * self.working.len() as f64;
         let (here, noise) = self.disagreement(&Vector6::zeros(), None);
@@ -116,7 +116,7 @@ impl Shared<'_, '_> {
             g += turn.transpose() * anchor_g;
         }
         let mut step = h.cholesky()?.solve(&-g);
-        // No further than the parabolas are known.
+        // The motion is limited to the range in which the parabolas were sampled.
         for axis in 0..6 {
             let most = 1.5 * self.reach[axis / 3];
             step[axis] = step[axis].clamp(-most, most);

@@ -1,9 +1,9 @@
-//! The default refinement: all poses at once, by Gauss-Newton against what the other photographs show, from coarse to fine.
+//! The default refinement: all poses at once, by Gauss-Newton against the colours of the other photographs, from coarse to fine.
 //!
-//! The residual is the dissertation's (equation 4.3), in the photograph's own pixels, with robust weights and the step that
-//! its curvature asks for. Where surfaces have no texture it says little; the outline of the mesh against the border of the
-//! object in the photograph is the second term. The third says that the given pose is rough, not wrong. Objects that stood
-//! still share the poses of the cameras ([`super::alignment`]).
+//! The residual is the dissertation's (equation 4.3), in the photograph's own pixels, with robust weights and Gauss-Newton steps.
+//! It carries little information on surfaces without texture, so the second term compares the outline of the mesh with the border
+//! of the object in the photograph. The third is a prior around the given pose. Objects that stood still share the poses of the
+//! cameras ([`super::alignment`]).
 
 use rayon::prelude::*;
 use sixfold_align::outline::outline_mesh;
@@ -26,13 +26,13 @@ use crate::surface::outwards;
 pub struct PosedSource<'a> {
     /// Number of the object in the list of meshes.
     pub object: usize,
-    /// Number of the image: sources of one image share its camera.
+    /// Number of the image: sources in one image share its camera.
     pub image: usize,
-    /// The photograph with the object's pose.
+    /// The photograph, with the object's pose.
     pub photograph: &'a PosedImage,
 }
 
-/// Makes the poses of photographs of one object better; see [`refine_scene`].
+/// Refines the poses of photographs of one object; see [`refine_scene`].
 ///
 /// # Errors
 /// [`NolError`] for options out of range.
@@ -50,8 +50,8 @@ pub fn refine_poses(
     refine_scene(&sources, std::slice::from_ref(mesh), options, progress)
 }
 
-/// Makes the poses of objects in photographs better. Once `progress` stops it, the poses of that moment are the
-/// result; it receives millionths of the work, for there are no parts of equal size.
+/// Refines the poses of objects in photographs. If `progress` stops it, the poses at that moment are the result. It receives
+/// millionths of the work, because there are no parts of equal size.
 ///
 /// # Errors
 /// [`NolError`] for options out of range.
@@ -118,8 +118,8 @@ pub fn refine_scene(
     })
 }
 
-/// Drops photographs that show something else than the others where the object should be: their poses are wrong by more than
-/// refinement can mend. Needs three others to say so.
+/// Drops photographs whose colours differ from the others where the object should be: their pose errors are too large for the
+/// refinement. Needs three others.
 fn drop_strangers(
     reports: &mut [SourceReport],
     working: &[Working<'_>],
@@ -148,10 +148,10 @@ fn drop_strangers(
     }
 }
 
-/// Differences in colour below this are light, not another object.
+/// Differences in colour below this are attributed to the light, not to another object.
 const MIN_STRANGE: f64 = 0.08;
 
-/// Mean difference of every source to the others of its object, in the finest blur.
+/// Mean difference of every source to the others of its object, at the finest blur.
 fn differences(working: &mut [Working<'_>], objects: &[Object], options: &PoseRefinementOptions) -> Vec<f64> {
     let blur = options.blurs.last().copied().unwrap_or(1.0);
     let maps: Vec<Maps> = working.par_iter().map(|w| Maps::of_patch(&w.view.patch, blur)).collect();

@@ -1,4 +1,4 @@
-//! What one photograph says about the pose of its object: colours against those of the others, the outline, the given pose.
+//! The measurements of one photograph for the pose of its object: colours against those of the others, the outline, the given pose.
 
 use sixfold_align::outline::{Line, MIN_LINES, Outline, add_lines, motion, tukey};
 use sixfold_geometry::{NormalEquations, Pose, Vec3};
@@ -11,11 +11,11 @@ use super::options::{PoseRefinementOptions, SourceReport};
 use crate::maps::Maps;
 use crate::source::SourceView;
 
-/// One photograph of one object while its pose is refined.
+/// One photograph of one object during the refinement of its pose.
 pub(super) struct Working<'a> {
     pub view: SourceView,
     pub given: Pose,
-    /// The present pose; the view's geometry follows it step by step.
+    /// The current pose; the view's geometry is updated with every step.
     pub pose: Pose,
     /// Where colours may be compared, 0 or 1.
     pub allowed: Vec<f32>,
@@ -25,7 +25,7 @@ pub(super) struct Working<'a> {
     pub lines: usize,
 }
 
-/// What one step of one photograph is made of.
+/// Inputs of one step for one photograph.
 pub(super) struct Terms<'a> {
     pub maps: &'a Maps,
     pub points: &'a [Vec3],
@@ -37,14 +37,14 @@ pub(super) struct Terms<'a> {
     pub reach: f64,
 }
 
-/// Shift of the object's centre and rotation vector from a given pose to the present one, in the camera's frame.
+/// Shift of the object's centre and rotation vector from a given pose to the current one, in the camera's frame.
 fn since(given: &Pose, pose: &Pose, centre: &Vec3) -> [f64; 6] {
     let shift = pose.transform_point(centre) - given.transform_point(centre);
     let turn = (pose.rotation() * given.rotation().inverse()).scaled_axis();
     [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
 }
 
-/// How far a pose is from another: root of the mean square over shift of the centre and turn, six numbers in units of the
+/// Distance of two poses: root mean square of the shift of the centre and the rotation vector, six numbers in units of the standard
 /// deviations of rough poses.
 pub(super) fn off(from: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2]) -> f64 {
     size(&since(from, pose, centre), rough)
@@ -55,8 +55,8 @@ fn size(offset: &[f64; 6], rough: [f64; 2]) -> f64 {
     (square / 6.0).sqrt()
 }
 
-/// The given pose is rough, not wrong; where it is wrong it counts little. Angles are small, so that shift and rotation are taken
-/// by themselves.
+/// Adds the prior around the given pose, with a weight that decreases with the distance from it. Angles are small, so shift and
+/// rotation are treated separately.
 fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], rough: [f64; 2]) {
     let trust = 1.0 / (1.0 + size(offset, rough).powi(2) / 6.0);
     for (k, offset) in offset.iter().enumerate() {
@@ -67,7 +67,7 @@ fn add_given(equations: &mut NormalEquations, offset: &[f64; 6], rough: [f64; 2]
     }
 }
 
-/// What a pose of this roughness alone wants of the present one.
+/// The correction that a given pose of this roughness alone requests.
 pub(super) fn wanted_by(given: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2]) -> Wanted {
     let mut equations = NormalEquations::default();
     add_given(&mut equations, &since(given, pose, centre), rough);
@@ -75,7 +75,7 @@ pub(super) fn wanted_by(given: &Pose, pose: &Pose, centre: &Vec3, rough: [f64; 2
 }
 
 impl Working<'_> {
-    /// Colours are compared inside the silhouette only, as far from its border as the blur carries what lies beside it.
+    /// Colours are compared inside the silhouette only, far enough from its border that the blur mixes in no pixels outside it.
     pub(crate) fn allow(&mut self, blur: f32) {
         let side = self.view.side();
         let mut inside = Coverage::from_fn(side, side, |x, y| {
@@ -102,7 +102,7 @@ impl Working<'_> {
         Maps::of_detail(&self.view.patch, &inside, blur, options.wide * blur)
     }
 
-    /// What the photograph says about its pose: colours and outline, as normal equations of a twist about the object's centre.
+    /// The measurements for the pose (colours, outline and given pose) as normal equations of a twist about the object's centre.
     pub(crate) fn measure(&mut self, terms: &Terms<'_>, options: &PoseRefinementOptions) -> Wanted {
         let pose = self.pose;
         let centre = pose.transform_point(terms.centre);
@@ -120,7 +120,7 @@ impl Working<'_> {
         Wanted { equations, centre }
     }
 
-    /// Outline and given pose without the colours.
+    /// The same without the colours.
     pub(crate) fn measure_anchors(
         &mut self,
         centre: &Vec3,
@@ -223,7 +223,7 @@ impl Working<'_> {
     }
 }
 
-/// Where the object is, by the present pose and the mask: certain inside and outside, open near the border.
+/// Prior probability of object pixels from the current pose and the mask: certain inside and outside, uncertain near the border.
 pub(super) fn prior(view: &SourceView) -> Vec<f32> {
     let side = view.side();
     let mut inside = Coverage::from_fn(side, side, |x, y| {
@@ -257,7 +257,7 @@ mod tests {
         let back = moved(step.into(), pose, about);
         let after = since(&given, &back, &centre);
         assert!(after.iter().all(|v| v.abs() < 2e-4), "{before:?} {after:?}");
-        // What is far off is trusted less.
+        // The weight of the given pose decreases with the distance.
         let weight = |scale: f64| {
             let mut equations = NormalEquations::default();
             add_given(&mut equations, &before.map(|v| v * scale), options.rough);

@@ -1,9 +1,8 @@
-//! Makes the poses of photographs better by what they show (dissertation, section 4.2.3).
+//! Refines the poses of photographs by comparing their contents (dissertation, section 4.2.3).
 //!
-//! [`refine_scene`] is the default: robust Gauss-Newton on SE(3) over the difference between what one photograph shows
-//! on the surface and what the others show there, with the outline as a second measurement, and one camera for all objects of
-//! an image that stood still between some of the photographs. `published_rule` is the dissertation's gradient step over the same
-//! difference.
+//! [`refine_scene`] is the default: robust Gauss-Newton on SE(3) over the difference between the colours of one photograph on the
+//! surface and those of the others, with the outline as a second measurement, and with one camera for all objects of an image that
+//! stood still between some of the photographs. `published_rule` is the dissertation's gradient descent on the same difference.
 
 mod alignment;
 mod appearance;

@@ -1,10 +1,10 @@
-//! How poses are refined, and what comes of it.
+//! Options and results of the refinement of poses.
 
 use sixfold_geometry::Pose;
 
 use crate::error::NolError;
 
-/// How poses are made better.
+/// Options of the refinement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseRefinementOptions {
     /// Pixels along a side of the crops that are compared.
@@ -13,29 +13,29 @@ pub struct PoseRefinementOptions {
     pub points: usize,
     /// Blur of the colours from coarse to fine, crop pixels.
     pub blurs: Vec<f32>,
-    /// How far from the outline the border is looked for at each blur, crop pixels.
+    /// Distance from the outline within which the border is searched at each blur, crop pixels.
     pub reaches: Vec<f64>,
-    /// Steps at each blur; the common appearance is made again before each.
+    /// Steps at each blur; the common appearance is recomputed before each.
     pub steps: usize,
-    /// Slow changes of colour are taken out: means over this many times the blur; 0 compares the colours as they are.
+    /// Slow changes of colour are removed with means over this many times the blur; 0 compares unfiltered colours.
     pub wide: f32,
-    /// Rounds at each blur in which the error that all poses of an object share is looked for. It finds that error on evenly
-    /// painted objects under even light; on LM-O's photographs it made poses no better, so none by default.
+    /// Rounds at each blur that search for the error common to all poses of an object. They find it on uniformly painted objects
+    /// under uniform light; on LM-O's photographs they did not improve poses, so there are none by default.
     pub shared: usize,
     /// Weight of the colours' differences as a whole, in independent measurements; 0 leaves them out.
     pub colors: f64,
-    /// Weight of a line of the outline, in independent measurements; 0 leaves the outline out.
+    /// Weight of one line across the outline, in independent measurements; 0 leaves the outline out.
     pub line: f64,
-    /// What the log likelihood of a border gains where colours change sharply; 0 for colours' odds alone.
+    /// Bonus to the log likelihood of a border where colours change sharply; 0 uses only the likelihood of colours.
     pub edges: f64,
-    /// Whether the objects stood still while the photographs were taken. Their places relative to each other are then the same
-    /// in all of them, which says more about a pose than its own pixels do.
+    /// Whether the objects stood still while the photographs were taken. Their places relative to each other are then the same in
+    /// all of them, which constrains a pose more than its own pixels do.
     pub scene: SceneKind,
     /// Standard deviation of the given poses: metres along each axis, radians about each.
     pub rough: [f64; 2],
     /// A photograph whose pose moved by more than this many standard deviations is dropped.
     pub max_moved: f64,
-    /// A photograph whose colours differ from the others' by more than this many times what is usual among them is dropped.
+    /// A photograph whose colours differ from the others' by more than this many times their median difference is dropped.
     pub max_different: f64,
     /// Seed of the points.
     pub seed: u64,
@@ -66,24 +66,24 @@ impl Default for PoseRefinementOptions {
 /// Whether objects moved between photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SceneKind {
-    /// By the given poses: whether they agree with one arrangement as well as poses of their roughness would; if not, which
-    /// objects stayed where they were between which of the images.
+    /// Decided from the given poses: whether they agree with one arrangement as well as expected for their roughness; if not, which
+    /// objects stood still between which of the images.
     #[default]
     Judge,
-    /// Nothing moved but the camera.
+    /// Only the camera moved.
     Still,
-    /// Every object in every photograph by itself.
+    /// Every object in every photograph is refined separately.
     Moving,
 }
 
-/// What became of one photograph.
+/// The result for one photograph.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SourceReport {
-    /// The new pose; the given one where the photograph was dropped.
+    /// The new pose; the given one if the photograph was dropped.
     pub camera_from_object: Pose,
-    /// How far the object's origin moved, metres.
+    /// Distance by which the object's origin moved, metres.
     pub moved: f64,
-    /// How far it was rotated, radians.
+    /// Angle by which it was rotated, radians.
     pub turned: f64,
     /// Mean difference in colour to the other photographs (0 to 1) before and after.
     pub difference: [f64; 2],
@@ -98,13 +98,13 @@ pub struct SourceReport {
 pub struct Refinement {
     /// One report per source, in their order.
     pub sources: Vec<SourceReport>,
-    /// Whether the objects were taken to have stood still in all photographs.
+    /// Whether the objects were assumed to have stood still in all photographs.
     pub still: bool,
-    /// At how many places they stood: as many as there are objects where nothing moved, or nothing is known of it; more where
-    /// some were moved between some of the photographs.
+    /// Number of places at which they stood: the number of objects if nothing moved or this is unknown; more if some were moved
+    /// between some of the photographs.
     pub places: usize,
-    /// How far the given poses are from one common arrangement, in units of what their roughness explains (1: as expected);
-    /// `None` where there is nothing to compare.
+    /// Disagreement of the given poses with one common arrangement, in units of that explained by their roughness (1: as expected);
+    /// `None` if there is nothing to compare.
     pub disagreement: Option<f64>,
 }
 

@@ -1,10 +1,10 @@
 //! The dissertation's refinement (section 4.2.3, equation 4.3), for comparison: gradient descent on the mean absolute difference
 //! between the first rendering and one photograph's projection, in one target view.
 //!
-//! What the text leaves open is taken from the author's code: step 0.0001, times 0.99 after a step that lowered the
-//! error; otherwise the step is undone and made smaller by 0.9; translations move at most 5 mm a step; the end is 50 steps or
-//! a change of the error below a millionth. The gradient with respect to the rotation is taken in Euler angles, as the text
-//! says (the author's code takes the angles of the matrix of gradients, which is none of a rotation).
+//! Details that the dissertation leaves open are taken from the author's code: step 0.0001, times 0.99 after a step that lowered
+//! the error; otherwise the step is undone and reduced by the factor 0.9; translations move at most 5 mm per step; it stops after
+//! 50 steps or at a change of the error below a millionth. The gradient with respect to the rotation is taken in Euler angles, as
+//! the dissertation states (the author's code takes the angles of the matrix of gradients, which is not a rotation matrix).
 
 use sixfold_align::outline::motion;
 use sixfold_geometry::nalgebra::UnitQuaternion;
@@ -16,16 +16,16 @@ use crate::maps::Maps;
 use crate::projection::TargetSurface;
 use crate::source::SourceView;
 
-/// The numbers of the published rule.
+/// The parameters of the published rule.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PublishedRuleOptions {
     /// First step.
     pub step: f64,
-    /// Most steps.
+    /// Maximum number of steps.
     pub iterations: usize,
-    /// Largest move in a step, metres.
+    /// Largest translation in a step, metres.
     pub longest: f64,
-    /// The end, when the error changes by less.
+    /// The descent stops when the error changes by less.
     pub min_change: f64,
 }
 
@@ -35,9 +35,9 @@ impl Default for PublishedRuleOptions {
     }
 }
 
-/// Moves one photograph's pose by the published rule. `target` is the view of the first rendering, `rendered` its channels at
-/// the target's pixels (`pixels x channels`), `known` which of them are; `maps` are the photograph's same channels.
-/// Returns the pose and the errors before and after.
+/// Moves one photograph's pose by the published rule. `target` is the view of the first rendering, `rendered` its channels at the
+/// target's pixels (`pixels x channels`), `known` which of them are valid; `maps` has the same channels of the photograph. Returns
+/// the pose and the errors before and after.
 pub(crate) fn published_rule(
     view: &mut SourceView,
     maps: &Maps,
@@ -75,8 +75,8 @@ pub(crate) fn published_rule(
     (pose, [first, best])
 }
 
-/// Mean absolute difference over pixels and channels, and its gradient by translation (per metre) and by small turns about the
-/// camera's axes through the object's origin (per radian).
+/// Mean absolute difference over pixels and channels, and its gradient with respect to translation (per metre) and small rotations
+/// about the camera's axes through the object's origin (per radian).
 fn error(
     view: &SourceView,
     maps: &Maps,

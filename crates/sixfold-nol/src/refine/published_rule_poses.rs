@@ -1,5 +1,5 @@
-//! The dissertation's refinement for all photographs of an object: the first rendering of each photograph's own view from
-//! itself and the others, then [`published_rule`] against it.
+//! The dissertation's refinement for all photographs of an object: a first rendering of each photograph's own view from itself and
+//! the others, then [`published_rule`] against it.
 
 use rayon::prelude::*;
 use sixfold_data::PosedImage;
@@ -19,12 +19,12 @@ use crate::surface::outwards;
 /// Points of the surface by which sources are chosen.
 const POINTS: usize = 3000;
 
-/// New poses of photographs of one object by the published rule, in their order, with the rule's own error before and after. The first rendering has `per_view` other
-/// photographs beside the one that moves (dissertation: 6), in crops of `side` pixels (a multiple of 16). With a network it has
-/// colours (-1 to 1) and features; without one it is the mean colour of the photographs.
+/// New poses of photographs of one object by the published rule, in their order, with the rule's own error before and after. The
+/// first rendering has `per_view` other photographs in addition to the one that moves (dissertation: 6), in crops of `side` pixels
+/// (a multiple of 16). With a network it has colours (-1 to 1) and features; without one it is the mean colour of the photographs.
 ///
 /// # Errors
-/// [`NolError`] for a photograph that cannot be cut out.
+/// [`NolError`] for a photograph that cannot be cropped.
 pub fn published_rule_poses(
     photographs: &[PosedImage],
     mesh: &Mesh,
@@ -53,7 +53,7 @@ pub fn published_rule_poses(
                     let sources: Vec<SourceView> = chosen.iter().map(|i| views[*i].clone()).collect();
                     let features: Vec<SourceFeatures> = chosen.iter().map(|i| features[*i].clone()).collect();
                     let rendering = model.render(&target, &sources, &features);
-                    // Without the cosine, which no photograph holds.
+                    // Without the cosine, which photographs do not have.
                     let channels = maps[k].channels();
                     let rendered = rendering.channels.iter().flat_map(|c| c[..channels].to_vec()).collect();
                     (rendered, rendering.seen)
@@ -66,7 +66,7 @@ pub fn published_rule_poses(
         .collect())
 }
 
-/// The photograph itself and the others that show most of what it shows.
+/// The photograph itself and the others that show most of the same surface.
 fn chosen(
     view: &SourceView,
     k: usize,
@@ -101,7 +101,7 @@ fn maps_of(features: &SourceFeatures, side: usize) -> Maps {
     Maps::from_planes(&planes, channels, side)
 }
 
-/// Mean over the sources that see a pixel, and which pixels any sees.
+/// Mean over the sources that show a pixel, and which pixels any source shows.
 fn average(
     target: &TargetSurface,
     chosen: &[usize],

@@ -1,34 +1,35 @@
-//! Which objects stayed where they were between which photographs, by rough poses alone.
+//! Which objects stood still between which photographs, from rough poses alone.
 //!
-//! Objects that stayed moved alike in front of the camera from one image to another: the motion of one predicts the others'. In
-//! every pair of images the largest set of objects that predict each other is taken to have stood still, and its mean motion says how
-//! far every object is from having done so. An object's images then fall into groups by the mean of these errors
-//! (average linkage, Sokal and Michener 1958; the rest is ours).
+//! Objects that stood still have the same motion relative to the camera from one image to another: the motion of one predicts that
+//! of the others. In every pair of images the largest set of objects that predict each other is assumed to have stood still, and
+//! the error of every object is measured against the mean motion of this set. The images of an object are then grouped by the mean
+//! of these errors (average linkage, Sokal and Michener 1958; the rest is ours).
 
 use std::collections::BTreeMap;
 
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Pose, Vec3};
 
-/// Where objects stood: a place for every object and every time it was moved.
+/// The places of objects: one for every object, and another one each time it was moved.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Places {
     /// The place of every source.
     pub of_source: Vec<usize>,
-    /// How many there are.
+    /// Number of places.
     pub count: usize,
 }
 
-/// Mean of six squared errors, in units of their expected ones, up to which a pose was predicted: 99 of 100 that should be are.
+/// Mean of six squared errors, in units of their expected values, up to which a pose counts as predicted: true for 99 of 100
+/// correct predictions.
 const PREDICTED: f64 = 2.8;
-/// The same as the mean over all pairs of images of two groups of them, up to which an object stood alike in both.
+/// The same, as the mean over all pairs of images of two groups, up to which an object stood at the same place in both.
 const ALIKE: f64 = 2.0;
 
 /// A source of an object in each of two images.
 type Both = (usize, usize, usize);
 
 impl Places {
-    /// Places of sources, image and object each, with their given poses; `centres` are the objects' in their own frames.
+    /// The places of sources, given as image and object with their poses; `centres` are the objects' centres in their own frames.
     pub(crate) fn new(pairs: &[[usize; 2]], given: &[Pose], centres: &[Vec3], rough: [f64; 2]) -> Places {
         let mut images: BTreeMap<usize, BTreeMap<usize, usize>> = BTreeMap::new();
         for (source, [image, object]) in pairs.iter().enumerate() {
@@ -36,7 +37,7 @@ impl Places {
         }
         let images: Vec<_> = images.into_values().collect();
         let judge = MotionTest { given, centres, rough };
-        // How far every object is from having stood still, by the two sources.
+        // The error of every object for each pair of its sources.
         let mut errors: Vec<BTreeMap<(usize, usize), f64>> = vec![BTreeMap::new(); centres.len()];
         for (number, one) in images.iter().enumerate() {
             for other in &images[number + 1..] {
@@ -67,7 +68,7 @@ struct MotionTest<'a> {
     rough: [f64; 2],
 }
 
-/// A motion in front of the camera, about a point of the first image that it takes to one of the second.
+/// A motion relative to the camera, about a point in the first image that it moves to a point in the second.
 struct Motion {
     rotation: UnitQuaternion<f64>,
     from: Vec3,
@@ -94,8 +95,8 @@ impl MotionTest<'_> {
         Motion { rotation, from, to }
     }
 
-    /// Mean of six squared errors of an object's pose as a motion that is the mean of `count` objects' predicts it, in units
-    /// of what rough poses explain.
+    /// Mean of six squared errors of an object's pose predicted by the mean motion of `count` objects, in units of that explained
+    /// by rough poses.
     fn error(&self, motion: &Motion, count: usize, (object, k, l): Both) -> f64 {
         let arm = self.centre(object, l) - motion.from;
         let shift = motion.to + motion.rotation * arm - self.centre(object, k);
@@ -107,14 +108,14 @@ impl MotionTest<'_> {
         (shift.norm_squared() / expected[0] + turn.norm_squared() / expected[1]) / 6.0
     }
 
-    /// The motion of the most objects that predict each other, and how many they are.
+    /// The motion of the largest set of objects that predict each other, and its size.
     fn common_motion(&self, both: &[Both]) -> Option<(Motion, usize)> {
         let agree = |motion: &Motion, count: usize| -> Vec<Both> {
             both.iter().filter(|b| self.error(motion, count, **b) < PREDICTED).copied().collect()
         };
         let sets = both.iter().map(|one| agree(&self.mean(&[*one]), 1));
         let mut best = sets.reduce(|best, set| if set.len() > best.len() { set } else { best })?;
-        // What they move on average predicts better than what one of them does.
+        // The mean motion predicts better than that of one object.
         for _ in 0..3 {
             let better = agree(&self.mean(&best), best.len());
             if better.len() < 2 || better == best {
@@ -122,13 +123,14 @@ impl MotionTest<'_> {
             }
             best = better;
         }
-        // Two of many agree by chance now and then.
+        // Two of many sometimes agree by chance.
         let least = if both.len() < 5 { 2 } else { 3.max(both.len() * 2 / 5) };
         (best.len() >= least).then(|| (self.mean(&best), best.len()))
     }
 }
 
-/// Sources in groups between which the mean error is too large (average linkage); what was never compared is not joined.
+/// Groups sources by average linkage, until the mean error between all groups is too large; sources that were never compared are
+/// not merged.
 fn groups(sources: Vec<usize>, errors: &BTreeMap<(usize, usize), f64>) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = sources.into_iter().map(|source| vec![source]).collect();
     let between = |a: &[usize], b: &[usize]| {
@@ -154,16 +156,16 @@ fn groups(sources: Vec<usize>, errors: &BTreeMap<(usize, usize), f64>) -> Vec<Ve
     }
 }
 
-/// Disjoint sets of numbers.
+/// Disjoint sets of numbers (union-find).
 pub(super) struct Joined(Vec<usize>);
 
 impl Joined {
-    /// Every number below `count` by itself.
+    /// A set for each number below `count`.
     pub(crate) fn new(count: usize) -> Joined {
         Joined((0..count).collect())
     }
 
-    /// The number that stands for a number's set.
+    /// The representative of a number's set.
     pub(crate) fn root(&mut self, mut at: usize) -> usize {
         while self.0[at] != at {
             self.0[at] = self.0[self.0[at]];
@@ -172,7 +174,7 @@ impl Joined {
         at
     }
 
-    /// Makes two sets one.
+    /// Merges two sets.
     pub(crate) fn join(&mut self, a: usize, b: usize) {
         let (a, b) = (self.root(a), self.root(b));
         self.0[a.max(b)] = a.min(b);
@@ -201,7 +203,7 @@ mod tests {
                 draw(turn),
             ))
         };
-        // Four objects in six images. The second is moved after the third image; the fourth stands elsewhere in every image.
+        // Four objects in six images. The second is moved after the third image; the fourth is elsewhere in every image.
         let cameras: Vec<Pose> =
             (0..6).map(|_| Pose::from_translation(Vec3::new(0.0, 0.0, 0.9)) * some(0.1, 0.8)).collect();
         let stood: Vec<Pose> = (0..4).map(|_| some(0.2, 1.0)).collect();

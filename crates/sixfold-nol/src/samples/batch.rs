@@ -1,4 +1,4 @@
-//! Samples as the numbers of tensors: sources looked up at what the target shows, the one that shows most of it last.
+//! Samples as tensor data: sources sampled at the surface points of the target, the one that shows most of it last.
 
 use std::sync::Arc;
 
@@ -13,10 +13,10 @@ use crate::network::COLOURS;
 use crate::projection::TargetSurface;
 use crate::source::SourceView;
 
-/// Below this a source's pixel counts as hidden.
+/// Below this visibility a source's pixel counts as hidden.
 const VISIBLE: f32 = 0.5;
 
-/// Where a source shows what a target shows.
+/// The pixels of a source that show points of a target.
 #[derive(Debug, Clone, Default)]
 pub struct Looked {
     /// Numbers of the target's points that the source shows.
@@ -28,13 +28,13 @@ pub struct Looked {
 }
 
 impl Looked {
-    /// How much the source says about the target: the sum of the cosines.
+    /// How much of the target the source shows: the sum of the cosines.
     pub fn worth(&self) -> f32 {
         self.cosines.iter().sum()
     }
 }
 
-/// Looks a target up in a source; what the source's mask leaves out is not seen.
+/// Projects a target into a source; pixels outside the source's mask are not visible.
 pub(crate) fn look_up(source: &SourceView, target: &TargetSurface) -> Looked {
     let mut looked = Looked::default();
     for (i, (point, normal)) in target.points.iter().zip(&target.normals).enumerate() {
@@ -48,14 +48,14 @@ pub(crate) fn look_up(source: &SourceView, target: &TargetSurface) -> Looked {
     looked
 }
 
-/// Order in which sources are integrated: an LSTM remembers the last one best, so the one that shows most comes last.
+/// Order in which sources are integrated: an LSTM remembers the last one best, so the one that shows most is last.
 pub(crate) fn order(looked: &[Looked]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..looked.len()).collect();
     order.sort_by(|a, b| looked[*a].worth().total_cmp(&looked[*b].worth()));
     order
 }
 
-/// A pixel of a crop as a fraction of its side, as [`SampledPixel`] has it.
+/// A pixel of a crop as a fraction of its side, as in [`SampledPixel`].
 pub(crate) fn share(pixel: f32, side: usize) -> f32 {
     (pixel + 0.5) / side as f32
 }
@@ -71,20 +71,20 @@ fn colour(patch: &Patch, [x, y]: [f32; 2]) -> [f32; COLOURS] {
     })
 }
 
-/// How many samples of which size there are in a step.
+/// Number and size of the samples in a step.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ViewBatchOptions {
-    /// Sides of the crops, pixels; a step has one of them.
+    /// Possible sides of the crops, pixels; each step uses one.
     pub sides: Vec<usize>,
     /// Fewest sources of a sample.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub min_sources: usize,
-    /// Most sources of a sample; a step has from `min_sources` to this many, each as likely.
+    /// Maximum number of sources of a sample; a step has from `min_sources` to this many, uniformly distributed.
     #[serde(rename = "most_sources")]
     pub max_sources: usize,
     /// Sources in a step at the smallest side; fewer at a larger one.
     pub sources: usize,
-    /// Most samples in a step.
+    /// Maximum number of samples in a step.
     #[serde(rename = "most_samples")]
     pub max_samples: usize,
 }
@@ -97,10 +97,10 @@ fn is_one(number: &usize) -> bool {
     *number == 1
 }
 
-/// Some samples as the numbers of tensors; `K` sources, `B` samples, source by source.
+/// Samples as tensor data; `K` sources, `B` samples, ordered source by source.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// Which step it is of; 0 where it is of none.
+    /// Number of its step; 0 if it does not belong to one.
     pub step: u64,
     /// Side of all crops, pixels.
     pub side: usize,
@@ -110,11 +110,11 @@ pub struct Batch {
     pub samples: usize,
     /// The sources, `K B x 3 x side x side`, -1 to 1.
     pub images: Vec<f32>,
-    /// Where features are looked up.
+    /// Positions at which features are sampled.
     pub places: Arc<Places>,
-    /// Looked-up colours, `K B x 3 x side x side`.
+    /// Sampled colours, `K B x 3 x side x side`.
     pub colours: Vec<f32>,
-    /// Cosines, `K B x 1 x side x side`; 0 where a source does not see the place.
+    /// Cosines, `K B x 1 x side x side`; 0 where a source does not show the point.
     pub cosines: Vec<f32>,
     /// X^GT, `B x 3 x side x side`, -1 to 1.
     pub target: Vec<f32>,
@@ -146,10 +146,10 @@ impl Batch {
         Batch { step, ..Batch::of_samples(&made) }
     }
 
-    /// Samples of one side and number of sources.
+    /// A batch of samples with the same side and number of sources.
     ///
     /// # Panics
-    /// If they differ in that, or there are none.
+    /// If they differ in these, or there are none.
     pub(crate) fn of_samples(samples: &[Sample]) -> Batch {
         let (side, sources) = (samples[0].target.width, samples[0].sources.len());
         let (count, pixels) = (samples.len(), side * side);
@@ -203,8 +203,8 @@ impl Batch {
         batch
     }
 
-    /// What averaging the sources comes to: images as of [`Batch::target`], and its mean squared error where any source sees
-    /// something, as of values from 0 to 1.
+    /// The average of the sources: images in the format of [`Batch::target`], and its mean squared error over the pixels that any
+    /// source shows, for values from 0 to 1.
     pub fn average(&self) -> (Vec<f32>, f64) {
         let pixels = self.side * self.side;
         let mut image = vec![0.0; self.target.len()];

@@ -1,8 +1,8 @@
-//! What the network learns from (dissertation, section 4.2.2): synthetic objects with random textures, seen in cluttered images with
-//! poses that are off.
+//! Training samples (dissertation, section 4.2.2): synthetic objects with random textures in cluttered images, with inaccurate
+//! poses.
 //!
-//! The dissertation renders 1,000 sets of ten images of scanned objects before the training; here every sample is made when it is
-//! needed, a function of seed and number alone, and no scanned object takes part.
+//! The dissertation renders 1,000 sets of ten images of scanned objects before the training; here every sample is generated on
+//! demand, as a function of seed and number alone, and no scanned objects are used.
 
 mod batch;
 mod object;

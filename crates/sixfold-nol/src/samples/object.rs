@@ -1,4 +1,4 @@
-//! A synthetic object with a random surface, and what a camera sees of it under a lamp.
+//! A synthetic object with random textures, and its image under a lamp.
 
 use rand::RngExt;
 use sixfold_geometry::nalgebra::{UnitQuaternion, Vector3};
@@ -12,12 +12,12 @@ use sixfold_synth::shapes::{Family, member};
 /// Pixels along a texture's side.
 const TEXTURE: usize = 160;
 
-/// A lamp far away, and light from everywhere.
+/// A distant lamp, and ambient light.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Lamp {
     /// Unit vector to the lamp, object frame.
     pub towards: Vec3,
-    /// Light from everywhere; 1 shows colours as they are.
+    /// Ambient light; 1 shows colours unchanged.
     pub ambient: f32,
     /// Light of the lamp on a surface that faces it.
     pub diffuse: f32,
@@ -27,15 +27,15 @@ pub(super) struct Lamp {
     pub shininess: f32,
 }
 
-/// A mesh whose colour is a function of place and direction: each of the six sides of its box is printed with a texture
-/// (so nothing depends on how finely the mesh is cut).
+/// A mesh whose colour is a function of position and normal: each of the six sides of its bounding box has a texture (so the
+/// colours do not depend on the resolution of the mesh).
 #[derive(Debug, Clone)]
 pub struct PaintedObject {
-    /// The surface, metres, its box about the origin.
+    /// The surface, metres, its bounding box centred on the origin.
     pub mesh: Mesh,
-    /// Of the sides +x, -x, +y, -y, +z, -z.
+    /// Textures of the sides +x, -x, +y, -y, +z, -z.
     textures: Vec<Patch>,
-    /// Texture pixels in a metre.
+    /// Texture pixels per metre.
     scale: f64,
 }
 
@@ -43,7 +43,7 @@ pub(super) fn between(random: &mut Random, low: f64, high: f64) -> f64 {
     low + (high - low) * random.random::<f64>()
 }
 
-/// A rotation, each as likely as any other.
+/// A uniformly random rotation.
 fn random_rotation(random: &mut Random) -> UnitQuaternion<f64> {
     let axis = random_direction(random);
     let turn =
@@ -53,7 +53,7 @@ fn random_rotation(random: &mut Random) -> UnitQuaternion<f64> {
         * turn
 }
 
-/// A unit vector, each as likely as any other.
+/// A uniformly random unit vector.
 pub(super) fn random_direction(random: &mut Random) -> Vec3 {
     let z = between(random, -1.0, 1.0);
     let angle = between(random, 0.0, std::f64::consts::TAU);
@@ -70,8 +70,8 @@ fn random_member(random: &mut Random) -> Mesh {
 }
 
 impl PaintedObject {
-    /// Draws an object: a household shape or two of them grown together, its longest side between these lengths (metres),
-    /// with textures out of `textures`.
+    /// Generates an object: a household shape, or two of them combined, its longest side between these lengths (metres), with
+    /// textures from `textures`.
     pub fn random(textures: &Backgrounds, size: [f64; 2], random: &mut Random) -> Self {
         let mut mesh = random_member(random);
         if random.random::<f32>() < 0.25 {
@@ -94,7 +94,7 @@ impl PaintedObject {
         PaintedObject { mesh, textures, scale }
     }
 
-    /// Colour at a place whose surface looks along `normal`, object frame.
+    /// Colour at a surface point with this normal, object frame.
     fn colour(&self, point: &Vec3, normal: &Vec3) -> [f32; 3] {
         let axis = normal.iamax();
         let side = 2 * axis + usize::from(normal[axis] < 0.0);
@@ -104,7 +104,7 @@ impl PaintedObject {
         sample_mirrored(texture, (u + half) as f32, (v + half) as f32)
     }
 
-    /// The object under a lamp over `background`, and where it is seen.
+    /// Renders the object under a lamp in front of `background`; returns the image and the object's coverage.
     pub(super) fn draw(
         &self,
         camera: &Camera,
@@ -148,7 +148,7 @@ fn texture(textures: &Backgrounds, random: &mut Random) -> Patch {
     }
 }
 
-/// Bilinear; beyond its border the texture continues mirrored.
+/// Bilinear sampling; beyond its border the texture is mirrored.
 fn sample_mirrored(texture: &Patch, x: f32, y: f32) -> [f32; 3] {
     let fold = |v: f32, n: usize| {
         let n = n as f32;

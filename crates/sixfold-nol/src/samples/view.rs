@@ -1,4 +1,4 @@
-//! One sample: a target view, and source views with clutter, other light, other colours and poses that are off (dissertation, table
+//! One sample: a target view, and source views with clutter, other light, other colours and inaccurate poses (dissertation, table
 //! 4.1).
 
 use rand::RngExt;
@@ -15,27 +15,27 @@ use crate::projection::TargetSurface;
 use crate::source::{MARGIN, SourceView};
 use crate::window::object_window;
 
-/// The target's side in units of the object's box.
+/// The target's side in units of the object's box in the image.
 const TARGET_MARGIN: f64 = 1.1;
 
 /// How samples are made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ViewSampleOptions {
-    /// Longest side of an object, smallest and largest, metres.
+    /// Smallest and largest length of an object's longest side, metres.
     pub size: [f64; 2],
-    /// Distance from camera to object, smallest and largest, metres.
+    /// Smallest and largest distance from camera to object, metres.
     pub distance: [f64; 2],
-    /// Poses of sources are off by up to this along every axis, metres (table 4.1).
+    /// Largest translation error of the sources' poses along every axis, metres (table 4.1).
     pub translation: f64,
-    /// And rotated by up to this about every axis, radians (table 4.1).
+    /// Largest rotation error about every axis, radians (table 4.1).
     pub rotation: f64,
-    /// In this fraction of the samples poses are good: off by 0 to 30 % of that, as refined ones are.
+    /// Fraction of the samples with good poses, as after refinement: with 0 to 30 % of these errors.
     pub good_poses: f64,
-    /// Probability that something stands in front of the object in a source.
+    /// Probability of an occluder in front of the object in a source.
     pub occluded: f64,
-    /// Most of the object that it hides.
+    /// Largest fraction of the object that it hides.
     pub occlusion: f32,
-    /// Probability that the source's mask leaves out what is hidden.
+    /// Probability that the source's mask excludes the hidden part.
     pub mask_known: f64,
 }
 
@@ -54,12 +54,12 @@ impl Default for ViewSampleOptions {
     }
 }
 
-/// What the network is given and what it should say.
+/// Input of the network and its ground truth.
 #[derive(Debug, Clone)]
 pub struct Sample {
-    /// The photographs' crops, with poses that are off.
+    /// The photographs' crops, with inaccurate poses.
     pub sources: Vec<SourceView>,
-    /// What the target view shows; its pose is exact.
+    /// The surface points of the target view; its pose is exact.
     pub surface: TargetSurface,
     /// X^GT, `side x side`.
     pub target: Patch,
@@ -92,7 +92,7 @@ pub fn make_sample(
         specular: 0.0,
         shininess: uniform(random, [8.0, 60.0]),
     };
-    // The object lies still while the camera goes round it, or is turned under a lamp that stands still.
+    // Either the object is fixed and the camera moves around it, or the object rotates under a fixed lamp.
     let turned = random.random::<f64>() < 0.3;
 
     let from = direction(random);
@@ -104,7 +104,7 @@ pub fn make_sample(
 
     let sources = (0..sources)
         .map(|_| {
-            // Sources are chosen because they show what the target shows: most lie within 60 degrees.
+            // Sources should show the surface of the target: most are within 60 degrees.
             let around = direction(random);
             let near = between(random, 0.3, 2.0);
             let from = (from * near + around).try_normalize(1e-6).unwrap_or(around);
@@ -130,7 +130,7 @@ fn photographs_camera(random: &mut Random) -> Camera {
     Camera { fx: f, fy: f, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None }
 }
 
-/// The pose of an object seen from a direction (object frame), somewhere in the image.
+/// The pose of an object seen from a direction (object frame), at a random position in the image.
 fn seen_from(direction: &Vec3, options: &ViewSampleOptions, random: &mut Random) -> Pose {
     let z = -direction;
     let helper = if z.z.abs() < 0.95 { Vec3::z() } else { Vec3::x() };
@@ -144,7 +144,7 @@ fn seen_from(direction: &Vec3, options: &ViewSampleOptions, random: &mut Random)
     Pose::new(roll * rotation, aside * distance)
 }
 
-/// A pose that is off as table 4.1 has it, in units of `share`.
+/// A pose with the errors of table 4.1, scaled by `share`.
 fn perturbed(pose: &Pose, options: &ViewSampleOptions, share: f64, random: &mut Random) -> Pose {
     let mut each = |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
     let (shift, angles) = (each(options.translation), each(options.rotation));
@@ -185,7 +185,7 @@ fn source(
             }
         }
     }
-    // Small objects are enlarged by the crop and come out soft.
+    // Small objects are enlarged by the crop and appear blurred.
     if random.random::<f64>() < 0.4 {
         patch.blur(uniform(random, [0.0, 1.2]));
     }
@@ -237,7 +237,7 @@ mod tests {
                     let at = s.surface.pixels[i] as usize;
                     let (x, y) = (place[0] as usize, place[1] as usize);
                     off.push((s.target.data[at] - s.sources[0].patch.data[y * 96 + x]).abs());
-                    // Another of the object's points: the same light, another place.
+                    // Another of the object's points: the same light, another position.
                     let other = projection.pixels[(i + 401) % projection.pixels.len()];
                     let (x, y) = (other[0] as usize, other[1] as usize);
                     elsewhere.push((s.target.data[at] - s.sources[0].patch.data[y * 96 + x]).abs());

@@ -1,4 +1,4 @@
-//! Both passes and PnP on predictions that are written down instead of made by a network: a ball whose every pixel is known.
+//! Tests both passes and PnP on constructed predictions instead of a network's: a ball with known coordinates at every pixel.
 
 use super::*;
 use sixfold_geometry::Vec2;
@@ -26,7 +26,7 @@ fn entry() -> ObjectEntry {
     }
 }
 
-/// The window about the ball.
+/// The window around the ball.
 fn window() -> Window {
     Window { centre: camera().project(&truth().translation()).unwrap(), side: 128.0 }
 }
@@ -96,7 +96,7 @@ fn theta_i_decides_which_pixels_are_correspondences() {
     assert_eq!(points(&Pix2PoseOptions::published()), pixels.len() - uncertain);
     let wider = Pix2PoseOptions { inlier_threshold: Some(0.2), ..Pix2PoseOptions::published() };
     assert_eq!(points(&wider), pixels.len());
-    // Ours takes what is below 0.3 or the outlier threshold, whichever is larger.
+    // Our default uses pixels below 0.3 or the outlier threshold, whichever is larger.
     pixels.iter().step_by(3).for_each(|i| p.error[*i] = 0.29);
     assert_eq!(candidate(&p, 0.1, &Pix2PoseOptions::default()).object_points.len(), pixels.len());
     pixels.iter().step_by(3).for_each(|i| p.error[*i] = 0.31);
@@ -120,7 +120,7 @@ fn theta_re_is_in_pixels_of_the_image() {
         candidate(&p, 0.2, &options).hypothesis.inliers
     };
     assert_eq!(inliers(Reprojection::ImagePixels(3.0)), all - moved);
-    // The same 3 in pixels of the network, each of two of the image, is no limit for most of them.
+    // The limit in pixels of the network, each of two image pixels, excludes only few of them.
     assert!(inliers(Reprojection::NetworkPixels(4.5)) > all - moved / 4);
 }
 
@@ -128,10 +128,10 @@ fn theta_re_is_in_pixels_of_the_image() {
 fn the_candidate_with_most_inliers_wins() {
     let (camera, object) = (camera(), entry());
     let good = prediction(&truth());
-    // A mask cut in half: fewer inliers, and the pose's centre away from the mask's.
+    // Half of the mask: fewer inliers, and the pose's centre is away from the mask's.
     let mut half = good.clone();
     ball(&good).into_iter().filter(|i| i % SIDE < SIDE / 2).for_each(|i| half.visible[i] = 0.0);
-    // The same number of pixels, of which a third say something else.
+    // The same number of pixels, of which a third are wrong.
     let mut worse = good.clone();
     ball(&good).into_iter().step_by(3).for_each(|i| worse.coordinates[i] = [0.9, -0.9, 0.9]);
     let views = vec![(0.1, crop(), half), (0.2, crop(), good), (0.3, crop(), worse)];
@@ -146,7 +146,7 @@ fn the_candidate_with_most_inliers_wins() {
     assert_eq!(threshold, [0.2, 0.3, 0.1]);
     let centre = Quirks { centre_choice: true, ..Quirks::default() };
     assert_eq!(order(centre, views), [0.2, 0.3, 0.1]);
-    // By their centres the smaller one wins where the larger one's mask is lopsided.
+    // With the choice by centres the smaller one wins if the larger one's mask is lopsided.
     let mut lopsided = prediction(&truth());
     ball(&lopsided).into_iter().filter(|i| i % SIDE < 28).for_each(|i| lopsided.visible[i] = 0.0);
     let mut small = prediction(&truth());
@@ -191,7 +191,7 @@ fn the_second_crop_is_centred_on_the_mask() {
         Vec2::new((80.0 * 41.5 + 32.0 * 47.5) / 112.0 - 31.5, (80.0 * 19.5 + 32.0 * 27.5) / 112.0 - 31.5);
     assert!((centroid.centre - (window.centre + mean * 2.0)).norm() < 1e-9);
     assert_eq!(centroid.side, 128.0);
-    // The author's code adds pixels of a network of 128 to pixels of the image.
+    // The author's code adds pixels of a network of side 128 to pixels of the image.
     let quirks = Quirks { unscaled_recentring: true, ..Quirks::default() };
     let large = Window { side: 256.0, ..window };
     let unscaled = recentred(&large, &mask, SIDE, &Pix2PoseOptions { quirks, ..options });

@@ -1,9 +1,8 @@
-//! The compact network: an EfficientNet-Lite0 encoder shared by all objects, and one small decoder an object.
+//! The compact network: an EfficientNet-Lite0 encoder shared by all objects, and one small decoder per object.
 //!
-//! It differs from the dissertation's generator in what two processor cores can train: the encoder starts from
-//! ImageNet and ends at a sixteenth of the resolution, its first stages stay frozen, the targets have half the
-//! resolution of the input, and a fifth channel says where the object is visible. Encoder and one decoder together have
-//! 1.0 million parameters.
+//! It differs from the dissertation's generator so that two processor cores can train it: the encoder starts from ImageNet weights
+//! and ends at a sixteenth of the resolution, its first stages are frozen, the targets have half the resolution of the input, and a
+//! fifth channel predicts the object's visibility. Encoder and one decoder together have 1.0 million parameters.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -23,11 +22,11 @@ const SKIPS: [usize; 4] = [16, 24, 40, 112];
 /// Sizes of the compact network.
 #[derive(Debug, Clone, Copy)]
 pub struct CompactConfig {
-    /// Decoders, one an object.
+    /// Number of decoders, one per object.
     pub objects: usize,
 }
 
-/// Shared encoder, a decoder for every object.
+/// Shared encoder, one decoder per object.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Compact {
@@ -37,7 +36,7 @@ pub struct Compact {
     pub decoders: Vec<Decoder>,
 }
 
-/// From the encoder's maps to one object's coordinates.
+/// Decodes the encoder's maps to one object's coordinates.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct Decoder {
@@ -65,7 +64,7 @@ impl CompactConfig {
         Compact { encoder, decoders }
     }
 
-    /// The network with random weights throughout, to be filled from a file.
+    /// The network with random weights throughout, for weights loaded from a file.
     pub fn init_random(&self, seed: u64, device: &Device) -> Compact {
         self.init(Lite0Config::default().init(seed, device), seed, device)
     }
@@ -92,7 +91,7 @@ impl Decoder {
         Self { code, context, eighth, narrow, detail, quarter, refine, head }
     }
 
-    /// The encoder's maps to `batch x 5 x half x half`.
+    /// From the encoder's maps to `batch x 5 x half x half`.
     fn forward(&self, maps: &[Tensor<4>]) -> Tensor<4> {
         let code = self.code.forward(maps[4].clone());
         let context = self.context.forward(code.clone().mean_dim(2).mean_dim(3));

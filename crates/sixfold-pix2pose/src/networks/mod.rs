@@ -1,4 +1,4 @@
-//! The networks: RGB crop in, per-pixel object coordinates and expected error out.
+//! The networks: from an RGB crop to per-pixel object coordinates and their expected error.
 
 mod compact;
 mod paper;

@@ -1,9 +1,9 @@
 //! The dissertation's generator (section 3.2.1): an auto-encoder with skip connections from a colour image of 128 x 128 pixels
 //! to object coordinates and expected error of every pixel, 25.7 million parameters.
 //!
-//! The authors' code has two parallel convolutions in each stage of the encoder and concatenates them; here they are one
-//! with the sum of the channels, which is the same function. A convolution before batch normalisation has no bias, which
-//! would be idle.
+//! The authors' code has two parallel convolutions in each stage of the encoder and concatenates them; here they are a single one
+//! with the sum of the channels, which is the same function. A convolution before batch normalisation has no bias, because it would
+//! have no effect.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -23,23 +23,23 @@ pub const SIDE: usize = 128;
 const KERNEL: usize = 5;
 /// Slope of the leaky rectifiers below zero.
 const SLOPE: f32 = 0.3;
-/// Length of the code in the middle.
+/// Length of the code (bottleneck).
 const CODE: usize = 256;
 /// Channels and side of the map on either side of the code.
 const BEFORE_CODE: usize = 512;
 const AFTER_CODE: usize = 256;
 const CODE_SIDE: usize = SIDE / 16;
 
-/// What a generator gives for every pixel.
+/// Output of a generator for every pixel.
 #[derive(Debug, Clone)]
 pub struct GeneratorOutput {
-    /// `batch x 3 x 128 x 128`: coordinates in the object's box, in -1..1.
+    /// `batch x 3 x 128 x 128`: coordinates in the object's bounding box, in -1..1.
     pub coordinates: Tensor<4>,
     /// `batch x 1 x 128 x 128`: expected error of the coordinates, in 0..1.
     pub error: Tensor<4>,
 }
 
-/// The dissertation's generator. It has no options but its seed.
+/// The dissertation's generator. Its only option is the seed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct PaperGeneratorConfig {
     /// Seed of the random weights.
@@ -58,7 +58,7 @@ impl PaperGeneratorConfig {
     }
 }
 
-/// The dissertation's generator, made by [`PaperGeneratorConfig`]. Input: RGB as `(value - 128) / 128` of 8-bit values.
+/// The dissertation's generator, created by [`PaperGeneratorConfig`]. Input: RGB as `(value - 128) / 128` of 8-bit values.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub struct PaperGenerator {
@@ -70,13 +70,13 @@ pub struct PaperGenerator {
 }
 
 impl PaperGenerator {
-    /// `batch x 3 x 128 x 128` to coordinates and error.
+    /// From images, `batch x 3 x 128 x 128`, to coordinates and error.
     pub fn forward(&self, x: Tensor<4>) -> GeneratorOutput {
         let e1 = self.e1.forward(x);
         let e2 = self.e2.forward(e1.clone());
         let e3 = self.e3.forward(e2.clone());
         let e4 = self.e4.forward(e3.clone());
-        // The second of the two parallel branches goes across.
+        // The second of the two parallel branches is the skip connection.
         let half = |map: Tensor<4>| {
             let channels = map.dims()[1] / 2;
             map.narrow(1, channels, channels)
@@ -105,7 +105,7 @@ impl ConvStage {
     }
 }
 
-/// Twice the resolution by a transposed convolution, the encoder's map beside it, and a convolution over both.
+/// Upsampling by two with a transposed convolution, concatenation with the encoder's map, and a convolution over both.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 struct UpStage {
@@ -130,7 +130,7 @@ impl UpStage {
     }
 }
 
-/// From the map of 8 x 8 pixels through the code to the output; shared by the generators.
+/// The part from the map of 8 x 8 pixels through the code to the output; shared by the generators.
 #[derive(Module, Debug)]
 #[module(custom_display)]
 pub(super) struct Decoder {

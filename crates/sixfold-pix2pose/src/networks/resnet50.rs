@@ -10,10 +10,10 @@ use sixfold_nn::resnet::{ResNet50, ResNet50Config};
 
 use super::paper::{ConvStage, Decoder, GeneratorOutput};
 
-/// Channels of the encoder's maps at 64, 32 and 16 pixels that go across: the first ones of 64, 256 and 512.
+/// Channels of the encoder's maps at 64, 32 and 16 pixels in the skip connections: the first ones of 64, 256 and 512.
 const SKIPS: [usize; 3] = [32, 128, 128];
 
-/// The generator with a ResNet-50 encoder. It has no options but its seed.
+/// The generator with a ResNet-50 encoder. Its only option is the seed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ResNet50GeneratorConfig {
     /// Seed of the random weights.
@@ -41,7 +41,7 @@ impl ResNet50GeneratorConfig {
     }
 }
 
-/// The generator with a ResNet-50 encoder, made by [`ResNet50GeneratorConfig`]. Input: RGB, for torchvision's weights in 0..1
+/// The generator with a ResNet-50 encoder, created by [`ResNet50GeneratorConfig`]. Input: RGB, for torchvision's weights in 0..1
 /// minus mean (0.485, 0.456, 0.406) over deviation (0.229, 0.224, 0.225).
 #[derive(Module, Debug)]
 #[module(custom_display)]
@@ -54,7 +54,7 @@ pub struct ResNet50Generator {
 sixfold_nn::displayed_by_name!(ResNet50Generator);
 
 impl ResNet50Generator {
-    /// `batch x 3 x 128 x 128` to coordinates and error.
+    /// From images, `batch x 3 x 128 x 128`, to coordinates and error.
     pub fn forward(&self, x: Tensor<4>) -> GeneratorOutput {
         let maps = self.encoder.features(x);
         let [first, second, third] = [0, 1, 2].map(|i| maps[i].clone().narrow(1, 0, SKIPS[i]));

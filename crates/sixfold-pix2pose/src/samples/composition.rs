@@ -8,19 +8,19 @@ use sixfold_synth::augment::{
 
 use super::options::SampleOptions;
 
-/// An image in the making and what of the object is still visible in it.
+/// An image under construction and the part of the object that is still visible in it.
 pub(super) struct Composition {
     pub image: Patch,
     pub visible: Coverage,
 }
 
-/// What is shared by all samples.
+/// Data shared by all samples.
 pub(super) struct Scenery<'a> {
     pub options: &'a SampleOptions,
     pub backgrounds: &'a Backgrounds,
     /// Images of objects, with the index of the object.
     pub cutouts: &'a [(usize, Cutout)],
-    /// Which object the sample is of: its own images are not used.
+    /// The object of the sample: its own images are not used.
     pub object_index: usize,
 }
 
@@ -30,7 +30,7 @@ impl Scenery<'_> {
     }
 
     fn cutout(&self, random: &mut Random) -> Option<&Cutout> {
-        // A few draws find another object's image where there is one.
+        // A few attempts find another object's image if there is one.
         (0..6).find_map(|_| {
             let (object, cutout) = self.cutouts.get(random.random_range(0..self.cutouts.len().max(1)))?;
             (*object != self.object_index).then_some(cutout)
@@ -56,7 +56,7 @@ impl Scenery<'_> {
         Composition { image, visible }
     }
 
-    /// A photograph as it is; what lies outside of it is grey or background.
+    /// A photograph without changes; the area outside it is grey or background.
     pub(crate) fn keep(
         &self,
         mut photograph: Patch,
@@ -104,7 +104,7 @@ impl Scenery<'_> {
         }
     }
 
-    /// Hides all that a part of the crop shows.
+    /// Hides a part of the crop.
     pub(crate) fn hide(&self, composition: &mut Composition, cover: &Coverage, random: &mut Random) {
         composition.image.blend(&self.material(random), cover);
         composition.visible.remove(cover);
@@ -124,7 +124,7 @@ impl Scenery<'_> {
 
     fn shape(&self, visible: &Coverage, fraction: f32, random: &mut Random) -> Option<(Patch, Coverage)> {
         let size = self.options.size;
-        // Centred on the object as often as at its rim: any pixel of the crop's centre part.
+        // Centred on any pixel of the crop's central part, so on the object as often as at its border.
         let centre = [0, 1].map(|_| uniform(random, [0.1, 0.9]) * size as f32);
         let cover = occluder_of_fraction(&Shape::random(random), centre, visible, fraction)?;
         Some((self.material(random), cover))

@@ -1,10 +1,10 @@
-//! What can be wrong with training data.
+//! Errors of training data.
 
 use sixfold_data::PosedImageError;
 use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
-/// Why no samples can be made.
+/// Why samples cannot be made.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SampleError {
@@ -13,18 +13,18 @@ pub enum SampleError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: String,
-        /// What it should hold.
+        /// The values allowed.
         expected: &'static str,
     },
-    /// Options of the augmentation, or backgrounds.
+    /// Error in the options of the augmentation, or in backgrounds.
     #[error(transparent)]
     Augment(#[from] AugmentError),
     /// An image does not show enough of its object.
     #[error(transparent)]
     Image(#[from] PosedImageError),
-    /// There is nothing to learn.
+    /// No object was given.
     #[error("no training object was given; give at least one mesh with its description")]
     NoObjects,
     /// A mesh cannot be rendered.
@@ -37,17 +37,17 @@ pub enum SampleError {
         /// Its vertices.
         vertices: usize,
     },
-    /// A mesh is flat to a point, or its scale is.
+    /// The size of a mesh, or its scale, is zero or not finite.
     #[error("object {id}, {field}: found {found}, expected finite numbers above zero (metres)")]
     Extent {
         /// The object.
         id: u32,
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: String,
     },
-    /// No image can be had of an object.
+    /// There is no image of an object.
     #[error(
         "object {id}: no photograph shows it and its mesh has neither colours nor texture; give posed images, a \
          coloured mesh, or set random_color_probability above zero to train on random colours"
@@ -63,7 +63,7 @@ pub enum SampleError {
     UnknownObject {
         /// The object.
         id: u32,
-        /// Those that are known.
+        /// The objects of the training.
         known: String,
     },
 }

@@ -1,8 +1,8 @@
 //! Training samples for Pix2Pose: crops of few posed images and renders, augmented, with the coordinates, the
 //! silhouette and the visible part of the object (dissertation, section 3.4.1, tables 3.2 and 3.3).
 //!
-//! [`SampleSource`] draws sample after sample. Each is a function of seed, object and number alone, so that any number
-//! of threads makes the same training run.
+//! [`SampleSource`] generates the samples. Each is a function of seed, object and number alone, so that the training run does not
+//! depend on the number of threads.
 
 mod composition;
 mod error;

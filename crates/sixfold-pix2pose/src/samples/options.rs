@@ -1,4 +1,4 @@
-//! What samples look like.
+//! Options of the samples.
 
 use std::f32::consts::FRAC_PI_4;
 
@@ -14,22 +14,22 @@ use sixfold_synth::augment::ColorAugmentation;
 pub struct SampleOptions {
     /// Side of the input image, pixels.
     pub size: usize,
-    /// Side of coordinates and masks, pixels; `None` for the input's.
+    /// Side of coordinates and masks, pixels; `None`: that of the input.
     pub target_size: Option<usize>,
     /// Fraction of rendered samples of an object that has photographs and can be rendered, 0..1.
     pub render_share: f32,
-    /// Side of the crop over the longer side of the object's box (dissertation: 1.5).
+    /// Ratio of the crop's side to the longer side of the object's box (dissertation: 1.5).
     pub crop_factor: f64,
-    /// The crop's centre moves by up to this fraction of the box.
+    /// Largest shift of the crop's centre, as a fraction of the box.
     pub centre_jitter: f64,
-    /// The crop's side changes by up to this fraction.
+    /// Largest relative change of the crop's side.
     pub size_jitter: f64,
     /// Probability that the box is that of the visible part; otherwise that of the whole object.
     pub visible_box_probability: f32,
-    /// Probability that something hides one side of the object and the box is that of the rest: so detections see an object that is
-    /// partly hidden, larger in its crop than a whole one.
+    /// Probability that one side of the object is hidden and the box is that of the rest: this is how partly hidden objects are
+    /// detected, so they appear larger in their crops than whole ones.
     pub cut_probability: f32,
-    /// How much of the box's side is cut off then, smallest and largest fraction.
+    /// Smallest and largest fraction of the box's side that is then cut off.
     pub cut: [f32; 2],
     /// Largest rotation in the image plane to either side, radians (table 3.3: 45 degrees).
     pub rotation: f32,
@@ -39,48 +39,48 @@ pub struct SampleOptions {
     pub occlusion_probability: f32,
     /// Fraction of the visible object that occluders hide (table 3.3).
     pub occlusion: [f32; 2],
-    /// What occluders show: other parts of the background, as in the dissertation; otherwise also plain colours and textures.
+    /// Occluders show only other parts of the background, as in the dissertation; otherwise also plain colours and textures.
     pub background_occluders: bool,
-    /// Targets and silhouette of a photograph end where the photograph's own mask of the object ends: a CAD model or a hull
-    /// is larger than what is seen (section 3.4.4). For photographs of unoccluded objects.
+    /// Restrict targets and silhouette of a photograph to the photograph's own mask of the object: a CAD model or a hull is larger
+    /// than the visible object (section 3.4.4). For photographs of unoccluded objects.
     pub synchronised_masks: bool,
-    /// Probability that an occluder is an image of another object, where there are others.
+    /// Probability that an occluder is an image of another object, if there are others.
     pub object_occluder_probability: f32,
-    /// Most images of other objects pasted behind the object.
+    /// Maximum number of images of other objects pasted behind the object.
     pub clutter: u32,
-    /// Factor on the brightness of an object cut from a photograph, against its new background.
+    /// Range of the factor on the brightness of an object cut from a photograph, relative to its new background.
     pub paste_gain: [f32; 2],
-    /// Sigma of the blur along the border of a pasted object, pixels.
+    /// Range of the sigma of the blur along the border of a pasted object, pixels.
     pub border_blur: [f32; 2],
     /// Fraction of samples that imitate the input of the second stage (grey outside a disturbed mask), 0..1.
     pub second_stage_fraction: f32,
-    /// `None` draws the stage of every sample by itself, which mixes both within a batch. `Some(n)` gives `n` consecutive
-    /// sample numbers the same stage: the batch size makes whole batches alternate as in the dissertation.
+    /// `None`: the stage of every sample is chosen independently, which mixes both within a batch. `Some(n)`: `n` consecutive
+    /// sample numbers have the same stage; with `n` equal to the batch size whole batches alternate, as in the dissertation.
     pub second_stage_block: Option<u64>,
     /// Colours of the finished image.
     pub color: ColorAugmentation,
     /// Colours of a rendered object before it is pasted.
     pub render_color: ColorAugmentation,
-    /// Fraction of rendered poses that lie near one of a photograph; the others look from anywhere within `elevation`.
+    /// Fraction of rendered poses that are near that of a photograph; the others are views from any direction within `elevation`.
     pub near_real_fraction: f32,
     /// Largest rotation about each axis away from a photograph's pose, radians.
     pub pose_noise: f64,
-    /// Elevation of the camera over the object's xy plane, radians: `[0, pi/2]` is the upper hemisphere.
+    /// Elevation of the camera above the object's xy plane, radians: `[0, pi/2]` is the upper hemisphere.
     pub elevation: [f32; 2],
     /// Largest rotation about the view axis from upright for poses that are not near a photograph's, radians.
     pub max_view_rotation: f32,
-    /// Distance of rendered objects, metres; `None` takes the photographs' range (without any: 4 to 12 diameters).
+    /// Distance of rendered objects, metres; `None`: the photographs' range (without any: 4 to 12 diameters).
     pub distance: Option<[f64; 2]>,
-    /// Camera of rendered objects; `None` takes the photographs' (without any: 640x480, focal length 600).
+    /// Camera of rendered objects; `None`: that of the photographs (without any: 640x480, focal length 600).
     pub camera: Option<Camera>,
     /// Probability that a rendered object has random colours instead of its mesh's (always, when the mesh has none).
     pub random_color_probability: f32,
-    /// Targets of an object with discrete symmetries are those of one side that stands for all (for comparison with the
+    /// Use as targets of an object with discrete symmetries those of one side that represents all (for comparison with the
     /// transformer loss).
     pub view_limits: bool,
-    /// Meshes with more faces are simplified to about so many before they are drawn.
+    /// Meshes with more faces are simplified to about this many before rendering.
     pub faces: usize,
-    /// Seed of the images that are made once (renders used as occluders).
+    /// Seed of the images that are generated once (renders used as occluders).
     pub seed: u64,
 }
 
@@ -126,8 +126,8 @@ impl Default for SampleOptions {
 }
 
 impl SampleOptions {
-    /// The dissertation's samples (section 3.4.1, tables 3.2 and 3.3): parts of photographs on random backgrounds, of each a
-    /// part replaced by the background, whole batches of `batch` alternately for the first and the second stage.
+    /// The dissertation's samples (section 3.4.1, tables 3.2 and 3.3): parts of photographs on random backgrounds, each with a part
+    /// replaced by the background; whole batches of `batch` samples alternate between the first and the second stage.
     pub fn published(batch: u64) -> Self {
         SampleOptions {
             render_share: 0.0,
@@ -151,7 +151,7 @@ impl SampleOptions {
         self.target_size.unwrap_or(self.size)
     }
 
-    /// How poses of renders vary.
+    /// The variation of the poses of renders.
     pub(super) fn poses(&self) -> PoseVariation {
         PoseVariation {
             near_fraction: self.near_real_fraction,

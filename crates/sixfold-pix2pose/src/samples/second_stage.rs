@@ -1,15 +1,15 @@
-//! The input of the second stage, imitated: everything outside what the first stage took for the object is grey
-//! (dissertation, section 3.3). The first stage errs, so the mask is disturbed: its border grows, shrinks and wobbles,
-//! rectangles are missing or added, holes appear.
+//! Imitates the input of the second stage: everything outside the object's mask from the first stage is grey (dissertation, section
+//! 3.3). The first stage makes errors, so the mask is perturbed: its border grows, shrinks and varies, rectangles are missing or
+//! added, and there are holes.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
 use sixfold_synth::augment::{Coverage, Patch};
 
-/// Value of what is masked out, in images of 0..1.
+/// Value of masked-out pixels, in images of 0..1.
 pub(crate) const GREY: f32 = 0.5;
 
-/// Greys out all but a disturbed form of `visible`; `whole` is the silhouette with its hidden parts, which the first
+/// Greys out everything outside a perturbed form of `visible`; `whole` is the silhouette with its hidden parts, which the first
 /// stage sometimes keeps.
 pub(super) fn imitate(image: &mut Patch, visible: &Coverage, whole: &Coverage, random: &mut Random) {
     let side = image.width as f32;
@@ -24,12 +24,12 @@ pub(super) fn imitate(image: &mut Patch, visible: &Coverage, whole: &Coverage, r
         fill(&mut cut, 0.5, 0.0, random);
     }
     if random.random::<f32>() < 0.25 {
-        // Holes where noise, fine against the object, is high.
+        // Holes where a noise field, fine compared with the object, is high.
         let field = Coverage::filled(kept.width, kept.height, 0.5);
         let holes = field.disturbed(-uniform(random, [1.5, 3.5]) * scale, 4.0 * scale, random);
         cut.remove(&holes);
     }
-    // What is left has to be enough to tell a pose.
+    // The remaining part must be large enough to determine a pose.
     if common(&cut, visible) > 0.4 * before {
         kept = cut;
     }
@@ -46,7 +46,7 @@ fn common(a: &Coverage, b: &Coverage) -> f32 {
     a.data.iter().zip(&b.data).map(|(a, b)| a * b).sum()
 }
 
-/// Sets a random rectangle, its sides at most `largest` of the crop.
+/// Sets a random rectangle with sides of at most the fraction `largest` of the crop.
 fn fill(mask: &mut Coverage, largest: f32, value: f32, random: &mut Random) {
     let mut span = |size: usize| {
         let length = uniform(random, [0.05, largest]) * size as f32;

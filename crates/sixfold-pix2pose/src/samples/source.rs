@@ -1,4 +1,4 @@
-//! The source of training samples: objects, photographs and backgrounds go in, samples come out.
+//! The source of training samples: combines objects, photographs and backgrounds.
 
 use super::composition::{Composition, Scenery, gain};
 use super::error::SampleError;
@@ -20,36 +20,36 @@ use sixfold_synth::augment::{Backgrounds, Coverage, Cutout, Patch, Window};
 use sixfold_synth::randomly_colored;
 use std::collections::BTreeMap;
 
-/// Renders of each object that serve as clutter and occluders, and their side in pixels.
+/// Number of renders of each object for clutter and occluders, and their side in pixels.
 const CUTOUTS_PER_OBJECT: u64 = 16;
 const CUTOUT_SIDE: usize = 96;
-/// Directions in which a mesh's farthest vertices decide about its box.
+/// Directions whose extreme vertices determine a mesh's bounding box.
 const EXTREMES: usize = 300;
 
-/// One training sample. All arrays are row-major, channel first; S is the input's side, T the targets'
-/// ([`SampleOptions::target`]). Target pixel `(x, y)` stands for the centre of its block of input pixels.
+/// One training sample. All arrays are row-major, channel first; S is the input's side, T the targets' ([`SampleOptions::target`]).
+/// Target pixel `(x, y)` represents the centre of its block of input pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// The input image, 3 x S x S, in 0..1.
     pub rgb: Vec<f32>,
-    /// Normalised object coordinates, 3 x T x T, in -1..1, 0 outside the object; also where it is hidden.
+    /// Normalised object coordinates, 3 x T x T, in -1..1, 0 outside the object; including hidden parts.
     pub coordinates: Vec<f32>,
-    /// 1 within the silhouette, hidden parts included, T x T.
+    /// 1 within the silhouette, including hidden parts, T x T.
     pub object: Vec<f32>,
     /// 1 where the object is visible in the input, T x T.
     pub visible: Vec<f32>,
-    /// Place of the object in the list given to [`SampleSource::new`].
+    /// Index of the object in the list given to [`SampleSource::new`].
     pub object_index: usize,
 }
 
-/// A training object made ready.
+/// A training object prepared for sampling.
 struct Prepared {
     id: u32,
     info: ModelInfo,
     scale: BoundingBoxScale,
-    /// What targets are sampled from.
+    /// The mesh from which targets are sampled.
     drawn: PreparedMesh,
-    /// The textured mesh, where there is one: the simplified mesh has lost its texture.
+    /// The textured mesh, if there is one, because the simplified mesh has no texture.
     textured: Option<Mesh>,
     real: Vec<PosedImage>,
     real_poses: Vec<Pose>,
@@ -57,7 +57,7 @@ struct Prepared {
     camera: Camera,
 }
 
-/// Draws training samples; shared between threads by reference.
+/// Generates training samples; shared between threads by reference.
 pub struct SampleSource {
     objects: Vec<Prepared>,
     backgrounds: Backgrounds,
@@ -66,8 +66,8 @@ pub struct SampleSource {
 }
 
 impl SampleSource {
-    /// Makes objects and photographs ready. Meshes are simplified and a few images of each object drawn, which takes
-    /// seconds for large meshes.
+    /// Prepares objects and photographs. Meshes are simplified and a few images of each object rendered, which takes seconds for
+    /// large meshes.
     ///
     /// # Errors
     /// [`SampleError`] for options out of range, a mesh without surface, a photograph of an unknown object, and an
@@ -91,7 +91,7 @@ impl SampleSource {
             }
             real_of.entry(crop.object_id()).or_default().push(crop);
         }
-        // Distances and camera of an object without photographs: those of the others.
+        // An object without photographs uses distances and camera of the others.
         let mut any_real = real_of.values().flatten();
         let common_distance = distances(any_real.clone());
         let common_camera = options.camera.or_else(|| any_real.next().map(|c| *c.camera()));
@@ -119,27 +119,27 @@ impl SampleSource {
         &self.options
     }
 
-    /// How many objects there are.
+    /// Number of objects.
     pub fn objects(&self) -> usize {
         self.objects.len()
     }
 
-    /// How many photographs show an object.
+    /// Number of photographs of an object.
     ///
     /// # Panics
-    /// When there is no such object.
+    /// If there is no such object.
     pub fn photographs(&self, object_index: usize) -> usize {
         self.objects[object_index].real.len()
     }
 
-    /// Draws a sample: the same for the same arguments, on any thread.
+    /// Generates a sample: the same for the same arguments, on any thread.
     ///
     /// # Panics
-    /// When there is no such object.
+    /// If there is no such object.
     pub fn sample(&self, object_index: usize, seed: u64, number: u64) -> Sample {
         let object = &self.objects[object_index];
         let options = &self.options;
-        // Objects draw different samples under the same number.
+        // Different objects get different samples for the same number.
         let mut random = stream(seed ^ (object_index as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15), number);
         let can_render = object.drawn.colored || options.random_color_probability > 0.0;
         let rendered =
@@ -163,7 +163,7 @@ impl SampleSource {
         }
         let mut seen = visible.resampled(options.target(), options.target());
         for (seen, object) in seen.data.iter_mut().zip(&object_mask.data) {
-            // A little below one half: a pixel on the object's own border counts as the silhouette counts it.
+            // Slightly below one half, so that pixels on the object's own border are treated as in the silhouette.
             *seen = if *seen > 0.4 && *object > 0.5 { 1.0 } else { 0.0 };
         }
         Sample { rgb: image.data, coordinates, object: object_mask.data, visible: seen.data, object_index }
@@ -237,7 +237,7 @@ impl SampleSource {
         };
         options.render_color.apply(&mut patch, random);
         let mut composition = scenery.paste(&patch, silhouette, random);
-        // A photograph's crop of fewer pixels than the input is enlarged, and so less sharp.
+        // A photograph's crop with fewer pixels than the input is enlarged and therefore less sharp.
         let enlarged = options.size as f64 / window.side;
         if enlarged > 1.0 && random.random::<f32>() < 0.7 {
             composition.image.blur((0.4 * enlarged) as f32);
@@ -245,7 +245,7 @@ impl SampleSource {
         (composition, coordinates, mask, hidden)
     }
 
-    /// The crop's window about an object's box, and what it hides of the object.
+    /// The crop's window around an object's box, and the part of the object that is to be hidden.
     fn window(&self, extent: Extent, random: &mut Random) -> (Window, Option<Coverage>) {
         let options = &self.options;
         if random.random::<f32>() >= options.cut_probability {
@@ -256,7 +256,7 @@ impl SampleSource {
         (window, Some(cut.beyond(&window, options.size)))
     }
 
-    /// The visible parts of photographs and a few renders of each object.
+    /// Cut-outs: the visible parts of photographs and a few renders of each object.
     fn draw_cutouts(&self) -> Vec<(usize, Cutout)> {
         let mut cutouts = Vec::new();
         if self.objects.len() < 2 {
@@ -334,7 +334,7 @@ impl Prepared {
         }
     }
 
-    /// The box of the whole object in the image; `None` when a part of it is behind the camera.
+    /// The bounding box of the whole object in the image; `None` when a part of it is behind the camera.
     fn extent(&self, camera: &Camera, pose: &Pose) -> Option<Extent> {
         let (low, high) = self.drawn.pixel_box(camera, pose)?;
         Extent::of([low, high])

@@ -1,26 +1,26 @@
-//! One pose for all that look alike: an object with a continuous symmetry is rotated about its axis until the camera
-//! lies in a fixed direction, so that equal images have equal targets.
+//! A canonical pose for all symmetric ones: an object with a continuous symmetry is rotated about its axis until the camera is in a
+//! fixed direction, so that equal images have equal targets.
 //!
-//! The author sets the Euler angle about the axis to zero, which still depends on the view; turning towards the camera
-//! does not, and has no jump except where the camera looks along the axis.
+//! The author sets the Euler angle about the axis to zero, which still depends on the view; a rotation towards the camera does not,
+//! and is continuous except where the camera looks along the axis.
 
 //!
-//! For comparison, discrete symmetries can be treated in the same way ("view limits" in the dissertation's table 3.1):
-//! the pose whose camera looks at one side of the object stands for all. Targets then jump where two sides meet.
+//! For comparison, discrete symmetries can be treated in the same way ("view limits" in the dissertation's table 3.1): the pose
+//! whose camera views one side of the object represents all. Targets then jump where two sides meet.
 
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo};
 
-/// The pose whose targets are trained; with `limits`, one of those that the discrete symmetries make equal.
+/// The pose whose targets are used in the training; with `limits`, one of those that are equivalent under the discrete symmetries.
 pub(super) fn canonical(pose: &Pose, info: &ModelInfo, limits: bool) -> Pose {
     let pose = if limits { within_limits(pose, info) } else { *pose };
     info.symmetries_continuous.iter().fold(pose, |pose, symmetry| facing_camera(&pose, symmetry))
 }
 
-/// Of the poses that look alike the one whose camera lies furthest in a fixed direction of the object.
+/// Of the symmetric poses, the one whose camera is furthest in a fixed direction of the object.
 fn within_limits(pose: &Pose, info: &ModelInfo) -> Pose {
-    // Along no axis of symmetry that a person would choose.
+    // Not along an axis of symmetry that a person would choose.
     let side = Vec3::new(0.67, 0.74, 0.05);
     let reach = |pose: &Pose| pose.inverse().translation().dot(&side);
     let equal = info.symmetries_discrete.iter().map(|symmetry| *pose * *symmetry);
@@ -29,7 +29,7 @@ fn within_limits(pose: &Pose, info: &ModelInfo) -> Pose {
 
 fn facing_camera(pose: &Pose, symmetry: &ContinuousSymmetry) -> Pose {
     let Some(axis) = Unit::try_new(symmetry.axis, 1e-9) else { return *pose };
-    // Of the two directions across the axis, the fixed one is made from the coordinate axis least along it.
+    // Of the two directions perpendicular to the axis, the fixed one is computed from the coordinate axis least parallel to it.
     let helper = if axis.x.abs() < 0.6 { Vec3::x() } else { Vec3::y() };
     let forward = (helper - axis.scale(axis.dot(&helper))).normalize();
     let side = axis.cross(&forward);
@@ -64,7 +64,7 @@ mod tests {
         for turn in info.symmetry_poses(0.3) {
             let found = canonical(&(pose * turn), &info, false);
             assert!((found.inverse() * expected).log().amax() < 1e-9);
-            // And it is one of those that look alike: points on the axis stay.
+            // It is also one of the symmetric poses: points on the axis are unchanged.
             let on_axis = symmetry.offset + symmetry.axis * 0.3;
             assert!((found.transform_point(&on_axis) - pose.transform_point(&on_axis)).norm() < 1e-9);
         }

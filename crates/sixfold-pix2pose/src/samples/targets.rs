@@ -1,4 +1,4 @@
-//! What a network is to find: the object's coordinates and silhouette.
+//! Targets of a network: the object's coordinates and silhouette.
 
 use sixfold_geometry::{Camera, Pose};
 use sixfold_mesh::Mesh;
@@ -33,8 +33,8 @@ pub(super) fn targets(
     (coordinates, silhouette)
 }
 
-/// Takes what lies outside the mask of the photograph away from coordinates and silhouette (section 3.4.4): CAD models and
-/// convex hulls cover pixels that the object does not.
+/// Removes everything outside the mask of the photograph from coordinates and silhouette (section 3.4.4): CAD models and convex
+/// hulls cover pixels that the object does not.
 pub(super) fn synchronise(coordinates: &mut [f32], silhouette: &mut Coverage, seen: &Coverage) {
     let pixels = silhouette.data.len();
     for pixel in (0..pixels).filter(|pixel| seen.data[*pixel] <= 0.4) {

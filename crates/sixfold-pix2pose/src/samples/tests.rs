@@ -1,4 +1,4 @@
-//! Samples of a box whose colours are its coordinates: what is seen can be compared with what is to be learnt.
+//! Samples of a box whose colours are its coordinates, so that images can be compared with targets.
 
 use super::targets::targets;
 use super::*;
@@ -15,7 +15,7 @@ fn camera() -> Camera {
     Camera::new(600.0, 590.0, 155.0, 118.0, 320, 240).unwrap()
 }
 
-/// A box of 12 x 8 x 5 cm off its origin, each side a fine grid. Red, green and blue are x, y and z.
+/// A box of 12 x 8 x 5 cm, not centred on its origin, each side a fine grid. Red, green and blue are x, y and z.
 fn colored_box() -> Mesh {
     const N: usize = 24;
     let (centre, half) = (Vec3::new(0.01, -0.02, 0.03), Vec3::new(0.06, 0.04, 0.025));
@@ -66,7 +66,7 @@ fn posed(
     PosedImage::new("photograph", id, image.clone(), camera, pose)?.with_mask(mask)
 }
 
-/// A "photograph" of the box on grey: its colours are its coordinates, as nothing but even white light shines.
+/// A "photograph" of the box on grey: its colours are its coordinates, because the light is uniform and white.
 fn photograph(id: u32, pose: Pose) -> PosedImage {
     let lights = [Light::Ambient { color: [1.0; 3] }];
     let (mut image, silhouette) = colors(&colored_box(), &camera(), &pose, &lights, &Material::default());
@@ -91,7 +91,7 @@ fn poses() -> Vec<Pose> {
     ]
 }
 
-/// Nothing but geometry.
+/// Options with geometric augmentation only.
 fn plain() -> SampleOptions {
     SampleOptions {
         target_size: Some(64),
@@ -177,7 +177,7 @@ fn renders_and_their_targets_cover_the_same_pixels() {
         for v in 1..63 {
             for u in 1..63 {
                 let inside = sample.object[v * 64 + u] > 0.5;
-                // Only where the silhouette's border is not near.
+                // Only away from the silhouette's border.
                 let even = (v - 1..=v + 1)
                     .all(|y| (u - 1..=u + 1).all(|x| (sample.object[y * 64 + x] > 0.5) == inside));
                 if even {
@@ -199,7 +199,7 @@ fn renders_and_their_targets_cover_the_same_pixels() {
 #[test]
 fn render_colors_follow_the_coordinates() {
     let source = source(SampleOptions { render_share: 1.0, ..plain() });
-    // Correlation of each colour with its coordinate, over all samples: light varies, the order does not.
+    // Correlation of each colour with its coordinate, over all samples: the light varies, but the order of colours does not.
     let mut sums = [[0.0f64; 5]; 3];
     let mut count = 0.0;
     for number in 0..40 {
@@ -235,7 +235,7 @@ fn a_coordinate_projects_to_its_pixel_and_lies_on_the_surface() {
             assert!((n.amax() - 1.0).abs() < 1e-4, "{n:?} is not on a side of the box");
             let pixel = camera().project(&pose.transform_point(&scale.restore(&n))).unwrap();
             let expected = Vec2::new((i % 320) as f64, (i / 320) as f64);
-            // Coordinates are cut to -1..1, which moves points at the rim a little.
+            // Coordinates are clipped to -1..1, which moves points at the border slightly.
             assert!((pixel - expected).norm() < 0.02, "{pixel:?} {expected:?}");
             seen += 1;
         }
@@ -256,7 +256,7 @@ fn occluders_change_what_is_visible_and_nothing_else() {
         assert!(a.visible.iter().zip(&b.visible).all(|(a, b)| b <= a));
         share += b.visible.iter().sum::<f32>() / a.visible.iter().sum::<f32>() / 60.0;
     }
-    // What remains of 1 on average, when between 0.2 and 0.5 are hidden.
+    // The mean visible fraction when between 0.2 and 0.5 are hidden.
     assert!((share - 0.65).abs() < 0.06, "{share}");
 }
 
@@ -285,12 +285,12 @@ fn what_is_left_of_a_cut_object_fills_the_crop_as_a_whole_one_does() {
         shown += b.visible.iter().sum::<f32>() / b.object.iter().sum::<f32>() / 60.0;
         fills += longest(&a) / 60.0;
         filled += longest(&b) / 60.0;
-        // What hides it changes neither its coordinates nor what is seen of it.
+        // The occluder changes neither the coordinates nor the visible part.
         for (u, v) in inner(&b, 64, 1) {
             assert!(b.object[v * 64 + u] > 0.5 && b.coordinates[v * 64 + u] != 0.0);
         }
     }
-    // Three tenths of the box hold about as much of the object, what of it the crop still shows.
+    // Three tenths of the box contain about as much of the object, as far as the crop still shows it.
     assert!((0.62..0.85).contains(&shown), "{shown}");
     assert!((filled / fills - 1.0).abs() < 0.1, "{filled} of {fills}");
 }
@@ -427,7 +427,7 @@ fn what_cannot_be_trained_is_said() {
         let message = error_of(vec![object(3, mesh.clone())], vec![], options);
         assert!(message.contains(field), "{message}");
     }
-    // Random colours, or photographs, make a mesh without colours usable.
+    // A mesh without colours is usable with random colours, or with photographs.
     let options = SampleOptions { random_color_probability: 1.0, size: 32, ..default() };
     let source =
         SampleSource::new(vec![object(3, gray(&mesh))], vec![], Backgrounds::procedural(), options).unwrap();
@@ -488,7 +488,7 @@ fn published_samples_are_photographs_on_backgrounds_with_the_stages_in_turns() {
     assert_eq!((published.keep_background_probability, published.cut_probability), (0.0, 0.0));
     assert!((published.rotation.to_degrees() - 45.0).abs() < 1e-4);
     assert!(published.check().is_ok());
-    // Nothing but the object, its surroundings and what hides it: on an even background that is grey.
+    // Only the object, its surroundings and occluders, which are parts of the uniform background and therefore grey.
     let even = SampleOptions {
         size: 64,
         target_size: Some(64),
@@ -509,7 +509,7 @@ fn published_samples_are_photographs_on_backgrounds_with_the_stages_in_turns() {
         assert!((0.2..0.6).contains(&share), "{number}: {share}");
         let grey = |i: &usize| (0..3).all(|c| (s.rgb[c * pixels + i] - s.rgb[c * pixels]).abs() < 0.03);
         let wrong = hidden.iter().filter(|i| !grey(i)).count();
-        // Pixels along the occluder's rim show some of both.
+        // Pixels along the occluder's border mix both.
         assert!(wrong * 5 < hidden.len(), "{number}: {wrong} of {}", hidden.len());
     }
 }

@@ -1,8 +1,8 @@
-//! Where the window of a training crop lies, and photographs that are rotated about their principal point.
+//! The window of a training crop, and photographs rotated about their principal point.
 //!
-//! A turn of the image about the principal point by `R_z` is exactly a turn of the scene about the camera's axis: the
-//! photograph of pose `P` becomes that of `R_z P` (for `fx != fy` with a small shear, which is kept). So targets are
-//! rendered at `R_z P` with the window's camera, and nothing but colour is ever interpolated.
+//! A rotation of the image about the principal point by `R_z` is exactly a rotation of the scene about the camera's axis: the
+//! photograph at pose `P` becomes that at `R_z P` (for `fx != fy` with a small shear, which is kept). Targets are therefore
+//! rendered at `R_z P` with the window's camera, and only colours are interpolated.
 
 use rand::RngExt;
 use sixfold_geometry::nalgebra::UnitQuaternion;
@@ -35,7 +35,7 @@ impl Extent {
         (self.high - self.low).max()
     }
 
-    /// The box without a part at one of its sides, and where that part begins.
+    /// The box without a part at one of its sides, and the border of that part.
     pub(super) fn cut(&self, options: &SampleOptions, random: &mut Random) -> (Extent, Cut) {
         let axis = random.random_range(0..2usize);
         let share = f64::from(uniform(random, options.cut));
@@ -54,13 +54,13 @@ impl Extent {
         (rest, Cut { point, outwards })
     }
 
-    /// A box of one point, for lack of a better one.
+    /// A degenerate box of one point.
     pub(crate) fn at(point: Vec2) -> Extent {
         Extent { low: point, high: point }
     }
 }
 
-/// A straight border of what hides a part of the object.
+/// The straight border of an occluder.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Cut {
     point: Vec2,
@@ -68,7 +68,7 @@ pub(super) struct Cut {
 }
 
 impl Cut {
-    /// What lies beyond it in a crop.
+    /// The area beyond it in a crop.
     pub(crate) fn beyond(&self, window: &Window, size: usize) -> Coverage {
         let step = window.side / size as f64;
         let corner = window.centre - Vec2::repeat(0.5 * window.side - 0.5 * step);
@@ -79,7 +79,7 @@ impl Cut {
     }
 }
 
-/// A crop about a box, moved and scaled at random.
+/// A crop around a box, randomly shifted and scaled.
 pub(super) fn window_around(extent: &Extent, options: &SampleOptions, random: &mut Random) -> Window {
     let mut symmetric = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
     let longest = extent.longest().max(2.0);
@@ -93,7 +93,7 @@ pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn), Vec3::zeros()) * *pose
 }
 
-/// Where a pixel of the photograph lies after its turn about the principal point.
+/// The position of a pixel of the photograph after its rotation about the principal point.
 pub(super) fn rotated_pixel(camera: &Camera, pixel: &Vec2, turn: f64) -> Vec2 {
     let (s, c) = turn.sin_cos();
     let (x, y) = ((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy);

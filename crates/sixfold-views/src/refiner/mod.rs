@@ -1,6 +1,7 @@
-//! A refiner of poses: the object is rendered at a pose, a network says for every cell of the render where the image shows it and
-//! how sure that is, and the pose moves there; several times (the structure of Lipson et al. 2022, "Coupled iterative refinement",
-//! and of GoTrack, Nguyen et al. 2025: correlations, displacements with confidence, PnP). It learns from synthetic objects alone.
+//! A refiner of poses: the object is rendered at a pose, a network predicts for every cell of the render its position in the image
+//! with a confidence, and the pose is updated accordingly, over several iterations (the structure of Lipson et al. 2022, "Coupled
+//! iterative refinement", and of GoTrack, Nguyen et al. 2025: correlations, displacements with confidence, PnP). It is trained on
+//! synthetic objects only.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -21,11 +22,11 @@ pub mod recipe;
 mod samples;
 pub mod training;
 
-/// The pixel of a cell that stands for it.
+/// The pixel that represents a cell.
 const MIDDLE: usize = CELL / 2;
-/// Renders that go through the network together.
+/// Renders per forward pass.
 const BATCH: usize = 16;
-/// Features of length 1 and their products, as large as other inputs.
+/// Scales unit features and their products to the magnitude of the other inputs.
 const FEATURE_SCALE: f32 = 8.0;
 const PRODUCT_SCALE: f32 = 3.0;
 
@@ -35,13 +36,13 @@ pub struct Shown {
     pub input: Vec<f32>,
     /// 1 for pixels that show the object.
     pub mask: Vec<f32>,
-    /// Cells in whose middle it is seen.
+    /// Cells whose centre shows the object.
     pub cells: Vec<u16>,
-    /// The points seen there, metres in the object's frame.
+    /// The points visible there, metres in the object's frame.
     pub points: Vec<[f32; 3]>,
 }
 
-/// Renders an object; `None` where no cell shows it.
+/// Renders an object; `None` if no cell shows it.
 pub fn shown(frame: &mut VisibilityBuffer, mesh: &Mesh, pose: &Pose) -> Option<Shown> {
     let rendered = render(frame, mesh, pose, None);
     let side = rendered.coordinates.size().0;
@@ -58,7 +59,7 @@ pub fn shown(frame: &mut VisibilityBuffer, mesh: &Mesh, pose: &Pose) -> Option<S
     (!cells.is_empty()).then(|| Shown { input: input_over_grey(&rendered), mask, cells, points })
 }
 
-/// What the network sees of a render and a crop.
+/// The network's inputs for a render and a crop.
 pub(crate) struct Pair {
     pub(crate) picture: Vec<f32>,
     pub(crate) cells: Vec<f32>,
@@ -96,7 +97,7 @@ pub(crate) fn pair(shown: &Shown, seen: &FeatureMap, crop: &[f32], map: &Feature
     Pair { picture, cells }
 }
 
-/// A crop to refine poses in.
+/// A crop in which poses are refined.
 pub struct Target<'a> {
     /// Its camera.
     pub camera: &'a Camera,
@@ -106,23 +107,23 @@ pub struct Target<'a> {
     pub map: &'a FeatureMap,
 }
 
-/// Where the crop shows the object as it is rendered at a pose.
+/// Positions in the crop of the object's points as rendered at a pose.
 #[derive(Debug, Clone)]
 pub struct Displaced {
     /// Points of the object, metres in its frame.
     pub points: Vec<Vec3>,
-    /// Where the crop shows them.
+    /// Their pixels in the crop.
     pub pixels: Vec<Vec2>,
-    /// How far each pixel may be off, pixels.
+    /// Uncertainty of each pixel, pixels.
     pub spreads: Vec<f64>,
-    /// How probably the crop shows each point.
+    /// Probability that the crop shows each point.
     pub weights: Vec<f64>,
-    /// The part of the cells that the crop shows where the render does, as the network has it: 0 to 1.
+    /// Fraction of the cells that the crop shows at the same position as the render, as predicted by the network: 0 to 1.
     pub score: f64,
 }
 
 impl Displaced {
-    /// The pose that it speaks for, from one near it.
+    /// The pose that fits these points, starting from one near it.
     fn pose(&self, camera: &Camera, from: &Pose) -> Option<Pose> {
         let trust: Vec<Trust> = self
             .spreads
@@ -147,7 +148,7 @@ impl Refiner {
         Refiner { network, device }
     }
 
-    /// The object rendered at each pose against the crop; `None` where it is not seen, or nearer than `nearest` metres.
+    /// Compares the object rendered at each pose with the crop; `None` if it is not visible, or nearer than `nearest` metres.
     ///
     /// # Errors
     /// [`ViewsError::Network`].
@@ -185,8 +186,8 @@ impl Refiner {
             .collect())
     }
 
-    /// Renders, compares and moves each pose `times` times; with how good what comes of it is, 0 to 1. The best of the poses on the
-    /// way, the first included, is kept.
+    /// Renders, compares and updates each pose `times` times; returns the best pose of all iterations, including the first, with
+    /// its score from 0 to 1.
     ///
     /// # Errors
     /// [`ViewsError::Network`].
@@ -272,7 +273,7 @@ mod tests {
         (Extractor::shipped().unwrap(), Refiner::new(network, device))
     }
 
-    /// An object in two colours without a symmetry, and a crop that shows it.
+    /// An object in two colours without symmetries, and a crop that shows it.
     fn scene() -> (Mesh, Crop, Pose, Patch) {
         let mesh = Mesh::merged(&[
             cuboid([-0.06, -0.03, -0.03], [0.06, 0.03, 0.03], [200, 60, 40]),
@@ -340,7 +341,7 @@ mod tests {
         let sample = make_sample(&textures, 160, 3, 1);
         assert_eq!(sample.renders.len(), RENDERS);
         assert_eq!(sample.photograph, make_sample(&textures, 160, 3, 1).photograph);
-        // A solid that is disturbed by hand: what is learned from is what projection says.
+        // A solid at a perturbed pose: the training targets agree with the projection.
         let mut random = stream(1, 0);
         let mesh = random_solid(&textures, &[], &mut random).scaled(0.1);
         let truth = Pose::from_translation(Vec3::new(0.0, 0.0, 1.0));

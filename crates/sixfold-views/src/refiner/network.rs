@@ -1,4 +1,4 @@
-//! The network: for every cell of a render, where the crop shows the same point of the object, and how sure that is.
+//! The network: for every cell of a render, the position of the same point of the object in the crop, with its confidence.
 
 use std::path::Path;
 
@@ -15,27 +15,27 @@ use crate::network::INPUTS;
 /// Name of the network in weight files.
 pub const ARCHITECTURE: &str = "views-refiner";
 
-/// How far from a cell features of the crop are compared with its own, cells.
+/// Distance within which features of the crop are compared with that of a cell, cells.
 pub const REACH: usize = 3;
-/// Products with the features about a cell.
+/// Number of products with the features around a cell.
 pub(crate) const PRODUCTS: usize = (2 * REACH + 1) * (2 * REACH + 1);
-/// Numbers for every cell: its features in the render and in the crop, products, whether it shows the object.
+/// Inputs per cell: its features in the render and in the crop, products, whether it shows the object.
 pub(crate) const CELL_INPUTS: usize = 2 * CHANNELS + PRODUCTS + 1;
-/// Planes of a picture: the render, the crop, and where the render shows the object.
+/// Planes of the image input: the render, the crop, and the mask of the render.
 pub(crate) const PICTURE_INPUTS: usize = 2 * INPUTS + 1;
-/// Numbers that come out for every cell: displacement (x, y), logarithm of its spread, and the logits that the crop shows the
-/// cell's point near, and that it shows it right there.
+/// Outputs per cell: displacement (x, y), logarithm of its spread, and the logits that the crop shows the cell's point nearby, and
+/// at the same position.
 pub(crate) const OUTPUTS: usize = 5;
 
-/// The weights within the program; their card lies beside them.
+/// The shipped weights; their card is next to them.
 const WEIGHTS: &[u8] = include_bytes!("../../weights/refiner.safetensors");
 
-/// Channels of the layers behind both inputs.
+/// Channels of the layers after both inputs are joined.
 const WIDTH: usize = 80;
-/// Channels of what is drawn from the cells' features, and from the pictures.
+/// Channels of the layers on the cells' features, and of those on the images.
 const FROM_CELLS: usize = 64;
 const DETAIL: [usize; 3] = [24, 32, 48];
-/// Layers that add to what they get.
+/// Number of residual layers.
 const DEPTH: usize = 5;
 
 /// Compares a render with a crop.
@@ -85,16 +85,16 @@ impl RefinerNetwork {
         }
     }
 
-    /// The network within the program.
+    /// The shipped network.
     ///
     /// # Errors
-    /// [`WeightsError`] if the program carries other weights than its own version's.
+    /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped(device: &Device) -> Result<RefinerNetwork, WeightsError> {
         let name = Path::new("refiner.safetensors");
         Ok(load_weights_from_bytes(RefinerNetwork::random(0, device), name, WEIGHTS, ARCHITECTURE)?.0)
     }
 
-    /// A network that `sixfold train refiner` wrote, with its card.
+    /// A network written by `sixfold train refiner`, with its card.
     ///
     /// # Errors
     /// [`WeightsError`].
@@ -102,8 +102,8 @@ impl RefinerNetwork {
         load_weights(RefinerNetwork::random(0, device), path, ARCHITECTURE)
     }
 
-    /// `pairs x OUTPUTS x side / 8 x side / 8` from pictures, `pairs x PICTURE_INPUTS x side x side`, and cells, `pairs x CELL_INPUTS x
-    /// side / 8 x side / 8`.
+    /// `pairs x OUTPUTS x side / 8 x side / 8` from images, `pairs x PICTURE_INPUTS x side x side`, and cells, `pairs x CELL_INPUTS
+    /// x side / 8 x side / 8`.
     pub fn forward(&self, pictures: Tensor<4>, cells: Tensor<4>) -> Tensor<4> {
         let detail = self.detail.iter().fold(pictures, |x, layer| layer.forward(x));
         let mut x = self.join.forward(Tensor::cat(vec![self.cells.forward(cells), detail], 1));

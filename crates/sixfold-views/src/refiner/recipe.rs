@@ -1,5 +1,5 @@
-//! The refiner's whole training: nothing but a seed in (better: photographs for textures and backgrounds too), a refiner for the
-//! features of the network within the program out. Interrupted at any time, it is resumed.
+//! The complete training of the refiner for the features of the shipped network, from a seed alone (better: with photographs for
+//! textures and backgrounds). It can be interrupted at any time and resumed.
 
 use std::path::PathBuf;
 
@@ -18,14 +18,14 @@ use crate::features::Extractor;
 use crate::network::shipped_hash;
 use crate::recipe::{described, textures};
 
-/// How the network is trained.
+/// Options of the training.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RefinerRecipe {
-    /// Folder of photographs for textures, backgrounds and occluders; procedural textures only without.
+    /// Folder of photographs for textures, backgrounds and occluders; procedural textures only if `None`.
     pub backgrounds: Option<PathBuf>,
     /// Steps, learning rate, seed, crops.
     pub options: RefinerTrainingOptions,
-    /// What was asked for, for the model's card.
+    /// The command, for the model's card.
     pub command: String,
 }
 
@@ -53,7 +53,7 @@ impl Recipe for RefinerRecipe {
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
-        // Every field by its name, so that a new one finds its place; what is left out is in the options, or changes nothing.
+        // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         let RefinerRecipe { backgrounds, options, command: _ } = self;
         let backgrounds =
             background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;

@@ -1,4 +1,4 @@
-//! What the refiner learns from: synthetic objects as photographs might show them, each with renders at poses near the true one and
+//! Training samples of the refiner: synthetic objects rendered like photographs, each with renders at poses near the true one and
 //! at wrong ones.
 //!
 //! A sample is a function of seed and number alone.
@@ -17,11 +17,11 @@ use super::{MIDDLE, Shown, shown};
 use crate::network::input;
 use crate::samples::{Framing, Photograph, SEEN, between, distance, object, photograph};
 
-/// Renders of each photograph.
+/// Renders per photograph.
 pub(crate) const RENDERS: usize = 4;
-/// A render that shows the object in fewer cells teaches nothing.
+/// Fewest cells that show the object in a render.
 const MIN_CELLS: usize = 12;
-/// The largest changes of a pose that is to be refined: an angle, a displacement in cells, a factor of distance.
+/// The largest changes of a pose that is to be refined: an angle (radians), a displacement in cells, a factor of distance.
 const ANGLE: f64 = 0.5;
 const SHIFT: f64 = 2.2;
 const DISTANCE: f64 = 0.16;
@@ -34,17 +34,17 @@ pub(crate) struct RefinerSample {
     pub renders: Vec<Target>,
 }
 
-/// A render, and where the photograph shows what it shows.
+/// A render, and the positions of its points in the photograph.
 pub(crate) struct Target {
     /// The render.
     pub shown: Shown,
-    /// For each of its cells, how far from there the photograph has its point, cells.
+    /// For each of its cells, the displacement to the position of its point in the photograph, cells.
     pub flow: Vec<[f32; 2]>,
-    /// Whether the photograph shows it at all.
+    /// Whether the photograph shows the point at all.
     pub visible: Vec<bool>,
 }
 
-/// A pose near another: `size` from 0 to 1.
+/// A random pose near another; `size` from 0 to 1 scales the change.
 fn near(pose: &Pose, centre: &Vec3, focal: f64, size: f64, random: &mut Random) -> Pose {
     let axis = Vec3::from_fn(|_, _| between(random, -1.0, 1.0));
     let axis = Unit::try_new(axis, 1e-6).unwrap_or_else(Vec3::z_axis);
@@ -52,7 +52,7 @@ fn near(pose: &Pose, centre: &Vec3, focal: f64, size: f64, random: &mut Random) 
     moved(pose, centre, focal, &rotation, size, random)
 }
 
-/// The pose rotated about the object's centre, which moves too.
+/// The pose rotated about the object's centre, which is also shifted.
 fn moved(
     pose: &Pose,
     centre: &Vec3,
@@ -69,7 +69,7 @@ fn moved(
     Pose::new(rotation, to - rotation * centre)
 }
 
-/// The poses to render at: three to refine, often nearly right, and a wrong one.
+/// The poses to render: three to refine, often nearly right, and a wrong one.
 fn poses(pose: &Pose, centre: &Vec3, focal: f64, random: &mut Random) -> [Pose; RENDERS] {
     std::array::from_fn(|k| {
         let size = random.random::<f64>();
@@ -111,7 +111,7 @@ fn target(shown: Shown, photograph: &Photograph, diameter: f32) -> Target {
     out
 }
 
-/// The pixel in the middle of a cell.
+/// The pixel at the centre of a cell.
 pub(crate) fn middle(cell: usize, cells: usize) -> Vec2 {
     Vec2::new((cell % cells * CELL + MIDDLE) as f64, (cell / cells * CELL + MIDDLE) as f64)
 }
@@ -142,7 +142,7 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<R
     Some(RefinerSample { photograph: input(&photograph.patch.data), renders })
 }
 
-/// The sample of a number.
+/// The sample with a number.
 pub(crate) fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> RefinerSample {
     let mut random = stream(seed, number);
     loop {

@@ -1,5 +1,5 @@
-//! The refiner's training: displacements under a Laplace distribution whose spread is learned too, for the points that the photograph
-//! shows near; and whether it shows them.
+//! The refiner's training: displacements under a Laplace distribution whose spread is learned too, for the points that the
+//! photograph shows nearby; and whether it shows them.
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
@@ -17,12 +17,12 @@ use crate::features::Extractor;
 
 /// Logarithm of the smallest and the largest spread, cells.
 pub(crate) const SPREADS: [f64; 2] = [-4.0, 1.5];
-/// A displacement up to this many cells counts as near.
+/// Displacements up to this many cells count as nearby.
 const NEAR: f32 = REACH as f32 + 0.5;
-/// A displacement up to this many cells counts as none.
+/// Displacements up to this many cells count as zero.
 const HERE: f32 = 0.4;
 
-/// How to train. All of it decides about the result.
+/// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RefinerTrainingOptions {
     /// Steps, learning rate, seed.
@@ -30,7 +30,7 @@ pub struct RefinerTrainingOptions {
     pub common: TrainingOptions,
     /// Side of the crops, pixels; a multiple of 32.
     pub side: usize,
-    /// Photographs in a step; of each four renders.
+    /// Photographs per step, each with four renders.
     pub batch: usize,
 }
 
@@ -66,13 +66,13 @@ impl RefinerTrainingOptions {
 
 /// Textures, and the network whose features are compared.
 pub struct Source {
-    /// What textures, backgrounds and occluders look like.
+    /// Textures, backgrounds and occluders.
     pub textures: Backgrounds,
     /// The frozen network.
     pub extractor: Extractor,
 }
 
-/// A step's samples as the numbers of tensors; `P` pairs, `N` cells in a crop.
+/// A batch as tensor data; `P` pairs, `N` cells in a crop.
 #[derive(Debug, Clone, Default)]
 pub struct Batch {
     pairs: usize,
@@ -80,7 +80,7 @@ pub struct Batch {
     cells: Vec<f32>,
     /// `P x 2 x N`, cells.
     flow: Vec<f32>,
-    /// `P x 3 x N`: whether a cell shows the object; whether the photograph shows its point near, and there.
+    /// `P x 3 x N`: whether a cell shows the object; whether the photograph shows its point nearby, and at the same position.
     truth: Vec<f32>,
 }
 
@@ -93,7 +93,7 @@ impl Batch {
                 std::iter::once(s.photograph.clone()).chain(s.renders.iter().map(|r| r.shown.input.clone()))
             })
             .collect();
-        // A network that cannot run has no weights: what trains it then fails on its own.
+        // A network that cannot run has invalid weights; the training itself then reports the failure.
         let maps = extractor.features(&inputs, side).unwrap_or_default();
         let mut batch = Batch::default();
         for (sample, maps) in samples.iter().zip(maps.chunks_exact(1 + RENDERS)) {
@@ -124,13 +124,13 @@ impl Batch {
 pub struct RefinerTraining {
     learner: Learner<RefinerNetwork>,
     options: RefinerTrainingOptions,
-    /// How often is logged and saved.
+    /// How often the training logs and saves.
     pub pace: Pace,
     device: Device,
 }
 
 impl RefinerTraining {
-    /// Of a network whose tensors are on the autodiff `device`.
+    /// Starts the training of a network whose tensors are on the autodiff `device`.
     pub fn new(network: RefinerNetwork, options: RefinerTrainingOptions, device: Device) -> Self {
         let learner = Learner::adam_w("network", network, &options.common);
         let pace = Pace { checkpoint_every: 200, ..Pace::default() };
@@ -142,7 +142,7 @@ impl RefinerTraining {
         self.learner.into_network()
     }
 
-    /// The losses of displacement, of near and of here, and the mean error of displacements, cells.
+    /// The losses of displacement, of the nearby logit and of the same-position logit, and the mean error of displacements, cells.
     fn losses(&self, batch: Batch) -> [Tensor<1>; 4] {
         let (pairs, side) = (batch.pairs, self.options.side);
         let n = side / CELL;
@@ -159,7 +159,7 @@ impl RefinerTraining {
         let shown = near.clone().sum() + 1.0;
         let off = (out.clone().narrow(1, 0, 2) - tensor(batch.flow, 2, n)).abs();
         let spread = out.clone().narrow(1, 2, 1).clamp(SPREADS[0], SPREADS[1]);
-        // Of both coordinates together: |x| / b + |y| / b + 2 log b.
+        // For both coordinates together: |x| / b + |y| / b + 2 log b.
         let off = off.sum_dim(1);
         let error = (off.clone() * near.clone()).sum() / shown.clone() * 0.5;
         let laplace = ((off * (-spread.clone()).exp() + spread * 2.0) * near.clone()).sum() / shown;
@@ -229,7 +229,7 @@ mod tests {
             .chunks_exact(3 * 144)
             .flat_map(|t| t[..144].iter().copied().zip(t[144..288].iter().copied()))
             .unzip();
-        // What is near is on the object, and there are both sorts of cells.
+        // Nearby cells are on the object, and there are both kinds of cells.
         assert!(object.iter().zip(&near).all(|(o, n)| o >= n));
         assert!(near.contains(&1.0) && object.iter().zip(&near).any(|(o, n)| *o > *n));
         let first = training.step(batch.clone(), 2e-3);
