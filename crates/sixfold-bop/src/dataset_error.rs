@@ -6,12 +6,12 @@ use std::path::PathBuf;
 use sixfold_io::ImageFileError;
 use thiserror::Error;
 
-/// Where in a scene file something is: image, then number in that image's list.
+/// A place in a scene file: the image, then the index in that image's list.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Place {
     /// The image.
     pub im_id: Option<u32>,
-    /// Number of the entry, from zero.
+    /// Index of the entry, from zero.
     pub index: Option<usize>,
 }
 
@@ -31,7 +31,7 @@ impl std::fmt::Display for Place {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DatasetError {
-    /// Something that has to be there is not.
+    /// A required file or folder is missing.
     #[error("{}: {what} is missing; {advice}", path.display())]
     Missing {
         /// Where it should be.
@@ -68,7 +68,7 @@ pub enum DatasetError {
         /// What and where.
         source: serde_json::Error,
     },
-    /// A field holds something else than it should.
+    /// A field holds an invalid value.
     #[error("{}: {place}field {field}: found {found}, expected {expected}", path.display())]
     Field {
         /// The file.
@@ -92,7 +92,7 @@ pub enum DatasetError {
         /// What is wrong.
         reason: String,
     },
-    /// Which pixels of an image file are a mask is not clear.
+    /// It is not clear which pixels of an image file belong to the mask.
     #[error("{}: im_id {im_id}: mask: {reason}", path.display())]
     Mask {
         /// The file.
@@ -117,10 +117,10 @@ pub enum DatasetError {
         expected: (usize, usize),
         /// Width and height found.
         found: (usize, usize),
-        /// Where the expectation comes from.
+        /// The file that states the expected size.
         size_from: String,
     },
-    /// A scene was asked for that is not there.
+    /// The requested scene does not exist.
     #[error("{}: scene {scene_id} is not there; the split has scenes {known}", path.display())]
     NoScene {
         /// Folder of the split.
@@ -130,7 +130,7 @@ pub enum DatasetError {
         /// What there is.
         known: String,
     },
-    /// An image was asked for that the scene does not have.
+    /// The scene does not have the requested image.
     #[error("{}: im_id {im_id} is not there; was the right split given?", path.display())]
     NoImage {
         /// The file that should have it.
@@ -138,7 +138,7 @@ pub enum DatasetError {
         /// What was asked for.
         im_id: u32,
     },
-    /// Nothing says how large the images are.
+    /// The size of the images is stated nowhere.
     #[error(
         "{}: im_id {im_id}: the image size is unknown; camera.json has no width and height and there is no rgb, \
          gray or depth image",
@@ -158,7 +158,7 @@ pub enum DatasetError {
         /// The object.
         obj_id: u32,
     },
-    /// Whoever received the progress asked to stop.
+    /// The receiver of the progress reports asked to stop.
     #[error("stopped")]
     Stopped,
     /// A model or `models_info.json` is broken.

@@ -12,7 +12,7 @@ pub struct VsdOptions {
     pub delta: f64,
     /// Misalignment tolerances.
     pub taus: Taus,
-    /// Whether a model is visible where the test image has no depth: so since 2019 ("bop19"), not in 2018 ("bop18").
+    /// Whether a model counts as visible where the test image has no depth: yes since 2019 ("bop19"), no in 2018 ("bop18").
     pub missing_is_visible: bool,
 }
 
@@ -26,7 +26,7 @@ pub enum Taus {
 }
 
 impl Taus {
-    /// The numbers, in their unit.
+    /// The tolerances, in the unit of the variant.
     pub fn values(&self) -> &[f64] {
         let (Taus::Diameters(values) | Taus::Metres(values)) = self;
         values
@@ -48,7 +48,7 @@ impl Default for VsdOptions {
 }
 
 impl VsdOptions {
-    /// Those of the benchmark of 2018 and of the dissertation: a tolerance of 20 mm, nothing visible where depth is missing.
+    /// The options of the benchmark of 2018 and of the dissertation: a tolerance of 20 mm, nothing visible where depth is missing.
     pub fn published() -> Self {
         VsdOptions {
             taus: Taus::Metres(vec![PUBLISHED_TAU]),
@@ -91,9 +91,8 @@ fn is_depth(z: f32) -> bool {
 /// The discrepancy in `0..=1` for every tau.
 ///
 /// `estimate` and `ground_truth` are depth images of the model rendered at the two poses (zero where the model is
-/// not), `test` is what the sensor saw (zero where nothing was measured). All three in metres, of the camera's size.
-/// Distances are along the ray, not along the optical axis. Where nothing of either model is visible the discrepancy
-/// is one.
+/// not), `test` is the sensor's depth image (zero where nothing was measured). All three in metres, of the camera's size. Distances
+/// are along the ray, not along the optical axis. Where nothing of either model is visible the discrepancy is one.
 ///
 /// # Errors
 /// [`VsdError`] when an image has another size or the diameter is not positive.
