@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 
-/// An error for a number outside its range, or that is none.
+/// An error for a number outside its range, or for NaN.
 ///
 /// # Errors
 /// As it says.
@@ -18,7 +18,7 @@ pub fn in_range<T: PartialOrd + Display>(option: &str, value: T, range: RangeInc
     Ok(())
 }
 
-/// Most threads: more only cost memory.
+/// Largest number of threads: more only cost memory.
 const MOST_THREADS: usize = 1024;
 
 /// Longest time on the command line, seconds.

@@ -17,7 +17,7 @@ pub struct Shipped {
     name: &'static str,
     /// Its path in a checkout.
     checkout: &'static str,
-    /// A file by which a folder is known to be it; empty for a file.
+    /// A file that identifies the folder; empty for a file.
     sign: &'static str,
     /// The option that names another one.
     option: &'static str,
@@ -38,7 +38,7 @@ pub const PIX2POSE: Shipped = Shipped::weights("weights/pix2pose-lmo.safetensors
 /// Weights of the detector for the samples' objects.
 pub const DETECTOR: Shipped = Shipped::weights("weights/detector-lmo.safetensors", "--detector FILE");
 
-/// The network that grasps from experience are found by.
+/// The network that finds grasps from experience.
 pub const DGCM: Shipped = Shipped::weights("weights/dgcm.safetensors", "--weights FILE");
 
 impl Shipped {
@@ -85,7 +85,7 @@ impl Shipped {
         }
     }
 
-    /// Where it may be, the first first. Where the variable names a folder, nothing else counts.
+    /// The possible places, in order of preference. Where the variable names a folder, no other place is used.
     fn candidates(&self, places: &Places) -> Vec<PathBuf> {
         let mut candidates: Vec<PathBuf> = match &places.variable {
             Some(folder) => vec![folder.join(self.name), folder.join(self.checkout)],
