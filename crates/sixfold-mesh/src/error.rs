@@ -1,4 +1,4 @@
-//! What can be wrong with a mesh file: each error names the file, the place in it, and what to do.
+//! Errors of mesh files: each names the file, the place in it, and what to do.
 
 use thiserror::Error;
 
@@ -28,17 +28,17 @@ pub enum MeshFileError {
         /// Why it cannot be used.
         reason: String,
     },
-    /// The file's name has no ending that is known.
+    /// The file name has an unknown extension.
     #[error(
         "{file}: unknown mesh format \"{found}\", expected a file ending in .ply, .obj, .stl, .gltf, .glb or .xyz"
     )]
     Format {
         /// The file.
         file: String,
-        /// The ending.
+        /// The extension.
         found: String,
     },
-    /// A field holds something else than it should.
+    /// A field holds an invalid value.
     #[error("{file}: {field}: expected {expected}, found {found}")]
     Field {
         /// The file.
@@ -75,7 +75,7 @@ pub enum MeshFileError {
         /// What is wrong.
         source: MeshError,
     },
-    /// The object is no tabletop object: most often the unit is wrong.
+    /// The object does not have the size of a tabletop object: usually the unit is wrong.
     #[error("{file}: {explanation}")]
     Size {
         /// The file.
