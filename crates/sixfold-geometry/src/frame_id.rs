@@ -1,9 +1,9 @@
-//! Which image of a dataset: the ids of its scene and of the image in it.
+//! The identity of an image in a dataset: the ids of its scene and of the image in the scene.
 
 use serde::{Deserialize, Serialize};
 
-/// One image of a dataset, as BOP numbers them. Written as `scene/image` for people, as
-/// `{"scene_id": 2, "im_id": 36}` in JSON.
+/// One image of a dataset, with BOP's ids. Written as `scene/image` for people, and as `{"scene_id": 2,
+/// "im_id": 36}` in JSON.
 ///
 /// ```
 /// let frame = sixfold_geometry::FrameId::new(2, 36);
