@@ -1,4 +1,4 @@
-//! What can be wrong with what a user gives: folders, images, options.
+//! Errors in a user's input: folders, images, options.
 
 use std::path::PathBuf;
 
@@ -27,7 +27,7 @@ pub enum AugmentError {
     /// An image given in memory is too small.
     #[error("background image {index}: found {width}x{height} pixels, expected at least 8x8")]
     SmallImage {
-        /// Its place in the list.
+        /// Its index in the list.
         index: usize,
         /// Columns.
         width: usize,
