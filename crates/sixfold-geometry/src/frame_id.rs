@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// One image of a dataset, with BOP's ids. Written as `scene/image` for people, and as `{"scene_id": 2,
-/// "im_id": 36}` in JSON.
+/// One image of a dataset, with BOP's ids. Written as `scene/image` for people, and as
+/// `{"scene_id": 2, "im_id": 36}` in JSON.
 ///
 /// ```
 /// let frame = sixfold_geometry::FrameId::new(2, 36);

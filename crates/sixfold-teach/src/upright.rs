@@ -4,8 +4,8 @@ use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::stats::median;
 use sixfold_geometry::{Mat3, Plane, PlaneOptions, PointCloud, Pose, Vec3, dominant_plane, fit_plane};
 
-/// Points within this distance of a plane count as its inliers in the search, as a fraction of the cameras' distance. Chosen by
-/// hand.
+/// Points within this distance of a plane count as its inliers in the search, as a fraction of the cameras' distance.
+/// Chosen by hand.
 const THICKNESS: f64 = 0.008;
 /// Only points within this distance of the point at which the cameras look count, as a fraction of the cameras' distance: points
 /// beyond the table carry no information about it. Chosen by hand.

@@ -36,8 +36,8 @@ const BODY_POINTS: usize = 3000;
 /// Steps of the search for the board's normal, as tangents of the angle: it is within 45 degrees of the camera's direction.
 const FIRST_STEP: f64 = 1.0;
 const LAST_STEP: f64 = 0.001;
-/// Minimum number of other objects for a plane, and the largest mean deviation of their lowest points from it, metres. Chosen by
-/// hand.
+/// Minimum number of other objects for a plane, and the largest mean deviation of their lowest points from it, metres.
+/// Chosen by hand.
 const FEWEST_BODIES: usize = 4;
 const BELOW: f64 = 0.006;
 /// A pose is right within this fraction of the diameter (Hinterstoisser et al. 2012).
