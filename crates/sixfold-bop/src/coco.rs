@@ -52,9 +52,9 @@ pub enum Adjustment {
 pub struct AdjustedDetection {
     /// Its index in the file, from zero.
     pub index: usize,
-    /// What was done.
+    /// The kind of adjustment.
     pub adjustment: Adjustment,
-    /// Where and why.
+    /// The place and the reason.
     pub message: String,
 }
 
@@ -63,13 +63,13 @@ pub struct AdjustedDetection {
 pub struct Detections {
     /// The valid detections, in the order of the file.
     pub detections: Vec<Detection>,
-    /// What was clipped or left out.
+    /// Detections that were clipped or left out.
     pub adjusted: Vec<AdjustedDetection>,
     /// Indices in `detections` of those without a scene, as in COCO's own files; their scene is 0.
     pub without_scene: Vec<usize>,
 }
 
-/// How detections are read.
+/// Options for reading detections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ReadDetections {
     /// Leave invalid detections out and report them, rather than refuse the file.

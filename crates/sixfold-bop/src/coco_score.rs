@@ -9,7 +9,7 @@ use sixfold_geometry::Rect;
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
 use crate::rle::Rle;
 
-/// What is compared.
+/// Whether boxes or masks are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IouType {
     /// Boxes; a detection without box counts with the box around its mask.

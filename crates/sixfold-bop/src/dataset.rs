@@ -353,12 +353,12 @@ impl SceneImage {
     }
 }
 
-/// Which mask of an object.
+/// A kind of mask of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MaskKind {
     /// The whole silhouette inside the image (`mask`).
     Full,
-    /// What is visible (`mask_visib`).
+    /// The visible part (`mask_visib`).
     Visible,
 }
 

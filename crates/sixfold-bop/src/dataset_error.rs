@@ -1,5 +1,5 @@
-//! What can be wrong with a dataset on disk: every message names the file, the place in it, what was expected, what
-//! was found and what to do.
+//! Errors of datasets on disk: every message names the file, the place in it, the values expected and found, and
+//! what to do.
 
 use std::path::PathBuf;
 
@@ -34,9 +34,9 @@ pub enum DatasetError {
     /// A required file or folder is missing.
     #[error("{}: {what} is missing; {advice}", path.display())]
     Missing {
-        /// Where it should be.
+        /// The expected path.
         path: PathBuf,
-        /// What it is.
+        /// Its description.
         what: &'static str,
         /// What to do.
         advice: &'static str,
@@ -46,7 +46,7 @@ pub enum DatasetError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The system could not write a file.
@@ -54,7 +54,7 @@ pub enum DatasetError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file is not JSON.
@@ -77,9 +77,9 @@ pub enum DatasetError {
         place: Place,
         /// Name of the field.
         field: String,
-        /// What it held.
+        /// Its value.
         found: String,
-        /// What it should hold.
+        /// The expected value.
         expected: String,
     },
     /// An image file cannot be decoded.
@@ -125,9 +125,9 @@ pub enum DatasetError {
     NoScene {
         /// Folder of the split.
         path: PathBuf,
-        /// What was asked for.
+        /// The requested scene.
         scene_id: u32,
-        /// What there is.
+        /// The existing scenes.
         known: String,
     },
     /// The scene does not have the requested image.
@@ -135,7 +135,7 @@ pub enum DatasetError {
     NoImage {
         /// The file that should have it.
         path: PathBuf,
-        /// What was asked for.
+        /// The requested image.
         im_id: u32,
     },
     /// The size of the images is stated nowhere.

@@ -11,7 +11,7 @@ const LEAF_SIZE: usize = 24;
 /// Testing this many points is cheaper than computing the bounds of their parts.
 const WHOLE_SIZE: usize = 128;
 
-/// Points that lie close together: their range, a box and a ball around them.
+/// A node of the tree: a range of nearby points, with a box and a ball around them.
 #[derive(Debug, Clone)]
 pub(crate) struct Node {
     low: [f64; 3],
@@ -74,7 +74,7 @@ impl ModelPoints {
         })
     }
 
-    /// How many points there are; never zero.
+    /// Number of points; never zero.
     #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.x.len()

@@ -30,8 +30,8 @@ pub struct Estimate {
     pub camera_from_object: Pose,
     /// Seconds that all estimates of this image took together; `None` where not measured (-1 in the file).
     pub time: Option<f64>,
-    /// The rotation as the file had it, where it came from one; the pose holds the nearest true rotation. The errors
-    /// of an evaluation are computed with these numbers, as the official one does.
+    /// The rotation as written in the file, if it came from one; the pose holds the nearest true rotation. An
+    /// evaluation computes errors with these numbers, as the official one does.
     pub rotation_as_written: Option<Mat3>,
 }
 
@@ -74,7 +74,7 @@ pub enum ResultsError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The system could not write the file.
@@ -82,7 +82,7 @@ pub enum ResultsError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -95,9 +95,9 @@ pub struct BadRow {
     pub line: usize,
     /// Name of the column.
     pub column: &'static str,
-    /// What it held.
+    /// Its value.
     pub found: String,
-    /// What it should hold.
+    /// The expected value.
     pub expected: String,
 }
 
@@ -277,7 +277,7 @@ impl ResultsAppender {
         Ok(ResultsAppender { path: path.to_owned(), file, existing, torn })
     }
 
-    /// What the file held when it was opened.
+    /// The estimates in the file when it was opened.
     pub fn existing(&self) -> &[Estimate] {
         &self.existing
     }

@@ -36,13 +36,12 @@ pub struct ImageCamera {
 /// One object in one image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// Which object.
+    /// Id of the object.
     pub obj_id: u32,
     /// Its pose.
     pub camera_from_object: Pose,
-    /// The rotation as the file had it, where it came from one (LM-O's are up to a thousandth off a rotation); the
-    /// pose holds the nearest true rotation. The errors of an evaluation are computed with these numbers, as the
-    /// official one does.
+    /// The rotation as written in the file, if it came from one (LM-O's differ from a rotation by up to a thousandth); the
+    /// pose holds the nearest true rotation. An evaluation computes errors with these numbers, as the official one does.
     pub rotation_as_written: Option<Mat3>,
 }
 
@@ -84,16 +83,16 @@ pub struct Target {
     pub scene_id: u32,
     /// The image.
     pub im_id: u32,
-    /// The object and how many instances of it are to be found; `None` in the BOP'24 format.
+    /// The object and the number of its instances to find; `None` in the BOP'24 format.
     pub object: Option<TargetObject>,
 }
 
 /// The object of a [`Target`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TargetObject {
-    /// Which object.
+    /// Id of the object.
     pub obj_id: u32,
-    /// How many instances are to be found.
+    /// Number of instances to find.
     pub inst_count: usize,
 }
 

@@ -183,7 +183,8 @@ mod tests {
         assert_eq!(found[0].info.visib_fract, 0.5);
         assert_eq!(found[1].info.visib_fract, 1.0);
 
-        // The sensor sees something 20 mm in front of the upper rows only; in the lower rows 10 mm, in one nothing.
+        // The measured depth is 20 mm in front of the object in the upper rows, 10 mm in front in the lower rows, and
+        // missing in one row.
         let depth = Image::from_fn(100, 80, |_, y| {
             if y < 35 {
                 0.98

@@ -9,7 +9,7 @@ use sixfold_mesh::MeshFileError;
 use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
-/// What is wrong with one posed image.
+/// An error of one posed image.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PosedImageError {

@@ -20,7 +20,7 @@ pub struct TrainingObject {
     pub mesh: Mesh,
     /// Diameter and symmetries.
     pub info: ModelInfo,
-    /// How its coordinates are normalised.
+    /// The normalisation of its coordinates.
     pub scale: BoundingBoxScale,
 }
 

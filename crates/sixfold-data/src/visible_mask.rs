@@ -55,7 +55,7 @@ impl VisibleMask {
         self.size
     }
 
-    /// How many pixels show the object.
+    /// Number of pixels that show the object.
     pub fn pixels(&self) -> usize {
         self.pixels
     }

@@ -22,7 +22,7 @@ pub enum Need {
     Required,
 }
 
-/// What a method needs of a query and of an object.
+/// The inputs that a method needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Needs {
     /// A depth image.
@@ -35,7 +35,7 @@ pub struct Needs {
     pub object: Need,
 }
 
-/// The confidence below which estimates are left out unless the caller says otherwise.
+/// The confidence below which estimates are left out, unless the caller sets another.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MinConfidence {
     /// For a single image, where a person wants no guesses.

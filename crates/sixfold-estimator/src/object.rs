@@ -7,7 +7,7 @@ use sixfold_mesh::{Mesh, ModelInfo};
 
 use crate::error::EstimatorError;
 
-/// An object to be found: a mesh, or an object that methods know without one.
+/// An object to be found: a mesh, or an object known to methods without one.
 #[derive(Debug, Clone)]
 pub struct Object {
     /// Its name for people; not a file name.

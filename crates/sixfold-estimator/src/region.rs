@@ -1,8 +1,8 @@
-//! Where in an image an instance is searched.
+//! A region of an image in which an instance is searched.
 
 use sixfold_geometry::{Camera, Mask, Rect};
 
-/// Where one instance is searched, in a pinhole image.
+/// The region of one instance in a pinhole image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
     /// Its box, pixels.

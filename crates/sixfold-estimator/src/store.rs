@@ -124,7 +124,7 @@ pub enum StoreError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// Derived data of the new object could not be computed or stored; nothing was stored.

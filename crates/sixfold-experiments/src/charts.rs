@@ -30,7 +30,7 @@ pub(crate) struct ChartsArguments {
     json: JsonArguments,
 }
 
-/// What was written or compared.
+/// The images that were written or compared.
 #[derive(Debug, Serialize)]
 struct Written {
     images: Vec<String>,

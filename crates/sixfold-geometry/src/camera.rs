@@ -40,9 +40,9 @@ pub enum CameraError {
     Field {
         /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: f64,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
     /// No lens has these parameters, or not with an image of this size.
@@ -50,9 +50,9 @@ pub enum CameraError {
     Implausible {
         /// Names of the fields.
         fields: &'static str,
-        /// What they hold and what that would mean.
+        /// Their values and what these would imply.
         found: String,
-        /// What they should hold.
+        /// The expected values.
         expected: &'static str,
         /// What to do.
         advice: &'static str,

@@ -46,7 +46,7 @@ pub enum IcpError {
         option: &'static str,
         /// Its value.
         found: f64,
-        /// What it should be.
+        /// The expected value.
         expected: &'static str,
     },
 }

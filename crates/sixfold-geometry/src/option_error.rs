@@ -11,9 +11,9 @@ use thiserror::Error;
 pub struct OptionError {
     /// Its name, with the field of a nested struct in front: `voting.bin_margin`.
     pub option: &'static str,
-    /// What it holds.
+    /// Its value.
     pub found: String,
-    /// What it may hold.
+    /// The allowed values.
     pub expected: &'static str,
 }
 

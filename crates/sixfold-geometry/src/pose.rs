@@ -24,7 +24,7 @@ pub enum PoseError {
         orthogonality: f64,
         /// The determinant of `R`.
         determinant: f64,
-        /// What was accepted.
+        /// The tolerance.
         tolerance: f64,
     },
     /// A number is NaN or infinite.

@@ -12,7 +12,7 @@ pub enum ImageFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The system could not write it.
@@ -20,7 +20,7 @@ pub enum ImageFileError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// It cannot be decoded, or has another kind of pixels.

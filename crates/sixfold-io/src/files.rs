@@ -23,7 +23,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// Creates the folder of `path` with its missing parents, and syncs their names to the disk.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub fn make_folder_of(path: &Path) -> io::Result<()> {
     let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) else { return Ok(()) };
     let missing: Vec<&Path> =

@@ -13,7 +13,7 @@ pub enum MeshFileError {
     Io {
         /// The file.
         file: String,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file that the mesh file names cannot be read.
@@ -45,9 +45,9 @@ pub enum MeshFileError {
         file: String,
         /// Element and property, or line, or object.
         field: String,
-        /// What should be there.
+        /// The expected value.
         expected: String,
-        /// What is there.
+        /// The value found.
         found: String,
     },
     /// A `models_info.json` does not describe the mesh of an object.
@@ -62,9 +62,9 @@ pub enum MeshFileError {
         object: u32,
         /// The field.
         field: String,
-        /// What is there.
+        /// The value found.
         found: String,
-        /// What the mesh says.
+        /// The value computed from the mesh.
         expected: String,
     },
     /// The arrays of the file do not form a mesh.

@@ -25,7 +25,7 @@ pub const LARGEST_AREA: f64 = 1000.0;
 /// Limit on the bytes of all files together that a mesh file refers to.
 const MOST_NAMED: u64 = 4 << 30;
 
-/// How [`read_mesh_with`] reads mesh files.
+/// Options of [`read_mesh_with`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MeshOptions {
     /// Read textures, materials and buffers from any path in the mesh file, not only from its own folder and below. A mesh from an

@@ -155,7 +155,7 @@ impl ModelsInfo {
         write_atomically(path.as_ref(), self.to_text().as_bytes())
     }
 
-    /// What [`ModelsInfo::write`] writes.
+    /// The text that [`ModelsInfo::write`] writes.
     pub fn to_text(&self) -> String {
         let objects: Vec<String> =
             self.0.iter().map(|(id, info)| format!(" \"{id}\": {}", to_json(info))).collect();
@@ -199,7 +199,7 @@ fn to_json(info: &ModelInfo) -> Value {
     Value::Object(object)
 }
 
-/// What sort of value this is, for messages.
+/// The kind of a value, for messages.
 fn kind(value: &Value) -> String {
     match value {
         Value::Array(items) => format!("an array of {}", items.len()),

@@ -102,9 +102,9 @@ struct Header {
     encoding: Encoding,
     elements: Vec<Element>,
     texture: Option<String>,
-    /// Where the body starts.
+    /// Start of the body in the bytes of the file.
     body: usize,
-    /// How many lines the header has.
+    /// Number of lines of the header.
     lines: usize,
 }
 

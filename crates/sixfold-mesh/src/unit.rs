@@ -27,7 +27,7 @@ pub enum Unit {
 #[derive(Debug, Error, Clone, PartialEq, Eq)]
 #[error("unit: found \"{found}\", expected one of m, mm, cm, in")]
 pub struct UnitError {
-    /// What was given.
+    /// The given value.
     pub found: String,
 }
 

@@ -51,7 +51,7 @@ impl Default for RenderOptions {
 pub struct SceneObject<'a> {
     /// The mesh, in its own frame, metres.
     pub mesh: &'a Mesh,
-    /// Where it is.
+    /// Its pose.
     pub camera_from_object: Pose,
 }
 
@@ -615,7 +615,7 @@ struct Rows {
 }
 
 impl Rows {
-    /// Where row `y` starts in a band that starts at `y0`, and 1/z there.
+    /// The index at which row `y` starts in a band that starts at `y0`, and 1/z there.
     #[inline]
     fn row(&self, y: i32, y0: i32, width: usize) -> (usize, f32) {
         let base = self.plane.a * f64::from(self.first_x) + self.plane.b * f64::from(y) + self.plane.c;

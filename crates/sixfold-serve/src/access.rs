@@ -133,7 +133,7 @@ fn text<'h>(headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
     headers.get(name).and_then(|value| value.to_str().ok())
 }
 
-/// Whether `Host` names this machine, or the address that the server was told to listen on.
+/// Whether `Host` names this machine, or the address on which the server listens.
 fn is_own(host: &str, listening: IpAddr) -> bool {
     let name = match host.rsplit_once(':') {
         Some((name, port)) if port.bytes().all(|b| b.is_ascii_digit()) => name,

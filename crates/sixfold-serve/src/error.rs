@@ -30,7 +30,7 @@ pub enum ServeError {
     Option {
         /// Its name.
         option: &'static str,
-        /// What was given.
+        /// The given value.
         found: String,
         /// What it may be.
         expected: String,
@@ -42,7 +42,7 @@ pub enum ServeError {
     Bind {
         /// The address.
         address: SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Two servers with the same folder.
@@ -53,7 +53,7 @@ pub enum ServeError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A method's files cannot be read.

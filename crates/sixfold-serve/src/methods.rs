@@ -154,7 +154,7 @@ impl Methods {
         self.methods.iter().map(|m| m.name).collect()
     }
 
-    /// All methods as clients see them.
+    /// All methods in the form for clients.
     pub fn describe(&self) -> Vec<MethodInfo> {
         let describe = |method: &Method| {
             let needs = method.estimator().ok()?.needs();

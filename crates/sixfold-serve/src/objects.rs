@@ -1,4 +1,5 @@
-//! Stored objects as clients see them: listed, rendered, their meshes, removed. They are added by a job (`tasks/object.rs`).
+//! The API of stored objects: list, render and remove them, and get their meshes. They are added by a job
+//! (`tasks/object.rs`).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};

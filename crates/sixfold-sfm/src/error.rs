@@ -93,7 +93,7 @@ pub enum SfmError {
         first: usize,
         /// The second.
         second: usize,
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
     /// The receiver of the progress reports asked to stop.

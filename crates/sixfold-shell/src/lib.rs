@@ -1,5 +1,5 @@
-//! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
-//! arguments, stores and scenes that both take.
+//! The parts that the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress,
+//! images, and the arguments, stores and scenes that both take.
 
 #![warn(unreachable_pub, unnameable_types)]
 

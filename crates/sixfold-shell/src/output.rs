@@ -51,7 +51,7 @@ pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()
 /// error.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     sixfold_io::write_atomically(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }

@@ -75,7 +75,7 @@ pub fn certainty(estimate: &PoseEstimate) -> f64 {
     estimate.probability.unwrap_or(estimate.confidence)
 }
 
-/// Where an object is seen.
+/// The shape of an object in an image.
 #[derive(Debug, Clone, Copy)]
 pub enum Shape<'a> {
     /// A mesh in metres at a pose camera_from_object.
@@ -87,7 +87,7 @@ pub enum Shape<'a> {
 /// One pose to be drawn.
 #[derive(Debug, Clone)]
 pub struct Drawn<'a> {
-    /// Where it is.
+    /// Its shape in the image.
     pub shape: Shape<'a>,
     /// Of its surface, silhouette and label.
     pub color: [u8; 3],

@@ -73,7 +73,7 @@ impl Progress {
         self.bar.set_message(printable(&message));
     }
 
-    /// What is shown behind the bar.
+    /// Sets the message behind the bar.
     pub fn message(&mut self, message: String) {
         if let Some((last, _)) = &self.plain
             && last.elapsed() < Duration::from_millis(100)

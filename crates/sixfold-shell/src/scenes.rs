@@ -180,11 +180,11 @@ pub fn write_objects(folder: &DatasetFolder, out: &Path, objects: &[FallingObjec
 pub struct Made {
     /// Objects that fell.
     pub dropped: usize,
-    /// Objects that came to rest within the used area.
+    /// Objects that came to rest within reach.
     pub resting: usize,
 }
 
-/// How scenes are made and written.
+/// Makes and writes scenes.
 pub struct SceneMaker<'a> {
     /// Folder of the dataset, and its split.
     pub dataset: (&'a Path, &'a str),

@@ -1,17 +1,17 @@
-//! Where the weights and samples are that come with Sixfold as files of their own: in a checkout, beside an installed program, or
-//! in the user's data folder (XDG Base Directory Specification 0.8). docs/install.md lists the places.
+//! The location of the weights and samples that come with Sixfold as separate files: in a checkout, beside an installed program,
+//! or in the user's data folder (XDG Base Directory Specification 0.8). docs/install.md lists the places.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
-/// The variable that names the one folder to look in.
+/// The environment variable that names the only folder to search.
 pub const VARIABLE: &str = "SIXFOLD_SHARE";
 
 /// A file or folder that comes with Sixfold.
 #[derive(Debug, Clone, Copy)]
 pub struct Shipped {
-    /// What it is, for messages.
+    /// Its description, for messages.
     what: &'static str,
     /// Its path in a folder of shipped files.
     name: &'static str,
@@ -46,7 +46,7 @@ impl Shipped {
         Shipped { what: "the file of weights", name, checkout: name, sign: "", option }
     }
 
-    /// Where it is.
+    /// Its path.
     ///
     /// # Errors
     ///
@@ -102,10 +102,10 @@ impl Shipped {
     }
 }
 
-/// The folders to look in.
+/// The folders to search.
 #[derive(Debug, Default)]
 struct Places {
-    /// What the variable names.
+    /// The folder that the variable names.
     variable: Option<PathBuf>,
     /// The current folder: it, or one above, may be a checkout.
     here: Option<PathBuf>,

@@ -101,7 +101,7 @@ pub enum TeachError {
          images are from the same places, or give --length and --ends"
     )]
     FewDepths {
-        /// How many have.
+        /// Number of features with a measured depth.
         found: usize,
         /// How many are needed.
         least: usize,
@@ -109,7 +109,7 @@ pub enum TeachError {
     /// Marked points that give no length.
     #[error("--ends: {what}")]
     Ends {
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
     /// No features can be searched in an image.
@@ -148,7 +148,7 @@ pub enum TeachError {
     /// A mask or pose for a photograph that does not exist.
     #[error("photograph {index}: there are {photographs}, numbered from 0")]
     NoPhotograph {
-        /// What was asked for.
+        /// The requested number.
         index: usize,
         /// How many there are.
         photographs: usize,
@@ -192,7 +192,7 @@ pub enum TeachError {
     /// Marked points that give no pose.
     #[error("pose from points: {what}")]
     Pairs {
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
     /// A step was started before one that it needs.
@@ -223,7 +223,7 @@ pub enum TeachError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The object cannot be stored.

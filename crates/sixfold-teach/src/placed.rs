@@ -227,7 +227,7 @@ impl Fit<'_> {
         Pose::new(step.rotation() * pose.rotation(), step.rotation() * shifted + middle + step.translation())
     }
 
-    /// How well the mesh's own colours agree with the photographs: mean correlation over the views; 0 for a mesh without colours.
+    /// Agreement of the mesh's own colours with the photographs: mean correlation over the views; 0 for a mesh without colours.
     fn colors(&self, given: &Mesh, pose: &Pose) -> f64 {
         if given.colors().is_none() && given.texture().is_none() {
             return 0.0;

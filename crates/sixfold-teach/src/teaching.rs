@@ -32,7 +32,7 @@ use crate::silhouette::Segmenter;
 use crate::snapshot::{Snapshot, State, VERSION};
 use crate::view::Volume;
 
-/// Most photographs.
+/// Maximum number of photographs.
 pub const MOST_PHOTOGRAPHS: usize = 200;
 /// The file of a mesh that was given.
 const GIVEN_MESH: &str = "given.ply";

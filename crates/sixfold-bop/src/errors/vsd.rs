@@ -5,7 +5,7 @@
 use sixfold_geometry::{Camera, DepthImage};
 use thiserror::Error;
 
-/// How VSD is computed. The default is BOP's.
+/// Options of VSD. The default is BOP's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VsdOptions {
     /// Tolerance of the visibility test in metres: 15 mm in all BOP datasets but ITODD (5 mm).
@@ -79,7 +79,7 @@ pub enum VsdError {
     /// The diameter is not a positive number.
     #[error("the diameter is {found} m, expected a number above zero")]
     Diameter {
-        /// What was given.
+        /// The given value.
         found: f64,
     },
 }

@@ -9,7 +9,7 @@ use crate::dataset_error::DatasetError;
 use crate::errors::{Taus, VsdError, VsdOptions};
 use crate::score::fractions_05_to_50;
 
-/// How an evaluation is done. The default is the BOP Challenge's.
+/// Options of an evaluation. The default is the BOP Challenge's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvalOptions {
     /// Step of discretised continuous symmetries, as a fraction of the diameter.
@@ -25,7 +25,7 @@ pub struct EvalOptions {
     pub visib_gt_min: Option<f64>,
     /// Steps of the recall curves.
     pub curve_steps: usize,
-    /// Which model folder.
+    /// The model folder to use.
     pub models: Models,
 }
 
@@ -52,9 +52,9 @@ pub enum EvalError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: f64,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
     /// The dataset is broken.

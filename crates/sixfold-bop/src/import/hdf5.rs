@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-/// What is wrong with a file, and where.
+/// Why a file cannot be read, and where.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hdf5Error {
     /// The dataset, or a part of the file.
@@ -47,7 +47,7 @@ pub(super) struct Dataset {
     pub whole: bool,
 }
 
-/// What the elements are.
+/// The type of the elements.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Element {
     float: bool,

@@ -72,7 +72,7 @@ pub enum PnpError {
         option: &'static str,
         /// Its value.
         found: f64,
-        /// What it should be.
+        /// The expected value.
         expected: &'static str,
     },
 }

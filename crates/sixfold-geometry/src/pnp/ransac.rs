@@ -193,7 +193,8 @@ impl Blocks {
         }
     }
 
-    /// Truncated cost and number of inliers, `None` as soon as the cost must exceed `most` or the pose looks wrong.
+    /// Truncated cost and number of inliers, `None` as soon as the cost must exceed `most` or the sequential test
+    /// rejects the pose.
     fn cost(&self, model: &Model, most: f32, test: &mut SequentialTest) -> Option<(f32, usize)> {
         let (r, t) = (&model.rotation, &model.translation);
         let row =

@@ -23,7 +23,7 @@ pub enum CameraFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// It is not JSON.

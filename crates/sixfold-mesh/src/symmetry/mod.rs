@@ -30,9 +30,9 @@ const LIKELY_P95: f64 = 0.03;
 /// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2020, who then inspected every object
 /// within it; with their 15 mm for small objects, any object of 5 cm would count as symmetric.
 const LIKELY_MAX: f64 = 0.1;
-/// What expected noise adds, in standard deviations and as squares. Both the moved point and the surface have noise, but the
-/// distance is to the nearest point: boxes with independent noise on their vertices reach 1.7 and 3.3 (`noise_of_a_millimetre` in
-/// the tests).
+/// The increase of the limits by expected noise, in standard deviations, added in squares. Both the moved point and the surface
+/// have noise, but the distance is to the nearest point: boxes with independent noise on their vertices reach 1.7 and 3.3
+/// (`noise_of_a_millimetre` in the tests).
 const NOISE_P95: f64 = 2.0;
 const NOISE_MAX: f64 = 4.0;
 /// Colours are the same if 95 % of the smoothed ones differ by less than this, 0 to 1.

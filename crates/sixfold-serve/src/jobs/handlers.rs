@@ -1,4 +1,4 @@
-//! Jobs as clients see them: listed, watched, cancelled, their results and images.
+//! The API of jobs: list, watch, cancel and remove them, and get results and images.
 
 use std::convert::Infallible;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Teachings as clients see them.
+//! Teachings in the form for clients.
 
 use serde::{Deserialize, Serialize};
 use sixfold_mesh::Mesh;

@@ -13,7 +13,7 @@ pub struct Colour {
     pub weights: Option<PathBuf>,
     /// Weights of the detector; without them the boxes come from the ground truth.
     pub detector: Option<PathBuf>,
-    /// What was found.
+    /// The poses found.
     pub poses: Vec<SamplePose>,
     /// How many of the poses are within 10 % of the diameter.
     pub correct: usize,

@@ -66,7 +66,7 @@ pub struct SamplePose {
     pub seconds: f64,
 }
 
-/// What the demo found.
+/// The results of the demo.
 #[derive(Serialize)]
 pub struct Demo {
     /// Poses from depth.

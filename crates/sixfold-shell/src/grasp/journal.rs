@@ -197,7 +197,7 @@ impl StoreJournal {
     }
 }
 
-/// What the first line of a store's journal begins with; its name and the options follow.
+/// The beginning of the first line of a store's journal; its name and the options follow.
 const HEADER: &str = "{\"journal\":\"";
 
 /// 128 random bits: the standard library seeds its hash tables from the system.

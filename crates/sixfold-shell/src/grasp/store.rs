@@ -182,7 +182,7 @@ pub fn refresh(place: &StorePlace, out: &StorePlace, network: &DgcmModel) -> Res
     Ok(Moved { added, experiences: target.list()?.len(), unreadable: left_out.count(place) })
 }
 
-/// What was written as files.
+/// Result of an export.
 #[derive(Serialize)]
 pub struct Exported {
     /// Experiences.
@@ -193,7 +193,7 @@ pub struct Exported {
 }
 
 impl Exported {
-    /// What the command returns.
+    /// The outcome of the command.
     pub fn outcome(&self) -> Outcome {
         match (self.experiences, self.unreadable) {
             (_, 1..) => Outcome::Incomplete,

@@ -14,7 +14,7 @@ use super::error::AugmentError;
 use super::patch::{AffineMap, Patch};
 use super::texture::procedural_texture;
 
-/// How a folder of photographs is read.
+/// Options for reading a folder of photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PhotographOptions {
     /// Photographs are reduced until their longer side has at most this many pixels.

@@ -13,7 +13,7 @@ pub enum AugmentError {
     Folder {
         /// The folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// There is no usable photograph.
@@ -39,9 +39,9 @@ pub enum AugmentError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: String,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
 }

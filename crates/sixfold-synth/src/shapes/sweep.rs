@@ -7,7 +7,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, MeshError};
 
-/// A solid of length 1 that begins at the origin and goes along z, bent in the xz plane.
+/// A solid of length 1 that starts at the origin along z and bends in the xz plane.
 #[derive(Debug, Clone)]
 pub(super) struct Sweep {
     /// (fraction of the path, fraction of the radii), from the beginning to the end.

@@ -25,7 +25,7 @@ type Result<T> = std::result::Result<T, PickleError>;
 
 /// Limit on copied bytes, as a multiple of the pickle's length: arrays are copied from its bytes, usually once.
 const COPIES: usize = 4;
-/// Most dimensions of an array: numpy's limit.
+/// Maximum number of dimensions of an array: numpy's limit.
 const MAX_DIMENSIONS: usize = 64;
 
 /// A value's index among all values that the pickle made.
@@ -356,7 +356,7 @@ impl Machine<'_> {
         }
     }
 
-    /// What `__setstate__` would do for arrays and types.
+    /// Applies a state to arrays and types, as `__setstate__` would.
     fn build(&mut self, object: Id, state: Id) -> Result<()> {
         // Version, shape, type, order and content of an array; version and byte order of a type.
         let items: Vec<Id> = self.items(state).iter().take(5).copied().collect();

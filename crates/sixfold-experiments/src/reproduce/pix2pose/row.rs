@@ -218,7 +218,7 @@ impl Bench {
         Ok(row)
     }
 
-    /// How many targets were detected, and the poses of those alone.
+    /// The fraction of detected targets, and the recall of poses on these targets.
     fn right_boxes(&self, detected: &Regions, estimates: &[Estimate]) -> Result<RightBoxes> {
         let overlaps = |t: &&Target| {
             let Some(key) = t.object.map(|o| (t.scene_id, t.im_id, o.obj_id)) else { return false };
