@@ -30,7 +30,7 @@ pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
     Every object is kept. After a stop, the same command resumes.";
 
-/// Spatial frequency of the colours given to a mesh without colours, 1/m: patches of a few centimetres.
+/// Angular spatial frequency of the colours given to a mesh without colours, 1/m: patches of a few centimetres.
 const PATCHES: f64 = 90.0;
 /// New images of each object.
 const NEW_IMAGES: usize = 5;
