@@ -57,7 +57,7 @@ impl VisibleTruth {
     /// The ground truth of these images (scene, image): boxes as `bbox_visib` (first pixel, last minus first), masks of
     /// what is visible. Where a scene has no masks or no `scene_gt_info.json`, all annotated objects of an image are
     /// rendered together (with the depth image, if there is one); without a depth image, occluders that are not annotated are
-    /// then unknown. Objects that are less than 10 % visible become crowds, objects of which nothing is visible are left out.
+    /// then unknown. Objects that are less than 10 % visible become crowds; objects without visible pixels are left out.
     ///
     /// # Errors
     /// [`DatasetError`].

@@ -7,7 +7,7 @@ use sixfold_geometry::{Mat3, Pose, Vec3};
 
 use crate::dataset_error::{DatasetError, Place};
 
-/// A value and where it came from.
+/// A value and its place in the file.
 #[derive(Clone, Copy)]
 pub(crate) struct At<'a> {
     pub path: &'a Path,

@@ -336,7 +336,7 @@ mod tests {
             contents.add_path("mesh", &input).unwrap();
             contents
         };
-        // Its input, by any path, and what is not its own.
+        // Refused: its input by any path, and a folder with files that are not its own.
         for path in ["dataset", "new/../dataset", "./dataset/"] {
             assert!(error(take(&root.path().join(path), 1)).contains("is the input"), "{path}");
         }

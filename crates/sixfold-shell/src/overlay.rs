@@ -89,7 +89,7 @@ pub enum Shape<'a> {
 pub struct Drawn<'a> {
     /// Its shape in the image.
     pub shape: Shape<'a>,
-    /// Of its surface, silhouette and label.
+    /// Colour of its surface, silhouette and label.
     pub color: [u8; 3],
     /// Its name on the label.
     pub name: String,

@@ -53,7 +53,7 @@ pub enum TeachError {
     Camera {
         /// Why.
         source: BoardError,
-        /// Of the photographs; empty or `; FILE: REASON; ...`.
+        /// Reasons of single photographs; empty or `; FILE: REASON; ...`.
         reasons: String,
     },
     /// The given camera is for another image size.
@@ -61,13 +61,13 @@ pub enum TeachError {
         "photographs have {width}x{height} pixels, the camera file is for {camera_width}x{camera_height}"
     )]
     CameraSize {
-        /// Of the photographs.
+        /// Width of the photographs, pixels.
         width: usize,
-        /// Of the photographs.
+        /// Height of the photographs, pixels.
         height: usize,
-        /// Of the camera.
+        /// Width of the camera's images, pixels.
         camera_width: usize,
-        /// Of the camera.
+        /// Height of the camera's images, pixels.
         camera_height: usize,
     },
     /// No photograph at all.
@@ -129,7 +129,7 @@ pub enum TeachError {
         "found {found} objects on the board, the second {percent:.0} % as large as the first: leave one, or give masks"
     )]
     SeveralObjects {
-        /// How many.
+        /// Number of objects.
         found: usize,
         /// Size of the second against the first, percent.
         percent: f64,
@@ -140,9 +140,9 @@ pub enum TeachError {
          from photographs, nor what moved between them; correct the masks, or give a mesh"
     )]
     Contradicting {
-        /// How many.
+        /// Number of contradicting masks.
         contradicting: usize,
-        /// Of how many.
+        /// Number of masks.
         all: usize,
     },
     /// A mask or pose for a photograph that does not exist.
@@ -160,13 +160,13 @@ pub enum TeachError {
     MaskSize {
         /// The photograph.
         name: String,
-        /// Of the mask.
+        /// Width of the mask, pixels.
         width: usize,
-        /// Of the mask.
+        /// Height of the mask, pixels.
         height: usize,
-        /// Of the photograph.
+        /// Width of the photograph, pixels.
         photograph_width: usize,
-        /// Of the photograph.
+        /// Height of the photograph, pixels.
         photograph_height: usize,
     },
     /// A given mesh of another size than the object in the photographs.

@@ -312,7 +312,7 @@ fn guided(p: &Image<f32>, image: &RgbImage) -> Image<f32> {
     combined(&combined(&mean_a, &guide, |a, i| a * i), &mean_b, |ai, b| (ai + b).clamp(0.0, 1.0))
 }
 
-/// The part of space that the views agree on, from log-odds: below zero where it belongs to the object.
+/// A field from the consensus of the views, from log-odds: below zero where a voxel belongs to the object.
 pub(crate) fn consensus(
     views: &[(View, Image<f32>)],
     volume: &Volume,

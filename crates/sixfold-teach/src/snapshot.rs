@@ -133,7 +133,7 @@ impl Snapshot {
         Some(self.state.ruler.and_then(|ruler| board.with_ruler(ruler)).unwrap_or(board))
     }
 
-    /// The plane on which the object stands, where there is no board and if it is known.
+    /// The plane on which the object stands, without a board and if known.
     pub fn floor(&self) -> Option<Plane> {
         self.state.floor.map(|[x, y, z, offset]| Plane { normal: Vec3::new(x, y, z), offset })
     }

@@ -250,8 +250,8 @@ mod tests {
         for diameter in [0.05, 0.5] {
             assert_eq!(published(e, g, g, diameter), vec![0.25]);
         }
-        // Of four pixels of the ground truth one has no depth: three count. The estimate misses one of them, and has one more where
-        // depth is missing, which counts for nothing: 1 of 3. Since 2019 both count: 2 of 5.
+        // One of the four pixels of the ground truth has no depth, so three count. The estimate misses one of them, and has one
+        // more where depth is missing, which counts for nothing: 1 of 3. Since 2019 both count: 2 of 5.
         let t = [OUT, OUT, 1.0, 1.0, 1.0, OUT, 2.0, 2.0, 2.0, 2.0];
         let e = [OUT, 1.0, 1.0, 1.0, OUT, 1.0, OUT, OUT, OUT, OUT];
         assert_eq!(published(e, g, t, 0.1), vec![1.0 / 3.0]);

@@ -64,7 +64,7 @@ fn why_no_vsd(prepared: &Prepared<'_>, options: &EvalOptions) -> Option<String> 
     }
 }
 
-/// The errors of all tasks of an image; those of VSD where it is given its options and the image has depth.
+/// The errors of all tasks of an image; VSD errors only if options for VSD are given and the image has depth.
 fn errors_of_image<'p, 'a>(
     prepared: &'p Prepared<'a>,
     image: &'p ImageTasks<'a>,
